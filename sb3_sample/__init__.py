@@ -1,0 +1,8 @@
+"""Sample-efficient reinforcement learning for users of Stable-Baselines3."""
+
+from sb3_sample.envs import make_env
+from sb3_sample.sac import BRO, SAC, BROFast
+
+__version__ = "0.1.0"
+
+__all__ = ["BRO", "SAC", "BROFast", "__version__", "make_env"]

@@ -1,0 +1,231 @@
+"""BRO and BRO Fast."""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import torch
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from sb3_sample.sac.algorithm import SAC
+from sb3_sample.sac.policies import SACPolicy
+
+#: Critic sizes by their names in P5, table 7 (parameters of all networks): residual blocks and width.
+MODEL_SIZES: dict[str, tuple[int, int]] = {
+    "0.55M": (1, 128),
+    "1.05M": (1, 256),
+    "2.83M": (1, 512),
+    "4.92M": (2, 512),
+    "26.31M": (3, 1024),
+}
+
+#: Environment steps at which all parameters are reset.
+BRO_RESETS = (15_000, 50_000, 250_000, 500_000, 750_000, 1_000_000, 1_500_000, 2_000_000)
+BRO_FAST_RESETS = (15_000,)
+
+
+class BRO(SAC):
+    """
+    BRO: bigger, regularized, optimistic (P5, Nauman et al. 2024, https://arxiv.org/abs/2405.16158, algorithm 2).
+
+    Two wide BroNet critics with 100 quantiles each and weight decay, their mean as value (no clipped double
+    Q-learning), ten gradient steps a transition, full-parameter resets, and an optimistic actor that explores
+    while the pessimistic one learns and is evaluated.
+
+    Defaults are those of the published curves. Where the paper's text and the published code differ, the code is
+    followed: the actors have one residual block (table 5 says two), and the divergence goes from the optimistic
+    to the pessimistic actor (algorithm 2 writes the other order).
+
+    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
+    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
+    :param learning_rate: of actor, critics, optimistic actor and temperature; a number or a function of the
+        remaining progress (from 1 to 0)
+    :param buffer_size: capacity of the replay buffer in transitions
+    :param learning_starts: transitions with uniformly random actions before the first gradient step, counted over
+        the model's life
+    :param batch_size: transitions a gradient step
+    :param tau: weight of the new critics in the Polyak average of the targets, in (0, 1]
+    :param gamma: discount factor
+    :param train_freq: as in Stable-Baselines3; if given, it replaces ``replay_ratio``
+    :param gradient_steps: as in Stable-Baselines3; if given, it replaces ``replay_ratio``
+    :param action_noise: noise added to the actions while training
+    :param replay_buffer_class: class of the replay buffer; chosen by the observation space if None
+    :param replay_buffer_kwargs: its arguments
+    :param optimize_memory_usage: as in Stable-Baselines3's replay buffer
+    :param n_steps: n-step returns, as in Stable-Baselines3
+    :param ent_coef: temperature: "auto" learns it from 1, "auto_0.1" from that start, a number fixes it
+    :param target_update_interval: gradient steps between two updates of the targets
+    :param target_entropy: entropy that the learned temperature aims at; "auto" is -|A|/2
+    :param replay_ratio: gradient steps per environment transition after the warm-up, whatever the number of
+        environments; may be below 1
+    :param model_size: size of the critics by its name in P5, table 7 ("0.55M", "1.05M", "2.83M", "4.92M",
+        "26.31M"), or (residual blocks, width); the actors are the same in all. None if ``policy_kwargs`` describe
+        the critics
+    :param n_quantiles: quantiles a critic; None for scalar critics
+    :param pessimism: weight of the critics' spread that is subtracted from their mean, at least 0
+    :param kl_target: KL divergence per action dimension between the two actors that optimism is adjusted to
+    :param std_multiplier: factor on the standard deviation of the actor while exploring
+    :param initial_optimism: weight of the critics' spread for the optimistic actor, at the start
+    :param initial_kl_weight: weight of the divergence in the optimistic actor's loss, at the start
+    :param adjustment_learning_rate: learning rate of optimism and of the divergence's weight
+    :param weight_decay: decoupled weight decay of critics and both actors
+    :param exploration: who acts while training: "optimistic_shift", or "actor" for no optimistic actor
+    :param exploration_kwargs: further arguments of the exploration
+    :param resets: environment steps at which all parameters start anew, counted in transitions over the model's life
+    :param use_sde: not supported, refused if True
+    :param stats_window_size: episodes over which the logged return is averaged
+    :param tensorboard_log: folder of the TensorBoard log; none if None
+    :param policy_kwargs: arguments of the policy
+    :param verbose: 0 nothing, 1 info, 2 debug
+    :param seed: seed of everything random
+    :param device: "auto", "cpu", "cuda", ...
+    :param _init_setup_model: whether to build the networks at once
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    temperature_beta1: ClassVar[float] = 0.5
+
+    def __init__(
+        self,
+        policy: str | type[SACPolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 2_500,
+        batch_size: int = 128,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] | None = None,
+        gradient_steps: int | None = None,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        ent_coef: str | float = "auto",
+        target_update_interval: int = 1,
+        target_entropy: str | float = "auto",
+        replay_ratio: float = 10,
+        model_size: str | Sequence[int] | None = "4.92M",
+        n_quantiles: int | None = 100,
+        pessimism: float = 0.0,
+        kl_target: float = 0.05,
+        std_multiplier: float = 0.75,
+        initial_optimism: float = 1.0,
+        initial_kl_weight: float = 0.25,
+        adjustment_learning_rate: float = 3e-5,
+        weight_decay: float = 1e-4,
+        exploration: str = "optimistic_shift",
+        exploration_kwargs: dict[str, Any] | None = None,
+        resets: Sequence[int] = BRO_RESETS,
+        use_sde: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: torch.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        exploration_kwargs = dict(exploration_kwargs or {})
+        if exploration == "optimistic_shift":
+            exploration_kwargs = {
+                "kl_target": kl_target,
+                "std_multiplier": std_multiplier,
+                "initial_optimism": initial_optimism,
+                "initial_kl_weight": initial_kl_weight,
+                "learning_rate": adjustment_learning_rate,
+                **exploration_kwargs,
+            }
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            ent_coef=ent_coef,
+            target_update_interval=target_update_interval,
+            target_entropy=target_entropy,
+            replay_ratio=replay_ratio,
+            n_quantiles=n_quantiles,
+            pessimism=pessimism,
+            exploration=exploration,
+            exploration_kwargs=exploration_kwargs,
+            resets=resets,
+            use_sde=use_sde,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=_policy_kwargs(policy_kwargs, model_size, weight_decay),
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=_init_setup_model,
+        )
+
+
+class BROFast(BRO):
+    """
+    BRO Fast: BRO with two gradient steps a transition and, as in the published code, the first reset only. The
+    arguments are BRO's.
+
+    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
+    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
+    :param replay_ratio: gradient steps per environment transition
+    :param resets: environment steps at which all parameters start anew
+    :param kwargs: every other argument of ``BRO``
+    """
+
+    def __init__(
+        self,
+        policy: str | type[SACPolicy],
+        env: GymEnv | str | None,
+        *args: Any,
+        replay_ratio: float = 2,
+        resets: Sequence[int] = BRO_FAST_RESETS,
+        **kwargs: Any,
+    ):
+        super().__init__(policy, env, *args, replay_ratio=replay_ratio, resets=resets, **kwargs)
+
+
+def _policy_kwargs(
+    given: dict[str, Any] | None, model_size: str | Sequence[int] | None, weight_decay: float
+) -> dict[str, Any]:
+    """BRO's networks and optimizer as arguments of the policy, with the user's own on top."""
+    given = dict(given or {})
+    if model_size is not None:
+        described = sorted({"critic_network", "critic_network_kwargs"} & given.keys())
+        if described:
+            raise ValueError(
+                f"policy_kwargs describe the critics ({', '.join(described)}), and so does model_size={model_size!r}: "
+                "pass model_size=None"
+            )
+        given["critic_network_kwargs"] = dict(zip(("n_blocks", "width"), _model_size(model_size), strict=True))
+    optimizer_kwargs = given.get("optimizer_kwargs") or {}
+    if "weight_decay" in optimizer_kwargs:
+        raise ValueError("weight_decay is an argument of the algorithm, not of policy_kwargs['optimizer_kwargs']")
+    given["optimizer_kwargs"] = {**optimizer_kwargs, "weight_decay": weight_decay}
+    given.setdefault("critic_network", "bronet")
+    if given.setdefault("actor_network", "bronet") == "bronet":
+        given.setdefault("actor_network_kwargs", {"width": 256, "n_blocks": 1})
+    return given
+
+
+def _model_size(model_size: str | Sequence[int]) -> tuple[int, int]:
+    """Residual blocks and width of a size given by name or by these two numbers."""
+    if isinstance(model_size, str):
+        if model_size in MODEL_SIZES:
+            return MODEL_SIZES[model_size]
+    elif len(model_size) == 2 and all(isinstance(n, int) for n in model_size):
+        return model_size[0], model_size[1]
+    raise ValueError(f"model_size must be one of {list(MODEL_SIZES)} or (residual blocks, width), not {model_size!r}")

@@ -1,0 +1,205 @@
+"""
+The losses of the off-policy family: pure functions of tensors.
+
+Shapes use the letters B batch, E critics, K quantiles, A action. "P5" is the BRO paper, "P3" the DAC paper.
+"""
+
+import math
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+
+
+def td_target(
+    rewards: torch.Tensor,
+    dones: torch.Tensor,
+    discounts: torch.Tensor | float,
+    next_values: torch.Tensor,
+    entropy_bonus: torch.Tensor | float,
+) -> torch.Tensor:
+    """
+    The value that every critic is drawn to, ``r + discount * (1 - done) * (V(s') + entropy bonus)``
+    (P5, algorithm 2, line 8), quantile by quantile.
+
+    :param rewards: (B, 1)
+    :param dones: (B, 1), 1 where the episode terminated; a time limit is 0
+    :param discounts: discount factor, a number or (B, 1) (with n-step returns)
+    :param next_values: target ensemble's value of the next state and action, (B, K)
+    :param entropy_bonus: ``-alpha * log pi(a'|s')``, (B, 1), or 0 without entropy
+    :return: (B, K)
+    """
+    return rewards + (1 - dones) * discounts * (next_values + entropy_bonus)
+
+
+def squared_error(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """
+    Squared error of scalar critics: mean over the batch, summed over the critics (no factor 1/2).
+
+    :param q: predictions, (E, B, 1)
+    :param target: target, (B, 1), without gradient
+    :return: scalar
+    """
+    return (q - target).square().sum() / target.shape[0]
+
+
+class _QuantileHuber(torch.autograd.Function):
+    """
+    Quantile Huber loss with threshold 1 from sorted targets, without the K x K pairs.
+
+    For a prediction x with midpoint t, the targets y of its sample enter through two sums,
+    ``below = sum_j huber((x - y_j)+)`` and ``above = sum_j huber((y_j - x)+)``; the loss is
+    ``(1 - t) * below + t * above``. A Huber function of a positive part is a difference of parabolas:
+    ``huber(z+) = (z+)^2 / 2 - ((z - 1)+)^2 / 2``. Hence, with ``P(x) = sum_j ((x - y_j)+)^2 / 2`` and
+    ``M(x) = sum_j ((y_j - x)+)^2 / 2``, below is ``P(x) - P(x - 1)`` and above ``M(x) - M(x + 1)``, and the same
+    holds for the derivatives. P and M follow from the number, sum and sum of squares of the targets below x:
+    a binary search and prefix sums, in float64 since they are differences of large numbers.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+        n_critics, batch_size, n_quantiles = q.shape
+        n_targets = target.shape[1]
+        y = target.sort(dim=1).values
+        # Distances to the sample's middle target: the same differences of smaller numbers.
+        centre = y[:, n_targets // 2, None]
+        y = y - centre
+        x = (q - centre).transpose(0, 1).reshape(batch_size, -1)
+        x = torch.cat((x - 1, x, x + 1), dim=1)
+
+        n_below = torch.searchsorted(y, x)
+        sums = F.pad(y.double().cumsum(dim=1), (1, 0))
+        squares = F.pad(y.double().square().cumsum(dim=1), (1, 0))
+        sum_below, square_below = sums.gather(1, n_below), squares.gather(1, n_below)
+        x = x.double()
+        # P, its derivative, and M - P and its derivative, which need no search.
+        dp = n_below * x - sum_below
+        p = (dp * x - sum_below * x + square_below) / 2
+        dm = dp - (n_targets * x - sums[:, -1:])
+        m = (n_targets * x - 2 * sums[:, -1:]).mul_(x).add_(squares[:, -1:]).div_(2).sub_(p)
+
+        shape = (batch_size, 3, n_critics, n_quantiles)
+        p, dp, m, dm = (z.view(shape) for z in (p, dp, m, dm))
+        t = (torch.arange(n_quantiles, device=q.device, dtype=torch.float64) + 0.5) / n_quantiles
+        scale = 1 / (n_targets * batch_size)
+        # dm is the derivative of -M: the signs of above's derivative are turned.
+        grad = (1 - t) * (dp[:, 1] - dp[:, 0]) - t * (dm[:, 1] - dm[:, 2])
+        loss = (1 - t) * (p[:, 1] - p[:, 0]) + t * (m[:, 1] - m[:, 2])
+        ctx.save_for_backward((grad * scale).to(q.dtype).transpose(0, 1))
+        return (loss.sum() * scale).to(q.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, grad_output: torch.Tensor) -> tuple[torch.Tensor, None]:  # type: ignore[override]
+        (grad,) = ctx.saved_tensors
+        return grad_output * grad, None
+
+
+def quantile_huber(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """
+    Quantile Huber loss, threshold 1: sum over the predicted quantiles, mean over the target quantiles and
+    the batch, summed over the critics (P5, algorithm 2, line 8; Dabney et al. 2018, eq. 10). The midpoint
+    of predicted quantile i is ``(i + 1/2) / K``. Exact: value and gradient are those of the K x K pairs.
+
+    :param q: predicted quantiles, (E, B, K)
+    :param target: target quantiles in any order, (B, K'), without gradient
+    :return: scalar
+    """
+    return _QuantileHuber.apply(q, target)
+
+
+def actor_loss(log_prob: torch.Tensor, value: torch.Tensor, alpha: torch.Tensor | float) -> torch.Tensor:
+    """
+    ``mean(alpha * log pi(a|s) - Q(s, a))`` (P5, algorithm 2, line 10).
+
+    :param log_prob: log-probability of the sampled actions, (B, 1)
+    :param value: the ensemble's value of them, (B, K); averaged over quantiles here
+    :param alpha: temperature
+    :return: scalar
+    """
+    return (alpha * log_prob).mean() - value.mean()
+
+
+def temperature_loss(alpha: torch.Tensor, entropy: torch.Tensor, target_entropy: float) -> torch.Tensor:
+    """
+    ``alpha * (H - H*)`` (P5, algorithm 2, line 13). The gradient goes through ``alpha`` itself, not its
+    logarithm as in stable_baselines3.
+
+    :param alpha: temperature, with gradient, scalar
+    :param entropy: mean of ``-log pi`` over the batch, scalar
+    :param target_entropy: H*
+    :return: scalar
+    """
+    return alpha * (entropy.detach() - target_entropy)
+
+
+def optimistic_actor_loss(upper_value: torch.Tensor, kl: torch.Tensor, kl_weight: torch.Tensor) -> torch.Tensor:
+    """
+    ``-mean(Q_upper) + weight * mean(KL)`` (P5, algorithm 2, line 12; P3, eq. 11).
+
+    :param upper_value: optimistic value of the sampled actions, (B, K)
+    :param kl: divergence of the two policies, summed over the action's dimensions, (B, 1)
+    :param kl_weight: weight of the divergence, scalar
+    :return: scalar
+    """
+    return kl_weight.detach() * kl.mean() - upper_value.mean()
+
+
+def optimism_loss(optimism: torch.Tensor, reference: torch.Tensor | float, kl_gap: torch.Tensor) -> torch.Tensor:
+    """
+    ``(beta_o - reference) * (KL / |A| - KL*)`` (P5, algorithm 2, line 14; P3, eq. 14).
+
+    The reference shifts the loss, not its gradient. The papers put beta_p there, which is minus our pessimism;
+    BRO's published code puts plus its pessimism.
+
+    :param optimism: beta_o, with gradient, scalar
+    :param reference: what optimism is measured from
+    :param kl_gap: ``KL / |A| - KL*``, scalar, without gradient
+    :return: scalar
+    """
+    return (optimism - reference) * kl_gap
+
+
+def kl_weight_loss(kl_weight: torch.Tensor, kl_gap: torch.Tensor) -> torch.Tensor:
+    """
+    ``-weight * (KL / |A| - KL*)`` (P5, algorithm 2, line 15; P3, eq. 14).
+
+    :param kl_weight: tau, with gradient, scalar
+    :param kl_gap: ``KL / |A| - KL*``, scalar, without gradient
+    :return: scalar
+    """
+    return -kl_weight * kl_gap
+
+
+def gaussian_kl(
+    mean: torch.Tensor, std: torch.Tensor, reference_mean: torch.Tensor, reference_std: torch.Tensor
+) -> torch.Tensor:
+    """
+    KL divergence from a diagonal Gaussian to a reference one, summed over the dimensions.
+
+    :param mean: (B, A)
+    :param std: (B, A)
+    :param reference_mean: (B, A)
+    :param reference_std: (B, A)
+    :return: (B, 1)
+    """
+    kl = torch.log(reference_std / std) + (std.square() + (mean - reference_mean).square()) / (
+        2 * reference_std.square()
+    )
+    return (kl - 0.5).sum(dim=1, keepdim=True)
+
+
+def tanh_gaussian_log_prob(x: torch.Tensor, noise: torch.Tensor, log_std: torch.Tensor) -> torch.Tensor:
+    """
+    Log-probability of the action ``tanh(x)``, ``x = mean + exp(log_std) * noise``.
+
+    It is computed from x and the noise that made it, never from the action: ``atanh`` of an action that
+    rounds to 1 is infinite, and ``(x - mean) / std`` loses the noise where the std is tiny.
+
+    :param x: pre-tanh sample, (B, A)
+    :param noise: standard normal noise, (B, A)
+    :param log_std: (B, A)
+    :return: (B, 1)
+    """
+    gaussian = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
+    log_det = 2 * (math.log(2) - x - F.softplus(-2 * x))
+    return (gaussian - log_det).sum(dim=1, keepdim=True)
