@@ -24,8 +24,8 @@ class ResidualBlock(nn.Module):
         self.norm2 = layer_norm(width, n_copies)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        residual = F.relu(self.norm1(self.dense1(x)))
-        return x + self.norm2(self.dense2(residual))
+        residual = F.relu(self.norm1(self.dense1(x)), inplace=True)
+        return self.norm2(self.dense2(residual)).add_(x)
 
 
 class BroNet(nn.Module):
@@ -54,7 +54,7 @@ class BroNet(nn.Module):
         :param x: (B, in), or (E, B, in) if there are copies
         :return: (B, width), or (E, B, width) if there are copies
         """
-        h = F.relu(self.norm(self.dense(x)))
+        h = F.relu(self.norm(self.dense(x)), inplace=True)
         for block in self.blocks:
             h = block(h)
         return h

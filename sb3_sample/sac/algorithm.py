@@ -228,6 +228,10 @@ class SAC(OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         super()._setup_model()
+        if self.device.type == "cpu":
+            # glibc hands freed memory back to the system above a threshold, at first below the size of one gradient,
+            # and every update then pays for page faults. The threshold follows the largest block freed so far.
+            torch.empty(31 * 2**20, dtype=torch.uint8)
         self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
         action_dim = self.actor.action_dim
         self._target_entropy = -action_dim / 2 if self.target_entropy == "auto" else float(self.target_entropy)

@@ -47,13 +47,15 @@ class _QuantileHuber(torch.autograd.Function):
     """
     Quantile Huber loss with threshold 1 from sorted targets, without the K x K pairs.
 
-    For a prediction x with midpoint t, the targets y of its sample enter through two sums,
-    ``below = sum_j huber((x - y_j)+)`` and ``above = sum_j huber((y_j - x)+)``; the loss is
-    ``(1 - t) * below + t * above``. A Huber function of a positive part is a difference of parabolas:
-    ``huber(z+) = (z+)^2 / 2 - ((z - 1)+)^2 / 2``. Hence, with ``P(x) = sum_j ((x - y_j)+)^2 / 2`` and
-    ``M(x) = sum_j ((y_j - x)+)^2 / 2``, below is ``P(x) - P(x - 1)`` and above ``M(x) - M(x + 1)``, and the same
-    holds for the derivatives. P and M follow from the number, sum and sum of squares of the targets below x:
-    a binary search and prefix sums, in float64 since they are differences of large numbers.
+    For a prediction x with midpoint t, the targets y of its sample lie in four intervals::
+
+        far below    y < x - 1        weight 1 - t    loss (x - y) - 1/2      derivative 1
+        near below   x - 1 <= y < x   weight 1 - t    loss (x - y)^2 / 2      derivative x - y
+        near above   x <= y <= x + 1  weight t        loss (y - x)^2 / 2      derivative x - y
+        far above    y > x + 1        weight t        loss (y - x) - 1/2      derivative -1
+
+    A binary search gives the borders of the intervals, differences of prefix sums of y and y^2 the sums over
+    them. The prefix sums are float64 since they are differences of large numbers.
     """
 
     @staticmethod
@@ -65,28 +67,31 @@ class _QuantileHuber(torch.autograd.Function):
         centre = y[:, n_targets // 2, None]
         y = y - centre
         x = (q - centre).transpose(0, 1).reshape(batch_size, -1)
-        x = torch.cat((x - 1, x, x + 1), dim=1)
+        borders = torch.searchsorted(y, torch.cat((x - 1, x, x + 1), dim=1))
 
-        n_below = torch.searchsorted(y, x)
-        sums = F.pad(y.double().cumsum(dim=1), (1, 0))
-        squares = F.pad(y.double().square().cumsum(dim=1), (1, 0))
-        sum_below, square_below = sums.gather(1, n_below), squares.gather(1, n_below)
-        x = x.double()
-        # P, its derivative, and M - P and its derivative, which need no search.
-        dp = n_below * x - sum_below
-        p = (dp * x - sum_below * x + square_below) / 2
-        dm = dp - (n_targets * x - sums[:, -1:])
-        m = (n_targets * x - 2 * sums[:, -1:]).mul_(x).add_(squares[:, -1:]).div_(2).sub_(p)
+        y, x = y.double(), x.double()
+        sums = F.pad(y.cumsum(dim=1), (1, 0))
+        squares = F.pad(y.square().cumsum(dim=1), (1, 0))
+        n_far_below, n_below, n_not_far_above = borders.chunk(3, dim=1)
+        s_far_below, s_below, s_not_far_above = sums.gather(1, borders).chunk(3, dim=1)
+        q_far_below, q_below, q_not_far_above = squares.gather(1, borders).chunk(3, dim=1)
+        n_near_below, n_near_above = n_below - n_far_below, n_not_far_above - n_below
+        s_near_below, s_near_above = s_below - s_far_below, s_not_far_above - s_below
+        n_far_above, s_far_above = n_targets - n_not_far_above, sums[:, -1:] - s_not_far_above
+        # Sums of x - y over the near intervals, of which the sums of their squares are made.
+        d_near_below, d_near_above = n_near_below * x - s_near_below, n_near_above * x - s_near_above
 
-        shape = (batch_size, 3, n_critics, n_quantiles)
-        p, dp, m, dm = (z.view(shape) for z in (p, dp, m, dm))
-        t = (torch.arange(n_quantiles, device=q.device, dtype=torch.float64) + 0.5) / n_quantiles
+        t = ((torch.arange(n_quantiles, device=q.device, dtype=y.dtype) + 0.5) / n_quantiles).repeat(n_critics)
+        below = n_far_below + d_near_below
+        above = d_near_above - n_far_above
+        grad = torch.lerp(below, above, t)
+        below = n_far_below * (x - 0.5) - s_far_below + (x * (d_near_below - s_near_below) + q_below - q_far_below) / 2
+        above = s_far_above - n_far_above * (x + 0.5) + (x * (d_near_above - s_near_above) + q_not_far_above - q_below) / 2
+        loss = torch.lerp(below, above, t).sum()
+
         scale = 1 / (n_targets * batch_size)
-        # dm is the derivative of -M: the signs of above's derivative are turned.
-        grad = (1 - t) * (dp[:, 1] - dp[:, 0]) - t * (dm[:, 1] - dm[:, 2])
-        loss = (1 - t) * (p[:, 1] - p[:, 0]) + t * (m[:, 1] - m[:, 2])
-        ctx.save_for_backward((grad * scale).to(q.dtype).transpose(0, 1))
-        return (loss.sum() * scale).to(q.dtype)
+        ctx.save_for_backward((grad * scale).to(q.dtype).view(batch_size, n_critics, n_quantiles).transpose(0, 1))
+        return (loss * scale).to(q.dtype)
 
     @staticmethod
     def backward(ctx: Any, grad_output: torch.Tensor) -> tuple[torch.Tensor, None]:  # type: ignore[override]
