@@ -67,14 +67,14 @@ class _QuantileHuber(torch.autograd.Function):
         centre = y[:, n_targets // 2, None]
         y = y - centre
         x = (q - centre).transpose(0, 1).reshape(batch_size, -1)
-        borders = torch.searchsorted(y, torch.cat((x - 1, x, x + 1), dim=1))
+        borders = torch.searchsorted(y.expand(3, -1, -1).contiguous(), torch.stack((x - 1, x, x + 1)))
 
         y, x = y.double(), x.double()
         sums = F.pad(y.cumsum(dim=1), (1, 0))
         squares = F.pad(y.square().cumsum(dim=1), (1, 0))
-        n_far_below, n_below, n_not_far_above = borders.chunk(3, dim=1)
-        s_far_below, s_below, s_not_far_above = sums.gather(1, borders).chunk(3, dim=1)
-        q_far_below, q_below, q_not_far_above = squares.gather(1, borders).chunk(3, dim=1)
+        n_far_below, n_below, n_not_far_above = borders
+        s_far_below, s_below, s_not_far_above = sums.expand(3, -1, -1).gather(2, borders)
+        q_far_below, q_below, q_not_far_above = squares.expand(3, -1, -1).gather(2, borders)
         n_near_below, n_near_above = n_below - n_far_below, n_not_far_above - n_below
         s_near_below, s_near_above = s_below - s_far_below, s_not_far_above - s_below
         n_far_above, s_far_above = n_targets - n_not_far_above, sums[:, -1:] - s_not_far_above
@@ -82,11 +82,11 @@ class _QuantileHuber(torch.autograd.Function):
         d_near_below, d_near_above = n_near_below * x - s_near_below, n_near_above * x - s_near_above
 
         t = ((torch.arange(n_quantiles, device=q.device, dtype=y.dtype) + 0.5) / n_quantiles).repeat(n_critics)
-        below = n_far_below + d_near_below
-        above = d_near_above - n_far_above
-        grad = torch.lerp(below, above, t)
-        below = n_far_below * (x - 0.5) - s_far_below + (x * (d_near_below - s_near_below) + q_below - q_far_below) / 2
-        above = s_far_above - n_far_above * (x + 0.5) + (x * (d_near_above - s_near_above) + q_not_far_above - q_below) / 2
+        grad = torch.lerp(n_far_below + d_near_below, d_near_above - n_far_above, t)
+        below = n_far_below * (x - 0.5) - s_far_below
+        below += (x * (d_near_below - s_near_below) + q_below - q_far_below) / 2
+        above = s_far_above - n_far_above * (x + 0.5)
+        above += (x * (d_near_above - s_near_above) + q_not_far_above - q_below) / 2
         loss = torch.lerp(below, above, t).sum()
 
         scale = 1 / (n_targets * batch_size)
