@@ -1,0 +1,150 @@
+"""Tiny environments and models that the tests of the off-policy family share."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_sample import BRO
+from sb3_sample.sac import SAC, BROFast
+
+#: Arguments that make a model small and quick.
+TINY_BRO: dict[str, Any] = dict(
+    model_size=(1, 8),
+    n_quantiles=5,
+    batch_size=8,
+    learning_starts=10,
+    buffer_size=500,
+    replay_ratio=1,
+    policy_kwargs={"actor_network_kwargs": {"width": 8, "n_blocks": 1}},
+    exploration_kwargs={"network_kwargs": {"width": 8, "n_blocks": 1}},
+    device="cpu",
+)
+TINY_SAC: dict[str, Any] = dict(
+    batch_size=8,
+    learning_starts=10,
+    buffer_size=500,
+    replay_ratio=1,
+    policy_kwargs={"net_arch": [8, 8]},
+    device="cpu",
+)
+
+
+class Toy(gym.Env):
+    """
+    A short deterministic episode of ``length`` steps: the observation counts the steps, the reward is their number.
+
+    :param obs_space: observation space, a small Box by default
+    :param action_space: action space, [-1, 1]^2 by default
+    :param length: steps an episode; it ends by a time limit if ``truncate``, else by termination
+    :param truncate: how the episodes end
+    :param poison: called with the total number of steps, observation and reward; returns what is given instead
+    """
+
+    def __init__(
+        self,
+        obs_space: spaces.Space | None = None,
+        action_space: spaces.Space | None = None,
+        length: int = 7,
+        truncate: bool = False,
+        poison: Callable[[int, Any, float], tuple[Any, float]] | None = None,
+    ):
+        self.observation_space = spaces.Box(-10, 10, (3,), np.float32) if obs_space is None else obs_space
+        self.action_space = spaces.Box(-1, 1, (2,), np.float32) if action_space is None else action_space
+        self.length, self.truncate, self.poison = length, truncate, poison
+        self.t = self.total = 0
+        #: every action received
+        self.actions: list[np.ndarray] = []
+
+    def _observation(self, space: spaces.Space) -> Any:
+        if isinstance(space, spaces.Dict):
+            return {key: self._observation(sub) for key, sub in space.items()}
+        if isinstance(space, spaces.Discrete):
+            return self.t % int(space.n)
+        assert isinstance(space, spaces.Box)
+        return np.full(space.shape, self.t, space.dtype)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.t = 0
+        return self._observation(self.observation_space), {}
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.actions.append(np.array(action))
+        self.t += 1
+        self.total += 1
+        observation, reward = self._observation(self.observation_space), float(self.t)
+        if self.poison is not None:
+            observation, reward = self.poison(self.total, observation, reward)
+        over = self.t >= self.length
+        return observation, reward, over and not self.truncate, over and self.truncate, {}
+
+
+def vec(n_envs: int = 1, **kwargs: Any) -> DummyVecEnv:
+    """A DummyVecEnv of monitored toys."""
+    return DummyVecEnv([lambda: Monitor(Toy(**kwargs)) for _ in range(n_envs)])
+
+
+def bro(env: Any = None, cls: type[BRO] = BRO, policy: str = "MlpPolicy", **kwargs: Any) -> BRO:
+    """A tiny BRO; arguments given replace the tiny ones."""
+    return cls(policy, vec() if env is None else env, **{"seed": 0, **TINY_BRO, **kwargs})
+
+
+def sac(env: Any = None, policy: str = "MlpPolicy", **kwargs: Any) -> SAC:
+    """A tiny SAC; arguments given replace the tiny ones."""
+    return SAC(policy, vec() if env is None else env, **{"seed": 0, **TINY_SAC, **kwargs})
+
+
+MAKERS: dict[str, Callable[..., Any]] = {
+    "SAC": sac,
+    "BRO": bro,
+    "BROFast": lambda env=None, **kwargs: bro(env, cls=BROFast, **kwargs),
+}
+
+
+def state(model: SAC) -> dict[str, torch.Tensor]:
+    """A copy of every tensor that the model's file holds, optimizers' moments included."""
+    flat: dict[str, torch.Tensor] = {}
+
+    def walk(prefix: str, value: Any) -> None:
+        if isinstance(value, torch.Tensor):
+            flat[prefix] = value.detach().clone()
+        elif isinstance(value, dict):
+            for key, sub in value.items():
+                walk(f"{prefix}/{key}", sub)
+        elif isinstance(value, (list, tuple)):
+            for i, sub in enumerate(value):
+                walk(f"{prefix}/{i}", sub)
+        elif isinstance(value, (int, float)):
+            flat[prefix] = torch.tensor(float(value), dtype=torch.float64)
+
+    for name, value in model.get_parameters().items():
+        walk(name, value)
+    return flat
+
+
+def differing(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> list[str]:
+    """Names of the tensors that are not equal bit for bit, or that only one of the two has."""
+    return sorted(set(a) ^ set(b)) + sorted(k for k in set(a) & set(b) if not torch.equal(a[k], b[k]))
+
+
+def random_batch(model: SAC, n: int = 8, seed: int = 0) -> Any:
+    """A batch of random transitions for a model with flat observations."""
+    from sb3_sample.sac.algorithm import Batch
+
+    g = torch.Generator().manual_seed(seed)
+    assert model.observation_space.shape is not None
+    o, a = model.observation_space.shape[0], model.actor.action_dim
+    return Batch(
+        torch.randn(n, o, generator=g),
+        torch.rand(n, a, generator=g) * 2 - 1,
+        torch.randn(n, o, generator=g),
+        (torch.rand(n, 1, generator=g) < 0.2).float(),
+        torch.randn(n, 1, generator=g),
+        model.gamma,
+    )

@@ -1,0 +1,269 @@
+"""Every wrong argument is a ValueError where it comes in; nothing that is not finite reaches the buffer."""
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_sample.sac import SAC
+from tests.sac.common import MAKERS, Toy, bro, sac, vec
+
+NAN, INF = float("nan"), float("inf")
+
+
+def refused(make: Callable[[], Any], *words: Any) -> None:
+    """It raises a ValueError whose message holds every word."""
+    with pytest.raises(ValueError) as caught:
+        make()
+    message = str(caught.value)
+    for word in words:
+        assert re.search(str(word), message), f"{word!r} is not in: {message}"
+
+
+# ---------------------------------------------------------------- arguments
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("replay_ratio", -1, "at least 0"),
+        ("replay_ratio", NAN, "at least 0"),
+        ("replay_ratio", INF, ""),
+        ("tau", 0.0, r"\(0, 1\]"),
+        ("tau", 1.5, r"\(0, 1\]"),
+        ("tau", -0.1, r"\(0, 1\]"),
+        ("tau", NAN, r"\(0, 1\]"),
+        ("gamma", -0.1, r"\[0, 1\]"),
+        ("gamma", 1.01, r"\[0, 1\]"),
+        ("gamma", NAN, r"\[0, 1\]"),
+        ("batch_size", 0, "at least 1"),
+        ("batch_size", -3, "at least 1"),
+        ("learning_starts", -1, "at least 0"),
+        ("buffer_size", 0, "at least 1"),
+        ("target_update_interval", 0, "at least 1"),
+        ("n_steps", 0, "at least 1"),
+        ("n_quantiles", 0, "at least 1"),
+        ("n_quantiles", -5, "at least 1"),
+        ("pessimism", -1.0, "at least 0"),
+        ("ent_coef", "foo", "auto"),
+        ("ent_coef", "auto_-1", "auto|above 0"),
+        ("ent_coef", "auto_0", "auto|above 0"),
+        ("ent_coef", "auto_foo", "auto"),
+        ("ent_coef", "auto_nan", "auto"),
+        ("ent_coef", "auto_inf", "auto"),
+        ("ent_coef", -0.1, "at least 0"),
+        ("ent_coef", NAN, "at least 0"),
+        ("ent_coef", INF, ""),
+        ("target_entropy", "foo", "auto"),
+        ("target_entropy", NAN, ""),
+        ("exploration", "foo", "optimistic_shift"),
+        ("exploration", "sde", "actor"),
+        ("resets", (20, 10), "ascending"),
+        ("resets", (-5,), "at least 1"),
+        ("train_freq", 0, ""),
+        ("train_freq", -3, ""),
+        ("train_freq", (1, "foo"), "episode"),
+        ("learning_rate", -1e-3, ""),
+        ("learning_rate", NAN, ""),
+    ],
+)
+@pytest.mark.parametrize("maker", ["SAC", "BRO"])
+def test_values_out_of_range(maker: str, name: str, value: Any, allowed: str) -> None:
+    """Caught at construction, with the argument's name, the value, and what is allowed."""
+    value_in_message = re.escape(str(value)) if not isinstance(value, tuple) else re.escape(str(value[-1]))
+    refused(lambda: MAKERS[maker](**{name: value}), name, value_in_message, allowed)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "words"),
+    [
+        (dict(model_size="5M"), ["model_size", "5M", "4.92M", "blocks"]),
+        (dict(model_size=(1,)), ["model_size", r"\(1,\)", "blocks"]),
+        (dict(model_size=(1, 2, 3)), ["model_size"]),
+        (dict(model_size=(1.5, 8)), ["model_size", "1.5"]),
+        (dict(model_size=(-1, 8)), ["n_blocks|model_size", "-1"]),
+        (dict(model_size=(1, 0)), ["width|model_size", "0"]),
+        (dict(model_size=5), ["model_size", "5"]),
+        (dict(policy_kwargs={"critic_network_kwargs": {"width": 8}}), ["model_size", "critic_network_kwargs", "None"]),
+        (dict(policy_kwargs={"critic_network": "mlp"}), ["model_size", "critic_network", "None"]),
+        (dict(policy_kwargs={"net_arch": [8]}), ["net_arch", "bronet", "network_kwargs"]),
+        (dict(policy_kwargs={"n_quantiles": 3}), ["n_quantiles", "policy_kwargs"]),
+        (dict(policy_kwargs={"optimizer_kwargs": {"weight_decay": 0.1}}), ["weight_decay"]),
+        (dict(weight_decay=-1.0), ["weight_decay", "-1.0"]),
+        (dict(kl_target=0.0), ["kl_target", "0"]),
+        (dict(std_multiplier=-1.0), ["std_multiplier", "-1"]),
+    ],
+)
+def test_bro_arguments(kwargs: dict[str, Any], words: list[str]) -> None:
+    refused(lambda: bro(**kwargs), *words)
+
+
+@pytest.mark.parametrize(
+    ("policy_kwargs", "words"),
+    [
+        ({"critic_network": "foo"}, ["critic_network", "foo", "bronet"]),
+        ({"actor_network": "foo"}, ["actor_network", "foo", "mlp"]),
+        ({"n_critics": 0}, ["n_critics", "0", "at least 1"]),
+        ({"net_arch": [8, 0]}, ["hidden_sizes|net_arch", "0"]),
+        ({"net_arch": [8], "critic_network": "bronet"}, ["net_arch", "bronet"]),
+        ({"net_arch": [8], "critic_network_kwargs": {"hidden_sizes": [9]}}, ["net_arch", "hidden_sizes"]),
+    ],
+)
+def test_policy_arguments(policy_kwargs: dict[str, Any], words: list[str]) -> None:
+    refused(lambda: sac(policy_kwargs=policy_kwargs), *words)
+
+
+def test_use_sde() -> None:
+    for make in MAKERS.values():
+        refused(lambda make=make: make(use_sde=True), "use_sde", "True", "action_noise|exploration")
+
+
+def test_wrong_policy() -> None:
+    refused(lambda: sac(policy="FooPolicy"), "[Pp]olicy", "FooPolicy", "MlpPolicy")
+    dict_env = Toy(spaces.Dict({"a": spaces.Box(-1, 1, (2,))}))
+    refused(lambda: sac(dict_env, policy="MlpPolicy"), "MultiInputPolicy")
+
+
+def test_episodes_of_several_environments() -> None:
+    """Stable-Baselines3 trains by episodes with one environment only: known at construction."""
+    refused(lambda: sac(vec(2), train_freq=(1, "episode")), "train_freq", "episode")
+
+
+# ---------------------------------------------------------------- action spaces
+
+
+@pytest.mark.parametrize(
+    ("space", "words"),
+    [
+        (spaces.Discrete(3), ["action space", "Box", r"Discrete\(3\)"]),
+        (spaces.MultiBinary(3), ["action space", "Box", "MultiBinary"]),
+        (spaces.MultiDiscrete([2, 3]), ["action space", "Box", "MultiDiscrete"]),
+        (spaces.Box(-INF, INF, (2,)), ["action space", "bound", "inf"]),
+        (spaces.Box(np.array([-1.0, 0.0], np.float32), np.array([1.0, INF], np.float32)), ["action space", "bound"]),
+    ],
+)
+def test_action_spaces(space: spaces.Space, words: list[str]) -> None:
+    for env in (Toy(action_space=space), vec(2, action_space=space)):
+        refused(lambda env=env: sac(env), *words)
+        refused(lambda env=env: bro(env), *words)
+
+
+def test_action_space_without_width() -> None:
+    """Such a dimension cannot be scaled to [-1, 1]: every stored action would be NaN."""
+    space = spaces.Box(np.array([-1.0, 2.0], np.float32), np.array([1.0, 2.0], np.float32))
+    refused(lambda: sac(Toy(action_space=space)), "action space", "2")
+
+
+# ---------------------------------------------------------------- observations and rewards that are not finite
+
+OBS_DICT = spaces.Dict({"a": spaces.Box(-10, 10, (3,), np.float32), "b": spaces.Box(-10, 10, (2,), np.float32)})
+
+
+def poison(at: int, what: str, value: float) -> Callable[[int, Any, float], tuple[Any, float]]:
+    """Spoil observation or reward at one step of an environment's life."""
+
+    def spoil(total: int, observation: Any, reward: float) -> tuple[Any, float]:
+        if total != at:
+            return observation, reward
+        if what == "reward":
+            return observation, value
+        bad = observation["b"] if isinstance(observation, dict) else observation
+        bad[1] = value
+        return observation, reward
+
+    return spoil
+
+
+def buffer_is_finite(model: SAC) -> bool:
+    buffer = model.replay_buffer
+    arrays = []
+    for name in ("observations", "next_observations", "actions", "rewards"):
+        value = getattr(buffer, name)
+        arrays += list(value.values()) if isinstance(value, dict) else [value]
+    return all(np.isfinite(array).all() for array in arrays)
+
+
+def spoilt_env(n_envs: int, index: int, at: int, what: str, value: float, obs_space: Any = None) -> Any:
+    env = vec(n_envs, obs_space=obs_space)
+    env.envs[index].unwrapped.poison = poison(at, what, value)
+    return env
+
+
+# Episodes of seven steps: 7 and 21 are last steps, whose observation is the terminal one.
+@pytest.mark.parametrize("at", [3, 7, 16, 21])
+@pytest.mark.parametrize(("what", "value"), [("observation", NAN), ("observation", -INF), ("reward", NAN),
+                                             ("reward", INF)])  # fmt: skip
+@pytest.mark.parametrize(("n_envs", "index"), [(1, 0), (3, 2)])
+@pytest.mark.parametrize("normalized", [False, True])
+@pytest.mark.parametrize("obs_space", [None, OBS_DICT], ids=["box", "dict"])
+def test_training_stops(
+    n_envs: int, index: int, at: int, what: str, value: float, normalized: bool, obs_space: Any
+) -> None:
+    env = spoilt_env(n_envs, index, at, what, value, obs_space)
+    if normalized:
+        env = VecNormalize(env)
+    model = bro(env, policy="MlpPolicy" if obs_space is None else "MultiInputPolicy", replay_ratio=0.2)
+    with pytest.raises(ValueError) as caught:
+        model.learn(120)
+    message = str(caught.value)
+    assert f"environment {index} " in message, message
+    assert re.search(rf"\bstep {at}\b", message), message
+    assert what in message and "not finite" in message, message
+    if obs_space is not None and what == "observation":
+        assert "'b'" in message, message
+    assert buffer_is_finite(model)
+    assert model.num_transitions == (at - 1) * n_envs
+    if normalized:
+        statistics = env.obs_rms.values() if isinstance(env.obs_rms, dict) else [env.obs_rms]
+        assert all(np.isfinite(s.mean).all() and np.isfinite(s.var).all() for s in [*statistics, env.ret_rms])
+    assert all(np.isfinite(p.detach().numpy()).all() for p in model.policy.parameters())
+
+
+@pytest.mark.parametrize("normalized", [False, True])
+def test_first_observation(normalized: bool) -> None:
+    class Bad(Toy):
+        def reset(self, **kwargs: Any) -> Any:
+            observation, info = super().reset(**kwargs)
+            return observation * NAN, info
+
+    env = vec(2)
+    env.envs[1] = Bad()
+    with pytest.raises(ValueError, match=r"environment 1 .*observation.*not finite.*reset"):
+        bro(VecNormalize(env) if normalized else env).learn(20)
+
+
+def test_observation_after_an_automatic_reset() -> None:
+    """The first observation of a later episode comes with the last step of the one before."""
+
+    class Bad(Toy):
+        n_resets = 0
+
+        def reset(self, **kwargs: Any) -> Any:
+            observation, info = super().reset(**kwargs)
+            self.n_resets += 1
+            return observation * (NAN if self.n_resets == 2 else 1), info
+
+    env = vec(2)
+    env.envs[1] = Bad()
+    model = bro(env)
+    with pytest.raises(ValueError, match=r"environment 1 .*observation.*not finite"):
+        model.learn(40)
+    assert buffer_is_finite(model)
+
+
+def test_environment_set_later() -> None:
+    model = bro(vec(2))
+    model.set_env(spoilt_env(2, 1, 5, "observation", NAN))
+    with pytest.raises(ValueError, match=r"environment 1 .*step 5\b"):
+        model.learn(40)
+
+
+def test_infinite_bounds_are_not_infinite_values() -> None:
+    space = spaces.Box(-INF, INF, (3,), np.float32)
+    assert bro(vec(2, obs_space=space)).learn(30)._n_updates > 0
+    assert isinstance(bro("Pendulum-v1").env.action_space, gym.spaces.Box)

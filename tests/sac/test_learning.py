@@ -1,0 +1,69 @@
+"""Training that ends in a policy that can do something: broken learning fails here whatever else passes."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+
+from sb3_sample import BRO
+from sb3_sample.sac import SAC
+
+#: Mean return over ten episodes: a random policy has about -1200, a good one about -150.
+GOOD = -300
+
+SHARED: dict[str, Any] = dict(
+    gamma=0.95, tau=0.01, learning_rate=1e-3, learning_starts=500, replay_ratio=1.5, buffer_size=5_000, device="cpu"
+)
+
+
+def score(model: SAC) -> float:
+    env = Monitor(gym.make("Pendulum-v1"))
+    env.reset(seed=100)
+    return float(np.mean(evaluate_policy(model, env, 10, deterministic=True)[0]))
+
+
+def small_bro(seed: int, **kwargs: Any) -> BRO:
+    small = {"width": 64, "n_blocks": 1}
+    return BRO(
+        "MlpPolicy", "Pendulum-v1", model_size="0.55M", n_quantiles=20, batch_size=64, seed=seed,
+        policy_kwargs={"actor_network_kwargs": small}, exploration_kwargs={"network_kwargs": small},
+        **{**SHARED, "resets": (), **kwargs},
+    )  # fmt: skip
+
+
+def small_sac(seed: int, **kwargs: Any) -> SAC:
+    return SAC(
+        "MlpPolicy", "Pendulum-v1", batch_size=128, seed=seed, policy_kwargs={"net_arch": [64, 64]},
+        **{**SHARED, **kwargs},
+    )  # fmt: skip
+
+
+def test_untrained_is_bad() -> None:
+    """The threshold means something."""
+    assert score(small_bro(0)) < 2 * GOOD
+
+
+def test_sac_learns_pendulum() -> None:
+    assert score(small_sac(0).learn(3_000)) > GOOD
+
+
+def test_bro_learns_pendulum() -> None:
+    assert score(small_bro(0).learn(2_500)) > GOOD
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_other_seeds(seed: int) -> None:
+    assert score(small_sac(seed).learn(4_000)) > GOOD
+    assert score(small_bro(seed).learn(4_000)) > GOOD
+
+
+@pytest.mark.slow
+def test_bro_recovers_from_a_reset() -> None:
+    """The buffer stays, so what was lost is learned again from it."""
+    model = small_bro(0, resets=(1_500,), replay_ratio=2).learn(3_500)
+    assert model.plasticity.n_done == 1
+    assert score(model) > GOOD

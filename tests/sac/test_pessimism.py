@@ -1,0 +1,86 @@
+"""How an ensemble becomes one value."""
+
+import pytest
+import torch
+
+from sb3_sample.sac.pessimism import FixedPessimism, epistemic_std
+from tests.sac.common import bro, random_batch, sac
+
+Q = torch.tensor([[[1.0, 2.0], [3.0, 0.0]], [[3.0, -2.0], [3.0, 4.0]]])  # (E, B, K) = (2, 2, 2)
+
+
+def test_spread_by_hand() -> None:
+    # |1 - 3| / 2, |2 + 2| / 2, |3 - 3| / 2, |0 - 4| / 2: per quantile, before any average over quantiles.
+    torch.testing.assert_close(epistemic_std(Q), torch.tensor([[1.0, 2.0], [0.0, 2.0]]))
+
+
+@pytest.mark.parametrize("n_critics", [1, 2, 3, 5])
+def test_spread_is_the_population_deviation(n_critics: int) -> None:
+    q = torch.randn(n_critics, 4, 3, generator=torch.Generator().manual_seed(n_critics))
+    torch.testing.assert_close(epistemic_std(q), q.std(dim=0, unbiased=False), rtol=1e-5, atol=2e-6)
+
+
+@pytest.mark.parametrize("n_critics", [1, 2, 3])
+def test_spread_of_agreeing_critics_has_a_finite_gradient(n_critics: int) -> None:
+    q = torch.ones(n_critics, 4, 3, requires_grad=True)
+    epistemic_std(q).sum().backward()
+    assert q.grad is not None and torch.isfinite(q.grad).all()
+
+
+@pytest.mark.parametrize(
+    ("beta", "expected"),
+    [
+        (0.0, [[2.0, 0.0], [3.0, 2.0]]),  # the mean
+        (1.0, [[1.0, -2.0], [3.0, 0.0]]),  # the minimum
+        (0.5, [[1.5, -1.0], [3.0, 1.0]]),
+        (2.0, [[0.0, -4.0], [3.0, -2.0]]),
+    ],
+)
+def test_value_by_hand(beta: float, expected: list[list[float]]) -> None:
+    torch.testing.assert_close(FixedPessimism(beta).value(Q), torch.tensor(expected))
+
+
+def test_three_critics_by_hand() -> None:
+    q = torch.tensor([1.0, 2.0, 6.0]).reshape(3, 1, 1)
+    # Mean 3, population variance (4 + 1 + 9) / 3.
+    value = FixedPessimism(1.0).value(q)
+    assert value.item() == pytest.approx(3 - (14 / 3) ** 0.5, rel=1e-6)
+
+
+def test_shortcuts_are_the_formula() -> None:
+    q = torch.randn(2, 5, 4)
+    for beta in (0.0, 1.0):
+        torch.testing.assert_close(
+            FixedPessimism(beta).value(q), q.mean(dim=0) - beta * q.std(dim=0, unbiased=False), rtol=1e-5, atol=1e-6
+        )
+
+
+@pytest.mark.parametrize("beta", [-0.1, float("nan")])
+def test_bad_beta(beta: float) -> None:
+    with pytest.raises(ValueError, match=f"pessimism.*{beta}"):
+        FixedPessimism(beta)
+    with pytest.raises(ValueError, match=f"pessimism.*{beta}"):
+        bro(pessimism=beta)
+
+
+def test_more_pessimism_lower_targets() -> None:
+    """The argument reaches the update: the learned values are lower."""
+    means = []
+    for beta in (0.0, 1.0, 5.0):
+        model = sac(pessimism=beta, ent_coef=0.0, gamma=0.9, tau=0.1, learning_rate=1e-2)
+        batch = random_batch(model, 32)
+        for _ in range(60):
+            torch.manual_seed(0)
+            metrics = model._update(batch)
+        means.append(metrics["train/q_mean"].item())
+    assert means[0] > means[1] > means[2], means
+
+
+@pytest.mark.parametrize("n_critics", [1, 3])
+def test_other_ensemble_sizes_learn(n_critics: int) -> None:
+    for make in (sac, bro):
+        kwargs = {"policy_kwargs": {"n_critics": n_critics}}
+        model = make(**kwargs)
+        metrics = model._update(random_batch(model))
+        assert all(torch.isfinite(value).all() for value in metrics.values())
+        assert model.critic(torch.zeros(4, 3), torch.zeros(4, 2)).shape[0] == n_critics

@@ -1,0 +1,292 @@
+"""Saving, loading, parameters, and seeds: everything bit for bit."""
+
+import copy
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from torch import nn
+
+from sb3_sample import BRO
+from sb3_sample.sac import SAC, BROFast
+from sb3_sample.sac.policies import SACPolicy
+from tests.sac.common import MAKERS, bro, differing, sac, state, vec
+
+OBSERVATIONS = np.random.default_rng(0).normal(size=(16, 3)).astype(np.float32)
+
+
+def continue_training(model: Any, n: int = 25) -> Any:
+    """Train on from a fresh environment and a fixed seed."""
+    model.set_env(vec())
+    model.set_random_seed(11)
+    return model.learn(n, reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("trained", [True, False])
+def test_save_load_gives_the_same_model(maker: str, trained: bool, tmp_path: Path) -> None:
+    model = MAKERS[maker](resets=(18,))
+    if trained:
+        model.learn(30)
+    path = tmp_path / "model.zip"
+    model.save(path)
+    loaded = type(model).load(path, env=vec(), device="cpu")
+    assert type(loaded) is type(model)
+    assert not differing(state(model), state(loaded))
+    for deterministic in (True, False):
+        torch.manual_seed(3)
+        ours, _ = model.predict(OBSERVATIONS, deterministic=deterministic)
+        torch.manual_seed(3)
+        np.testing.assert_array_equal(loaded.predict(OBSERVATIONS, deterministic=deterministic)[0], ours)
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_loaded_model_trains_on_identically(maker: str, tmp_path: Path) -> None:
+    model = MAKERS[maker](resets=(18, 50), replay_ratio=1.5, target_update_interval=2).learn(30)
+    model.save(tmp_path / "m")
+    model.save_replay_buffer(tmp_path / "b")
+    loaded = type(model).load(tmp_path / "m", env=vec(), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "b")
+    continue_training(model)
+    continue_training(loaded)
+    assert model._n_updates == loaded._n_updates and model.num_transitions == loaded.num_transitions == 55
+    assert model.plasticity.n_done == loaded.plasticity.n_done == 2
+    assert not differing(state(model), state(loaded))
+    np.testing.assert_array_equal(model.replay_buffer.actions, loaded.replay_buffer.actions)
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_through_memory_and_a_second_time(maker: str) -> None:
+    model = MAKERS[maker]().learn(20)
+    for _ in range(2):
+        file = io.BytesIO()
+        model.save(file)
+        file.seek(0)
+        loaded = type(model).load(file, env=vec())
+        assert not differing(state(model), state(loaded))
+        model = loaded
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_load_without_environment(maker: str, tmp_path: Path) -> None:
+    model = MAKERS[maker]().learn(20)
+    model.save(tmp_path / "m")
+    loaded = type(model).load(tmp_path / "m")
+    assert loaded.get_env() is None
+    np.testing.assert_array_equal(
+        loaded.predict(OBSERVATIONS, deterministic=True)[0], model.predict(OBSERVATIONS, deterministic=True)[0]
+    )
+    loaded.set_env(vec())
+    loaded.learn(15)
+
+
+def test_the_file_holds_no_pickled_part(tmp_path: Path) -> None:
+    """Networks and parts are named tensors, loaded without executing anything."""
+    bro(resets=(15,)).learn(20).save(tmp_path / "m.zip")
+    with zipfile.ZipFile(tmp_path / "m.zip") as archive:
+        data = json.loads(archive.read("data"))
+        for name in [n for n in archive.namelist() if n.endswith(".pth")]:
+            torch.load(io.BytesIO(archive.read(name)), weights_only=True)
+    modules = {"policy", "actor", "critic", "critic_target", "temperature", "exploration", "pessimism", "plasticity"}
+    assert not modules & data.keys()
+    pickled = {key for key, value in data.items() if isinstance(value, dict) and ":serialized:" in value}
+    ours = {"num_transitions", "_updates_owed", "replay_ratio", "resets", "exploration_kwargs", "exploration_name",
+            "pessimism_beta", "ent_coef", "n_quantiles", "target_entropy", "target_update_interval"}  # fmt: skip
+    assert not ours & pickled
+
+
+def test_load_with_more_environments(tmp_path: Path) -> None:
+    bro(replay_ratio=1).learn(20).save(tmp_path / "m")
+    loaded = BRO.load(tmp_path / "m", env=vec(3))
+    assert loaded.n_envs == 3
+    before = loaded._n_updates
+    loaded.learn(60)
+    assert loaded.num_transitions == 80
+    assert 0 < loaded._n_updates - before <= 60
+
+
+def test_load_checks_the_spaces(tmp_path: Path) -> None:
+    bro().save(tmp_path / "m")
+    with pytest.raises(ValueError, match=r"[Ss]paces do not match"):
+        BRO.load(tmp_path / "m", env=vec(action_space=spaces.Box(-1, 1, (3,))))
+
+
+def test_brofast_round_trip(tmp_path: Path) -> None:
+    model = bro(cls=BROFast)
+    assert model.replay_ratio == 1 and model.resets == (15_000,)
+    model.save(tmp_path / "m")
+    loaded = BROFast.load(tmp_path / "m", env=vec())
+    assert isinstance(loaded, BROFast)
+    assert loaded.replay_ratio == 1 and tuple(loaded.plasticity.steps) == (15_000,)
+    loaded.learn(20)
+    assert BROFast.load(tmp_path / "m", env=vec(), replay_ratio=0.5).replay_ratio == 0.5
+
+
+@pytest.mark.parametrize("name", ["learning_rate", "gamma", "tau", "batch_size", "learning_starts"])
+def test_overrides_at_loading(name: str, tmp_path: Path) -> None:
+    value = {"learning_rate": 1e-3, "gamma": 0.5, "tau": 0.5, "batch_size": 3, "learning_starts": 3}[name]
+    sac().learn(12).save(tmp_path / "m")
+    loaded = SAC.load(tmp_path / "m", env=vec(), **{name: value})
+    assert getattr(loaded, name) == value
+    loaded.learn(15)
+    if name == "learning_rate":
+        assert {group["lr"] for group in loaded.critic.optimizer.param_groups} == {1e-3}
+
+
+@pytest.mark.parametrize("override", [{"pessimism": 0.25}, {"exploration": "actor"}])
+def test_a_part_given_at_loading_is_taken_or_refused(override: dict[str, Any], tmp_path: Path) -> None:
+    """Never dropped without a word."""
+    bro().save(tmp_path / "m")
+    try:
+        loaded = BRO.load(tmp_path / "m", env=vec(), **override)
+    except (ValueError, TypeError):
+        return
+    if "pessimism" in override:
+        assert loaded.pessimism.beta() == 0.25
+    else:
+        assert type(loaded.exploration).__name__ == "Exploration"
+
+
+def test_bad_override_at_loading(tmp_path: Path) -> None:
+    sac().save(tmp_path / "m")
+    with pytest.raises(ValueError, match="replay_ratio.*-1"):
+        SAC.load(tmp_path / "m", env=vec(), replay_ratio=-1)
+
+
+# ---------------------------------------------------------------- parameters
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_get_and_set_parameters(maker: str) -> None:
+    model, other = MAKERS[maker](seed=0).learn(20), MAKERS[maker](seed=1)
+    assert differing(state(model), state(other))
+    other.set_parameters(model.get_parameters())
+    assert not differing(state(model), state(other))
+    np.testing.assert_array_equal(
+        model.predict(OBSERVATIONS, deterministic=True)[0], other.predict(OBSERVATIONS, deterministic=True)[0]
+    )
+
+
+def test_set_parameters_from_a_file(tmp_path: Path) -> None:
+    model, other = bro(seed=0).learn(20), bro(seed=1)
+    model.save(tmp_path / "m")
+    other.set_parameters(str(tmp_path / "m"))
+    assert not differing(state(model), state(other))
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_exact_match(maker: str) -> None:
+    model = MAKERS[maker]()
+    parameters = model.get_parameters()
+    with pytest.raises(ValueError, match="foo"):
+        model.set_parameters({**parameters, "foo": {}}, exact_match=True)
+    missing = dict(parameters)
+    missing.pop("policy")
+    with pytest.raises(ValueError, match="policy"):
+        model.set_parameters(missing, exact_match=True)
+    model.set_parameters(missing, exact_match=False)
+    wrong = dict(parameters["policy"])
+    wrong.pop(next(iter(wrong)))
+    with pytest.raises(RuntimeError, match="Missing key"):
+        model.set_parameters({**parameters, "policy": wrong}, exact_match=True)
+
+
+def test_every_learned_tensor_is_in_the_parameters() -> None:
+    """Two models with equal parameters (and seeds, and data) train on equally: nothing learned is left out."""
+    model, other = bro(seed=0).learn(30), bro(seed=5).learn(30)
+    # A copy, because torch's optimizers keep the very tensors that they load.
+    other.set_parameters(copy.deepcopy(model.get_parameters()))
+    other.replay_buffer = model.replay_buffer
+    for m in (model, other):
+        torch.manual_seed(0)
+        np.random.seed(0)
+        m.train(5, 8)
+    assert not differing(state(model), state(other))
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_policy_save_load(maker: str, tmp_path: Path) -> None:
+    policy = MAKERS[maker]().learn(20).policy
+    policy.save(tmp_path / "p")
+    loaded = SACPolicy.load(tmp_path / "p")
+    for (name, a), b in zip(policy.state_dict().items(), loaded.state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
+    np.testing.assert_array_equal(
+        policy.predict(OBSERVATIONS, deterministic=True)[0], loaded.predict(OBSERVATIONS, deterministic=True)[0]
+    )
+
+
+@pytest.mark.parametrize(
+    "policy_kwargs",
+    [
+        dict(net_arch=[7, 5]),
+        dict(net_arch=dict(pi=[4], qf=[6, 6]), activation_fn=nn.Tanh, n_critics=3),
+        dict(critic_network="bronet", critic_network_kwargs=dict(width=8, n_blocks=1)),
+        dict(optimizer_class=torch.optim.Adam, optimizer_kwargs=dict(betas=(0.5, 0.9))),
+    ],
+)
+def test_custom_policy_kwargs(policy_kwargs: dict[str, Any], tmp_path: Path) -> None:
+    model = sac(policy_kwargs=policy_kwargs).learn(20)
+    model.save(tmp_path / "m")
+    loaded = SAC.load(tmp_path / "m", env=vec())
+    assert not differing(state(model), state(loaded))
+    loaded.learn(20)
+
+
+@pytest.mark.parametrize("maker", ["SAC", "BRO"])
+def test_policy_kwargs_repeated_at_loading(maker: str, tmp_path: Path) -> None:
+    """Stable-Baselines3 lets a user repeat the arguments given at construction, and refuses others."""
+    given: dict[str, Any] = {"n_critics": 3}
+    model = MAKERS[maker](policy_kwargs=dict(given))
+    model.save(tmp_path / "m")
+    with pytest.raises(ValueError, match="policy"):
+        type(model).load(tmp_path / "m", env=vec(), policy_kwargs={"n_critics": 4})
+    loaded = type(model).load(tmp_path / "m", env=vec(), policy_kwargs=dict(given))
+    assert not differing(state(model), state(loaded))
+
+
+def test_the_callers_arguments_are_left_alone() -> None:
+    policy_kwargs: dict[str, Any] = {"actor_network_kwargs": {"width": 8, "n_blocks": 1}}
+    exploration_kwargs: dict[str, Any] = {"network_kwargs": {"width": 8, "n_blocks": 1}}
+    for _ in range(2):
+        bro(policy_kwargs=policy_kwargs, exploration_kwargs=exploration_kwargs)
+    assert policy_kwargs == {"actor_network_kwargs": {"width": 8, "n_blocks": 1}}
+    assert exploration_kwargs == {"network_kwargs": {"width": 8, "n_blocks": 1}}
+
+
+def test_replay_buffer(tmp_path: Path) -> None:
+    model = sac().learn(30)
+    model.save_replay_buffer(tmp_path / "b")
+    other = sac(seed=1)
+    other.load_replay_buffer(tmp_path / "b")
+    assert other.replay_buffer.size() == 30
+    for name in ("observations", "actions", "rewards", "dones"):
+        np.testing.assert_array_equal(getattr(model.replay_buffer, name), getattr(other.replay_buffer, name))
+    other.learn(20)
+
+
+# ---------------------------------------------------------------- seeds
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("maker", MAKERS)
+def test_seeds(maker: str, n_envs: int) -> None:
+    first, same, different = (MAKERS[maker](vec(n_envs), seed=s, resets=(20,)).learn(36) for s in (4, 4, 5))
+    assert not differing(state(first), state(same))
+    np.testing.assert_array_equal(first.replay_buffer.actions, same.replay_buffer.actions)
+    assert differing(state(first), state(different))
+    assert not np.array_equal(first.replay_buffer.actions, different.replay_buffer.actions)
+
+
+def test_logging_and_prediction_change_nothing() -> None:
+    """The log, deterministic predictions and verbosity draw no random numbers."""
+    quiet, loud = bro(seed=4).learn(36, log_interval=None), bro(seed=4, verbose=1)
+    loud.predict(OBSERVATIONS, deterministic=True)
+    loud.learn(36, log_interval=1)
+    assert not differing(state(quiet), state(loud))
