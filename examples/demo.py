@@ -94,7 +94,9 @@ def main() -> None:
         print(f"Saved {folder / 'behaviour.gif'}.")
     except Exception as error:  # whatever the graphics stack lacks, the demo has done its work
         print(f"No GIF, since this machine cannot render ({error}): install libegl1 or libosmesa6.")
-    print("\nNext: README.md, and `.venv/bin/sb3-sample train --help` once `make test` or the [zoo] extra is installed.")
+    print(
+        "\nNext: README.md, and `.venv/bin/sb3-sample train --help` once `make test` or the [zoo] extra is installed."
+    )
 
 
 if __name__ == "__main__":

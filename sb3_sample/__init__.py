@@ -2,7 +2,6 @@
 
 from sb3_sample.envs import make_env
 from sb3_sample.sac import BRO, SAC, BROFast
-
-__version__ = "0.1.0"
+from sb3_sample.version import __version__
 
 __all__ = ["BRO", "SAC", "BROFast", "__version__", "make_env"]

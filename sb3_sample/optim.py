@@ -44,7 +44,7 @@ class AdamW(Optimizer):
             raise ValueError(f"eps must be above 0, not {eps}")
         if not weight_decay >= 0:
             raise ValueError(f"weight_decay must be at least 0, not {weight_decay}")
-        super().__init__(params, dict(lr=lr, betas=betas, eps=eps, weight_decay=weight_decay))
+        super().__init__(params, {"lr": lr, "betas": betas, "eps": eps, "weight_decay": weight_decay})
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -63,7 +63,10 @@ class AdamW(Optimizer):
             if not params:
                 continue
             states = [self._state_of(p) for p in params]
-            rows = [(p, p.grad, s["exp_avg"], s["exp_avg_sq"], s["step"]) for p, s in zip(params, states, strict=True)]
+            rows: list[tuple[torch.Tensor, ...]] = [
+                (p, _laid_out_like(p, p.grad), s["exp_avg"], s["exp_avg_sq"], s["step"])
+                for p, s in zip(params, states, strict=True)
+            ]
             torch._foreach_add_([row[-1] for row in rows], 1)
             if group["weight_decay"] == 0:
                 _adam(group, *zip(*rows, strict=True))
@@ -82,6 +85,11 @@ class AdamW(Optimizer):
             state["exp_avg"] = torch.zeros_like(p)
             state["exp_avg_sq"] = torch.zeros_like(p)
         return state
+
+
+def _laid_out_like(p: torch.Tensor, grad: torch.Tensor) -> torch.Tensor:
+    """The gradient in the parameter's memory layout, which the fused kernel takes for granted."""
+    return grad if grad.stride() == p.stride() else torch.empty_like(p).copy_(grad)
 
 
 def _adam(group: dict[str, Any], params: Any, grads: Any, exp_avgs: Any, exp_avg_sqs: Any, steps: Any) -> None:

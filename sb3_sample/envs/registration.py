@@ -8,8 +8,9 @@ registers the ids before the environment is made.
 """
 
 import difflib
+from collections.abc import Callable
 from multiprocessing.reduction import ForkingPickler
-from typing import Any, Callable
+from typing import Any
 
 import gymnasium as gym
 

@@ -4,7 +4,9 @@ The off-policy family: soft actor-critic with exchangeable parts, and its one up
 ``SAC._update`` is the whole gradient step, in the order of BRO's pseudo-code (P5, algorithm 2).
 """
 
+import inspect
 import io
+import math
 import pathlib
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -12,14 +14,14 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.envs.vec_check_finite import VecCheckFinite
+from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.optim import AdamW
 from sb3_sample.sac import losses
 from sb3_sample.sac.exploration import EXPLORATIONS, Exploration
@@ -33,6 +35,10 @@ Self = TypeVar("Self", bound="SAC")
 
 # Batches of at most this many gradient steps are gathered at once, to bound the memory they take.
 MAX_BATCHES_AT_ONCE = 64
+
+# Buffers whose every transition is drawn independently, so that one large draw can be cut into batches. Others compose
+# each batch (HerReplayBuffer: so many real, so many relabelled transitions) and are asked once a gradient step.
+INDEPENDENT_BUFFERS = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer)
 
 
 class Batch(NamedTuple):
@@ -163,8 +169,6 @@ class SAC(OffPolicyAlgorithm):
                 "use_sde=True is not supported by this family of algorithms: use action_noise, "
                 f"or exploration=, one of {sorted(EXPLORATIONS)}"
             )
-        if policy_kwargs is not None and "n_quantiles" in policy_kwargs:
-            raise ValueError("n_quantiles is an argument of the algorithm, not of policy_kwargs")
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]  # None when a model is loaded for prediction only
@@ -181,7 +185,7 @@ class SAC(OffPolicyAlgorithm):
             replay_buffer_kwargs=replay_buffer_kwargs,
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
-            policy_kwargs={**(policy_kwargs or {}), "n_quantiles": n_quantiles},
+            policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
@@ -190,14 +194,14 @@ class SAC(OffPolicyAlgorithm):
             sde_support=False,
             support_multi_env=True,
         )
-        # None once Stable-Baselines3's two arguments are in force.
+        # None: Stable-Baselines3's two arguments are in force.
         self.replay_ratio: float | None = replay_ratio if train_freq is None and gradient_steps is None else None
         self.n_quantiles = n_quantiles
         self.ent_coef = ent_coef
         self.target_update_interval = target_update_interval
         self.target_entropy = target_entropy
-        self.pessimism_beta = pessimism
-        self.exploration_name = exploration
+        self.pessimism = pessimism
+        self.exploration = exploration
         self.exploration_kwargs = exploration_kwargs
         self.resets = resets
         #: Transitions stored over the model's life; unlike ``num_timesteps`` never zeroed by ``learn``.
@@ -205,56 +209,143 @@ class SAC(OffPolicyAlgorithm):
         # Gradient steps owed but not yet taken, the fraction that a replay ratio leaves over.
         self._updates_owed = 0.0
         self._metrics: dict[str, torch.Tensor] = {}
-
-        for name, low in (
-            ("buffer_size", 1), ("learning_starts", 0), ("batch_size", 1), ("target_update_interval", 1), ("n_steps", 1),
-        ):  # fmt: skip
-            if getattr(self, name) < low:
-                raise ValueError(f"{name} must be at least {low}, not {getattr(self, name)}")
-        if not replay_ratio >= 0:
-            raise ValueError(f"replay_ratio must be at least 0, not {replay_ratio}")
-        if not 0 < tau <= 1:
-            raise ValueError(f"tau must lie in (0, 1], not {tau}")
-        if not 0 <= gamma <= 1:
-            raise ValueError(f"gamma must lie in [0, 1], not {gamma}")
-        if not isinstance(ent_coef, str) and not ent_coef >= 0:
-            raise ValueError(f"ent_coef must be at least 0, 'auto' or 'auto_<start>', not {ent_coef}")
-        if exploration not in EXPLORATIONS:
-            raise ValueError(f"exploration must be one of {sorted(EXPLORATIONS)}, not {exploration!r}")
         if _init_setup_model:
             self._setup_model()
 
     # ---------------------------------------------------------------- construction
 
     def _setup_model(self) -> None:
-        super()._setup_model()
+        self._check_arguments()
+        given = self.policy_kwargs
+        # The policy is built with more than the user's own arguments, and only the latter are saved.
+        self.policy_kwargs = self._full_policy_kwargs()
+        try:
+            super()._setup_model()
+        finally:
+            self.policy_kwargs = given
         if self.device.type == "cpu":
             # glibc hands freed memory back to the system above a threshold, at first below the size of one gradient,
             # and every update then pays for page faults. The threshold follows the largest block freed so far.
             torch.empty(31 * 2**20, dtype=torch.uint8)
         self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
-        action_dim = self.actor.action_dim
-        self._target_entropy = -action_dim / 2 if self.target_entropy == "auto" else float(self.target_entropy)
+        self._target_entropy = (
+            -self.actor.action_dim / 2 if self.target_entropy == "auto" else float(self.target_entropy)
+        )
         self._critic_loss = losses.squared_error if self.n_quantiles is None else losses.quantile_huber
         self.temperature = self._make_temperature()
-        self.pessimism: Pessimism = FixedPessimism(self.pessimism_beta).to(self.device)
-        self.exploration: Exploration = self._make_exploration()
+        self.explorer = self._make_explorer()
+        self.pessimism_rule: Pessimism = FixedPessimism(self.pessimism).to(self.device)
         self.plasticity = Resets(self.resets)
-        learned = list(self.temperature.parameters())
-        if learned:
-            self.temperature.optimizer = AdamW(learned, lr=self.lr_schedule(1), betas=(self.temperature_beta1, 0.999))
+        self.temperature_optimizer: AdamW | None = None
+        if isinstance(self.temperature, LogScalar):
+            betas = (self.temperature_beta1, 0.999)
+            self.temperature_optimizer = AdamW(self.temperature.parameters(), lr=self.lr_schedule(1), betas=betas)
+
+    def _check_arguments(self) -> None:
+        """
+        :raises ValueError: if an argument is out of range or contradicts another
+        """
+        for name, low in (
+            ("buffer_size", 1),
+            ("learning_starts", 0),
+            ("batch_size", 1),
+            ("target_update_interval", 1),
+            ("n_steps", 1),
+        ):
+            if not getattr(self, name) >= low:
+                raise ValueError(f"{name} must be at least {low}, not {getattr(self, name)}")
+        if not callable(self.learning_rate) and not 0 <= self.learning_rate < math.inf:
+            raise ValueError(f"learning_rate must be at least 0 and finite, or a schedule, not {self.learning_rate}")
+        if self.replay_ratio is not None and not 0 <= self.replay_ratio < math.inf:
+            raise ValueError(f"replay_ratio must be at least 0 and finite, not {self.replay_ratio}")
+        if not 0 < self.tau <= 1:
+            raise ValueError(f"tau must lie in (0, 1], not {self.tau}")
+        if not 0 <= self.gamma <= 1:
+            raise ValueError(f"gamma must lie in [0, 1], not {self.gamma}")
+        if self.target_entropy != "auto" and not math.isfinite(
+            _number("target_entropy", self.target_entropy, "'auto'")
+        ):
+            raise ValueError(f"target_entropy must be finite, or 'auto', not {self.target_entropy}")
+        if self.exploration not in EXPLORATIONS:
+            raise ValueError(f"exploration must be one of {sorted(EXPLORATIONS)}, not {self.exploration!r}")
+        if "n_quantiles" in self.policy_kwargs:
+            raise ValueError("n_quantiles is an argument of the algorithm, not of policy_kwargs")
+        train_freq: Any = self.train_freq
+        if not isinstance(train_freq, TrainFreq):
+            every, unit = train_freq if isinstance(train_freq, tuple) else (train_freq, "step")
+            if not isinstance(every, int) or every < 1 or unit not in ("step", "episode"):
+                raise ValueError(f"train_freq must be at least 1, or (n, 'step' or 'episode'), not {train_freq!r}")
+            if unit == "episode" and self.env is not None and self.n_envs > 1:
+                raise ValueError(
+                    f"train_freq={train_freq!r} counts episodes, which needs one environment, not {self.n_envs}"
+                )
+
+    def _full_policy_kwargs(self) -> dict[str, Any]:
+        """
+        :return: the policy's arguments: the user's and the algorithm's
+        """
+        return {**self.policy_kwargs, "n_quantiles": self.n_quantiles}
+
+    def _full_exploration_kwargs(self) -> dict[str, Any]:
+        """
+        :return: the explorer's arguments: the user's and the algorithm's
+        """
+        return dict(self.exploration_kwargs or {})
 
     def _make_temperature(self) -> LogScalar | FixedScalar:
-        if isinstance(self.ent_coef, str):
-            head, _, start = self.ent_coef.partition("_")
-            if head != "auto":
-                raise ValueError(f"ent_coef must be at least 0, 'auto' or 'auto_<start>', not {self.ent_coef!r}")
-            return LogScalar(float(start) if start else 1.0).to(self.device)
-        return FixedScalar(self.ent_coef).to(self.device)
+        allowed = "'auto' or 'auto_<start above 0>'"
+        if isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto"):
+            start = self.ent_coef.removeprefix("auto").removeprefix("_") or "1"
+            value = _number("ent_coef", start, allowed, shown=self.ent_coef)
+            if not 0 < value < math.inf:
+                raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
+            return LogScalar(value).to(self.device)
+        value = _number("ent_coef", self.ent_coef, allowed)
+        if not 0 <= value < math.inf:
+            raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
+        return FixedScalar(value).to(self.device)
 
-    def _make_exploration(self) -> Exploration:
-        part = EXPLORATIONS[self.exploration_name](self, **(self.exploration_kwargs or {}))
-        return part.to(self.device)
+    def _make_explorer(self) -> Exploration:
+        return EXPLORATIONS[self.exploration](self, **self._full_exploration_kwargs()).to(self.device)
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        if policy_name not in self.policy_aliases:
+            raise ValueError(
+                f"policy must be one of {list(self.policy_aliases)} or a policy class, not {policy_name!r}"
+            )
+        return self.policy_aliases[policy_name]
+
+    @classmethod
+    def load(
+        cls: type[Self],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: torch.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> Self:
+        """
+        Load a model, as in Stable-Baselines3.
+
+        :param path: file, or where ``save`` wrote it
+        :param env: environment to go on with; none is needed for prediction
+        :param device: "auto", "cpu", "cuda", ...
+        :param custom_objects: objects that replace what the file holds under their names
+        :param print_system_info: whether to print the saved and the present versions
+        :param force_reset: whether the environment is reset before training goes on
+        :param kwargs: arguments of the constructor that shall differ from the saved ones
+        :return: the model
+        :raises ValueError: if ``kwargs`` holds something else, or values that are not allowed
+        """
+        known = {name for c in cls.__mro__ if issubclass(c, SAC) for name in inspect.signature(c.__init__).parameters}
+        unknown = sorted(kwargs.keys() - known)
+        if unknown:
+            raise ValueError(f"{', '.join(unknown)}: not an argument of {cls.__name__}, so load cannot change it")
+        if "train_freq" in kwargs or "gradient_steps" in kwargs:
+            kwargs.setdefault("replay_ratio", None)
+        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -263,7 +354,11 @@ class SAC(OffPolicyAlgorithm):
             raise ValueError(f"env must have a bounded Box action space, not {space}")
         if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
             raise ValueError(f"env must have a bounded action space: the bounds of {space} are not finite")
-        return VecCheckFinite.insert(OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper))
+        if not (space.low < space.high).all():
+            raise ValueError(f"env must have an action space with low < high in every dimension, not {space}")
+        venv = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        FiniteCheck.install(venv)
+        return venv
 
     def make_optimizer(self, parameters: Any) -> torch.optim.Optimizer:
         """
@@ -273,13 +368,16 @@ class SAC(OffPolicyAlgorithm):
         return self.policy.make_optimizer(parameters, self.lr_schedule)
 
     def _parts(self) -> dict[str, Part]:
-        return {"exploration": self.exploration, "pessimism": self.pessimism, "plasticity": self.plasticity}
+        return {"explorer": self.explorer, "pessimism_rule": self.pessimism_rule, "plasticity": self.plasticity}
 
     def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Every optimizer by its path from the algorithm."""
-        optimizers = {"actor.optimizer": self.actor.optimizer, "critic.optimizer": self.critic.optimizer}
-        if isinstance(self.temperature, LogScalar):
-            optimizers["temperature.optimizer"] = self.temperature.optimizer
+        optimizers: dict[str, torch.optim.Optimizer] = {
+            "actor.optimizer": self.actor.optimizer,
+            "critic.optimizer": self.critic.optimizer,
+        }
+        if self.temperature_optimizer is not None:
+            optimizers["temperature_optimizer"] = self.temperature_optimizer
         for name, part in self._parts().items():
             optimizers.update({f"{name}.{key}": optimizer for key, optimizer in part.optimizers().items()})
         return optimizers
@@ -294,10 +392,12 @@ class SAC(OffPolicyAlgorithm):
         """
         Start every network, optimizer and learned number anew, in place; the replay buffer stays.
         """
-        fresh = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs)
+        fresh = self.policy_class(
+            self.observation_space, self.action_space, self.lr_schedule, **self._full_policy_kwargs()
+        )
         self.policy.load_state_dict(fresh.state_dict())
         self.temperature.load_state_dict(self._make_temperature().state_dict())
-        self.exploration.load_state_dict(self._make_exploration().state_dict())
+        self.explorer.load_state_dict(self._make_explorer().state_dict())
         for optimizer in self._optimizers().values():
             optimizer.state.clear()
 
@@ -314,7 +414,7 @@ class SAC(OffPolicyAlgorithm):
             assert self._last_obs is not None
             with torch.inference_mode():
                 observations, _ = self.policy.obs_to_tensor(self._last_obs)
-                actions = self.exploration.act(self, observations)
+                actions = self.explorer.act(self, observations)
             scaled = actions.cpu().numpy().reshape((n_envs, *self.action_space.shape))
         if action_noise is not None:
             scaled = np.clip(scaled + action_noise(), -1, 1)
@@ -423,8 +523,10 @@ class SAC(OffPolicyAlgorithm):
                 self._metrics = self._update(batch)
 
     def _sample_batches(self, n_batches: int, batch_size: int) -> list[Batch]:
-        """Draw the transitions of several gradient steps at once and cut them into batches."""
+        """The batches of several gradient steps, drawn at once where that gives the same distribution."""
         assert self.replay_buffer is not None
+        if n_batches > 1 and type(self.replay_buffer) not in INDEPENDENT_BUFFERS:
+            return [batch for _ in range(n_batches) for batch in self._sample_batches(1, batch_size)]
         data = self.replay_buffer.sample(n_batches * batch_size, env=self._vec_normalize_env)
         discounts = getattr(data, "discounts", None)
 
@@ -463,7 +565,7 @@ class SAC(OffPolicyAlgorithm):
         # Critics, towards the targets' value of the actor's next action.
         with torch.no_grad():
             next_actions, next_log_prob = self.actor.sample(batch.next_observations, noise.critic)
-            next_values = self.pessimism.value(self.critic_target(batch.next_observations, next_actions))
+            next_values = self.pessimism_rule.value(self.critic_target(batch.next_observations, next_actions))
             target = losses.td_target(
                 batch.rewards, batch.dones, batch.discounts, next_values, -fixed_alpha * next_log_prob
             )
@@ -481,12 +583,12 @@ class SAC(OffPolicyAlgorithm):
 
         # Actor, on the new critics.
         actions, log_prob = self.actor.sample(batch.observations, noise.actor)
-        value = self.pessimism.value(self.critic(batch.observations, actions))
+        value = self.pessimism_rule.value(self.critic(batch.observations, actions))
         actor_loss = losses.actor_loss(log_prob, value, fixed_alpha)
         self.minimize(self.actor.optimizer, actor_loss)
 
         # Whoever explores, on the new critics and the new actor.
-        exploration_metrics = self.exploration.update(self, batch, noise.exploration)
+        exploration_metrics = self.explorer.update(self, batch, noise.exploration)
 
         # Temperature.
         entropy = -log_prob.detach().mean()
@@ -498,13 +600,13 @@ class SAC(OffPolicyAlgorithm):
             "train/ent_coef": alpha,
             **exploration_metrics,
         }
-        if isinstance(self.temperature, LogScalar):
+        if self.temperature_optimizer is not None:
             temperature_loss = losses.temperature_loss(alpha, entropy, self._target_entropy)
-            self.minimize(self.temperature.optimizer, temperature_loss)
+            self.minimize(self.temperature_optimizer, temperature_loss)
             metrics["train/ent_coef_loss"] = temperature_loss
 
         # Pessimism.
-        metrics.update(self.pessimism.update(self, batch))
+        metrics.update(self.pessimism_rule.update(self, batch))
         return {name: value.detach() for name, value in metrics.items()}
 
     @staticmethod
@@ -531,3 +633,12 @@ class SAC(OffPolicyAlgorithm):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("plasticity/n_resets", self.plasticity.n_done)
         super().dump_logs()
+
+
+def _number(name: str, value: Any, otherwise: str, shown: Any = None) -> float:
+    """An argument as a number, or an error that names it, its value and what else is allowed."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        shown = value if shown is None else shown
+        raise ValueError(f"{name} must be a number, or {otherwise}, not {shown!r}") from None

@@ -1,5 +1,6 @@
 """BRO and BRO Fast."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -128,16 +129,13 @@ class BRO(SAC):
         device: torch.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        exploration_kwargs = dict(exploration_kwargs or {})
-        if exploration == "optimistic_shift":
-            exploration_kwargs = {
-                "kl_target": kl_target,
-                "std_multiplier": std_multiplier,
-                "initial_optimism": initial_optimism,
-                "initial_kl_weight": initial_kl_weight,
-                "learning_rate": adjustment_learning_rate,
-                **exploration_kwargs,
-            }
+        self.model_size = model_size
+        self.kl_target = kl_target
+        self.std_multiplier = std_multiplier
+        self.initial_optimism = initial_optimism
+        self.initial_kl_weight = initial_kl_weight
+        self.adjustment_learning_rate = adjustment_learning_rate
+        self.weight_decay = weight_decay
         super().__init__(
             policy,
             env,
@@ -166,12 +164,53 @@ class BRO(SAC):
             use_sde=use_sde,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
-            policy_kwargs=_policy_kwargs(policy_kwargs, model_size, weight_decay),
+            policy_kwargs=policy_kwargs,
             verbose=verbose,
             seed=seed,
             device=device,
             _init_setup_model=_init_setup_model,
         )
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        if not 0 <= self.weight_decay < math.inf:
+            raise ValueError(f"weight_decay must be at least 0 and finite, not {self.weight_decay}")
+        described = sorted({"critic_network", "critic_network_kwargs"} & self.policy_kwargs.keys())
+        if described and self.model_size is not None:
+            raise ValueError(
+                f"policy_kwargs describe the critics ({', '.join(described)}), and so does "
+                f"model_size={self.model_size!r}: pass model_size=None"
+            )
+        if "weight_decay" in (self.policy_kwargs.get("optimizer_kwargs") or {}):
+            raise ValueError("weight_decay is an argument of the algorithm, not of policy_kwargs['optimizer_kwargs']")
+
+    def _full_policy_kwargs(self) -> dict[str, Any]:
+        kwargs: dict[str, Any] = {
+            "critic_network": "bronet",
+            "actor_network": "bronet",
+            **super()._full_policy_kwargs(),
+        }
+        if kwargs["actor_network"] == "bronet":
+            kwargs.setdefault("actor_network_kwargs", {"width": 256, "n_blocks": 1})
+        if self.model_size is not None:
+            kwargs["critic_network_kwargs"] = dict(
+                zip(("n_blocks", "width"), _model_size(self.model_size), strict=True)
+            )
+        kwargs["optimizer_kwargs"] = {**(kwargs.get("optimizer_kwargs") or {}), "weight_decay": self.weight_decay}
+        return kwargs
+
+    def _full_exploration_kwargs(self) -> dict[str, Any]:
+        kwargs = super()._full_exploration_kwargs()
+        if self.exploration == "optimistic_shift":
+            for name in (
+                "kl_target",
+                "std_multiplier",
+                "initial_optimism",
+                "initial_kl_weight",
+                "adjustment_learning_rate",
+            ):
+                kwargs.setdefault(name, getattr(self, name))
+        return kwargs
 
 
 class BROFast(BRO):
@@ -181,51 +220,28 @@ class BROFast(BRO):
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
+    :param learning_rate: a number or a function of the remaining progress (from 1 to 0)
     :param replay_ratio: gradient steps per environment transition
     :param resets: environment steps at which all parameters start anew
-    :param kwargs: every other argument of ``BRO``
+    :param kwargs: every other argument of ``BRO``, by name
     """
 
     def __init__(
         self,
         policy: str | type[SACPolicy],
         env: GymEnv | str | None,
-        *args: Any,
+        learning_rate: float | Schedule = 3e-4,
+        *,
         replay_ratio: float = 2,
         resets: Sequence[int] = BRO_FAST_RESETS,
         **kwargs: Any,
     ):
-        super().__init__(policy, env, *args, replay_ratio=replay_ratio, resets=resets, **kwargs)
-
-
-def _policy_kwargs(
-    given: dict[str, Any] | None, model_size: str | Sequence[int] | None, weight_decay: float
-) -> dict[str, Any]:
-    """BRO's networks and optimizer as arguments of the policy, with the user's own on top."""
-    given = dict(given or {})
-    if model_size is not None:
-        described = sorted({"critic_network", "critic_network_kwargs"} & given.keys())
-        if described:
-            raise ValueError(
-                f"policy_kwargs describe the critics ({', '.join(described)}), and so does model_size={model_size!r}: "
-                "pass model_size=None"
-            )
-        given["critic_network_kwargs"] = dict(zip(("n_blocks", "width"), _model_size(model_size), strict=True))
-    optimizer_kwargs = given.get("optimizer_kwargs") or {}
-    if "weight_decay" in optimizer_kwargs:
-        raise ValueError("weight_decay is an argument of the algorithm, not of policy_kwargs['optimizer_kwargs']")
-    given["optimizer_kwargs"] = {**optimizer_kwargs, "weight_decay": weight_decay}
-    given.setdefault("critic_network", "bronet")
-    if given.setdefault("actor_network", "bronet") == "bronet":
-        given.setdefault("actor_network_kwargs", {"width": 256, "n_blocks": 1})
-    return given
+        super().__init__(policy, env, learning_rate, replay_ratio=replay_ratio, resets=resets, **kwargs)
 
 
 def _model_size(model_size: str | Sequence[int]) -> tuple[int, int]:
     """Residual blocks and width of a size given by name or by these two numbers."""
-    if isinstance(model_size, str):
-        if model_size in MODEL_SIZES:
-            return MODEL_SIZES[model_size]
-    elif len(model_size) == 2 and all(isinstance(n, int) for n in model_size):
-        return model_size[0], model_size[1]
+    size: Any = MODEL_SIZES.get(model_size) if isinstance(model_size, str) else model_size
+    if isinstance(size, Sequence) and len(size) == 2 and all(isinstance(n, int) for n in size):
+        return size[0], size[1]
     raise ValueError(f"model_size must be one of {list(MODEL_SIZES)} or (residual blocks, width), not {model_size!r}")

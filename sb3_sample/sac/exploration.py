@@ -2,6 +2,7 @@
 Exploration: who acts while the agent trains. ``predict`` and evaluation are the pessimistic actor's alone.
 """
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -67,9 +68,9 @@ class OptimisticShift(Exploration):
     :param std_multiplier: factor on the pessimistic standard deviation, above 0
     :param initial_optimism: optimism at the start and after a reset
     :param initial_kl_weight: weight of the divergence at the start and after a reset
-    :param learning_rate: of optimism and weight, by Adam with beta1 = 0.5
-    :param network: name of the shift network's trunk
-    :param network_kwargs: its arguments
+    :param adjustment_learning_rate: of optimism and weight, by Adam with beta1 = 0.5
+    :param network: trunk of the shift network, "bronet" or "mlp"
+    :param network_kwargs: its arguments; None: one block, 256 wide, for "bronet", the network's own otherwise
     :raises ValueError: if an argument is out of range
     """
 
@@ -80,28 +81,33 @@ class OptimisticShift(Exploration):
         std_multiplier: float = 0.75,
         initial_optimism: float = 1.0,
         initial_kl_weight: float = 0.25,
-        learning_rate: float = 3e-5,
+        adjustment_learning_rate: float = 3e-5,
         network: str = "bronet",
         network_kwargs: dict[str, Any] | None = None,
     ):
         super().__init__(agent)
         for name, value in (("kl_target", kl_target), ("std_multiplier", std_multiplier)):
-            if not value > 0:
-                raise ValueError(f"{name} must be above 0, not {value}")
+            if not 0 < value < math.inf:
+                raise ValueError(f"{name} must be above 0 and finite, not {value}")
+        if not 0 <= adjustment_learning_rate < math.inf:
+            raise ValueError(f"adjustment_learning_rate must be at least 0 and finite, not {adjustment_learning_rate}")
+        if network not in NETWORKS:
+            raise ValueError(f"network must be one of {sorted(NETWORKS)}, not {network!r}")
         self.kl_target = kl_target
         self.std_multiplier = std_multiplier
         actor = agent.actor
         action_dim = actor.action_dim
-        network_kwargs = {"width": 256, "n_blocks": 1} if network_kwargs is None else network_kwargs
+        if network_kwargs is None:
+            network_kwargs = {"width": 256, "n_blocks": 1} if network == "bronet" else {}
         self.trunk = NETWORKS[network](actor.features_dim + action_dim, **network_kwargs)
         # Without bias and nearly zero, so that the optimistic actor starts as the pessimistic one.
         self.shift = linear(self.trunk.out_features, action_dim, None, bias=False, gain=0.01)
-        self.optimism = BoundedLogScalar(initial_optimism)
-        self.kl_weight = BoundedLogScalar(initial_kl_weight)
+        self.optimism = BoundedLogScalar("initial_optimism", initial_optimism)
+        self.kl_weight = BoundedLogScalar("initial_kl_weight", initial_kl_weight)
         self.actor_optimizer = agent.make_optimizer([*self.trunk.parameters(), *self.shift.parameters()])
         # Their learning rate is their own, whatever the schedule of the others.
         scalars = {"params": [*self.optimism.parameters(), *self.kl_weight.parameters()], "scheduled": False}
-        self.scalar_optimizer = AdamW([scalars], lr=learning_rate, betas=(0.5, 0.999))
+        self.scalar_optimizer = AdamW([scalars], lr=adjustment_learning_rate, betas=(0.5, 0.999))
 
     def optimizers(self) -> dict[str, Optimizer]:
         return {"actor_optimizer": self.actor_optimizer, "scalar_optimizer": self.scalar_optimizer}
@@ -137,7 +143,7 @@ class OptimisticShift(Exploration):
         agent.minimize(self.actor_optimizer, actor_loss)
 
         kl_gap = kl.detach().mean() / mean.shape[1] - self.kl_target
-        optimism_loss = losses.optimism_loss(optimism, agent.pessimism.beta(), kl_gap)
+        optimism_loss = losses.optimism_loss(optimism, agent.pessimism_rule.beta(), kl_gap)
         kl_weight_loss = losses.kl_weight_loss(kl_weight, kl_gap)
         agent.minimize(self.scalar_optimizer, optimism_loss + kl_weight_loss)
         return {

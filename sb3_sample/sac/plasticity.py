@@ -1,7 +1,11 @@
 """Plasticity: what keeps the networks able to learn, at the environment steps that it names."""
 
+import itertools
 from collections.abc import Sequence
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from sb3_sample.sac.parts import Part
 
@@ -24,10 +28,11 @@ class Resets(Part):
 
     def __init__(self, steps: Sequence[int] = ()):
         super().__init__()
+        is_sequence = isinstance(steps, (Sequence, np.ndarray))
+        if not is_sequence or not all(_is_integer(step) and step >= 1 for step in steps):
+            raise ValueError(f"resets must be a sequence of environment steps, integers of at least 1, not {steps!r}")
         steps = tuple(steps)
-        if any(isinstance(step, bool) or int(step) != step or step < 1 for step in steps):
-            raise ValueError(f"resets must be environment steps, integers of at least 1, not {steps}")
-        if any(late <= early for early, late in zip(steps, steps[1:], strict=False)):
+        if any(late <= early for early, late in itertools.pairwise(steps)):
             raise ValueError(f"resets must be strictly ascending environment steps, not {steps}")
         self.steps = steps
         self.n_done = 0
@@ -52,3 +57,7 @@ class Resets(Part):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self._reached, self.n_done = state["reached"], state["n_done"]
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool)

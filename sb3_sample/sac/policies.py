@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel, BasePolicy
@@ -17,7 +18,7 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_sample.networks import NETWORKS, linear
+from sb3_sample.networks import NETWORKS, Network, linear
 from sb3_sample.optim import AdamW
 from sb3_sample.sac.losses import tanh_gaussian_log_prob
 
@@ -44,7 +45,7 @@ class Actor(BasePolicy):
         self,
         observation_space: spaces.Space,
         action_space: spaces.Box,
-        network: type[nn.Module],
+        network: type[Network],
         network_kwargs: dict[str, Any],
         features_extractor: BaseFeaturesExtractor,
         normalize_images: bool = True,
@@ -125,7 +126,7 @@ class CriticEnsemble(BaseModel):
         self,
         observation_space: spaces.Space,
         action_space: spaces.Box,
-        network: type[nn.Module],
+        network: type[Network],
         network_kwargs: dict[str, Any],
         features_extractor: BaseFeaturesExtractor,
         n_critics: int = 2,
@@ -174,6 +175,7 @@ class SACPolicy(BasePolicy):
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
+    action_space: spaces.Box
     actor: Actor
     critic: CriticEnsemble
     critic_target: CriticEnsemble
@@ -242,7 +244,7 @@ class SACPolicy(BasePolicy):
         self.critic_target.requires_grad_(False)
         self.actor.optimizer = self.make_optimizer(self.actor.parameters(), lr_schedule)
         self.critic.optimizer = self.make_optimizer(self.critic.parameters(), lr_schedule)
-        self._constructor_args = dict(
+        self._constructor_args: dict[str, Any] = dict(
             lr_schedule=self._dummy_schedule,
             net_arch=net_arch,
             activation_fn=activation_fn,
@@ -280,6 +282,13 @@ class SACPolicy(BasePolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
         return self(observation, deterministic)
 
+    def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
+        """
+        :param scaled_action: actions in [-1, 1], (B, A)
+        :return: the same in the action space's own bounds, (B, A), inside them also where scaling rounds
+        """
+        return np.clip(super().unscale_action(scaled_action), self.action_space.low, self.action_space.high)
+
     def set_training_mode(self, mode: bool) -> None:
         """
         :param mode: training (True) or evaluation mode of actor and critics; the targets stay in evaluation mode
@@ -295,17 +304,17 @@ MlpPolicy = SACPolicy
 class CnnPolicy(SACPolicy):
     """The same with a CNN as features extractor, for images."""
 
-    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN, **kwargs: Any):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    def __init__(self, *args: Any, **kwargs: Any):
+        kwargs.setdefault("features_extractor_class", NatureCNN)
+        super().__init__(*args, **kwargs)
 
 
 class MultiInputPolicy(SACPolicy):
     """The same with an extractor for dict observations."""
 
-    def __init__(
-        self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any
-    ):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    def __init__(self, *args: Any, **kwargs: Any):
+        kwargs.setdefault("features_extractor_class", CombinedExtractor)
+        super().__init__(*args, **kwargs)
 
 
 def _network_args(
@@ -314,7 +323,7 @@ def _network_args(
     kwargs: dict[str, Any] | None,
     net_arch: list[int] | None,
     activation_fn: type[nn.Module] | None,
-) -> tuple[type[nn.Module], dict[str, Any]]:
+) -> tuple[type[Network], dict[str, Any]]:
     """Class and arguments of a trunk, from its name and from Stable-Baselines3's shorthand."""
     if network not in NETWORKS:
         raise ValueError(f"{who}_network must be one of {sorted(NETWORKS)}, not {network!r}")

@@ -11,13 +11,10 @@ class LogScalar(nn.Module):
     A positive number, the exponential of its parameter.
 
     :param initial: initial value, above 0
-    :raises ValueError: if the initial value is not above 0
     """
 
     def __init__(self, initial: float):
         super().__init__()
-        if not initial > 0:
-            raise ValueError(f"a learned positive number must start above 0, not at {initial}")
         self.log_value = nn.Parameter(torch.tensor(math.log(initial)))
 
     def forward(self) -> torch.Tensor:
@@ -32,18 +29,17 @@ class BoundedLogScalar(nn.Module):
     A positive number whose logarithm is kept in an interval by a tanh (BRO's published code):
     ``log(value) = low + (high - low) / 2 * (1 + tanh(parameter))``.
 
+    :param name: name of the argument that gives the initial value, for the error
     :param initial: initial value, its logarithm strictly inside the interval
     :param low: lower bound of the logarithm
     :param high: upper bound of the logarithm
     :raises ValueError: if the initial value is not strictly inside the bounds
     """
 
-    def __init__(self, initial: float, low: float = -10.0, high: float = 7.5):
+    def __init__(self, name: str, initial: float, low: float = -10.0, high: float = 7.5):
         super().__init__()
         if not math.exp(low) < initial < math.exp(high):
-            raise ValueError(
-                f"a bounded learned number must start between exp({low}) and exp({high}), exclusive, not at {initial}"
-            )
+            raise ValueError(f"{name} must lie between exp({low}) and exp({high}), exclusive, not {initial}")
         self.low, self.half_range = low, (high - low) / 2
         self.raw_value = nn.Parameter(torch.tensor(math.atanh((math.log(initial) - low) / self.half_range - 1)))
 

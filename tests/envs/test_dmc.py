@@ -36,7 +36,7 @@ def test_dimensions(task: str) -> None:
     assert env.observation_space.shape == (n_observations,) and env.action_space.shape == (n_actions,)
 
 
-@pytest.mark.parametrize("domain, task", [*SAMPLE, *REST])
+@pytest.mark.parametrize(("domain", "task"), [*SAMPLE, *REST])
 def test_the_same_numbers_as_the_suite(domain: str, task: str) -> None:
     env = gym.make(f"dmc/{domain}-{task}-v0")
     raw = suite.load(domain, task, task_kwargs={"random": 11})
@@ -66,7 +66,7 @@ def test_actions_span_the_bounds_of_the_suite() -> None:
         np.testing.assert_allclose(dm_env.physics.control(), bound)
 
 
-@pytest.mark.parametrize("action_repeat, decisions", [(1, 1000), (4, 250), (3, 334), (1000, 1)])
+@pytest.mark.parametrize(("action_repeat", "decisions"), [(1, 1000), (4, 250), (3, 334), (1000, 1)])
 def test_an_episode_is_1000_steps_and_truncated(action_repeat: int, decisions: int) -> None:
     env = gym.make("dmc/pendulum-swingup-v0", action_repeat=action_repeat)
     env.reset(seed=0)

@@ -61,7 +61,7 @@ def test_the_module_prefix_needs_no_import() -> None:
 
 
 @pytest.mark.parametrize(
-    "env_id, module, extra",
+    ("env_id", "module", "extra"),
     [
         ("dmc/cheetah-run-v0", "dm_control.suite", "dmc"),
         ("metaworld/push-v3", "metaworld.env_dict", "metaworld"),

@@ -31,7 +31,7 @@ def test_lists_hold_registered_ids_once(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "env_id, key",
+    ("env_id", "key"),
     [
         ("metaworld/push-v3", ("metaworld", "push")),
         ("sb3_sample:metaworld/pick-place-wall-v3", ("metaworld", "pick-place-wall")),

@@ -210,18 +210,18 @@ def test_trunks_are_orthogonal_with_root_two(stack: nn.Module) -> None:
 def test_gains_of_a_model() -> None:
     """Root two everywhere but for the actor's log standard deviation (1) and the optimistic shift (0.01, no bias)."""
     model = BRO("MlpPolicy", Toy(), model_size=(1, 16), buffer_size=1, device="cpu")
-    assert isinstance(model.exploration, OptimisticShift)
+    assert isinstance(model.explorer, OptimisticShift)
     gains = {
         "mean": (model.actor.mean.weight, math.sqrt(2)),
         "log_std": (model.actor.log_std.weight, 1.0),
-        "shift": (model.exploration.shift.weight, 0.01),
+        "shift": (model.explorer.shift.weight, 0.01),
         "head of critic 0": (model.critic.head.weight[0], math.sqrt(2)),
         "head of critic 1": (model.critic.head.weight[1], math.sqrt(2)),
     }
     for name, (kernel, gain) in gains.items():
         norms = torch.linalg.svdvals(kernel)
         torch.testing.assert_close(norms, torch.full_like(norms, gain), rtol=1e-4, atol=1e-6, msg=name)
-    assert model.exploration.shift.bias is None
+    assert model.explorer.shift.bias is None
 
 
 @pytest.mark.parametrize(
@@ -251,7 +251,7 @@ def test_bad_sizes(make: Callable[[], nn.Module]) -> None:
 def test_number_of_parameters(size: str, millions: float, tolerance: float) -> None:
     env = Toy(spaces.Box(-1, 1, (67,)), spaces.Box(-1, 1, (24,)))
     model = BRO("MlpPolicy", env, model_size=size, buffer_size=1, device="cpu")
-    modules = (model.actor, model.critic, model.critic_target, model.exploration)
+    modules = (model.actor, model.critic, model.critic_target, model.explorer)
     n = sum(p.numel() for module in modules for p in module.parameters()) / 1e6
     critics = sum(p.numel() for m in (model.critic, model.critic_target) for p in m.parameters()) / 1e6
     print(f"{size}: {n:.2f}M parameters, of which critics and targets {critics:.2f}M")

@@ -63,13 +63,13 @@ def test_resets(bro: BRO) -> None:
 def test_networks(bro: BRO) -> None:
     assert widths(bro.critic.trunk) == widths(bro.critic_target.trunk) == (512, 2)
     assert widths(bro.actor.trunk) == (256, 1)
-    assert isinstance(bro.exploration, OptimisticShift)
-    assert widths(bro.exploration.trunk) == (256, 1)
+    assert isinstance(bro.explorer, OptimisticShift)
+    assert widths(bro.explorer.trunk) == (256, 1)
     assert bro.critic(torch.zeros(4, 5), torch.zeros(4, N_ACTIONS)).shape == (2, 4, 100)
     norms = [m for m in bro.policy.modules() if isinstance(m, (nn.LayerNorm, EnsembleLayerNorm))]
     assert norms and {m.eps for m in norms} == {1e-6}
     # The optimistic actor sees the observation and the mean.
-    assert bro.exploration.trunk.dense.in_features == 5 + N_ACTIONS
+    assert bro.explorer.trunk.dense.in_features == 5 + N_ACTIONS
 
 
 def test_log_std_interval(bro: BRO) -> None:
@@ -83,8 +83,8 @@ def test_log_std_interval(bro: BRO) -> None:
 
 
 def test_pessimism_and_optimism(bro: BRO) -> None:
-    assert bro.pessimism.beta() == 0
-    exploration = bro.exploration
+    assert bro.pessimism_rule.beta() == 0
+    exploration = bro.explorer
     assert isinstance(exploration, OptimisticShift)
     assert exploration.kl_target == 0.05
     assert exploration.std_multiplier == 0.75
@@ -101,12 +101,12 @@ def test_pessimism_and_optimism(bro: BRO) -> None:
 
 def test_optimizers_of_the_networks(bro: BRO) -> None:
     """The same settings for critics and both actors, decay on every parameter, each parameter in one optimizer."""
-    assert isinstance(bro.exploration, OptimisticShift)
-    shift = [*bro.exploration.trunk.parameters(), *bro.exploration.shift.parameters()]
+    assert isinstance(bro.explorer, OptimisticShift)
+    shift = [*bro.explorer.trunk.parameters(), *bro.explorer.shift.parameters()]
     for optimizer, parameters in (
         (bro.critic.optimizer, list(bro.critic.parameters())),
         (bro.actor.optimizer, list(bro.actor.parameters())),
-        (bro.exploration.actor_optimizer, shift),
+        (bro.explorer.actor_optimizer, shift),
     ):
         settings = group(optimizer)
         assert settings["lr"] == 3e-4
@@ -118,10 +118,10 @@ def test_optimizers_of_the_networks(bro: BRO) -> None:
 
 
 def test_optimizers_of_the_learned_numbers(bro: BRO) -> None:
-    temperature = group(bro.temperature.optimizer)
+    temperature = group(bro.temperature_optimizer)
     assert temperature["lr"] == 3e-4 and tuple(temperature["betas"]) == (0.5, 0.999)
-    assert isinstance(bro.exploration, OptimisticShift)
-    adjustment = group(bro.exploration.scalar_optimizer)
+    assert isinstance(bro.explorer, OptimisticShift)
+    adjustment = group(bro.explorer.scalar_optimizer)
     assert adjustment["lr"] == 3e-5 and tuple(adjustment["betas"]) == (0.5, 0.999)
     assert temperature["weight_decay"] == adjustment["weight_decay"] == 0
 
@@ -145,8 +145,8 @@ def test_sac(sac: SAC) -> None:
     assert sac.learning_starts == 10_000
     assert sac.buffer_size == 1_000_000
     assert sac.plasticity.steps == ()
-    assert sac.pessimism.beta() == 1
-    assert type(sac.exploration) is Exploration
+    assert sac.pessimism_rule.beta() == 1
+    assert type(sac.explorer) is Exploration
     assert sac.temperature().item() == 1.0
     assert sac._target_entropy == -N_ACTIONS / 2
     assert sac.critic(torch.zeros(4, 5), torch.zeros(4, N_ACTIONS)).shape == (2, 4, 1)
@@ -154,7 +154,7 @@ def test_sac(sac: SAC) -> None:
     assert hidden == [256, 256]
     assert sum(isinstance(layer, nn.ReLU) for layer in sac.actor.trunk.layers) == 2
     assert [p.shape[-1] for name, p in sac.critic.trunk.named_parameters() if name.endswith("weight")] == [256, 256]
-    for optimizer in (sac.actor.optimizer, sac.critic.optimizer, sac.temperature.optimizer):
+    for optimizer in (sac.actor.optimizer, sac.critic.optimizer, sac.temperature_optimizer):
         settings = group(optimizer)
         assert settings["lr"] == 3e-4 and settings["weight_decay"] == 0
         assert tuple(settings["betas"]) == (0.9, 0.999)

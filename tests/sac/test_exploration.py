@@ -12,8 +12,8 @@ from tests.sac.common import bro, random_batch, sac, vec
 
 def optimistic(**kwargs: Any) -> tuple[Any, OptimisticShift]:
     model = bro(**kwargs)
-    assert isinstance(model.exploration, OptimisticShift)
-    return model, model.exploration
+    assert isinstance(model.explorer, OptimisticShift)
+    return model, model.explorer
 
 
 def shift_by(exploration: OptimisticShift, value: float) -> None:
@@ -30,18 +30,18 @@ def samples(model: Any, observation: torch.Tensor, n: int = 4000) -> torch.Tenso
     """Pre-tanh samples of who acts while training, (n, A)."""
     torch.manual_seed(0)
     with torch.no_grad():
-        return torch.atanh(model.exploration.act(model, observation.expand(n, -1)).double())
+        return torch.atanh(model.explorer.act(model, observation.expand(n, -1)).double())
 
 
 def test_plain_exploration_samples_the_actor() -> None:
     model = sac()
-    assert type(model.exploration) is Exploration
+    assert type(model.explorer) is Exploration
     observations = torch.randn(5, 3)
     torch.manual_seed(0)
-    actions = model.exploration.act(model, observations)
+    actions = model.explorer.act(model, observations)
     torch.manual_seed(0)
     assert torch.equal(actions, model.actor.sample(observations)[0])
-    assert model.exploration.update(model, random_batch(model)) == {}
+    assert model.explorer.update(model, random_batch(model)) == {}
 
 
 def test_starts_near_the_pessimistic_actor() -> None:
@@ -49,7 +49,7 @@ def test_starts_near_the_pessimistic_actor() -> None:
     observations = torch.randn(100, 3)
     with torch.no_grad():
         features = model.actor.features(observations)
-        mean, log_std = model.actor.gaussian(features)
+        mean, _log_std = model.actor.gaussian(features)
         shift = exploration._mean(features, mean) - mean
     # Kernel gain 0.01 and no bias. The trunk's width is 8, its features of order 3.
     assert 0 < shift.abs().max() < 0.15
@@ -57,7 +57,7 @@ def test_starts_near_the_pessimistic_actor() -> None:
 
 @pytest.mark.parametrize("multiplier", [0.75, 1.5])
 def test_acting_has_the_multiplied_deviation(multiplier: float) -> None:
-    model, exploration = optimistic(std_multiplier=multiplier)
+    model, _exploration = optimistic(std_multiplier=multiplier)
     with torch.no_grad():
         # A std well inside what atanh can give back.
         model.actor.log_std.weight.zero_()
@@ -161,7 +161,7 @@ def test_update_leaves_the_others_alone() -> None:
         ours, theirs = getattr(model, name).state_dict(), getattr(fresh, name).state_dict()
         assert all(torch.equal(ours[key], theirs[key]) for key in theirs), name
     moved = exploration.state_dict()
-    assert any(not torch.equal(moved[key], value) for key, value in fresh.exploration.state_dict().items())
+    assert any(not torch.equal(moved[key], value) for key, value in fresh.explorer.state_dict().items())
 
 
 def test_predict_is_the_pessimistic_actors_and_acting_is_not() -> None:
@@ -182,7 +182,7 @@ def test_predict_is_the_pessimistic_actors_and_acting_is_not() -> None:
     # The shift drives every training action to its upper bound.
     env = vec()
     model = bro(env, learning_starts=5, replay_ratio=0)
-    shift_by(model.exploration, 50.0)
+    shift_by(model.explorer, 50.0)
     model.learn(15)
     taken = model.replay_buffer.actions[:15].reshape(15, 2)
     assert (taken[5:] > 0.999).all()
@@ -191,7 +191,7 @@ def test_predict_is_the_pessimistic_actors_and_acting_is_not() -> None:
 
 def test_warm_up_is_uniformly_random() -> None:
     model = bro(vec(4), learning_starts=400, replay_ratio=1)
-    shift_by(model.exploration, 50.0)
+    shift_by(model.explorer, 50.0)
     model.learn(400)
     taken = model.replay_buffer.actions[:100].reshape(-1, 2)
     assert model._n_updates == 0
@@ -201,7 +201,7 @@ def test_warm_up_is_uniformly_random() -> None:
 
 def test_without_an_optimistic_actor() -> None:
     model = bro(exploration="actor", exploration_kwargs={})
-    assert type(model.exploration) is Exploration
+    assert type(model.explorer) is Exploration
     model.learn(20)
     assert model._n_updates == 10
 

@@ -60,8 +60,8 @@ def named_parameters(model: BRO) -> dict[str, torch.Tensor]:
     """Views of every parameter of the model by its name and in its layout in the files."""
     single = {"actor/Dense_0": model.actor.mean, "actor/Dense_1": model.actor.log_std}
     single.update(trunk_layers(model.actor.trunk, "actor/BroNet_0"))
-    single.update(trunk_layers(model.exploration.trunk, "actor_o/BroNet_0"))
-    single["actor_o/Dense_0"] = model.exploration.shift
+    single.update(trunk_layers(model.explorer.trunk, "actor_o/BroNet_0"))
+    single["actor_o/Dense_0"] = model.explorer.shift
     named: dict[str, torch.Tensor] = {}
     for name, layer in single.items():
         is_norm = isinstance(layer, nn.LayerNorm)
@@ -78,8 +78,8 @@ def named_parameters(model: BRO) -> dict[str, torch.Tensor]:
                 named[f"{module}/Critic_{e}/{name}/{'scale' if norm else 'kernel'}"] = weight
                 named[f"{module}/Critic_{e}/{name}/bias"] = layer.bias[e, 0]
     named["temp/log_temp"] = model.temperature.log_value
-    named["optimism/log_value"] = model.exploration.optimism.raw_value
-    named["regularizer/log_value"] = model.exploration.kl_weight.raw_value
+    named["optimism/log_value"] = model.explorer.optimism.raw_value
+    named["regularizer/log_value"] = model.explorer.kl_weight.raw_value
     return named
 
 
@@ -133,22 +133,18 @@ def replay(path: Path) -> tuple[BRO, dict[str, np.ndarray], dict[int, dict[str, 
             torch.as_tensor(data[f"batch/{i}/{key}"])
             for key in ("observations", "actions", "rewards", "masks", "next_observations")
         )
-        batch = Batch(
-            observations, actions, next_observations, 1 - masks[:, None], rewards[:, None], model.gamma
-        )
+        batch = Batch(observations, actions, next_observations, 1 - masks[:, None], rewards[:, None], model.gamma)
         noise = Noise(*(torch.as_tensor(data[f"noise/{i}/{key}"]) for key in ("critic", "actor", "actor_o")))
         groups = {
             "critic": list(model.critic.parameters()),
             "actor": list(model.actor.parameters()),
-            "actor_o": model.exploration.actor_optimizer.param_groups[0]["params"],
+            "actor_o": model.explorer.actor_optimizer.param_groups[0]["params"],
         }
         reported = {f"{name}_pnorm": norm(parameters) for name, parameters in groups.items()}
         a = actions.clone().requires_grad_()
         q = model.critic(observations, a)
         q1, q2 = q.mean(dim=(1, 2))
-        reported["critic_agnorm"] = float(
-            torch.autograd.grad(0.5 * (q1 + q2), a)[0].norm(dim=1).mean()
-        )
+        reported["critic_agnorm"] = float(torch.autograd.grad(0.5 * (q1 + q2), a)[0].norm(dim=1).mean())
         reported.update(q1=q1.item(), q2=q2.item(), r=rewards.mean().item(), std=mean_std(model, observations))
 
         metrics = {name: value.item() for name, value in model._update(batch, noise).items()}
@@ -171,7 +167,7 @@ def replay(path: Path) -> tuple[BRO, dict[str, np.ndarray], dict[int, dict[str, 
         reported.update({f"{name}_gnorm": norm([p.grad for p in ps]) for name, ps in groups.items()})
         # The optimistic actor started from the new actor's standard deviation.
         reported["std_c"] = mean_std(model, observations)
-        reported["std_o"] = reported["std_c"] * model.exploration.std_multiplier
+        reported["std_o"] = reported["std_c"] * model.explorer.std_multiplier
         info[i] = reported
 
         if i < meta["dims"]["n_updates"] - 1 and f"after/{i}/temp/log_temp" in data:

@@ -14,7 +14,7 @@ def listen(model: Any) -> tuple[list[Any], list[Any], list[str]]:
     steps: list[Any] = []
     episodes: list[Any] = []
     order: list[str] = []
-    part = model.pessimism
+    part = model.pessimism_rule
 
     def on_step(agent: Any, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         assert agent is model
@@ -56,6 +56,6 @@ def test_environments_without_monitor() -> None:
 def test_the_transition_is_stored_before() -> None:
     model = sac(replay_ratio=0)
     sizes = []
-    model.pessimism.on_step = lambda agent, *_: sizes.append((agent.replay_buffer.size(), agent.num_transitions))
+    model.pessimism_rule.on_step = lambda agent, *_: sizes.append((agent.replay_buffer.size(), agent.num_transitions))
     model.learn(5)
     assert sizes == [(n, n) for n in range(1, 6)]

@@ -82,7 +82,7 @@ def test_transitions_are_counted_over_environments_and_learns(n_envs: int) -> No
 def test_everything_starts_anew(maker: str) -> None:
     model = MAKERS[maker](replay_ratio=2, learning_rate=1e-2, tau=0.3, seed=1)
     fresh = MAKERS[maker](seed=2)
-    names = ["policy", "temperature", "exploration"]
+    names = ["policy", "temperature", "explorer"]
     initial = {name: {k: v.clone() for k, v in getattr(model, name).state_dict().items()} for name in names}
     model.learn(40)
     stored = model.replay_buffer.observations.copy()
@@ -111,8 +111,8 @@ def test_everything_starts_anew(maker: str) -> None:
         assert not optimizer.state, name
     assert model.temperature().item() == pytest.approx(1.0)
     if maker == "BRO":
-        assert model.exploration.optimism().item() == pytest.approx(1.0, rel=1e-5)
-        assert model.exploration.kl_weight().item() == pytest.approx(0.25, rel=1e-5)
+        assert model.explorer.optimism().item() == pytest.approx(1.0, rel=1e-5)
+        assert model.explorer.kl_weight().item() == pytest.approx(0.25, rel=1e-5)
     np.testing.assert_array_equal(model.replay_buffer.observations, stored)
     assert model.replay_buffer.size() == 40
 

@@ -93,7 +93,7 @@ def test_the_file_holds_no_pickled_part(tmp_path: Path) -> None:
         data = json.loads(archive.read("data"))
         for name in [n for n in archive.namelist() if n.endswith(".pth")]:
             torch.load(io.BytesIO(archive.read(name)), weights_only=True)
-    modules = {"policy", "actor", "critic", "critic_target", "temperature", "exploration", "pessimism", "plasticity"}
+    modules = {"policy", "actor", "critic", "critic_target", "temperature", "explorer", "pessimism_rule", "plasticity"}
     assert not modules & data.keys()
     pickled = {key for key, value in data.items() if isinstance(value, dict) and ":serialized:" in value}
     ours = {"num_transitions", "_updates_owed", "replay_ratio", "resets", "exploration_kwargs", "exploration_name",
@@ -148,7 +148,7 @@ def test_a_part_given_at_loading_is_taken_or_refused(override: dict[str, Any], t
     except (ValueError, TypeError):
         return
     if "pessimism" in override:
-        assert loaded.pessimism.beta() == 0.25
+        assert loaded.pessimism_rule.beta() == 0.25
     else:
         assert type(loaded.exploration).__name__ == "Exploration"
 

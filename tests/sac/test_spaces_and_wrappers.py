@@ -439,21 +439,21 @@ def rates(model: SAC) -> dict[str, float]:
 
 def test_constant_learning_rate() -> None:
     model = bro(learning_rate=7e-4).learn(20)
-    own = rates(model).pop("exploration.scalar_optimizer")
+    own = rates(model).pop("explorer.scalar_optimizer")
     assert own == 3e-5
-    assert {r for name, r in rates(model).items() if name != "exploration.scalar_optimizer"} == {7e-4}
+    assert {r for name, r in rates(model).items() if name != "explorer.scalar_optimizer"} == {7e-4}
 
 
 def test_scheduled_learning_rate(tmp_path: Path) -> None:
     """A schedule moves every rate but that of optimism and its weight."""
     model = bro(learning_rate=lambda remaining: 1e-3 * remaining, adjustment_learning_rate=2e-5).learn(40)
     for name, rate in rates(model).items():
-        expected = 2e-5 if name == "exploration.scalar_optimizer" else 1e-3 * model._current_progress_remaining
+        expected = 2e-5 if name == "explorer.scalar_optimizer" else 1e-3 * model._current_progress_remaining
         assert rate == pytest.approx(expected), name
     assert model._current_progress_remaining < 0.05
     model.save(tmp_path / "m")
     loaded = type(model).load(tmp_path / "m", env=vec()).learn(30)
-    assert rates(loaded)["exploration.scalar_optimizer"] == 2e-5
+    assert rates(loaded)["explorer.scalar_optimizer"] == 2e-5
     assert rates(loaded)["critic.optimizer"] == pytest.approx(1e-3 * loaded._current_progress_remaining)
 
 

@@ -97,7 +97,7 @@ def test_every_network_moves_once() -> None:
     assert model._n_updates == 1
     after = state(model)
     for name in before:
-        if name.startswith(("policy", "exploration/", "temperature/")):
+        if name.startswith(("policy", "explorer/", "temperature/")):
             assert not torch.equal(before[name], after[name]), name
     assert all(value.shape == () and torch.isfinite(value) and not value.requires_grad for value in metrics.values())
 
@@ -106,9 +106,7 @@ def test_polyak() -> None:
     model = sac(tau=0.1, learning_rate=1e-2)
     before = [p.clone() for p in model.critic_target.parameters()]
     model._update(random_batch(model))
-    for old, target, critic in zip(
-        before, model.critic_target.parameters(), model.critic.parameters(), strict=True
-    ):
+    for old, target, critic in zip(before, model.critic_target.parameters(), model.critic.parameters(), strict=True):
         torch.testing.assert_close(target, 0.9 * old + 0.1 * critic)
 
 

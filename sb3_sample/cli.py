@@ -1,0 +1,129 @@
+"""
+The command ``sb3-sample``: the zoo's commands with the algorithms of this package in them, and ``plot``.
+"""
+
+import argparse
+import importlib
+import runpy
+import sys
+from collections.abc import Callable, Sequence
+from types import ModuleType
+from typing import NamedTuple
+
+from sb3_sample.envs.base import select_gl_backend
+from sb3_sample.version import __version__
+
+
+class Command(NamedTuple):
+    """
+    :param run: what to do with the arguments after the command's name
+    :param help: one line
+    """
+
+    run: Callable[[list[str]], None]
+    help: str
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """
+    :param argv: command line without the program's name; this process's own if None
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    name = arguments[0] if arguments else "--help"
+    if name in ("-h", "--help"):
+        print(_usage())
+    elif name == "--version":
+        print(__version__)
+    elif name in COMMANDS:
+        COMMANDS[name].run(arguments[1:])
+    else:
+        sys.exit(f"sb3-sample: command must be one of {', '.join(COMMANDS)}, not {name!r}")
+
+
+def _usage() -> str:
+    commands = "\n".join(f"  {name:<15} {command.help}" for name, command in COMMANDS.items())
+    return (
+        "usage: sb3-sample COMMAND [OPTION ...]\n\n"
+        f"commands:\n{commands}\n\n"
+        "sb3-sample COMMAND --help shows a command's options; those of the zoo's commands are the zoo's own."
+    )
+
+
+def _zoo_module(name: str) -> ModuleType:
+    """A module of the zoo, with our algorithms and environments in the zoo."""
+    _register()
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        # Of the zoo itself all is there; what its plots need is an extra of it.
+        sys.exit(f'sb3-sample: {error}. Install it with: pip install "sb3_sample[zoo,plots]"')
+
+
+def _register() -> None:
+    try:
+        from sb3_sample import zoo
+    except ImportError as error:
+        if isinstance(error.__cause__, ModuleNotFoundError):
+            sys.exit(f"sb3-sample: {error}")
+        raise
+    zoo.register()
+
+
+def _set_command_line(command: str, arguments: list[str]) -> None:
+    """The zoo's commands read ``sys.argv``; its first entry is the name in their help."""
+    sys.argv = [f"sb3-sample {command}", *arguments]
+
+
+def _zoo_function(module: str, function: str) -> Callable[[list[str]], None]:
+    def run(arguments: list[str]) -> None:
+        command = getattr(_zoo_module(module), function)
+        _set_command_line(function, arguments)
+        command()
+
+    return run
+
+
+def _zoo_plot(function: str) -> Callable[[list[str]], None]:
+    def run(arguments: list[str]) -> None:
+        # These commands look for the id in the names of the log folders, in which a dash stands for the slash.
+        import gymnasium as gym
+
+        import sb3_sample.envs  # noqa: F401  # registers the ids
+
+        names = [argument.replace("/", "-") if argument in gym.registry else argument for argument in arguments]
+        _zoo_function("rl_zoo3.plots", function)(names)
+
+    return run
+
+
+def _record_video(arguments: list[str]) -> None:
+    # The zoo's other commands have this option, this one has not.
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--gym-packages", nargs="+", default=[])
+    known, rest = parser.parse_known_args(arguments)
+    select_gl_backend()
+    _register()
+    for package in known.gym_packages:
+        importlib.import_module(package)
+    _set_command_line("record_video", rest)
+    runpy.run_module("rl_zoo3.record_video", run_name="__main__")  # it has no function to call
+
+
+def _plot(arguments: list[str]) -> None:
+    from sb3_sample.plots import main as plot
+
+    plot(arguments)
+
+
+COMMANDS: dict[str, Command] = {
+    "train": Command(_zoo_function("rl_zoo3.train", "train"), "train an agent, or search for hyperparameters"),
+    "enjoy": Command(_zoo_function("rl_zoo3.enjoy", "enjoy"), "run a trained agent"),
+    "record_video": Command(_record_video, "write a video of a trained agent"),
+    "plot": Command(_plot, "draw the runs of a task, mean and range over seeds, beside the published curves"),
+    "plot_train": Command(_zoo_plot("plot_train"), "draw the return of the training episodes"),
+    "all_plots": Command(_zoo_plot("all_plots"), "draw and tabulate the evaluations of several runs"),
+    "plot_from_file": Command(_zoo_plot("plot_from_file"), "draw what all_plots has saved"),
+}
+
+if __name__ == "__main__":
+    main()

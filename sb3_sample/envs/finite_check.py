@@ -1,0 +1,77 @@
+"""A check at the vectorised environment that observations and rewards are finite."""
+
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn
+
+
+class FiniteCheck:
+    """
+    Stop with an error when an environment gives a NaN or an infinity, before anything learns from it.
+
+    The check sits at the innermost vectorised environment: ``VecNormalize`` would otherwise carry the value into its
+    running statistics first. It takes the place of that environment's ``reset`` and ``step_wait`` instead of being one
+    more wrapper, because Stable-Baselines3 compares the wrappers of the training and the evaluation environment
+    (``sync_envs_normalization``).
+
+    :param venv: the innermost vectorised environment
+    """
+
+    def __init__(self, venv: VecEnv):
+        self._reset, self._step_wait = venv.reset, venv.step_wait
+        self.n_steps = 0
+
+    @classmethod
+    def install(cls, venv: VecEnv) -> None:
+        """
+        Put the check into a vectorised environment, unless it is there.
+
+        :param venv: a vectorised environment, wrapped or not
+        """
+        innermost = venv.unwrapped
+        if not isinstance(getattr(innermost.step_wait, "__self__", None), cls):
+            check = cls(innermost)
+            innermost.reset, innermost.step_wait = check.reset, check.step_wait  # type: ignore[method-assign]
+
+    def reset(self) -> Any:
+        """
+        :return: first observations, as the environment gave them
+        :raises ValueError: if one is not finite
+        """
+        observations = self._reset()
+        self._check("observation", observations, "at reset")
+        return observations
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        :return: the step's results, as the environment gave them
+        :raises ValueError: if an observation or reward is not finite
+        """
+        observations, rewards, dones, infos = self._step_wait()
+        self.n_steps += 1
+        when = f"at its step {self.n_steps}"
+        self._check("reward", rewards, when)
+        self._check("observation", observations, when)
+        for index in np.flatnonzero(dones):
+            terminal = infos[index].get("terminal_observation")
+            if isinstance(terminal, dict):
+                terminal = {key: np.asarray(value)[None] for key, value in terminal.items()}
+            elif terminal is not None:
+                terminal = np.asarray(terminal)[None]
+            if terminal is not None:
+                self._check("last observation of the episode", terminal, when, offset=int(index))
+        return observations, rewards, dones, infos
+
+    @staticmethod
+    def _check(what: str, values: Any, when: str, offset: int = 0) -> None:
+        for key, array in values.items() if isinstance(values, dict) else (("", values),):
+            # Integers (images) are always finite.
+            if array.dtype.kind != "f" or np.isfinite(array).all():
+                continue
+            index = int(np.argwhere(~np.isfinite(array))[0][0])
+            name = f"{what} {key!r}" if key else what
+            raise ValueError(
+                f"environment {index + offset} gave a {name} that is not finite {when}: {array[index]}. Allowed are "
+                "finite numbers. Training stopped before the value reached the replay buffer."
+            )

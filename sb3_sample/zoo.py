@@ -1,0 +1,204 @@
+"""
+The algorithms of this package in the commands of the RL Zoo (``rl_zoo3``).
+
+A new algorithm is one entry of ``ALGORITHMS`` and one file ``hyperparams/<name>.yml``.
+
+How the zoo searches: its sampler suggests a trial's parameters and turns them into constructor arguments, Optuna stores
+what was suggested, and ``--trial-id`` sends the stored parameters through the converter. Here both decode with
+``decode``, so that a stored trial gives the arguments it was run with.
+"""
+
+import functools
+import importlib
+import inspect
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+try:
+    import optuna
+    import rl_zoo3.hyperparams_opt
+    import rl_zoo3.utils
+except ModuleNotFoundError as error:
+    raise ImportError(
+        f'The zoo\'s commands need rl_zoo3 ({error}). Install it with: pip install "sb3_sample[zoo]"'
+    ) from error
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_sample.sac import BRO, BROFast
+
+#: The files ``<algorithm>.yml``, read when ``--conf-file`` is not given.
+HYPERPARAMS = Path(__file__).parent / "hyperparams"
+
+#: Environments whose ``info`` has ``is_success`` at every step.
+SUCCESS_PREFIXES = ("metaworld/", "myosuite/")
+
+#: Suggests a value for the parameter of that name.
+Suggest = Callable[[optuna.Trial, str], Any]
+#: A search space: parameters, by the name under which Optuna stores them.
+Space = Mapping[str, Suggest]
+#: (trial, number of actions, number of environments, what the zoo knows of the replay buffer) to arguments.
+Sampler = Callable[[optuna.Trial, int, int, dict[str, Any]], dict[str, Any]]
+#: A stored trial's parameters to arguments.
+Converter = Callable[[dict[str, Any]], dict[str, Any]]
+
+
+def _float(low: float, high: float, log: bool = False) -> Suggest:
+    return lambda trial, name: trial.suggest_float(name, low, high, log=log)
+
+
+def _int(low: int, high: int, log: bool = False) -> Suggest:
+    return lambda trial, name: trial.suggest_int(name, low, high, log=log)
+
+
+def _choice(*options: Any) -> Suggest:
+    return lambda trial, name: trial.suggest_categorical(name, options)
+
+
+# ---------------------------------------------------------------- search spaces
+# ``one_minus_<x>`` and ``<x>_pow`` are 1 - x and log2(x): the scales on which a change by the same amount means as much
+# anywhere in the range. The ranges contain the defaults of the classes.
+
+#: With ``HerReplayBuffer``, in addition.
+HER_SPACE: Space = {
+    "n_sampled_goal": _int(1, 5),
+    "goal_selection_strategy": _choice("final", "episode", "future"),
+}
+#: What every off-policy algorithm has.
+OFF_POLICY_SPACE: Space = {
+    "learning_rate": _float(1e-5, 2e-3, log=True),
+    "one_minus_gamma": _float(1e-4, 0.03, log=True),
+    "batch_size_pow": _int(5, 10),
+    "tau": _float(1e-3, 0.08, log=True),
+}
+#: BRO's own, but for the replay ratio. The largest model is left out: a trial of it takes as long as several others.
+BRO_SPACE: Space = {
+    **OFF_POLICY_SPACE,
+    "model_size": _choice("0.55M", "1.05M", "2.83M", "4.92M"),
+    "pessimism": _float(0.0, 1.0),
+    "kl_target": _float(0.01, 0.5, log=True),
+    "std_multiplier": _float(0.5, 1.0),
+    "weight_decay": _float(1e-5, 1e-2, log=True),
+}
+
+
+def decode(params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param params: suggested parameters, as Optuna stores them
+    :return: arguments of the constructor: ``one_minus_gamma`` is ``gamma``, ``batch_size_pow`` ``batch_size``, and the
+        parameters of ``HER_SPACE`` are ``replay_buffer_kwargs``
+    """
+    arguments: dict[str, Any] = {}
+    for name, value in params.items():
+        if name in HER_SPACE:
+            arguments.setdefault("replay_buffer_kwargs", {})[name] = value
+        elif name.startswith("one_minus_"):
+            arguments[name.removeprefix("one_minus_")] = 1 - value
+        elif name.endswith("_pow"):
+            arguments[name.removesuffix("_pow")] = 2**value
+        else:
+            arguments[name] = value
+    return arguments
+
+
+def sampler(space: Space) -> Sampler:
+    """
+    :param space: search space of an algorithm
+    :return: the zoo's sampler of it
+    """
+
+    def sample(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+        uses_her = additional_args["using_her_replay_buffer"]
+        params = {name: suggest(trial, name) for name, suggest in {**space, **(HER_SPACE if uses_her else {})}.items()}
+        arguments = decode(params)
+        for name in arguments.keys() - params.keys() - {"replay_buffer_kwargs"}:
+            trial.set_user_attr(name, arguments[name])  # so that reports show the value itself, not its code
+        if uses_her:
+            arguments["replay_buffer_kwargs"] = {
+                **additional_args["her_kwargs"],
+                **arguments["replay_buffer_kwargs"],
+            }
+        return arguments
+
+    return sample
+
+
+# ---------------------------------------------------------------- registration
+
+
+class ZooAlgorithm(NamedTuple):
+    """
+    An algorithm as the zoo needs it.
+
+    :param algorithm: the class
+    :param sample: suggests arguments for a trial of the search
+    :param convert: turns a stored trial's parameters into the same arguments
+    """
+
+    algorithm: type[BaseAlgorithm]
+    sample: Sampler
+    convert: Converter = decode
+
+
+#: The algorithms by their names in the zoo (``--algo``, log folders, ``hyperparams/<name>.yml``).
+ALGORITHMS: dict[str, ZooAlgorithm] = {
+    "bro": ZooAlgorithm(BRO, sampler({**BRO_SPACE, "replay_ratio": _int(1, 16, log=True)})),
+    "bro_fast": ZooAlgorithm(BROFast, sampler({**BRO_SPACE, "replay_ratio": _int(1, 4)})),
+}
+
+
+def register() -> None:
+    """
+    Put the algorithms, their search spaces and their hyperparameters into the zoo. More than one call does no harm.
+
+    A program that uses ``rl_zoo3.exp_manager.ExperimentManager`` itself calls this first; ``sb3-sample`` and, in the
+    folder of this repository, ``python -m rl_zoo3.train`` do so.
+    """
+    samplers: dict[str, Any] = rl_zoo3.hyperparams_opt.HYPERPARAMS_SAMPLER
+    converters: dict[str, Any] = rl_zoo3.hyperparams_opt.HYPERPARAMS_CONVERTER
+    for name, entry in ALGORITHMS.items():
+        # In place: the zoo's other modules hold these same dicts.
+        rl_zoo3.utils.ALGOS[name] = entry.algorithm
+        samplers[name] = entry.sample
+        converters[name] = entry.convert
+    _adapt_experiment_manager()
+
+
+def _adapt_experiment_manager() -> None:
+    """
+    Have the zoo's ``ExperimentManager`` take our hyperparameter files for our algorithms, and record successes in the
+    Monitor files of our environments that report them. The zoo has no option for either.
+    """
+    # Not at the top: it imports custom_envs, and the custom_envs of this repository imports this module.
+    module = importlib.import_module("rl_zoo3.exp_manager")
+    if not hasattr(module, "ExperimentManager"):
+        # The zoo is in the midst of importing that module and has come to custom_envs. Of its commands only
+        # record_video starts there, which reads no hyperparameter file.
+        return
+    manager: Any = module.ExperimentManager
+    if hasattr(manager, "_adapted_by_sb3_sample"):
+        return
+    manager._adapted_by_sb3_sample = True
+    original_init = manager.__init__
+    original_is_robotics_env = manager.is_robotics_env
+    signature = inspect.signature(original_init)
+
+    @functools.wraps(original_init)
+    def init(*args: Any, **kwargs: Any) -> None:
+        given = signature.bind(*args, **kwargs)
+        if given.arguments["algo"] in ALGORITHMS:
+            if not given.arguments.get("config"):
+                given.arguments["config"] = str(HYPERPARAMS / f"{given.arguments['algo']}.yml")
+            if given.arguments.get("trial_id") == 0:
+                raise ValueError(
+                    "trial_id must be at least 1, not 0: the zoo takes 0 for no trial and would train with the "
+                    "parameters of the file; pass trial 0's parameters with -params"
+                )
+        original_init(*given.args, **given.kwargs)
+
+    def is_robotics_env(env_id: str) -> bool:
+        # The zoo asks this question only to decide whether Monitor records is_success.
+        return env_id.startswith(SUCCESS_PREFIXES) or original_is_robotics_env(env_id)
+
+    manager.__init__ = init
+    manager.is_robotics_env = staticmethod(is_robotics_env)

@@ -1,0 +1,74 @@
+"""The check at the vectorised environment."""
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
+
+from sb3_sample.envs.finite_check import FiniteCheck
+from tests.sac.common import Toy, vec
+
+
+def checked(venv: VecEnv) -> VecEnv:
+    FiniteCheck.install(venv)
+    return venv
+
+
+def test_sits_at_the_innermost_and_adds_no_wrapper() -> None:
+    inner = vec()
+    normalized = VecNormalize(VecFrameStack(inner, 2))
+    FiniteCheck.install(normalized)
+    assert type(inner.step_wait.__self__) is FiniteCheck
+    assert normalized.venv.venv is inner
+
+
+def test_is_installed_once() -> None:
+    env = vec()
+    FiniteCheck.install(env)
+    check = env.step_wait.__self__
+    FiniteCheck.install(VecNormalize(env))
+    assert env.step_wait.__self__ is check
+
+
+def test_passes_everything_through() -> None:
+    plain, ours_too = vec(2), checked(vec(2))
+    np.testing.assert_array_equal(plain.reset(), ours_too.reset())
+    for _ in range(20):
+        actions = np.zeros((2, 2), np.float32)
+        for theirs, ours in zip(plain.step(actions)[:3], ours_too.step(actions)[:3], strict=True):
+            np.testing.assert_array_equal(theirs, ours)
+    ours_too.close()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_names_environment_step_and_value(value: float) -> None:
+    env = checked(vec(3))
+    env.envs[1].unwrapped.poison = lambda total, o, r: (o, value if total == 9 else r)
+    env.reset()
+    for _ in range(8):
+        env.step(np.zeros((3, 2), np.float32))
+    with pytest.raises(ValueError, match=rf"environment 1 gave a reward .*step 9: {value}"):
+        env.step(np.zeros((3, 2), np.float32))
+
+
+@pytest.mark.parametrize("space", [spaces.Discrete(5), spaces.MultiDiscrete([3, 4]), spaces.MultiBinary(3)])
+def test_integers_pass(space: spaces.Space) -> None:
+    """Also where the environment gives Python's own integers, and at the end of an episode."""
+
+    class Integers(Toy):
+        def _observation(self, space: spaces.Space) -> int | np.ndarray:
+            sample = space.sample()
+            return int(sample) if isinstance(space, spaces.Discrete) else sample
+
+    env = checked(DummyVecEnv([lambda: Integers(space)]))
+    env.reset()
+    for _ in range(20):
+        env.step(np.zeros((1, 2), np.float32))
+
+
+def test_dict_with_an_integer() -> None:
+    space = spaces.Dict({"a": spaces.Box(-10, 10, (2,)), "b": spaces.Discrete(4)})
+    env = checked(vec(2, obs_space=space))
+    env.reset()
+    for _ in range(20):
+        env.step(np.zeros((2, 2), np.float32))

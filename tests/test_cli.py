@@ -1,0 +1,168 @@
+"""The command line, run in this process where that is enough."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sb3_sample import cli
+
+ENV = "dmc/pendulum-swingup-v0"
+NAME = "dmc-pendulum-swingup-v0"
+TINY = ["-params", "model_size:'0.55M'", "learning_starts:25", "replay_ratio:0.2", "buffer_size:2000"]
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Runs the command in an empty folder; the zoo's commands change ``sys.argv``."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["sb3-sample"])
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    return lambda *arguments: cli.main(arguments)
+
+
+@pytest.fixture
+def zoo_run(run):
+    pytest.importorskip("rl_zoo3")
+    pytest.importorskip("dm_control")
+    return run
+
+
+def test_help_lists_the_commands(run, capsys: pytest.CaptureFixture[str]) -> None:
+    run()
+    output = capsys.readouterr().out
+    assert all(command in output for command in cli.COMMANDS)
+    run("--version")
+    assert capsys.readouterr().out.strip() == cli.__version__
+
+
+def test_an_unknown_command_is_refused(run) -> None:
+    with pytest.raises(SystemExit, match=r"command must be one of train, .*, not 'trian'"):
+        run("trian")
+
+
+def test_train_shows_the_options_of_the_zoo(zoo_run, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        zoo_run("train", "--help")
+    assert exit_.value.code == 0
+    output = capsys.readouterr().out
+    assert "usage: sb3-sample train" in output
+    assert "--optimize-hyperparameters" in output
+    assert "bro_fast" in output
+
+
+def test_train_continue_enjoy_and_plot_an_id_with_a_slash(zoo_run, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = Path("logs/bro") / f"{NAME}_1"
+    zoo_run(
+        "train", "--algo", "bro", "--env", ENV, "-n", "1010", "--seed", "3", "--eval-freq", "505",
+        "--eval-episodes", "2", "--save-freq", "505", "--save-replay-buffer", "-P", *TINY,
+    )  # fmt: skip
+    for file in (f"{NAME}.zip", "replay_buffer.pkl", "rl_model_505_steps.zip", "best_model.zip", "0.monitor.csv"):
+        assert (folder / file).exists()
+    assert list(np.load(folder / "evaluations.npz")["timesteps"]) == [505, 1010]
+
+    zoo_run("train", "--algo", "bro", "--env", ENV, "-n", "20", "-i", f"{folder}/{NAME}.zip", "--eval-freq", "-1")
+    assert "Loading replay buffer" in capsys.readouterr().out
+    assert (Path("logs/bro") / f"{NAME}_2" / f"{NAME}.zip").exists()
+
+    for which in (["--load-best"], ["--load-checkpoint", "505"], ["--load-last-checkpoint"]):
+        zoo_run("enjoy", "--algo", "bro", "--env", ENV, "-f", "logs", "--exp-id", "1", "--no-render", "-n", "5", *which)
+    zoo_run("enjoy", "--algo", "bro", "--env", ENV, "-f", "logs", "--exp-id", "1", "--no-render", "-n", "1000")
+    assert "1 Episodes" in capsys.readouterr().out
+
+    pytest.importorskip("seaborn")
+    from matplotlib import pyplot as plt
+
+    zoo_run("plot_train", "--algo", "bro", "--env", ENV, "-f", "logs", "-w", "1")
+    assert plt.gca().get_legend_handles_labels()[1] == [f"{NAME}_1"]  # run 2 has no finished episode
+    # The zoo's tables need two runs.
+    shutil.copytree(folder, folder.with_name(f"{NAME}_3"))
+    zoo_run("all_plots", "--algos", "bro", "--env", ENV, "-f", "logs", "-o", "all", "--no-display")
+    assert Path("all.pkl").exists()
+    zoo_run("plot_from_file", "-i", "all.pkl", "-o", "all.png", "--format", "png")
+    assert Path("all.png").exists()
+    plt.close("all")
+
+    zoo_run("plot", str(folder), "-o", "picture.png")
+    assert Path("picture.png").exists()
+    assert "| 505 |" in capsys.readouterr().out
+
+
+def test_the_algorithms_of_the_zoo_go_on_working(zoo_run, capsys: pytest.CaptureFixture[str]) -> None:
+    zoo_run("train", "--algo", "sac", "--env", "Pendulum-v1", "-n", "110", "--eval-freq", "-1")
+    assert "rl_zoo3/hyperparams/sac.yml" in capsys.readouterr().out
+    assert Path("logs/sac/Pendulum-v1_1/Pendulum-v1.zip").exists()
+
+
+def test_a_missing_zoo_is_named(tmp_path: Path) -> None:
+    code = "import sys; sys.modules['rl_zoo3'] = None; from sb3_sample.cli import main; main(['train'])"
+    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 1
+    assert 'pip install "sb3_sample[zoo]"' in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_a_broken_import_is_not_taken_for_a_missing_zoo(tmp_path: Path) -> None:
+    (tmp_path / "optuna.py").write_text("raise ImportError('broken')")  # stands before the installed one
+    code = "from sb3_sample.cli import main; main(['train'])"
+    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 1
+    assert "ImportError: broken" in result.stderr
+    assert "pip install" not in result.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", ENV])
+def test_search_store_and_train_with_a_stored_trial(zoo_run, capsys: pytest.CaptureFixture[str], env_id: str) -> None:
+    study = ["--storage", "sqlite:///study.db", "--study-name", "study"]
+    zoo_run(
+        "train", "--algo", "bro_fast", "--env", env_id, "-n", "60", "-optimize", "--n-trials", "2",
+        "--n-startup-trials", "1", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots", *study,
+        "-params", "learning_starts:50",
+    )  # fmt: skip
+    import optuna
+
+    from sb3_sample.zoo import decode
+
+    trials = optuna.load_study(storage="sqlite:///study.db", study_name="study").trials
+    assert len(trials) == 2
+    zoo_run("train", "--algo", "bro_fast", "--env", env_id, "-n", "30", "--eval-freq", "-1", *study, "--trial-id", "1")
+    output = capsys.readouterr().out
+    assert f"('learning_rate', {decode(trials[1].params)['learning_rate']})" in output
+    assert f"('gamma', {decode(trials[1].params)['gamma']})" in output
+
+
+@pytest.mark.slow
+def test_subprocesses_in_the_installed_command(tmp_path: Path) -> None:
+    pytest.importorskip("rl_zoo3")
+    pytest.importorskip("dm_control")
+    command = Path(sys.executable).parent / "sb3-sample"
+    arguments = ["train", "--algo", "bro_fast", "--env", ENV, "-n", "60", "--vec-env", "subproc", *TINY, "n_envs:2"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    result = subprocess.run(
+        [str(command), *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "logs/bro_fast" / f"{NAME}_1" / "1.monitor.csv").exists()
+
+
+@pytest.mark.slow
+def test_record_video(zoo_run) -> None:
+    pytest.importorskip("moviepy")
+    from sb3_sample import make_env
+
+    env = make_env(ENV, render_mode="rgb_array")
+    env.reset()
+    try:
+        env.render()
+    except Exception as error:  # OpenGL's libraries fail in many ways
+        pytest.skip(f"this machine cannot render: {error}")
+    finally:
+        env.close()
+    zoo_run("train", "--algo", "bro", "--env", ENV, "-n", "20", "--eval-freq", "-1", *TINY)
+    zoo_run("record_video", "--algo", "bro", "--env", ENV, "-f", "logs", "-n", "10")
+    assert list(Path("logs/bro").glob(f"{NAME}_1/videos/*.mp4"))

@@ -1,0 +1,171 @@
+"""Runs beside published curves, on made-up runs."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sb3_sample import plots
+
+ENV = "dmc/cheetah-run-v0"
+
+
+def write_run(
+    folder: Path, steps: Sequence[int], values: Sequence[float], env_id: str = ENV, successes: bool = False
+) -> Path:
+    """A run's folder as the zoo leaves it, evaluated at the steps; two episodes an evaluation, one above, one below."""
+    write_monitor(folder, [1000], [0.0], env_id)
+    results = np.array(values)[:, None] + [[-0.25, 0.25]]
+    arrays: dict[str, Any] = {"timesteps": np.array(steps), "results": results}
+    if successes:
+        arrays["successes"] = results
+    np.savez(folder / "evaluations.npz", **arrays)
+    return folder
+
+
+def write_monitor(folder: Path, lengths: Sequence[int], returns: Sequence[float], env_id: str = ENV) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = "".join(f"{r},{n},{i}\n" for i, (n, r) in enumerate(zip(lengths, returns, strict=True), 1))
+    (folder / "0.monitor.csv").write_text(f'#{{"t_start": 0.0, "env_id": "{env_id}"}}\nr,l,t\n{rows}')
+    return folder
+
+
+# ---------------------------------------------------------------- published curves
+
+
+def test_published_curves_are_those_of_the_task() -> None:
+    curves = plots.published_curves(ENV)
+    bro = curves[curves["algorithm"] == "BRO (RR=10)"]
+    assert list(bro["env_step"]) == list(range(25_000, 1_000_001, 25_000))
+    assert (curves["metric"] == "return").all()
+    assert ((curves["min"] <= curves["mean"]) & (curves["mean"] <= curves["max"])).all()
+    assert (plots.published_curves("metaworld/push-v3")["metric"] == "success_rate").all()
+    assert len(plots.published_curves("HalfCheetah-v5"))
+    assert not len(plots.published_curves("Pendulum-v1"))
+
+
+def test_the_data_file_is_small() -> None:
+    assert plots.DATA.stat().st_size < 200_000
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (None, ["BRO (RR=10)", "BRO Fast (RR=2)", "SAC"]),
+        ([], []),
+        (["bro fast"], ["BRO Fast (RR=2)"]),
+        (["SimbaV2", "SimbaV2 (RR=2)"], ["SimbaV2 (RR=2)", "SimbaV2 (RR=8)"]),
+    ],
+)
+def test_published_curves_by_name(names: list[str] | None, expected: list[str]) -> None:
+    assert [curve.label for curve in plots.select_published(ENV, names, "return")] == expected
+
+
+def test_an_unknown_published_name_is_refused_with_those_there_are() -> None:
+    with pytest.raises(ValueError, match=r"published must be of BRO \(RR=10\), .*, not 'BROO'"):
+        plots.select_published(ENV, ["BROO"], "return")
+
+
+# ---------------------------------------------------------------- runs
+
+
+def test_summary_over_seeds() -> None:
+    values = [3.0, 1.0, 100.0, 2.0, 4.0]
+    runs = [plots.Run("a", Path(str(v)), np.array([10, 20]), np.array([v, 2 * v])) for v in values]
+    table = plots.summarize(runs)
+    assert list(table["env_step"]) == [10, 20]
+    first = table.iloc[0]
+    assert (first["n_seeds"], first["mean"], first["min"], first["max"], first["iqm"]) == (5, 22, 1, 100, 3)
+    assert first["std"] == pytest.approx(np.std(values, ddof=1))
+
+
+def test_only_steps_of_all_seeds_count() -> None:
+    long = plots.Run("a", Path("1"), np.array([10, 20, 30]), np.zeros(3))
+    short = plots.Run("a", Path("2"), np.array([10, 20]), np.ones(2))
+    assert list(plots.summarize([long, short])["env_step"]) == [10, 20]
+
+
+def test_seeds_without_a_common_step_are_interpolated_where_both_reach() -> None:
+    often = plots.Run("a", Path("1"), np.array([5, 15, 25, 35]), np.array([5.0, 15.0, 25.0, 35.0]))
+    seldom = plots.Run("a", Path("2"), np.array([20, 40]), np.array([0.0, 0.0]))
+    table = plots.summarize([often, seldom])
+    assert list(table["env_step"]) == [20]
+    assert list(table["max"]) == [20]
+    apart = plots.Run("a", Path("3"), np.array([50, 60]), np.zeros(2))
+    with pytest.raises(ValueError, match="must overlap"):
+        plots.summarize([often, apart])
+
+
+def test_a_run_reads_its_evaluations_and_else_its_training_episodes(tmp_path: Path) -> None:
+    evaluated = plots.read_run(write_run(tmp_path / "bro/x_1", [10, 20], [1, 2]), "a", "return", 1)
+    assert (list(evaluated.steps), list(evaluated.values)) == ([10, 20], [1, 2])
+    folder = write_monitor(tmp_path / "bro/x_2", [10, 10, 10, 30], [1, 3, 5, 7])
+    trained = plots.read_run(folder, "a", "return", 20)
+    # Episodes end at 10, 20 | 30 | 60.
+    assert (list(trained.steps), list(trained.values)) == ([20, 40, 60], [2, 5, 7])
+    with pytest.raises(ValueError, match="metric must be one that was recorded, not 'success_rate'"):
+        plots.read_run(folder, "a", "success_rate", 20)
+
+
+# ---------------------------------------------------------------- command
+
+
+def test_plot_groups_runs_by_algorithm_beside_the_published(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for seed in (1, 2, 3):
+        write_run(tmp_path / f"bro/dmc-cheetah-run-v0_{seed}", [25_000, 50_000], [100 * seed, 200 * seed])
+    write_run(tmp_path / "sac/dmc-cheetah-run-v0_1", [25_000, 50_000], [10, 20])
+    write_run(tmp_path / "sac/Pendulum-v1_1", [25_000], [5], "Pendulum-v1")
+    picture = tmp_path / "out" / "picture.png"
+    plots.main([str(tmp_path), "--env", ENV, "-o", str(picture), "--published", "BRO", "--xlim", "60000"])
+    output = capsys.readouterr().out
+    assert "| 50,000 | bro | 3 | 400 | 200 | 200 | 600 | 400 |" in output
+    assert "| 50,000 | sac | 1 | 20 | - | 20 | 20 | 20 |" in output
+    assert "| 50,000 | BRO (RR=10), published | 5 |" in output
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_plot_takes_labels_and_infers_the_environment(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first = write_run(tmp_path / "bro/1", [10], [1], "metaworld/push-v3", successes=True)
+    second = write_run(tmp_path / "bro/2", [10], [0], "metaworld/push-v3", successes=True)
+    plots.main([f"mine={first}", f"theirs={second}", "-o", str(tmp_path / "x.png"), "-p", "none"])
+    output = capsys.readouterr().out
+    assert "metaworld/push-v3, success rate" in output
+    assert "| 10 | mine | 1 |" in output
+    assert "| 10 | theirs | 1 |" in output
+
+
+def test_picture_has_a_line_a_curve_and_the_colour_tells_the_algorithm() -> None:
+    pytest.importorskip("matplotlib")
+    run = plots.Run("bro_fast", Path("1"), np.array([25_000, 50_000]), np.array([1.0, 2.0]))
+    curves = [plots.Curve("bro_fast", plots.summarize([run])), *plots.select_published(ENV, None, "return")]
+    axes = plots.draw(ENV, curves, "return").axes[0]
+    lines = {line.get_label(): line for line in axes.lines}
+    assert list(lines) == ["bro_fast, 1 seed", "BRO (RR=10), 5 seeds", "BRO Fast (RR=2), 5 seeds", "SAC, 3 seeds"]
+    assert lines["bro_fast, 1 seed"].get_color() == lines["BRO Fast (RR=2), 5 seeds"].get_color()
+    assert len({line.get_color() for line in axes.lines}) == 3
+    assert axes.get_xlim() == (0, 50_000)
+    assert axes.get_title() == ENV
+    assert axes.get_xlabel()
+    assert axes.get_ylabel()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{0}/nowhere"], "runs must be folders with an evaluations.npz or Monitor files"),
+        (["{0}"], "env must be given: the runs are of Pendulum-v1, dmc/cheetah-run-v0"),
+        (["{0}", "-e", "Ant-v5"], "env must be one that the runs are of, not 'Ant-v5'"),
+        (["{0}/bro/1", "-e", "Pendulum-v1"], "runs must be of Pendulum-v1"),
+        (["{0}/bro/1", "{0}/bro/../bro/1"], "runs must be named once"),
+        (["{0}/bro/1", "--xlim", "5", "5"], "xlim must be"),
+        (["{0}/bro/1", "--bin", "0"], "bin must be at least 1, not 0"),
+        (["{0}/bro/1", "--metric", "success_rate"], "metric must be one that was recorded"),
+    ],
+)
+def test_wrong_arguments_are_named(tmp_path: Path, arguments: list[str], message: str) -> None:
+    write_run(tmp_path / "bro/1", [10], [1])
+    write_run(tmp_path / "bro/2", [10], [1], "Pendulum-v1")
+    with pytest.raises(SystemExit, match=message):
+        plots.main([argument.format(tmp_path) for argument in arguments])
