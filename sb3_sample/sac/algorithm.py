@@ -9,12 +9,12 @@ import io
 import math
 import pathlib
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.optim import AdamW
 from sb3_sample.sac import losses
+from sb3_sample.sac.batch import Batch, Noise, draw_batches
 from sb3_sample.sac.exploration import EXPLORATIONS, Exploration
 from sb3_sample.sac.parts import Part
 from sb3_sample.sac.pessimism import FixedPessimism, Pessimism
@@ -33,37 +34,8 @@ from sb3_sample.sac.scalars import FixedScalar, LogScalar
 
 Self = TypeVar("Self", bound="SAC")
 
-# Batches of at most this many gradient steps are gathered at once, to bound the memory they take.
+# Batches of at most this many gradient steps are drawn at once, to bound the memory they take.
 MAX_BATCHES_AT_ONCE = 64
-
-# Buffers whose every transition is drawn independently, so that one large draw can be cut into batches. Others compose
-# each batch (HerReplayBuffer: so many real, so many relabelled transitions) and are asked once a gradient step.
-INDEPENDENT_BUFFERS = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer)
-
-
-class Batch(NamedTuple):
-    """
-    One gradient step's transitions.
-
-    ``observations`` and ``next_observations`` are (B, O) or dicts of tensors; ``actions``, in [-1, 1], (B, A);
-    ``dones``, 1 where the episode terminated (a time limit is 0), and ``rewards``, (B, 1); ``discounts`` a
-    number or (B, 1).
-    """
-
-    observations: Any
-    actions: torch.Tensor
-    next_observations: Any
-    dones: torch.Tensor
-    rewards: torch.Tensor
-    discounts: torch.Tensor | float
-
-
-class Noise(NamedTuple):
-    """Standard normal noise of one gradient step's sampled actions, (B, A) each; drawn where it is None."""
-
-    critic: torch.Tensor | None = None
-    actor: torch.Tensor | None = None
-    exploration: torch.Tensor | None = None
 
 
 class SAC(OffPolicyAlgorithm):
@@ -510,6 +482,7 @@ class SAC(OffPolicyAlgorithm):
         :param gradient_steps: how many
         :param batch_size: transitions a step
         """
+        assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
         rate = self.lr_schedule(self._current_progress_remaining)
         for optimizer in self._optimizers().values():
@@ -519,35 +492,8 @@ class SAC(OffPolicyAlgorithm):
         self.plasticity.before_updates(self)
         for first in range(0, gradient_steps, MAX_BATCHES_AT_ONCE):
             n_batches = min(MAX_BATCHES_AT_ONCE, gradient_steps - first)
-            for batch in self._sample_batches(n_batches, batch_size):
+            for batch in draw_batches(self.replay_buffer, n_batches, batch_size, self.gamma, self._vec_normalize_env):
                 self._metrics = self._update(batch)
-
-    def _sample_batches(self, n_batches: int, batch_size: int) -> list[Batch]:
-        """The batches of several gradient steps, drawn at once where that gives the same distribution."""
-        assert self.replay_buffer is not None
-        if n_batches > 1 and type(self.replay_buffer) not in INDEPENDENT_BUFFERS:
-            return [batch for _ in range(n_batches) for batch in self._sample_batches(1, batch_size)]
-        data = self.replay_buffer.sample(n_batches * batch_size, env=self._vec_normalize_env)
-        discounts = getattr(data, "discounts", None)
-
-        def cut(x: Any) -> list[Any]:
-            if isinstance(x, dict):
-                pieces = {key: value.split(batch_size) for key, value in x.items()}
-                return [{key: value[i] for key, value in pieces.items()} for i in range(n_batches)]
-            return list(x.split(batch_size))
-
-        return [
-            Batch(*pieces)
-            for pieces in zip(
-                cut(data.observations),
-                cut(data.actions),
-                cut(data.next_observations),
-                cut(data.dones),
-                cut(data.rewards),
-                [self.gamma] * n_batches if discounts is None else cut(discounts),
-                strict=True,
-            )
-        ]
 
     def _update(self, batch: Batch, noise: Noise | None = None) -> dict[str, torch.Tensor]:
         """

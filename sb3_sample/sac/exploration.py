@@ -16,7 +16,8 @@ from sb3_sample.sac.pessimism import epistemic_std
 from sb3_sample.sac.scalars import BoundedLogScalar
 
 if TYPE_CHECKING:
-    from sb3_sample.sac.algorithm import SAC, Batch
+    from sb3_sample.sac.algorithm import SAC
+    from sb3_sample.sac.batch import Batch
 
 
 class Exploration(Part):

@@ -13,7 +13,8 @@ import torch
 from sb3_sample.sac.parts import Part
 
 if TYPE_CHECKING:
-    from sb3_sample.sac.algorithm import SAC, Batch
+    from sb3_sample.sac.algorithm import SAC
+    from sb3_sample.sac.batch import Batch
 
 
 def epistemic_std(q: torch.Tensor) -> torch.Tensor:

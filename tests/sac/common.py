@@ -135,7 +135,7 @@ def differing(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> list[st
 
 def random_batch(model: SAC, n: int = 8, seed: int = 0) -> Any:
     """A batch of random transitions for a model with flat observations."""
-    from sb3_sample.sac.algorithm import Batch
+    from sb3_sample.sac.batch import Batch
 
     g = torch.Generator().manual_seed(seed)
     assert model.observation_space.shape is not None

@@ -19,7 +19,7 @@ from torch import nn
 
 from sb3_sample import BRO
 from sb3_sample.networks import BroNet
-from sb3_sample.sac.algorithm import Batch, Noise
+from sb3_sample.sac.batch import Batch, Noise
 
 FOLDER = Path(os.environ.get("SB3_SAMPLE_GOLDEN") or Path(__file__).parents[1] / "golden")
 FILES = sorted(FOLDER.glob("bro_*.npz"))
