@@ -98,7 +98,7 @@ def _all_published() -> pd.DataFrame:
 def _published_task(env_id: str) -> str:
     """The task of the published curves, where its version is not that of the id; else empty."""
     suite, task = published_key(env_id)
-    return {"metaworld": f"{task}-v2", "gymnasium": task, "myosuite": "MyoSuite 2"}.get(suite, "")
+    return {"metaworld": f"{task}-v2", "gymnasium": task}.get(suite, "")
 
 
 def _of_task(env_id: str) -> str:
