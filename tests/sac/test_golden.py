@@ -21,8 +21,9 @@ from sb3_sample import BRO
 from sb3_sample.networks import BroNet
 from sb3_sample.sac.batch import Batch, Noise
 
-FOLDER = Path(os.environ.get("SB3_SAMPLE_GOLDEN") or Path(__file__).parents[1] / "golden")
-FILES = sorted(FOLDER.glob("bro_*.npz"))
+OWN_FOLDER = Path(__file__).parents[1] / "golden"
+FOLDER = Path(os.environ.get("SB3_SAMPLE_GOLDEN") or OWN_FOLDER)
+FILES = sorted(path for path in FOLDER.glob("*.npz") if not path.stem.startswith("dac"))
 
 INFO_TOLERANCE = 3e-5
 SCALAR_TOLERANCE = 2e-7
@@ -193,7 +194,7 @@ def check_parameters(
 
 
 def test_files_are_there() -> None:
-    assert FILES, f"no bro_*.npz in {FOLDER}"
+    assert FILES, f"no file of BRO's updates in {FOLDER}"
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
@@ -210,17 +211,14 @@ def test_golden_bro(path: Path) -> None:
         ours = info[int(i)][name]
         assert abs(ours - theirs) <= INFO_TOLERANCE * max(1, abs(theirs)), f"{key}: {ours} instead of {theirs}"
         compared += 1
-    assert compared >= 16 * n_updates
+    assert compared, "the file reports nothing to compare with"
 
 
 def test_torch_adamw_would_fail(monkeypatch: pytest.MonkeyPatch) -> None:
     """The check of the weight decay can tell torch's rounding from the published rule."""
-    path = next((path for path in FILES if path.stem == "bro_quantile_public"), None)
-    if path is None:
-        pytest.skip("the folder holds no bro_quantile_public.npz")
     monkeypatch.setattr("sb3_sample.sac.policies.SACPolicy.make_optimizer", _torch_adamw)
     with pytest.raises(AssertionError, match="weight decay is off"):
-        replay(path)
+        replay(OWN_FOLDER / "bro_quantile_public.npz")
 
 
 def _torch_adamw(policy: Any, parameters: Any, lr_schedule: Any) -> torch.optim.Optimizer:
