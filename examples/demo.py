@@ -1,5 +1,5 @@
 """
-The demo of ``make demo``: BRO learns a DeepMind Control task from scratch while you watch.
+The demo of ``make demo``: BRO learns a DeepMind Control task from scratch while you watch, to catch a ball in a cup.
 
     python examples/demo.py [--folder demo]
 
@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.callbacks import EvalCallback, StopTrainingOnRewardThreshold
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from tqdm import tqdm
@@ -20,7 +20,9 @@ from tqdm import tqdm
 from sb3_sample import BRO, make_env
 from sb3_sample.plots import Curve, Run, draw, summarize
 
-ENV, STEPS, EVERY = "dmc/ball_in_cup-catch-v0", 8_000, 500
+ENV = "dmc/ball_in_cup-catch-v0"
+STEPS, EVERY = 8_000, 500  # environment steps at most, and between two evaluations
+SOLVED = 900  # evaluation return at which training ends
 
 
 class ProgressWithReturn(EvalCallback):
@@ -77,12 +79,21 @@ def main() -> None:
 
     # The smallest critics and no resets: enough for this task, and quick on a laptop.
     model = BRO("MlpPolicy", ENV, model_size="0.55M", replay_ratio=4, learning_starts=1_000, resets=(), seed=0)
-    evaluation = ProgressWithReturn(env, n_eval_episodes=3, eval_freq=EVERY, log_path=str(folder), verbose=0)
+    evaluation = ProgressWithReturn(
+        env,
+        n_eval_episodes=5,
+        eval_freq=EVERY,
+        log_path=str(folder),
+        callback_on_new_best=StopTrainingOnRewardThreshold(SOLVED),
+        verbose=0,
+    )
     start = time.time()
     model.learn(STEPS, callback=evaluation)
     minutes = (time.time() - start) / 60
     mean, std = evaluate_policy(model, env, n_eval_episodes=10)
-    print(f"\nBRO reaches {mean:.0f} ± {std:.0f} of 1000 after {STEPS:,} steps, {minutes:.1f} minutes (10 episodes).")
+    print(
+        f"\nBRO reaches {mean:.0f} ± {std:.0f} of 1000 after {model.num_timesteps:,} steps, {minutes:.1f} minutes (10 episodes)."
+    )
 
     model.save(folder / "model")
     log = np.load(folder / "evaluations.npz")
