@@ -84,22 +84,22 @@ def main() -> None:
         n_eval_episodes=5,
         eval_freq=EVERY,
         log_path=str(folder),
+        best_model_save_path=str(folder),
         callback_on_new_best=StopTrainingOnRewardThreshold(SOLVED),
         verbose=0,
     )
     start = time.time()
     model.learn(STEPS, callback=evaluation)
     minutes = (time.time() - start) / 60
+    steps = f"{model.num_timesteps:,} steps, {minutes:.1f} minutes"
+    model = BRO.load(folder / "best_model")
     mean, std = evaluate_policy(model, env, n_eval_episodes=10)
-    print(
-        f"\nBRO reaches {mean:.0f} ± {std:.0f} of 1000 after {model.num_timesteps:,} steps, {minutes:.1f} minutes (10 episodes)."
-    )
+    print(f"\nAfter {steps}, BRO's best policy reaches {mean:.0f} ± {std:.0f} of 1000 (10 episodes).")
 
-    model.save(folder / "model")
     log = np.load(folder / "evaluations.npz")
     run = Run("BRO 0.55M, replay ratio 4", folder, log["timesteps"], log["results"].mean(axis=1))
     draw(ENV, [Curve(run.label, summarize([run]))], "return").savefig(folder / "learning_curve.png")
-    print(f"Saved {folder / 'model.zip'} and {folder / 'learning_curve.png'}.")
+    print(f"Saved {folder / 'best_model.zip'} and {folder / 'learning_curve.png'}.")
     try:
         save_gif(model, folder / "behaviour.gif")
         print(f"Saved {folder / 'behaviour.gif'}.")
