@@ -39,10 +39,10 @@ lint: $(VENV)/.all
 	$(BIN)/mypy sb3_sample
 
 test: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -m "not slow" -n 2
 
 test-all: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -n 2
 
 clean:
 	rm -rf $(VENV)
