@@ -8,7 +8,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-all lint check-python clean
+.PHONY: demo demo-imports test test-all lint check-python clean
 
 check-python:
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; \
@@ -41,7 +41,14 @@ lint: $(VENV)/.all
 test: lint
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -m "not slow" -n 2
 
-test-all: lint
+# The demo has to run with the extras that it installs, not with what a full environment happens to hold.
+demo-imports: setup.cfg constraints.txt | check-python
+	rm -rf .venv-demo
+	$(MAKE) --no-print-directory VENV=.venv-demo .venv-demo/.demo
+	.venv-demo/bin/python examples/demo.py --help > /dev/null
+	rm -rf .venv-demo
+
+test-all: lint demo-imports
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -n 2
 
 clean:

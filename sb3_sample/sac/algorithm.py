@@ -226,10 +226,13 @@ class SAC(OffPolicyAlgorithm):
         ):
             if not getattr(self, name) >= low:
                 raise ValueError(f"{name} must be at least {low}, not {getattr(self, name)}")
-        if not callable(self.learning_rate) and not 0 <= self.learning_rate < math.inf:
+        if (
+            not callable(self.learning_rate)
+            and not 0 <= _number("learning_rate", self.learning_rate, "a schedule") < math.inf
+        ):
             raise ValueError(f"learning_rate must be at least 0 and finite, or a schedule, not {self.learning_rate}")
-        if self.replay_ratio is not None and not 0 <= self.replay_ratio < math.inf:
-            raise ValueError(f"replay_ratio must be at least 0 and finite, not {self.replay_ratio}")
+        if isinstance(self.replay_ratio, str) or not (self.replay_ratio is None or 0 <= self.replay_ratio < math.inf):
+            raise ValueError(f"replay_ratio must be at least 0 and finite, not {self.replay_ratio!r}")
         if not 0 < self.tau <= 1:
             raise ValueError(f"tau must lie in (0, 1], not {self.tau}")
         if not 0 <= self.gamma <= 1:
@@ -317,7 +320,14 @@ class SAC(OffPolicyAlgorithm):
             raise ValueError(f"{', '.join(unknown)}: not an argument of {cls.__name__}, so load cannot change it")
         if "train_freq" in kwargs or "gradient_steps" in kwargs:
             kwargs.setdefault("replay_ratio", None)
-        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        try:
+            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        except RuntimeError as error:
+            if kwargs and "size mismatch" in str(error):
+                raise ValueError(
+                    f"{', '.join(sorted(kwargs))}: with these arguments the networks have other sizes than in the file"
+                ) from error
+            raise
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
