@@ -281,7 +281,14 @@ class SAC(OffPolicyAlgorithm):
         return FixedScalar(value).to(self.device)
 
     def _make_explorer(self) -> Exploration:
-        return EXPLORATIONS[self.exploration](self, **self._full_exploration_kwargs()).to(self.device)
+        explorer, kwargs = EXPLORATIONS[self.exploration], self._full_exploration_kwargs()
+        allowed = list(inspect.signature(explorer.__init__).parameters)[2:]
+        for name in kwargs:
+            if name not in allowed:
+                raise ValueError(
+                    f"exploration_kwargs has {name!r}, but exploration={self.exploration!r} takes {allowed or 'none'}"
+                )
+        return explorer(self, **kwargs).to(self.device)
 
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
         if policy_name not in self.policy_aliases:
@@ -323,9 +330,9 @@ class SAC(OffPolicyAlgorithm):
         try:
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except RuntimeError as error:
-            if kwargs and "size mismatch" in str(error):
+            if kwargs and "loading state_dict" in str(error):
                 raise ValueError(
-                    f"{', '.join(sorted(kwargs))}: with these arguments the networks have other sizes than in the file"
+                    f"{', '.join(sorted(kwargs))}: with these arguments the model has other networks than the file"
                 ) from error
             raise
 

@@ -34,6 +34,7 @@ def refused(make: Callable[[], Any], *words: Any) -> None:
         ("replay_ratio", -1, "at least 0"),
         ("replay_ratio", NAN, "at least 0"),
         ("replay_ratio", INF, ""),
+        ("replay_ratio", "10", "at least 0"),
         ("tau", 0.0, r"\(0, 1\]"),
         ("tau", 1.5, r"\(0, 1\]"),
         ("tau", -0.1, r"\(0, 1\]"),
@@ -70,6 +71,7 @@ def refused(make: Callable[[], Any], *words: Any) -> None:
         ("train_freq", (1, "foo"), "episode"),
         ("learning_rate", -1e-3, ""),
         ("learning_rate", NAN, ""),
+        ("learning_rate", "lin", "schedule"),
     ],
 )
 @pytest.mark.parametrize("maker", ["SAC", "BRO"])
