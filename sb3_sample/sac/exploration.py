@@ -33,7 +33,7 @@ class Exploration(Part):
     def act(self, agent: "SAC", observations: Any) -> torch.Tensor:
         """
         :param agent: the algorithm
-        :param observations: preprocessed by the policy, (B, O) or a dict
+        :param observations: tensors on the device of the model, (B, O) or a dict of them
         :return: actions in [-1, 1], (B, A)
         """
         return agent.actor.sample(observations)[0]
