@@ -1,6 +1,6 @@
-"""Adam with decoupled weight decay that is exact in float32."""
+"""Adam with decoupled weight decay that is exact in float32, and sharpness-aware gradients around any optimizer."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -121,3 +121,45 @@ def _cache_sized(rows: list[tuple[torch.Tensor, ...]]) -> Iterator[Iterable[tupl
             group.append((*piece, step))
             size += piece[0].numel()
     yield zip(*group, strict=True)
+
+
+def sharpness_aware_gradients(
+    loss: torch.Tensor,
+    evaluate: Callable[[], torch.Tensor],
+    parameters: Sequence[torch.Tensor],
+    radius: float,
+    n_copies: Sequence[int | None],
+) -> list[torch.Tensor]:
+    """
+    Gradients of sharpness-aware minimisation (Foret et al. 2021, eq. 2 and 3): those of the loss at ``p + radius * g /
+    |g|``, where g is the gradient at p. The parameters are afterwards as they were, bit for bit.
+
+    Networks that are stacked along a leading axis are each moved by the radius, as if each stood alone.
+
+    :param loss: the loss at p, a scalar with its graph
+    :param evaluate: computes the loss anew
+    :param parameters: what it is minimised over
+    :param radius: length of the step uphill
+    :param n_copies: for each parameter, the number of networks stacked in its leading axis, or None if it is not
+        stacked; those of the same number belong together
+    :return: the gradient for each parameter
+    """
+    gradients = torch.autograd.grad(loss, parameters)
+    with torch.no_grad():
+        squares: dict[int | None, torch.Tensor] = {}
+        for gradient, copies in zip(gradients, n_copies, strict=True):
+            flat = gradient.reshape(1 if copies is None else copies, -1)
+            square = flat.square().sum(dim=1)
+            squares[copies] = squares[copies] + square if copies in squares else square
+        # The floor keeps a gradient of zero from being divided by zero.
+        scales = {copies: radius / square.sqrt().clamp_min(1e-12) for copies, square in squares.items()}
+        saved = [p.detach().clone() for p in parameters]
+        for p, gradient, copies in zip(parameters, gradients, n_copies, strict=True):
+            scale = scales[copies]
+            p.add_(gradient * (scale if copies is None else scale.view(-1, *[1] * (p.dim() - 1))))
+    try:
+        uphill = torch.autograd.grad(evaluate(), parameters)
+    finally:
+        with torch.no_grad():
+            torch._foreach_copy_(list(parameters), saved)
+    return list(uphill)

@@ -1,10 +1,10 @@
 """BroNet, the residual network of BRO (paper, figure 5)."""
 
 import torch
-import torch.nn.functional as F
 from torch import nn
 
-from sb3_sample.networks.ensemble import layer_norm
+from sb3_sample.networks.dormant import HiddenUnits
+from sb3_sample.networks.ensemble import Dense, layer_norm
 from sb3_sample.networks.initialization import linear
 
 
@@ -20,11 +20,12 @@ class ResidualBlock(nn.Module):
         super().__init__()
         self.dense1 = linear(width, width, n_copies)
         self.norm1 = layer_norm(width, n_copies)
+        self.activation = nn.ReLU(inplace=True)
         self.dense2 = linear(width, width, n_copies)
         self.norm2 = layer_norm(width, n_copies)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        residual = F.relu(self.norm1(self.dense1(x)), inplace=True)
+        residual = self.activation(self.norm1(self.dense1(x)))
         return self.norm2(self.dense2(residual)).add_(x)
 
 
@@ -37,16 +38,25 @@ class BroNet(nn.Module):
     :param width: width of every layer
     :param n_blocks: number of residual blocks, at least 0
     :param n_copies: E for E independent trunks, None for one
+    :param first_layer_norm: False for "BRO wo first LN" (P5, figure 14): Dense, ReLU, then the blocks
     :raises ValueError: if a size is out of range
     """
 
-    def __init__(self, in_features: int, width: int = 512, n_blocks: int = 2, n_copies: int | None = None):
+    def __init__(
+        self,
+        in_features: int,
+        width: int = 512,
+        n_blocks: int = 2,
+        n_copies: int | None = None,
+        first_layer_norm: bool = True,
+    ):
         super().__init__()
         if width < 1 or n_blocks < 0:
             raise ValueError(f"BroNet needs width >= 1 and n_blocks >= 0, not width={width}, n_blocks={n_blocks}")
         self.out_features = width
         self.dense = linear(in_features, width, n_copies)
-        self.norm = layer_norm(width, n_copies)
+        self.norm = layer_norm(width, n_copies) if first_layer_norm else None
+        self.activation = nn.ReLU(inplace=True)
         self.blocks = nn.ModuleList(ResidualBlock(width, n_copies) for _ in range(n_blocks))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -54,7 +64,25 @@ class BroNet(nn.Module):
         :param x: (B, in), or (E, B, in) if there are copies
         :return: (B, width), or (E, B, width) if there are copies
         """
-        h = F.relu(self.norm(self.dense(x)), inplace=True)
+        h = self.dense(x)
+        if self.norm is not None:
+            h = self.norm(h)
+        h = self.activation(h)
         for block in self.blocks:
             h = block(h)
         return h
+
+    def hidden_units(self, head: Dense | None) -> list[HiddenUnits]:
+        """
+        The first layer opens the residual stream, which every block and the head read: its neurons are listed to be
+        looked at, not to be recycled (``outgoing`` is None). Those inside a block are read by its second layer alone.
+        The stream after a block is no activation and is not listed.
+
+        :param head: the layer that reads the network's output; it plays no part here
+        :return: the first layer, then the hidden layer of each block
+        """
+        units = [HiddenUnits("dense", self.dense, self.norm, self.activation, None)]
+        for k, block in enumerate(self.blocks):
+            assert isinstance(block, ResidualBlock)
+            units.append(HiddenUnits(f"blocks.{k}.dense1", block.dense1, block.norm1, block.activation, block.dense2))
+        return units

@@ -24,7 +24,7 @@ class EnsembleLinear(nn.Module):
     def __init__(self, n_copies: int, in_features: int, out_features: int, bias: bool = True):
         super().__init__()
         self.n_copies, self.in_features, self.out_features = n_copies, in_features, out_features
-        self.weight = nn.Parameter(torch.zeros(n_copies, in_features, out_features))
+        self.weight: torch.Tensor = nn.Parameter(torch.zeros(n_copies, in_features, out_features))
         self.bias = nn.Parameter(torch.zeros(n_copies, 1, out_features)) if bias else None
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -32,11 +32,19 @@ class EnsembleLinear(nn.Module):
         :param x: input, (B, in) shared by the copies or (E, B, in)
         :return: output, (E, B, out)
         """
+        return self.multiply(x, self.weight)
+
+    def multiply(self, x: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+        """
+        :param x: input, (B, in) shared by the copies or (E, B, in)
+        :param weight: kernels in place of the layer's own, (E, in, out)
+        :return: output, (E, B, out)
+        """
         if x.dim() == 2:
             x = x.expand(self.n_copies, -1, -1)
         if self.bias is None:
-            return torch.bmm(x, self.weight)
-        return torch.baddbmm(self.bias, x, self.weight)
+            return torch.bmm(x, weight)
+        return torch.baddbmm(self.bias, x, weight)
 
     def extra_repr(self) -> str:
         return f"n_copies={self.n_copies}, in_features={self.in_features}, out_features={self.out_features}"
@@ -68,7 +76,12 @@ class EnsembleLayerNorm(nn.Module):
         return f"n_copies={self.n_copies}, n_features={self.n_features}, eps={self.eps}"
 
 
-def layer_norm(n_features: int, n_copies: int | None, eps: float = 1e-6) -> nn.LayerNorm | EnsembleLayerNorm:
+#: One layer, or a stack of them.
+Dense = nn.Linear | EnsembleLinear
+Norm = nn.LayerNorm | EnsembleLayerNorm
+
+
+def layer_norm(n_features: int, n_copies: int | None, eps: float = 1e-6) -> Norm:
     """
     A layer norm: one, or a stack of independent ones.
 

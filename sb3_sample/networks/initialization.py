@@ -2,31 +2,52 @@
 
 import math
 
+import torch
 from torch import nn
 
-from sb3_sample.networks.ensemble import EnsembleLinear
+from sb3_sample.networks.ensemble import Dense, EnsembleLinear
+from sb3_sample.networks.spectral_norm import SpectralEnsembleLinear, SpectralLinear, SpectralNorm
 
 #: Gain of every kernel unless a head asks for another one (BRO's and DAC's published code).
 DEFAULT_GAIN = math.sqrt(2)
 
 
-def init_orthogonal(layer: nn.Linear | EnsembleLinear, gain: float = DEFAULT_GAIN) -> None:
+def draw_orthogonal(weight: torch.Tensor, gain: float = DEFAULT_GAIN) -> torch.Tensor:
+    """
+    Draw orthogonal kernels, each copy its own, in place.
+
+    :param weight: (in, out) or (out, in), or a stack of E of them
+    :param gain: factor on the orthogonal matrix
+    :return: the same tensor
+    """
+    # torch's own helper treats a stack of matrices as one matrix, hence the loop over copies.
+    for kernel in weight if weight.dim() == 3 else [weight]:
+        nn.init.orthogonal_(kernel, gain)
+    return weight
+
+
+def init_orthogonal(layer: Dense, gain: float = DEFAULT_GAIN) -> None:
     """
     Draw an orthogonal kernel, each copy of an ensemble its own, and set the bias to zero, in place.
 
     :param layer: the layer to initialise
     :param gain: factor on the orthogonal matrix
     """
-    # torch's own helper treats a stack of matrices as one matrix, hence the loop over copies.
-    for kernel in layer.weight if isinstance(layer, EnsembleLinear) else [layer.weight]:
-        nn.init.orthogonal_(kernel, gain)
+    draw_orthogonal(layer.weight, gain)
     if layer.bias is not None:
         nn.init.zeros_(layer.bias)
+    if isinstance(layer, SpectralNorm):
+        layer.find_direction()
 
 
 def linear(
-    in_features: int, out_features: int, n_copies: int | None, bias: bool = True, gain: float = DEFAULT_GAIN
-) -> nn.Linear | EnsembleLinear:
+    in_features: int,
+    out_features: int,
+    n_copies: int | None,
+    bias: bool = True,
+    gain: float = DEFAULT_GAIN,
+    spectral_norm: bool = False,
+) -> Dense:
     """
     A dense layer with orthogonal kernels: one, or a stack of independent ones.
 
@@ -35,11 +56,13 @@ def linear(
     :param n_copies: E for a stack of E layers, None for a plain ``nn.Linear``
     :param bias: whether the layer has a bias
     :param gain: factor on the orthogonal kernel
+    :param spectral_norm: whether the kernel is divided by its largest singular value, which undoes the gain
     """
-    layer: nn.Linear | EnsembleLinear
+    layer: Dense
     if n_copies is None:
-        layer = nn.Linear(in_features, out_features, bias=bias)
+        layer = (SpectralLinear if spectral_norm else nn.Linear)(in_features, out_features, bias=bias)
     else:
-        layer = EnsembleLinear(n_copies, in_features, out_features, bias=bias)
+        ensemble = SpectralEnsembleLinear if spectral_norm else EnsembleLinear
+        layer = ensemble(n_copies, in_features, out_features, bias=bias)
     init_orthogonal(layer, gain)
     return layer

@@ -1,24 +1,30 @@
-"""The plain multi-layer perceptron of SAC, with optional layer norm."""
+"""The plain multi-layer perceptron of SAC, with optional layer norm, spectral norm and dropout."""
 
 from collections.abc import Sequence
 
 import torch
 from torch import nn
 
+from sb3_sample.networks.activations import width_factor
+from sb3_sample.networks.dormant import HiddenUnits
+from sb3_sample.networks.ensemble import Dense, Norm
 from sb3_sample.networks.ensemble import layer_norm as make_layer_norm
 from sb3_sample.networks.initialization import linear
 
 
 class MLP(nn.Module):
     """
-    Hidden layers of an MLP; the output layer belongs to whoever uses them.
+    Hidden layers of an MLP; the output layer belongs to whoever uses them. A hidden layer is Dense, dropout, layer
+    norm, activation; the last kernel may have spectral norm 1 (P2, appendix B).
 
     :param in_features: width of the input
     :param hidden_sizes: widths of the hidden layers
-    :param activation_fn: activation after each hidden layer
+    :param activation_fn: activation after each hidden layer; ``CReLU`` doubles the input of the next layer
     :param layer_norm: whether each hidden layer is normalised before its activation
     :param n_copies: E for E independent networks, None for one
-    :raises ValueError: if a width is below 1
+    :param spectral_norm: whether the last hidden layer's kernel is divided by its largest singular value
+    :param dropout: probability of dropping a neuron in training mode, each copy its own (DroQ, Hiraoka et al. 2021)
+    :raises ValueError: if a width is below 1, the dropout is out of range, or there is no layer for the spectral norm
     """
 
     def __init__(
@@ -28,23 +34,45 @@ class MLP(nn.Module):
         activation_fn: type[nn.Module] = nn.ReLU,
         layer_norm: bool = False,
         n_copies: int | None = None,
+        spectral_norm: bool = False,
+        dropout: float = 0.0,
     ):
         super().__init__()
         if any(width < 1 for width in hidden_sizes):
             raise ValueError(f"the widths in hidden_sizes must be at least 1, not {list(hidden_sizes)}")
+        if spectral_norm and not hidden_sizes:
+            raise ValueError("spectral_norm needs a hidden layer, but hidden_sizes is empty")
+        if not 0 <= dropout < 1:
+            raise ValueError(f"dropout must be at least 0 and below 1, not {dropout}")
         layers: list[nn.Module] = []
-        for width in hidden_sizes:
-            layers.append(linear(in_features, width, n_copies))
-            if layer_norm:
-                layers.append(make_layer_norm(width, n_copies))
-            layers.append(activation_fn())
-            in_features = width
+        self._hidden: list[tuple[str, Dense, Norm | None, nn.Module]] = []
+        for i, width in enumerate(hidden_sizes):
+            is_last = i == len(hidden_sizes) - 1
+            dense = linear(in_features, width, n_copies, spectral_norm=spectral_norm and is_last)
+            norm = make_layer_norm(width, n_copies) if layer_norm else None
+            activation = activation_fn()
+            self._hidden.append((f"layers.{len(layers)}", dense, norm, activation))
+            layers.append(dense)
+            if dropout > 0:
+                layers.append(nn.Dropout(dropout))
+            if norm is not None:
+                layers.append(norm)
+            layers.append(activation)
+            in_features = width * width_factor(activation)
         self.layers = nn.Sequential(*layers)
         self.out_features = in_features
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """
         :param x: (B, in), or (E, B, in) if there are copies
-        :return: (B, last width), or (E, B, last width) if there are copies
+        :return: (B, out_features), or (E, B, out_features) if there are copies
         """
         return self.layers(x)
+
+    def hidden_units(self, head: Dense | None) -> list[HiddenUnits]:
+        """
+        :param head: the layer that reads the network's output, None if several do
+        :return: every hidden layer, in the order of the forward pass
+        """
+        outgoing = [*(dense for _, dense, _, _ in self._hidden[1:]), head]
+        return [HiddenUnits(*layer, reader) for layer, reader in zip(self._hidden, outgoing, strict=False)]

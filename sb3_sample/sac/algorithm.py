@@ -6,7 +6,6 @@ The off-policy family: soft actor-critic with exchangeable parts, and its one up
 
 import inspect
 import io
-import math
 import pathlib
 from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar
@@ -18,17 +17,19 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
 
 from sb3_sample.envs.finite_check import FiniteCheck
-from sb3_sample.optim import AdamW
-from sb3_sample.sac import losses
-from sb3_sample.sac.batch import Batch, Noise, draw_batches
+from sb3_sample.optim import AdamW, sharpness_aware_gradients
+from sb3_sample.sac import arguments, losses
+from sb3_sample.sac.batch import Batch, CriticStep, Noise, draw_batches
+from sb3_sample.sac.buffers import ValidationDictReplayBuffer, ValidationReplayBuffer, ValidationSplit
 from sb3_sample.sac.exploration import EXPLORATIONS, Exploration
 from sb3_sample.sac.parts import Part
-from sb3_sample.sac.pessimism import FixedPessimism, Pessimism
-from sb3_sample.sac.plasticity import Resets
+from sb3_sample.sac.pessimism import PESSIMISMS, Pessimism, pessimistic_value
+from sb3_sample.sac.plasticity import ReDo, Resets
 from sb3_sample.sac.policies import Actor, CnnPolicy, CriticEnsemble, MlpPolicy, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.scalars import FixedScalar, LogScalar
 
@@ -74,10 +75,23 @@ class SAC(OffPolicyAlgorithm):
         environments; may be below 1
     :param n_quantiles: quantiles a critic; None for scalar critics
     :param pessimism: weight of the critics' spread that is subtracted from their mean, at least 0; 1 is the
-        minimum of two critics, 0 the mean
-    :param exploration: who acts while training: "actor", "optimistic_shift" (BRO)
+        minimum of two critics, 0 the mean. Or the rule that moves it: "gpl", "opl", "top", "vpl"
+    :param pessimism_kwargs: arguments of the rule
+    :param actor_pessimism: a weight for the actor's objective alone (REDQ and DroQ: 0); None: the same
+    :param target_subset: how many critics, drawn at random, make the TD target (REDQ: 2); None: all
+    :param validation_proportion: share of the transitions that is held out of training, in [0, 1); "vpl" learns from
+        them
+    :param exploration: who acts while training: "actor", "oac", "optimistic_actor" (DAC), "optimistic_shift" (BRO)
     :param exploration_kwargs: its arguments
-    :param resets: environment steps at which all parameters start anew, counted in transitions over the model's life
+    :param backbone: "sac", or "td3": a deterministic actor, without entropy
+    :param policy_delay: gradient steps between two of the actors' and of the temperature
+    :param resets: environment steps at which all parameters start anew, counted in transitions over the model's life;
+        or one integer for every so many
+    :param reset_shrink: share of the old parameters that a reset leaves (shrink and perturb), in [0, 1)
+    :param redo_period: gradient steps between two recyclings of the critics' dormant neurons (ReDo; the original:
+        1,000); None for none
+    :param redo_threshold: score up to which a neuron is dormant
+    :param sam_radius: radius of sharpness-aware minimisation of the critics' loss (the original: 0.05); None for none
     :param use_sde: not supported, refused if True
     :param stats_window_size: episodes over which the logged return is averaged
     :param tensorboard_log: folder of the TensorBoard log; none if None
@@ -123,10 +137,20 @@ class SAC(OffPolicyAlgorithm):
         target_entropy: str | float = "auto",
         replay_ratio: float = 2,
         n_quantiles: int | None = None,
-        pessimism: float = 1.0,
+        pessimism: float | str = 1.0,
+        pessimism_kwargs: dict[str, Any] | None = None,
+        actor_pessimism: float | None = None,
+        target_subset: int | None = None,
+        validation_proportion: float = 0.0,
         exploration: str = "actor",
         exploration_kwargs: dict[str, Any] | None = None,
-        resets: Sequence[int] = (),
+        backbone: str = "sac",
+        policy_delay: int = 1,
+        resets: Sequence[int] | int = (),
+        reset_shrink: float = 0.0,
+        redo_period: int | None = None,
+        redo_threshold: float = 0.025,
+        sam_radius: float | None = None,
         use_sde: bool = False,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -173,9 +197,19 @@ class SAC(OffPolicyAlgorithm):
         self.target_update_interval = target_update_interval
         self.target_entropy = target_entropy
         self.pessimism = pessimism
+        self.pessimism_kwargs = pessimism_kwargs
+        self.actor_pessimism = actor_pessimism
+        self.target_subset = target_subset
+        self.validation_proportion = validation_proportion
         self.exploration = exploration
         self.exploration_kwargs = exploration_kwargs
+        self.backbone = backbone
+        self.policy_delay = policy_delay
         self.resets = resets
+        self.reset_shrink = reset_shrink
+        self.redo_period = redo_period
+        self.redo_threshold = redo_threshold
+        self.sam_radius = sam_radius
         #: Transitions stored over the model's life; unlike ``num_timesteps`` never zeroed by ``learn``.
         self.num_transitions = 0
         # Gradient steps owed but not yet taken, the fraction that a replay ratio leaves over.
@@ -188,13 +222,14 @@ class SAC(OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         self._check_arguments()
-        given = self.policy_kwargs
-        # The policy is built with more than the user's own arguments, and only the latter are saved.
+        given = self.policy_kwargs, self.replay_buffer_kwargs
+        # Policy and buffer are built with more than the user's own arguments, and only the latter are saved.
         self.policy_kwargs = self._full_policy_kwargs()
+        self._choose_replay_buffer()
         try:
             super()._setup_model()
         finally:
-            self.policy_kwargs = given
+            self.policy_kwargs, self.replay_buffer_kwargs = given
         if self.device.type == "cpu":
             # glibc hands freed memory back to the system above a threshold, at first below the size of one gradient,
             # and every update then pays for page faults. The threshold follows the largest block freed so far.
@@ -205,9 +240,10 @@ class SAC(OffPolicyAlgorithm):
         )
         self._critic_loss = losses.squared_error if self.n_quantiles is None else losses.quantile_huber
         self.temperature = self._make_temperature()
-        self.explorer = self._make_explorer()
-        self.pessimism_rule: Pessimism = FixedPessimism(self.pessimism).to(self.device)
-        self.plasticity = Resets(self.resets)
+        self.pessimism_rule = self.make_pessimism()
+        self.explorer = self.make_explorer()
+        self.plasticity = Resets(self.resets, self.reset_shrink)
+        self.redo = None if self.redo_period is None else ReDo(self.redo_period, self.redo_threshold)
         self.temperature_optimizer: AdamW | None = None
         if isinstance(self.temperature, LogScalar):
             betas = (self.temperature_beta1, 0.999)
@@ -217,49 +253,25 @@ class SAC(OffPolicyAlgorithm):
         """
         :raises ValueError: if an argument is out of range or contradicts another
         """
-        for name, low in (
-            ("buffer_size", 1),
-            ("learning_starts", 0),
-            ("batch_size", 1),
-            ("target_update_interval", 1),
-            ("n_steps", 1),
-        ):
-            if not getattr(self, name) >= low:
-                raise ValueError(f"{name} must be at least {low}, not {getattr(self, name)}")
-        if (
-            not callable(self.learning_rate)
-            and not 0 <= _number("learning_rate", self.learning_rate, "a schedule") < math.inf
-        ):
-            raise ValueError(f"learning_rate must be at least 0 and finite, or a schedule, not {self.learning_rate}")
-        if isinstance(self.replay_ratio, str) or not (self.replay_ratio is None or 0 <= self.replay_ratio < math.inf):
-            raise ValueError(f"replay_ratio must be at least 0 and finite, not {self.replay_ratio!r}")
-        if not 0 < self.tau <= 1:
-            raise ValueError(f"tau must lie in (0, 1], not {self.tau}")
-        if not 0 <= self.gamma <= 1:
-            raise ValueError(f"gamma must lie in [0, 1], not {self.gamma}")
-        if self.target_entropy != "auto" and not math.isfinite(
-            _number("target_entropy", self.target_entropy, "'auto'")
-        ):
-            raise ValueError(f"target_entropy must be finite, or 'auto', not {self.target_entropy}")
-        if self.exploration not in EXPLORATIONS:
-            raise ValueError(f"exploration must be one of {sorted(EXPLORATIONS)}, not {self.exploration!r}")
-        if "n_quantiles" in self.policy_kwargs:
-            raise ValueError("n_quantiles is an argument of the algorithm, not of policy_kwargs")
-        train_freq: Any = self.train_freq
-        if not isinstance(train_freq, TrainFreq):
-            every, unit = train_freq if isinstance(train_freq, tuple) else (train_freq, "step")
-            if not isinstance(every, int) or every < 1 or unit not in ("step", "episode"):
-                raise ValueError(f"train_freq must be at least 1, or (n, 'step' or 'episode'), not {train_freq!r}")
-            if unit == "episode" and self.env is not None and self.n_envs > 1:
-                raise ValueError(
-                    f"train_freq={train_freq!r} counts episodes, which needs one environment, not {self.n_envs}"
-                )
+        arguments.check(self)
+
+    def _choose_replay_buffer(self) -> None:
+        if self.validation_proportion > 0:
+            is_dict = isinstance(self.observation_space, spaces.Dict)
+            self.replay_buffer_class = ValidationDictReplayBuffer if is_dict else ValidationReplayBuffer
+            self.replay_buffer_kwargs = {
+                **self.replay_buffer_kwargs,
+                "validation_proportion": self.validation_proportion,
+            }
+        elif self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, ValidationSplit):
+            # Loaded, with validation_proportion=0 instead of the saved one.
+            self.replay_buffer_class = None
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         """
         :return: the policy's arguments: the user's and the algorithm's
         """
-        return {**self.policy_kwargs, "n_quantiles": self.n_quantiles}
+        return {**self.policy_kwargs, "n_quantiles": self.n_quantiles, "backbone": self.backbone}
 
     def _full_exploration_kwargs(self) -> dict[str, Any]:
         """
@@ -267,28 +279,44 @@ class SAC(OffPolicyAlgorithm):
         """
         return dict(self.exploration_kwargs or {})
 
+    def _full_pessimism_kwargs(self) -> dict[str, Any]:
+        """
+        :return: the arguments of the rule that moves pessimism: the user's and the algorithm's
+        """
+        return dict(self.pessimism_kwargs or {})
+
     def _make_temperature(self) -> LogScalar | FixedScalar:
+        if not self.actor.has_entropy:
+            return FixedScalar(0.0).to(self.device)
         allowed = "'auto' or 'auto_<start above 0>'"
         if isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto"):
             start = self.ent_coef.removeprefix("auto").removeprefix("_") or "1"
-            value = _number("ent_coef", start, allowed, shown=self.ent_coef)
-            if not 0 < value < math.inf:
+            value = arguments.number("ent_coef", start, allowed, shown=self.ent_coef)
+            if not 0 < value < np.inf:
                 raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
             return LogScalar(value).to(self.device)
-        value = _number("ent_coef", self.ent_coef, allowed)
-        if not 0 <= value < math.inf:
+        value = arguments.number("ent_coef", self.ent_coef, allowed)
+        if not 0 <= value < np.inf:
             raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
         return FixedScalar(value).to(self.device)
 
-    def _make_explorer(self) -> Exploration:
-        explorer, kwargs = EXPLORATIONS[self.exploration], self._full_exploration_kwargs()
-        allowed = list(inspect.signature(explorer.__init__).parameters)[2:]
-        for name in kwargs:
-            if name not in allowed:
-                raise ValueError(
-                    f"exploration_kwargs has {name!r}, but exploration={self.exploration!r} takes {allowed or 'none'}"
-                )
-        return explorer(self, **kwargs).to(self.device)
+    def make_explorer(self) -> Exploration:
+        """
+        :return: a freshly initialised explorer
+        """
+        make, kwargs = EXPLORATIONS[self.exploration], self._full_exploration_kwargs()
+        arguments.check_names("exploration", self.exploration, make.__init__, kwargs)
+        return make(self, **kwargs).to(self.device)
+
+    def make_pessimism(self) -> Pessimism:
+        """
+        :return: a freshly initialised rule of pessimism
+        """
+        if not isinstance(self.pessimism, str):
+            return Pessimism(self.pessimism)
+        make, kwargs = PESSIMISMS[self.pessimism], self._full_pessimism_kwargs()
+        arguments.check_names("pessimism", self.pessimism, make, kwargs)
+        return make(self, **kwargs).to(self.device)
 
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
         if policy_name not in self.policy_aliases:
@@ -357,7 +385,14 @@ class SAC(OffPolicyAlgorithm):
         return self.policy.make_optimizer(parameters, self.lr_schedule)
 
     def _parts(self) -> dict[str, Part]:
-        return {"explorer": self.explorer, "pessimism_rule": self.pessimism_rule, "plasticity": self.plasticity}
+        parts: dict[str, Part] = {
+            "explorer": self.explorer,
+            "pessimism_rule": self.pessimism_rule,
+            "plasticity": self.plasticity,
+        }
+        if self.redo is not None:
+            parts["redo"] = self.redo
+        return parts
 
     def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Every optimizer by its path from the algorithm."""
@@ -377,18 +412,40 @@ class SAC(OffPolicyAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor", "critic", "critic_target", "_metrics", "_critic_loss"]
 
-    def reinitialize(self) -> None:
+    def reinitialize(self, shrink: float = 0.0) -> None:
         """
         Start every network, optimizer and learned number anew, in place; the replay buffer stays.
+
+        :param shrink: share of the old parameters that stays
         """
         fresh = self.policy_class(
             self.observation_space, self.action_space, self.lr_schedule, **self._full_policy_kwargs()
         )
-        self.policy.load_state_dict(fresh.state_dict())
-        self.temperature.load_state_dict(self._make_temperature().state_dict())
-        self.explorer.load_state_dict(self._make_explorer().state_dict())
+        self.restart(self.policy, fresh, shrink)
+        self.restart(self.temperature, self._make_temperature(), shrink)
+        # The explorer's start may depend on the pessimism in force.
+        self.restart(self.pessimism_rule, self.make_pessimism(), shrink)
+        self.restart(self.explorer, self.make_explorer(), shrink)
         for optimizer in self._optimizers().values():
             optimizer.state.clear()
+
+    @staticmethod
+    def restart(module: nn.Module, fresh: nn.Module, shrink: float = 0.0) -> None:
+        """
+        Give a module the values of a fresh one, in place, and start the optimizers of a part anew.
+
+        :param module: the module
+        :param fresh: a module of the same kind
+        :param shrink: share of the old parameters that stays
+        """
+        state = fresh.state_dict()
+        if shrink > 0:
+            for name, parameter in module.named_parameters():
+                state[name] = torch.lerp(state[name].to(parameter.device), parameter.detach(), shrink)
+        module.load_state_dict(state)
+        if isinstance(module, Part):
+            for optimizer in module.optimizers().values():
+                optimizer.state.clear()
 
     # ---------------------------------------------------------------- acting
 
@@ -480,6 +537,8 @@ class SAC(OffPolicyAlgorithm):
         assert self.replay_buffer is not None
         if self.num_transitions <= self.learning_starts:
             return 0
+        if isinstance(self.replay_buffer, ValidationSplit) and self.replay_buffer.n_training == 0:
+            return 0
         # A model that was loaded without its buffer fills it first, acting with what it has learned.
         capacity = self.replay_buffer.buffer_size * self.n_envs
         if self.replay_buffer.size() * self.n_envs < min(self.learning_starts, capacity):
@@ -506,11 +565,12 @@ class SAC(OffPolicyAlgorithm):
             for group in optimizer.param_groups:
                 if group.get("scheduled", True):
                     group["lr"] = rate
-        self.plasticity.before_updates(self)
+        for part in self._parts().values():
+            part.before_updates(self)
         for first in range(0, gradient_steps, MAX_BATCHES_AT_ONCE):
             n_batches = min(MAX_BATCHES_AT_ONCE, gradient_steps - first)
             for batch in draw_batches(self.replay_buffer, n_batches, batch_size, self.gamma, self._vec_normalize_env):
-                self._metrics = self._update(batch)
+                self._metrics.update(self._update(batch))
 
     def _update(self, batch: Batch, noise: Noise | None = None) -> dict[str, torch.Tensor]:
         """
@@ -527,50 +587,81 @@ class SAC(OffPolicyAlgorithm):
 
         # Critics, towards the targets' value of the actor's next action.
         with torch.no_grad():
-            next_actions, next_log_prob = self.actor.sample(batch.next_observations, noise.critic)
-            next_values = self.pessimism_rule.value(self.critic_target(batch.next_observations, next_actions))
-            target = losses.td_target(
-                batch.rewards, batch.dones, batch.discounts, next_values, -fixed_alpha * next_log_prob
-            )
+            next_actions, next_log_prob = self.policy.next_actions(batch.next_observations, noise.critic)
+            next_q = self.critic_target(batch.next_observations, next_actions)
+            if self.target_subset is not None:
+                next_q = next_q[torch.randperm(len(next_q), device=next_q.device)[: self.target_subset]]
+            entropy_bonus = -fixed_alpha * next_log_prob
+            next_values = self.pessimism_rule.value(next_q)
+            target = losses.td_target(batch.rewards, batch.dones, batch.discounts, next_values, entropy_bonus)
         q = self.critic(batch.observations, batch.actions)
         critic_loss = self._critic_loss(q, target)
-        self.minimize(self.critic.optimizer, critic_loss)
+        if self.sam_radius is None:
+            self.minimize(self.critic.optimizer, critic_loss)
+        else:
+            self._sharpness_aware_step(critic_loss, batch, target)
+        metrics = {"train/critic_loss": critic_loss, "train/q_mean": q.mean()}
 
         # Targets, by Polyak averaging.
         self._n_updates += 1
         if self._n_updates % self.target_update_interval == 0:
-            with torch.no_grad():
-                torch._foreach_lerp_(
-                    list(self.critic_target.parameters()), list(self.critic.parameters()), weight=self.tau
-                )
+            self._follow(self.critic_target, self.critic)
 
-        # Actor, on the new critics.
-        actions, log_prob = self.actor.sample(batch.observations, noise.actor)
-        value = self.pessimism_rule.value(self.critic(batch.observations, actions))
-        actor_loss = losses.actor_loss(log_prob, value, fixed_alpha)
-        self.minimize(self.actor.optimizer, actor_loss)
+        if self._n_updates % self.policy_delay == 0:
+            # Actor, on the new critics.
+            actions, log_prob = self.actor.sample(batch.observations, noise.actor)
+            value = self._actor_value(self.critic(batch.observations, actions))
+            actor_loss = losses.actor_loss(log_prob, value, fixed_alpha)
+            self.minimize(self.actor.optimizer, actor_loss)
+            metrics["train/actor_loss"] = actor_loss
+            if self.policy.actor_target is not None:
+                self._follow(self.policy.actor_target, self.actor)
 
-        # Whoever explores, on the new critics and the new actor.
-        exploration_metrics = self.explorer.update(self, batch, noise.exploration)
+            # Whoever explores, on the new critics and the new actor.
+            metrics.update(self.explorer.update(self, batch, noise.exploration))
 
-        # Temperature.
-        entropy = -log_prob.detach().mean()
-        metrics = {
-            "train/critic_loss": critic_loss,
-            "train/q_mean": q.mean(),
-            "train/actor_loss": actor_loss,
-            "train/entropy": entropy,
-            "train/ent_coef": alpha,
-            **exploration_metrics,
-        }
-        if self.temperature_optimizer is not None:
-            temperature_loss = losses.temperature_loss(alpha, entropy, self._target_entropy)
-            self.minimize(self.temperature_optimizer, temperature_loss)
-            metrics["train/ent_coef_loss"] = temperature_loss
+            # Temperature.
+            if self.actor.has_entropy:
+                entropy = -log_prob.detach().mean()
+                metrics.update({"train/entropy": entropy, "train/ent_coef": alpha})
+                if self.temperature_optimizer is not None:
+                    temperature_loss = losses.temperature_loss(alpha, entropy, self._target_entropy)
+                    self.minimize(self.temperature_optimizer, temperature_loss)
+                    metrics["train/ent_coef_loss"] = temperature_loss
 
-        # Pessimism.
-        metrics.update(self.pessimism_rule.update(self, batch))
+        # Pessimism, and neurons that have gone dormant.
+        step = CriticStep(q.detach(), next_q, entropy_bonus)
+        metrics.update(self.pessimism_rule.update(self, batch, step, noise.pessimism))
+        if self.redo is not None:
+            metrics.update(self.redo.after_update(self, batch))
         return {name: value.detach() for name, value in metrics.items()}
+
+    def _actor_value(self, q: torch.Tensor) -> torch.Tensor:
+        """The ensemble's value for the actor's objective, (E, B, K) to (B, K)."""
+        if self.actor_pessimism is None:
+            return self.pessimism_rule.value(q)
+        return pessimistic_value(q, float(self.actor_pessimism))
+
+    def _follow(self, target: nn.Module, online: nn.Module) -> None:
+        """One step of Polyak averaging; with ``tau=1`` the target is the online network."""
+        with torch.no_grad():
+            torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), weight=self.tau)
+
+    def _sharpness_aware_step(self, loss: torch.Tensor, batch: Batch, target: torch.Tensor) -> None:
+        """One step of the critics' optimizer with the gradient from ``sam_radius`` uphill."""
+        assert self.sam_radius is not None
+        parameters = list(self.critic.parameters())
+        copied = {id(p) for p in self.critic.copied_parameters()}
+        gradients = sharpness_aware_gradients(
+            loss,
+            lambda: self._critic_loss(self.critic(batch.observations, batch.actions), target),
+            parameters,
+            self.sam_radius,
+            [len(p) if id(p) in copied else None for p in parameters],
+        )
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        self.critic.optimizer.step()
 
     @staticmethod
     def minimize(optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:
@@ -594,14 +685,7 @@ class SAC(OffPolicyAlgorithm):
             self.logger.record(name, value.item())
         self.logger.record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("plasticity/n_resets", self.plasticity.n_done)
+        self.logger.record("plasticity/reset", self.plasticity.n_done)
+        if isinstance(self.replay_buffer, ValidationSplit):
+            self.logger.record("validation/size", self.replay_buffer.n_validation)
         super().dump_logs()
-
-
-def _number(name: str, value: Any, otherwise: str, shown: Any = None) -> float:
-    """An argument as a number, or an error that names it, its value and what else is allowed."""
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        shown = value if shown is None else shown
-        raise ValueError(f"{name} must be a number, or {otherwise}, not {shown!r}") from None

@@ -73,7 +73,8 @@ class BRO(SAC):
     :param weight_decay: decoupled weight decay of critics and both actors
     :param exploration: who acts while training: "optimistic_shift", or "actor" for no optimistic actor
     :param exploration_kwargs: further arguments of the exploration
-    :param resets: environment steps at which all parameters start anew, counted in transitions over the model's life
+    :param resets: environment steps at which all parameters start anew, counted in transitions over the model's life;
+        or one integer for every so many
     :param use_sde: not supported, refused if True
     :param stats_window_size: episodes over which the logged return is averaged
     :param tensorboard_log: folder of the TensorBoard log; none if None
@@ -82,6 +83,7 @@ class BRO(SAC):
     :param seed: seed of everything random
     :param device: "auto", "cpu", "cuda", ...
     :param _init_setup_model: whether to build the networks at once
+    :param kwargs: every other argument of :class:`SAC`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
@@ -110,7 +112,7 @@ class BRO(SAC):
         replay_ratio: float = 10,
         model_size: str | Sequence[int] | None = "4.92M",
         n_quantiles: int | None = 100,
-        pessimism: float = 0.0,
+        pessimism: float | str = 0.0,
         kl_target: float = 0.05,
         std_multiplier: float = 0.75,
         initial_optimism: float = 1.0,
@@ -119,7 +121,7 @@ class BRO(SAC):
         weight_decay: float = 1e-4,
         exploration: str = "optimistic_shift",
         exploration_kwargs: dict[str, Any] | None = None,
-        resets: Sequence[int] = BRO_RESETS,
+        resets: Sequence[int] | int = BRO_RESETS,
         use_sde: bool = False,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -128,6 +130,7 @@ class BRO(SAC):
         seed: int | None = None,
         device: torch.device | str = "auto",
         _init_setup_model: bool = True,
+        **kwargs: Any,
     ):
         self.model_size = model_size
         self.kl_target = kl_target
@@ -169,6 +172,7 @@ class BRO(SAC):
             seed=seed,
             device=device,
             _init_setup_model=_init_setup_model,
+            **kwargs,
         )
 
     def _check_arguments(self) -> None:

@@ -13,7 +13,7 @@ from sb3_sample.optim import AdamW
 from sb3_sample.sac import losses
 from sb3_sample.sac.parts import Part
 from sb3_sample.sac.pessimism import epistemic_std
-from sb3_sample.sac.scalars import BoundedLogScalar
+from sb3_sample.sac.scalars import BoundedLogScalar, LogScalar
 
 if TYPE_CHECKING:
     from sb3_sample.sac.algorithm import SAC
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 class Exploration(Part):
     """
-    Base class, and the plain choice: a sample of the actor itself.
+    Base class, and the plain choice: the actor itself, a sample of it or, if it is deterministic, with noise added.
 
     :param agent: the algorithm, whose policy exists already
     """
@@ -36,7 +36,8 @@ class Exploration(Part):
         :param observations: tensors on the device of the model, (B, O) or a dict of them
         :return: actions in [-1, 1], (B, A)
         """
-        return agent.actor.sample(observations)[0]
+        mean, log_std = agent.actor.gaussian(agent.actor.features(observations))
+        return agent.actor.act(mean, log_std.exp(), torch.randn_like(mean))
 
     def update(self, agent: "SAC", batch: "Batch", noise: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         """
@@ -50,41 +51,54 @@ class Exploration(Part):
         return {}
 
 
-class OptimisticShift(Exploration):
+#: What may be meant by the spread of the critics.
+UNCERTAINTIES = ("epistemic", "aleatoric", "both")
+
+
+def spread(q: torch.Tensor, uncertainty: str) -> torch.Tensor:
     """
-    BRO's optimistic actor (P5, algorithm 2, lines 11, 12, 14, 15; section B.7): a network that sees the
-    observation and the pessimistic actor's pre-tanh mean and answers with a shift of that mean; the standard
-    deviation is the pessimistic one times ``std_multiplier``.
+    The uncertainty that optimism adds (P3, figure 12; Moskovitz et al. 2021, section 4).
 
-    It climbs the optimistic value ``Q_mean + optimism * Q_std`` under a penalty on the KL divergence to the
-    pessimistic actor. Optimism and the penalty's weight are learned so that the divergence per action
-    dimension meets ``kl_target``.
+    "epistemic" is the disagreement of the critics, quantile by quantile; "aleatoric" the standard deviation over the
+    quantiles of their mean, the spread of the return itself; "both" the root of the sum of the variances, the
+    epistemic one averaged over the quantiles.
 
-    Where text and published code differ, the code is followed (the published curves were made with it): the
-    divergence goes from the optimistic to the pessimistic Gaussian, with the multiplier removed from the
-    optimistic standard deviation, so that only the squared shift of the mean remains.
+    :param q: (E, B, K)
+    :param uncertainty: one of ``UNCERTAINTIES``
+    :return: (B, K) for "epistemic", (B, 1) for the others
+    """
+    if uncertainty == "epistemic":
+        return epistemic_std(q)
+    aleatoric = q.mean(dim=0).var(dim=1, unbiased=False, keepdim=True)
+    if uncertainty == "both":
+        aleatoric = aleatoric + q.var(dim=0, unbiased=False).mean(dim=1, keepdim=True)
+    return aleatoric.clamp_min(1e-12).sqrt()
+
+
+class OptimisticExploration(Exploration):
+    """
+    Base class of the optimistic actors, which only act while training. They climb the optimistic value ``Q_mean +
+    optimism * Q_std`` under a penalty on the KL divergence to the pessimistic actor; optimism and the penalty's
+    weight are learned so that the divergence per action dimension meets ``kl_target``.
 
     :param agent: the algorithm, whose policy exists already
     :param kl_target: KL divergence per action dimension to be met, above 0
-    :param std_multiplier: factor on the pessimistic standard deviation, above 0
-    :param initial_optimism: optimism at the start and after a reset
-    :param initial_kl_weight: weight of the divergence at the start and after a reset
+    :param std_multiplier: factor on the standard deviation while exploring, above 0; taken out before the divergence
+    :param uncertainty: what Q_std is: "epistemic", "aleatoric" or "both"; see :func:`spread`
     :param adjustment_learning_rate: of optimism and weight, by Adam with beta1 = 0.5
-    :param network: trunk of the shift network, "bronet" or "mlp"
-    :param network_kwargs: its arguments; None: one block, 256 wide, for "bronet", the network's own otherwise
-    :raises ValueError: if an argument is out of range
+    :raises ValueError: if an argument is out of range or contradicts another
     """
+
+    actor_optimizer: Optimizer
+    scalar_optimizer: Optimizer
 
     def __init__(
         self,
         agent: "SAC",
-        kl_target: float = 0.05,
-        std_multiplier: float = 0.75,
-        initial_optimism: float = 1.0,
-        initial_kl_weight: float = 0.25,
-        adjustment_learning_rate: float = 3e-5,
-        network: str = "bronet",
-        network_kwargs: dict[str, Any] | None = None,
+        kl_target: float,
+        std_multiplier: float,
+        uncertainty: str,
+        adjustment_learning_rate: float,
     ):
         super().__init__(agent)
         for name, value in (("kl_target", kl_target), ("std_multiplier", std_multiplier)):
@@ -92,40 +106,64 @@ class OptimisticShift(Exploration):
                 raise ValueError(f"{name} must be above 0 and finite, not {value}")
         if not 0 <= adjustment_learning_rate < math.inf:
             raise ValueError(f"adjustment_learning_rate must be at least 0 and finite, not {adjustment_learning_rate}")
-        if network not in NETWORKS:
-            raise ValueError(f"network must be one of {sorted(NETWORKS)}, not {network!r}")
+        if uncertainty not in UNCERTAINTIES:
+            raise ValueError(f"uncertainty must be one of {UNCERTAINTIES}, not {uncertainty!r}")
+        if uncertainty != "epistemic" and (agent.n_quantiles or 1) < 2:
+            raise ValueError(
+                f"uncertainty={uncertainty!r} needs critics with at least two quantiles, "
+                f"not n_quantiles={agent.n_quantiles}"
+            )
         self.kl_target = kl_target
         self.std_multiplier = std_multiplier
-        actor = agent.actor
-        action_dim = actor.action_dim
-        if network_kwargs is None:
-            network_kwargs = {"width": 256, "n_blocks": 1} if network == "bronet" else {}
-        self.trunk = NETWORKS[network](actor.features_dim + action_dim, **network_kwargs)
-        # Without bias and nearly zero, so that the optimistic actor starts as the pessimistic one.
-        self.shift = linear(self.trunk.out_features, action_dim, None, bias=False, gain=0.01)
-        self.optimism = BoundedLogScalar("initial_optimism", initial_optimism)
-        self.kl_weight = BoundedLogScalar("initial_kl_weight", initial_kl_weight)
-        self.actor_optimizer = agent.make_optimizer([*self.trunk.parameters(), *self.shift.parameters()])
+        self.uncertainty = uncertainty
+        self._adjustment_learning_rate = adjustment_learning_rate
+
+    def _make_optimizers(self, agent: "SAC", actor: Any, optimism: Any, kl_weight: Any) -> None:
+        """For the parameters of the optimistic actor and of the two numbers."""
+        self.actor_optimizer = agent.make_optimizer(actor)
         # Their learning rate is their own, whatever the schedule of the others.
-        scalars = {"params": [*self.optimism.parameters(), *self.kl_weight.parameters()], "scheduled": False}
-        self.scalar_optimizer = AdamW([scalars], lr=adjustment_learning_rate, betas=(0.5, 0.999))
+        scalars = {"params": [*optimism, *kl_weight], "scheduled": False}
+        self.scalar_optimizer = AdamW([scalars], lr=self._adjustment_learning_rate, betas=(0.5, 0.999))
 
     def optimizers(self) -> dict[str, Optimizer]:
         return {"actor_optimizer": self.actor_optimizer, "scalar_optimizer": self.scalar_optimizer}
 
-    def _mean(self, features: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
+    def _gaussian(
+        self, observations: Any, features: torch.Tensor, mean: torch.Tensor, std: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """
-        :param features: extracted features of the observations, (B, F)
+        :param observations: (B, O) or a dict
+        :param features: the pessimistic actor's features of them, (B, F)
         :param mean: the pessimistic actor's pre-tanh mean, (B, A)
-        :return: the optimistic actor's pre-tanh mean, (B, A)
+        :param std: its standard deviation, (B, A)
+        :return: the optimistic actor's mean and, without the multiplier, standard deviation, (B, A) each
         """
-        return mean + self.shift(self.trunk(torch.cat((features, mean), dim=1)))
+        raise NotImplementedError
+
+    def _kl(self, agent: "SAC", optimistic: Any, pessimistic: Any) -> torch.Tensor:
+        """Divergence of the two Gaussians, (B, 1)."""
+        return agent.actor.kl(*optimistic, *pessimistic)
+
+    def _optimism(self, agent: "SAC") -> torch.Tensor:
+        """Optimism, a scalar with gradient."""
+        raise NotImplementedError
+
+    def _optimism_loss(self, agent: "SAC", optimism: torch.Tensor, kl_gap: torch.Tensor) -> torch.Tensor:
+        raise NotImplementedError
+
+    def _kl_weight(self) -> torch.Tensor:
+        """The divergence's weight, a scalar with gradient."""
+        raise NotImplementedError
+
+    def _penalty(self, kl_weight: torch.Tensor) -> torch.Tensor:
+        """The weight as the actor's loss uses it."""
+        return kl_weight
 
     def act(self, agent: "SAC", observations: Any) -> torch.Tensor:
         features = agent.actor.features(observations)
         mean, log_std = agent.actor.gaussian(features)
-        std = self.std_multiplier * log_std.exp()
-        return torch.tanh(self._mean(features, mean) + std * torch.randn_like(std))
+        mean, std = self._gaussian(observations, features, mean, log_std.exp())
+        return agent.actor.act(mean, self.std_multiplier * std, torch.randn_like(std))
 
     def update(self, agent: "SAC", batch: "Batch", noise: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         with torch.no_grad():
@@ -133,18 +171,19 @@ class OptimisticShift(Exploration):
             mean, log_std = agent.actor.gaussian(features)
             std = log_std.exp()
         noise = torch.randn_like(mean) if noise is None else noise
-        optimism, kl_weight = self.optimism(), self.kl_weight()
+        optimism, kl_weight = self._optimism(agent), self._kl_weight()
 
-        optimistic_mean = self._mean(features, mean)
-        action = torch.tanh(optimistic_mean + self.std_multiplier * std * noise)
+        optimistic_mean, optimistic_std = self._gaussian(batch.observations, features, mean, std)
+        action = agent.actor.learned_action(optimistic_mean, self.std_multiplier * optimistic_std, noise)
         q = agent.critic(batch.observations, action)
-        q_mean, q_std = q.mean(dim=0), epistemic_std(q)
-        kl = losses.gaussian_kl(optimistic_mean, std, mean, std)
-        actor_loss = losses.optimistic_actor_loss(q_mean + optimism.detach() * q_std, kl, kl_weight)
+        q_mean, q_std = q.mean(dim=0), spread(q, self.uncertainty)
+        kl = self._kl(agent, (optimistic_mean, optimistic_std), (mean, std))
+        upper_value = q_mean + optimism.detach() * q_std
+        actor_loss = losses.optimistic_actor_loss(upper_value, kl, self._penalty(kl_weight))
         agent.minimize(self.actor_optimizer, actor_loss)
 
         kl_gap = kl.detach().mean() / mean.shape[1] - self.kl_target
-        optimism_loss = losses.optimism_loss(optimism, agent.pessimism_rule.beta(), kl_gap)
+        optimism_loss = self._optimism_loss(agent, optimism, kl_gap)
         kl_weight_loss = losses.kl_weight_loss(kl_weight, kl_gap)
         agent.minimize(self.scalar_optimizer, optimism_loss + kl_weight_loss)
         return {
@@ -159,5 +198,248 @@ class OptimisticShift(Exploration):
         }
 
 
+class OptimisticShift(OptimisticExploration):
+    """
+    BRO's optimistic actor (P5, algorithm 2, lines 11, 12, 14, 15; section B.7): a network that sees the
+    observation and the pessimistic actor's pre-tanh mean and answers with a shift of that mean; the standard
+    deviation is the pessimistic one times ``std_multiplier``.
+
+    Where text and published code differ, the code is followed (the published curves were made with it): the
+    divergence goes from the optimistic to the pessimistic Gaussian, with the multiplier removed from the
+    optimistic standard deviation, so that only the squared shift of the mean remains.
+
+    :param agent: the algorithm, whose policy exists already
+    :param kl_target: KL divergence per action dimension to be met, above 0
+    :param std_multiplier: factor on the pessimistic standard deviation, above 0
+    :param uncertainty: what Q_std is: "epistemic", "aleatoric" or "both"; see :func:`spread`
+    :param initial_optimism: optimism at the start and after a reset
+    :param initial_kl_weight: weight of the divergence at the start and after a reset
+    :param adjustment_learning_rate: of optimism and weight, by Adam with beta1 = 0.5
+    :param network: trunk of the shift network, one of ``NETWORKS``
+    :param network_kwargs: its arguments; None: one block, 256 wide, for "bronet", the network's own otherwise
+    :raises ValueError: if an argument is out of range
+    """
+
+    def __init__(
+        self,
+        agent: "SAC",
+        kl_target: float = 0.05,
+        std_multiplier: float = 0.75,
+        uncertainty: str = "epistemic",
+        initial_optimism: float = 1.0,
+        initial_kl_weight: float = 0.25,
+        adjustment_learning_rate: float = 3e-5,
+        network: str = "bronet",
+        network_kwargs: dict[str, Any] | None = None,
+    ):
+        super().__init__(agent, kl_target, std_multiplier, uncertainty, adjustment_learning_rate)
+        if network not in NETWORKS:
+            raise ValueError(f"network must be one of {sorted(NETWORKS)}, not {network!r}")
+        actor = agent.actor
+        action_dim = actor.action_dim
+        if network_kwargs is None:
+            network_kwargs = {"width": 256, "n_blocks": 1} if network == "bronet" else {}
+        self.trunk = NETWORKS[network](actor.features_dim + action_dim, **network_kwargs)
+        # Without bias and nearly zero, so that the optimistic actor starts as the pessimistic one.
+        self.shift = linear(self.trunk.out_features, action_dim, None, bias=False, gain=0.01)
+        self.optimism = BoundedLogScalar("initial_optimism", initial_optimism)
+        self.kl_weight = BoundedLogScalar("initial_kl_weight", initial_kl_weight)
+        self._make_optimizers(
+            agent,
+            [*self.trunk.parameters(), *self.shift.parameters()],
+            self.optimism.parameters(),
+            self.kl_weight.parameters(),
+        )
+
+    def _gaussian(
+        self, observations: Any, features: torch.Tensor, mean: torch.Tensor, std: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        return mean + self.shift(self.trunk(torch.cat((features, mean), dim=1))), std
+
+    def _optimism(self, agent: "SAC") -> torch.Tensor:
+        return self.optimism()
+
+    def _optimism_loss(self, agent: "SAC", optimism: torch.Tensor, kl_gap: torch.Tensor) -> torch.Tensor:
+        return losses.optimism_loss(optimism, agent.pessimism_rule.beta(), kl_gap)
+
+    def _kl_weight(self) -> torch.Tensor:
+        return self.kl_weight()
+
+
+class OptimisticActor(OptimisticExploration):
+    """
+    DAC's optimistic actor (P3, algorithm 1, lines 8, 10, 11; eq. 11, 14, 15): a policy of its own, with the networks of
+    the pessimistic one, that samples with its standard deviation times ``std_multiplier``.
+
+    Optimism is kept above minus the pessimism in force: ``optimism = exp(p) - beta``, so that at worst both actors
+    climb the same value. A barrier ends its decline 0.001 above that bound.
+
+    Where text and published code differ, the code is followed: the divergence goes from the optimistic to the
+    pessimistic Gaussian (eq. 11 writes the other order, ``kl_direction="pessimistic_to_optimistic"``), with the
+    multiplier taken out of the sampled distribution (the text's "m-times smaller"; algorithm 1 writes ``m *
+    sigma``); its weight enters the loss as at most 20; the actor starts from weights of its own, not from the
+    pessimistic actor's; and it starts anew, with optimism, weight and their optimizers, every 25,000 environment
+    steps, which the text does not mention (``reinitialize_every=None`` turns it off). At a full reset it starts anew
+    as everything does.
+
+    :param agent: the algorithm, whose policy exists already
+    :param kl_target: KL divergence per action dimension to be met, above 0
+    :param std_multiplier: m, factor on its standard deviation while exploring, above 0
+    :param uncertainty: what Q_std is: "epistemic", "aleatoric" or "both"; see :func:`spread`
+    :param initial_optimism: optimism at the start, above minus the pessimism; None: 0.5 above it
+    :param initial_kl_weight: weight of the divergence at the start, above 0
+    :param adjustment_learning_rate: of optimism and weight, by Adam with beta1 = 0.5
+    :param kl_direction: "optimistic_to_pessimistic" or "pessimistic_to_optimistic"
+    :param reinitialize_every: environment steps, counted in transitions over the model's life, after which it starts
+        anew; None for never
+    :raises ValueError: if an argument is out of range
+    """
+
+    KL_DIRECTIONS = ("optimistic_to_pessimistic", "pessimistic_to_optimistic")
+    MAX_KL_WEIGHT = 20.0
+    BARRIER = 1e-3
+
+    def __init__(
+        self,
+        agent: "SAC",
+        kl_target: float = 0.5,
+        std_multiplier: float = 1.25,
+        uncertainty: str = "epistemic",
+        initial_optimism: float | None = None,
+        initial_kl_weight: float = 1.0,
+        adjustment_learning_rate: float = 3e-5,
+        kl_direction: str = "optimistic_to_pessimistic",
+        reinitialize_every: int | None = 25_000,
+    ):
+        super().__init__(agent, kl_target, std_multiplier, uncertainty, adjustment_learning_rate)
+        beta = float(agent.pessimism_rule.beta())
+        distance = 0.5 if initial_optimism is None else initial_optimism + beta
+        if not 0 < distance < math.inf:
+            raise ValueError(f"initial_optimism must be above minus the pessimism, {-beta}, not {initial_optimism}")
+        if not 0 < initial_kl_weight < math.inf:
+            raise ValueError(f"initial_kl_weight must be above 0 and finite, not {initial_kl_weight}")
+        if kl_direction not in self.KL_DIRECTIONS:
+            raise ValueError(f"kl_direction must be one of {self.KL_DIRECTIONS}, not {kl_direction!r}")
+        if reinitialize_every is not None and not reinitialize_every >= 1:
+            raise ValueError(f"reinitialize_every must be at least 1, or None for never, not {reinitialize_every}")
+        self.kl_direction = kl_direction
+        self.reinitialize_every = reinitialize_every
+        self.actor = agent.policy.make_actor()
+        #: How far optimism lies above minus the pessimism.
+        self.optimism_distance = LogScalar(distance)
+        self.kl_weight = LogScalar(initial_kl_weight)
+        self._make_optimizers(
+            agent, self.actor.parameters(), self.optimism_distance.parameters(), self.kl_weight.parameters()
+        )
+        self._n_intervals = self._intervals(agent)
+
+    def _intervals(self, agent: "SAC") -> int:
+        return 0 if self.reinitialize_every is None else agent.num_transitions // self.reinitialize_every
+
+    def before_updates(self, agent: "SAC") -> None:
+        if self._intervals(agent) > self._n_intervals:
+            agent.restart(self, agent.make_explorer())
+
+    def get_extra_state(self) -> dict[str, Any]:
+        return {"n_intervals": self._n_intervals}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self._n_intervals = state["n_intervals"]
+
+    def _gaussian(
+        self, observations: Any, features: torch.Tensor, mean: torch.Tensor, std: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        mean, log_std = self.actor.gaussian(self.actor.features(observations))
+        return mean, log_std.exp()
+
+    def act(self, agent: "SAC", observations: Any) -> torch.Tensor:
+        mean, log_std = self.actor.gaussian(self.actor.features(observations))
+        return self.actor.act(mean, self.std_multiplier * log_std.exp(), torch.randn_like(mean))
+
+    def _kl(self, agent: "SAC", optimistic: Any, pessimistic: Any) -> torch.Tensor:
+        if self.kl_direction == "pessimistic_to_optimistic":
+            return agent.actor.kl(*pessimistic, *optimistic)
+        return agent.actor.kl(*optimistic, *pessimistic)
+
+    def _optimism(self, agent: "SAC") -> torch.Tensor:
+        return self.optimism_distance() - agent.pessimism_rule.beta()
+
+    def _optimism_loss(self, agent: "SAC", optimism: torch.Tensor, kl_gap: torch.Tensor) -> torch.Tensor:
+        lowest = -agent.pessimism_rule.beta()
+        barrier = torch.clamp(optimism, max=self.BARRIER + lowest)
+        return losses.optimism_loss(optimism, lowest, kl_gap) - barrier
+
+    def _kl_weight(self) -> torch.Tensor:
+        return self.kl_weight()
+
+    def _penalty(self, kl_weight: torch.Tensor) -> torch.Tensor:
+        return kl_weight.clamp(max=self.MAX_KL_WEIGHT)
+
+
+class OptimisticGradient(Exploration):
+    """
+    OAC's exploration (Ciosek et al. 2019, proposition 7): the actor's Gaussian with its pre-tanh mean shifted along the
+    gradient g of the upper bound ``Q_mean + optimism * Q_std`` there, as far as a KL radius allows::
+
+        mean + sqrt(2 * kl_radius) * S g / sqrt(g' S g),    S the Gaussian's covariance
+
+    which maximises the bound's linear approximation among the Gaussians of the same covariance within that divergence.
+    Nothing is learned.
+
+    The defaults are those of the comparison in P3 as published with its code (optimism 4.36, ``sqrt(2 * kl_radius)``
+    = 3.69).
+
+    :param agent: the algorithm, whose policy exists already
+    :param optimism: weight of the critics' spread in the upper bound, at least 0
+    :param kl_radius: KL divergence to the actor's Gaussian, summed over the action's dimensions, at least 0
+    :raises ValueError: if an argument is out of range, or if the actor is deterministic
+    """
+
+    def __init__(self, agent: "SAC", optimism: float = 4.36, kl_radius: float = 3.69**2 / 2):
+        super().__init__(agent)
+        for name, value in (("optimism", optimism), ("kl_radius", kl_radius)):
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name} must be at least 0 and finite, not {value}")
+        if not agent.actor.has_entropy:
+            raise ValueError("exploration='oac' shifts a Gaussian: it needs backbone='sac', not 'td3'")
+        self.optimism = optimism
+        self.kl_radius = kl_radius
+
+    def shifted_mean(self, agent: "SAC", observations: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        :param agent: the algorithm
+        :param observations: (B, O) or a dict of them
+        :return: the shifted pre-tanh mean and the standard deviation, (B, A) each
+        """
+        with torch.no_grad():
+            mean, log_std = agent.actor.gaussian(agent.actor.features(observations))
+        std = log_std.exp()
+        # Acting runs in inference mode, which knows no gradients.
+        with torch.inference_mode(False), torch.enable_grad():
+            at = mean.clone().requires_grad_()
+            q = agent.critic(_cloned(observations), torch.tanh(at))
+            upper_value = q.mean(dim=(0, 2)) + self.optimism * epistemic_std(q).mean(dim=1)
+            (gradient,) = torch.autograd.grad(upper_value.sum(), at)
+        scaled = std.square() * gradient
+        length = (scaled * gradient).sum(dim=1, keepdim=True).sqrt()
+        return mean + math.sqrt(2 * self.kl_radius) * scaled / (length + 1e-6), std
+
+    def act(self, agent: "SAC", observations: Any) -> torch.Tensor:
+        mean, std = self.shifted_mean(agent, observations)
+        return agent.actor.act(mean, std, torch.randn_like(std))
+
+
+def _cloned(observations: Any) -> Any:
+    """Ordinary tensors of what may be inference tensors."""
+    if isinstance(observations, dict):
+        return {key: value.clone() for key, value in observations.items()}
+    return observations.clone()
+
+
 #: Choices by the name that the algorithm's ``exploration`` argument takes.
-EXPLORATIONS: dict[str, type[Exploration]] = {"actor": Exploration, "optimistic_shift": OptimisticShift}
+EXPLORATIONS: dict[str, type[Exploration]] = {
+    "actor": Exploration,
+    "oac": OptimisticGradient,
+    "optimistic_actor": OptimisticActor,
+    "optimistic_shift": OptimisticShift,
+}

@@ -27,6 +27,13 @@ class Part(nn.Module):
         """
         return {}
 
+    def before_updates(self, agent: "SAC") -> None:
+        """
+        Called before the gradient steps that follow an environment step.
+
+        :param agent: the algorithm
+        """
+
     def on_step(self, agent: "SAC", rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """
         Called when the transitions of one step of all environments are in the replay buffer.

@@ -6,15 +6,21 @@ standard deviation over the critics. With two critics the spread is ``|Q1 - Q2| 
 Q-learning (the minimum) and 0 the mean.
 """
 
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import nn
+from torch.optim import Optimizer
 
+from sb3_sample.optim import AdamW
+from sb3_sample.sac import buffers, losses
+from sb3_sample.sac.batch import Batch, CriticStep
 from sb3_sample.sac.parts import Part
 
 if TYPE_CHECKING:
     from sb3_sample.sac.algorithm import SAC
-    from sb3_sample.sac.batch import Batch
 
 
 def epistemic_std(q: torch.Tensor) -> torch.Tensor:
@@ -31,55 +37,427 @@ def epistemic_std(q: torch.Tensor) -> torch.Tensor:
     return q.var(dim=0, unbiased=False).clamp_min(1e-12).sqrt()
 
 
+def pessimistic_value(q: torch.Tensor, beta: torch.Tensor | float) -> torch.Tensor:
+    """
+    The one value of an ensemble, ``Q_mean - beta * Q_std``, quantile by quantile.
+
+    :param q: (E, B, K)
+    :param beta: pessimism, at least 0
+    :return: (B, K)
+    """
+    if isinstance(beta, float):
+        if beta == 0:
+            return q.mean(dim=0)
+        if beta == 1 and q.shape[0] == 2:
+            return torch.minimum(q[0], q[1])
+    return q.mean(dim=0) - beta * epistemic_std(q)
+
+
 class Pessimism(Part):
-    """Base class of the rules. A rule has a weight ``beta`` and may move it once a gradient step."""
+    """
+    A constant weight, and the base class of the rules that move it: 1 is clipped double Q-learning, 0 the mean (BRO).
+
+    :param beta: the weight
+    :raises ValueError: if it is negative or not finite
+    """
+
+    def __init__(self, beta: float):
+        super().__init__()
+        check_beta("pessimism", beta)
+        self._beta = float(beta)
 
     def beta(self) -> torch.Tensor | float:
         """
-        :return: the weight in force, at least 0, a scalar
+        :return: the weight in force, at least 0, a number or a scalar tensor without gradient
         """
-        raise NotImplementedError
+        return self._beta
 
     def value(self, q: torch.Tensor) -> torch.Tensor:
         """
-        The one value of an ensemble, ``Q_mean - beta * Q_std``, quantile by quantile.
+        The one value of an ensemble under the weight in force.
 
         :param q: (E, B, K)
         :return: (B, K)
         """
-        return q.mean(dim=0) - self.beta() * epistemic_std(q)
+        return pessimistic_value(q, self.beta())
 
-    def update(self, agent: "SAC", batch: "Batch") -> dict[str, torch.Tensor]:
+    def update(
+        self, agent: "SAC", batch: Batch, step: CriticStep, noise: torch.Tensor | None = None
+    ) -> dict[str, torch.Tensor]:
         """
         Move the weight; called last in every gradient step.
 
         :param agent: the algorithm, its networks already updated
         :param batch: the step's batch
+        :param step: what the critics' step computed of it
+        :param noise: standard normal noise of actions that the rule samples, one row each; drawn if None
         :return: what to log, by name, scalars
         """
         return {}
 
 
-class FixedPessimism(Pessimism):
+class LearnedPessimism(Pessimism):
     """
-    A constant weight: 1 is clipped double Q-learning, 0 the mean (BRO).
+    A weight that is learned by gradient descent, one step of Adam a gradient step, and kept at least 0: GPL, OPL and
+    VPL are choices of ``loss`` and ``source``, and so are the variants of P4 (figures 8 and 9).
 
-    :param beta: the weight
-    :raises ValueError: if it is negative
+    With the lower bound's TD error ``e = Q_mean(s, a) - r - gamma * (V_lb(s'))``, where ``V_lb`` holds beta:
+
+    - ``loss="squared"`` is VPL's ``mean(e^2)`` (P4, eq. 12); the gradient goes through the beta of ``V_lb``;
+    - ``loss="dual"`` is ``beta * mean(e)`` with the error as a constant (P4, eq. 6): beta rises where the lower bound
+      promises more than the critics' mean gave.
+
+    - ``source="replay"`` takes the gradient step's own batch (GPL), and what the critics' step has computed of it;
+    - ``source="validation"`` takes transitions that are held out of training (VPL), ``round(validation_proportion *
+      batch_size)`` of them, at least 1; there is no step before as many are held out;
+    - ``source="recent"`` takes the latest 8 steps of every environment;
+    - ``source="on_policy"`` (OPL) takes the latest 8 steps too and replaces the estimate ``Q_mean`` by the
+      TD(0.95) return of what really followed; see :meth:`lambda_returns`.
+
+    What the papers leave open: the bootstrap ``V_lb`` is that of the TD target, of the target critics and a fresh
+    action of the actor, with its entropy bonus, since that is the value whose bias beta has to mend; ``Q_mean(s, a)``
+    is of the online critics, which are trained towards it. The batch of replay is judged with the values from before
+    the step, which cost nothing more. Quantiles are averaged after the spread over critics is taken.
+
+    At a reset beta and its optimizer start anew, as every learned number does.
+
+    :param agent: the algorithm
+    :param loss: "squared" or "dual"
+    :param source: "replay", "validation", "recent" or "on_policy"; the last with "dual" only
+    :param initial_pessimism: beta at the start and after a reset
+    :param learning_rate: of beta
+    :param segment_length: steps of every environment that "recent" and "on_policy" take
+    :param td_lambda: lambda of the returns of "on_policy"
+    :raises ValueError: if an argument is out of range or contradicts another
     """
 
-    def __init__(self, beta: float):
-        super().__init__()
-        if not beta >= 0:
-            raise ValueError(f"pessimism must be at least 0 (0 is the mean, 1 the minimum of two), not {beta}")
-        self._beta = float(beta)
+    def __init__(
+        self,
+        agent: "SAC",
+        loss: str,
+        source: str,
+        initial_pessimism: float = 1.0,
+        learning_rate: float = 5e-5,
+        segment_length: int = 8,
+        td_lambda: float = 0.95,
+    ):
+        check_beta("initial_pessimism", initial_pessimism)
+        super().__init__(initial_pessimism)
+        if loss not in ("squared", "dual"):
+            raise ValueError(f"loss of the pessimism must be 'squared' or 'dual', not {loss!r}")
+        sources = ("replay", "validation", "recent", "on_policy")
+        if source not in sources:
+            raise ValueError(f"source of the pessimism's transitions must be one of {sources}, not {source!r}")
+        if not 0 <= learning_rate < math.inf:
+            raise ValueError(f"learning_rate of the pessimism must be at least 0 and finite, not {learning_rate}")
+        if segment_length < 1:
+            raise ValueError(f"segment_length must be at least 1, not {segment_length}")
+        if not 0 <= td_lambda <= 1:
+            raise ValueError(f"td_lambda must lie in [0, 1], not {td_lambda}")
+        if source == "validation" and agent.validation_proportion == 0:
+            raise ValueError(
+                "the pessimism learns from transitions held out, and validation_proportion=0 holds none out: "
+                "pass validation_proportion=1/32, or another source of its transitions"
+            )
+        if source == "on_policy":
+            if loss != "dual":
+                raise ValueError(f"source='on_policy' goes with loss='dual' only, not {loss!r}")
+            if agent.exploration != "actor":
+                raise ValueError(
+                    f"OPL's segments must be on-policy, but exploration={agent.exploration!r}: "
+                    "it goes with exploration='actor' only"
+                )
+            if agent.action_noise is not None:
+                raise ValueError("OPL's segments must be on-policy: it cannot be combined with action_noise")
+        self.loss, self.source = loss, source
+        self.segment_length, self.td_lambda = segment_length, td_lambda
+        self.n_validation = max(1, round(agent.validation_proportion * agent.batch_size))
+        self.weight = nn.Parameter(torch.tensor(float(initial_pessimism)))
+        # Its learning rate is its own, whatever the schedule of the others.
+        self.optimizer = AdamW([{"params": [self.weight], "scheduled": False}], lr=learning_rate)
+        # Steps of every environment since the actor acts (and since a reset made it a new one).
+        self._n_steps = 0
 
-    def beta(self) -> float:
-        return self._beta
+    def optimizers(self) -> dict[str, Optimizer]:
+        return {"optimizer": self.optimizer}
 
-    def value(self, q: torch.Tensor) -> torch.Tensor:
-        if self._beta == 0:
-            return q.mean(dim=0)
-        if self._beta == 1 and q.shape[0] == 2:
-            return torch.minimum(q[0], q[1])
-        return super().value(q)
+    def beta(self) -> torch.Tensor:
+        return self.weight.detach()
+
+    def on_step(self, agent: "SAC", rewards: Any, dones: Any, infos: list[dict[str, Any]]) -> None:
+        # The actions of the warm-up are random.
+        self._n_steps = self._n_steps + 1 if agent.num_transitions - len(dones) >= agent.learning_starts else 0
+
+    def get_extra_state(self) -> dict[str, Any]:
+        return {"n_steps": self._n_steps}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self._n_steps = state["n_steps"]
+
+    def update(
+        self, agent: "SAC", batch: Batch, step: CriticStep, noise: torch.Tensor | None = None
+    ) -> dict[str, torch.Tensor]:
+        metrics = {"pessimism/beta": self.beta().clone()}
+        error = self._error(agent, batch, step, noise)
+        if error is not None:
+            loss = error.square().mean() if self.loss == "squared" else self.weight * error.detach().mean()
+            agent.minimize(self.optimizer, loss)
+            with torch.no_grad():
+                self.weight.clamp_(min=0)
+            metrics.update({"pessimism/loss": loss, "pessimism/error": error.mean()})
+        return metrics
+
+    def _error(self, agent: "SAC", batch: Batch, step: CriticStep, noise: torch.Tensor | None) -> torch.Tensor | None:
+        """
+        :return: error of the lower bound, (B,), its gradient through beta; None if there are too few transitions yet
+        """
+        if self.source == "replay":
+            return self._td_error(batch, step)
+        assert agent.replay_buffer is not None
+        if self.source == "validation":
+            split = agent.replay_buffer
+            assert isinstance(split, buffers.ValidationSplit)
+            if split.n_validation < self.n_validation:
+                return None
+            samples = split.sample_validation(self.n_validation, env=agent.get_vec_normalize_env())
+            batch = Batch.of(samples, agent.gamma)
+            return self._td_error(batch, self._judge(agent, batch, noise))
+        if agent.replay_buffer.size() < self.segment_length or (
+            self.source == "on_policy" and self._n_steps < self.segment_length
+        ):
+            return None
+        samples, ends = buffers.latest(agent.replay_buffer, self.segment_length, agent.get_vec_normalize_env())
+        batch = Batch.of(samples, agent.gamma)
+        judged = self._judge(agent, batch, noise)
+        if self.source == "recent":
+            return self._td_error(batch, judged)
+        shape = ends.shape
+        returns = self.lambda_returns(
+            batch.rewards.view(shape),
+            batch.dones.view(shape),
+            ends,
+            self.value(judged.next_q).mean(dim=1).view(shape),
+            judged.entropy_bonus.view(shape),
+            agent.gamma,
+            self.td_lambda,
+        )
+        return returns.view(-1) - self.value(judged.q).mean(dim=1)
+
+    @staticmethod
+    def _judge(agent: "SAC", batch: Batch, noise: torch.Tensor | None) -> CriticStep:
+        """What the critics' step computes, of other transitions."""
+        with torch.no_grad():
+            actions, log_prob = agent.policy.next_actions(batch.next_observations, noise)
+            next_q = agent.critic_target(batch.next_observations, actions)
+            return CriticStep(agent.critic(batch.observations, batch.actions), next_q, -agent.temperature() * log_prob)
+
+    def _td_error(self, batch: Batch, step: CriticStep) -> torch.Tensor:
+        """``Q_mean(s, a) - r - gamma V_lb(s')``, (B,)."""
+        next_value = pessimistic_value(step.next_q, self.weight).mean(dim=1, keepdim=True)
+        target = losses.td_target(batch.rewards, batch.dones, batch.discounts, next_value, step.entropy_bonus)
+        return step.q.mean(dim=(0, 2)) - target.squeeze(1)
+
+    @staticmethod
+    def lambda_returns(
+        rewards: torch.Tensor,
+        terminated: torch.Tensor,
+        ends: torch.Tensor,
+        next_values: torch.Tensor,
+        entropy_bonus: torch.Tensor,
+        gamma: float,
+        td_lambda: float,
+    ) -> torch.Tensor:
+        """
+        TD(lambda) returns of recent segments, the estimate of the true value that OPL compares the lower bound with
+        (P4, table 2; Kuznetsov et al. 2021)::
+
+            G_t = r_t + gamma * (h + (1 - lambda) * V + lambda * G_{t+1})     within an episode
+            G_t = r_t + gamma * (h + V)                                       at the segment's end and at a time limit
+            G_t = r_t                                                         at a termination
+
+        V and h are the lower bound of, and the entropy bonus for, an action that the actor samples anew in the next
+        state: the log-probability of the recorded one is infinite where tanh rounds to 1. After a time limit the next
+        state is the one that the episode ended in, not the first of the next episode.
+
+        :param rewards: r, (T, N) for N environments
+        :param terminated: 1 where the episode terminated, (T, N)
+        :param ends: 1 where it ended for whatever reason, (T, N)
+        :param next_values: V, (T, N)
+        :param entropy_bonus: h, (T, N)
+        :param gamma: discount factor
+        :param td_lambda: lambda
+        :return: (T, N)
+        """
+        returns = []
+        following = next_values[-1]
+        for t in reversed(range(len(rewards))):
+            weight = td_lambda * (1 - ends[t])
+            future = torch.lerp(next_values[t], following, weight) + entropy_bonus[t]
+            following = rewards[t] + gamma * (1 - terminated[t]) * future
+            returns.append(following)
+        return torch.stack(returns[::-1])
+
+
+class TOP(Pessimism):
+    """
+    Tactical optimism and pessimism (Moskovitz et al. 2021, algorithm 2): an exponential-weights bandit chooses beta
+    among a few values, one arm at a time, and is rewarded with the improvement of the episodic return.
+
+    With the arm's probability p at the time it was drawn, its log-weight grows by ``learning_rate * improvement /
+    p``. The improvement is the return of an episode minus that of the same environment's episode before, undiscounted
+    and in the rewards' own unit, averaged over the episodes that ended under the arm; an environment's first episode
+    has none. One arm is in force for all environments. Once each of them has ended an episode under it, the bandit
+    learns and draws anew; a second episode of a fast environment counts as well.
+
+    The papers' learning rate is for raw returns, up to 1000 an episode: the bandit is then quick to decide. Where
+    returns are larger, make it smaller.
+
+    At a reset the bandit starts anew too, so that the arm in force is not blamed for the drop.
+
+    :param agent: the algorithm
+    :param arms: the values of beta
+    :param learning_rate: of the bandit
+    :raises ValueError: if an argument is out of range
+    """
+
+    #: Least probability that an arm's feedback is divided by.
+    MIN_PROBABILITY = 1e-3
+
+    weight: torch.Tensor
+
+    def __init__(self, agent: "SAC", arms: Sequence[float] = (0.0, 1.0), learning_rate: float = 0.1):
+        if isinstance(arms, str) or len(arms) < 2:
+            raise ValueError(f"arms must be at least two values of the pessimism, not {arms!r}")
+        for beta in arms:
+            check_beta("each of arms", beta)
+        if not 0 <= learning_rate < math.inf:
+            raise ValueError(f"learning_rate of the bandit must be at least 0 and finite, not {learning_rate}")
+        super().__init__(arms[0])
+        self.arms = tuple(float(beta) for beta in arms)
+        self.learning_rate = learning_rate
+        #: The bandit, on the host, where it lives.
+        self.log_weights = [0.0] * len(self.arms)
+        self.arm = 0
+        self.register_buffer("weight", torch.tensor(0.0))
+        # By environment: the last episode's return, and the improvements under the arm in force.
+        self._previous: dict[int, float] = {}
+        self._improvements: dict[int, list[float]] = {}
+        self._draw()
+
+    def probabilities(self) -> list[float]:
+        """
+        :return: each arm's probability to be drawn
+        """
+        top = max(self.log_weights)
+        weights = [math.exp(w - top) for w in self.log_weights]
+        return [w / sum(weights) for w in weights]
+
+    def _draw(self) -> None:
+        probabilities = torch.tensor(self.probabilities(), dtype=torch.float64)
+        self.arm = int(torch.multinomial(probabilities, 1))
+        self.weight.fill_(self.arms[self.arm])
+        self._improvements = {}
+
+    def beta(self) -> torch.Tensor:
+        return self.weight
+
+    def on_episode_end(self, agent: "SAC", env_index: int, episode_return: float) -> None:
+        improvements = self._improvements.setdefault(env_index, [])
+        if env_index in self._previous:
+            improvements.append(episode_return - self._previous[env_index])
+        self._previous[env_index] = episode_return
+        if len(self._improvements) < agent.n_envs:
+            return
+        all_improvements = [x for of_env in self._improvements.values() for x in of_env]
+        if all_improvements:
+            feedback = sum(all_improvements) / len(all_improvements)
+            p = max(self.probabilities()[self.arm], self.MIN_PROBABILITY)
+            self.log_weights[self.arm] += self.learning_rate * feedback / p
+        self._draw()
+
+    def get_extra_state(self) -> dict[str, Any]:
+        return {
+            "arm": self.arm,
+            "log_weights": list(self.log_weights),
+            "previous": list(self._previous.items()),
+            "improvements": list(self._improvements.items()),
+        }
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self.arm, self.log_weights = state["arm"], list(state["log_weights"])
+        self._previous, self._improvements = dict(state["previous"]), dict(state["improvements"])
+
+    def update(
+        self, agent: "SAC", batch: Batch, step: CriticStep, noise: torch.Tensor | None = None
+    ) -> dict[str, torch.Tensor]:
+        return {"pessimism/beta": self.weight}
+
+
+def check_beta(name: str, beta: Any) -> None:
+    """
+    :param name: name of the argument
+    :param beta: a weight of pessimism
+    :raises ValueError: if it is not a finite number of at least 0
+    """
+    if isinstance(beta, str) or not 0 <= beta < math.inf:
+        raise ValueError(f"{name} must be at least 0 and finite (0 is the mean, 1 the minimum of two), not {beta!r}")
+
+
+def gpl(agent: "SAC", initial_pessimism: float = 1.0, learning_rate: float = 5e-5) -> LearnedPessimism:
+    """
+    Generalized pessimism learning (Cetin and Celiktutan 2023; P4, eq. 6): the dual loss on replay.
+
+    :param agent: the algorithm
+    :param initial_pessimism: beta at the start
+    :param learning_rate: of beta; 5e-5 in P4, 1e-5 in P2
+    :return: the rule
+    """
+    return LearnedPessimism(agent, "dual", "replay", initial_pessimism, learning_rate)
+
+
+def opl(
+    agent: "SAC",
+    initial_pessimism: float = 1.0,
+    learning_rate: float = 5e-5,
+    segment_length: int = 8,
+    td_lambda: float = 0.95,
+) -> LearnedPessimism:
+    """
+    On-policy pessimism learning (Kuznetsov et al. 2021; P4, tables 2 and 5): the dual loss against the TD(lambda)
+    returns of the latest steps.
+
+    :param agent: the algorithm
+    :param initial_pessimism: beta at the start
+    :param learning_rate: of beta
+    :param segment_length: steps of every environment
+    :param td_lambda: lambda of the returns
+    :return: the rule
+    """
+    return LearnedPessimism(agent, "dual", "on_policy", initial_pessimism, learning_rate, segment_length, td_lambda)
+
+
+def vpl(
+    agent: "SAC",
+    initial_pessimism: float = 1.0,
+    learning_rate: float = 5e-5,
+    loss: str = "squared",
+    source: str = "validation",
+) -> LearnedPessimism:
+    """
+    Validation pessimism learning (P4, eq. 12 and algorithm 1), and its variants.
+
+    :param agent: the algorithm
+    :param initial_pessimism: beta at the start
+    :param learning_rate: of beta
+    :param loss: "squared" or "dual"
+    :param source: "validation", "replay" or "recent"
+    :return: the rule
+    :raises ValueError: if the source is another
+    """
+    if source == "on_policy":
+        raise ValueError("source must be 'validation', 'replay' or 'recent', not 'on_policy', which is OPL's")
+    return LearnedPessimism(agent, loss, source, initial_pessimism, learning_rate)
+
+
+#: Rules that move pessimism, by the name that the algorithm's ``pessimism`` argument takes; a number is constant.
+PESSIMISMS: dict[str, Any] = {"gpl": gpl, "opl": opl, "top": TOP, "vpl": vpl}

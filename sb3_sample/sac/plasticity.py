@@ -1,4 +1,4 @@
-"""Plasticity: what keeps the networks able to learn, at the environment steps that it names."""
+"""Plasticity: what keeps the networks able to learn, at the steps that it names."""
 
 import itertools
 from collections.abc import Sequence
@@ -6,11 +6,14 @@ from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
+from sb3_sample.networks.dormant import recycle
 from sb3_sample.sac.parts import Part
 
 if TYPE_CHECKING:
     from sb3_sample.sac.algorithm import SAC
+    from sb3_sample.sac.batch import Batch
 
 
 class Resets(Part):
@@ -18,45 +21,100 @@ class Resets(Part):
     Full-parameter resets (P5, section 2.2; Nikishin et al. 2022): every network, optimizer and learned number
     starts anew, the replay buffer stays.
 
+    With ``shrink`` above 0 it is shrink and perturb (Ash and Adams 2020, in the form of D'Oro et al. 2022): every
+    parameter becomes ``shrink * old + (1 - shrink) * fresh``, target networks and learned numbers (on the scale on
+    which they are learned, that of the logarithm for a temperature) included; the optimizers start anew.
+
     A step counts transitions over the model's life, warm-up included and whatever ``learn`` zeroes; the reset
     happens at the first update at or after it. The step reached is saved with the model, so that a loaded one
     does not reset again.
 
-    :param steps: transitions at which to reset, above 0, strictly ascending; none by default
-    :raises ValueError: if the steps are not positive integers in ascending order
+    :param steps: transitions at which to reset, above 0, strictly ascending; an integer for every so many; none by
+        default
+    :param shrink: share of the old parameters that stays, in [0, 1)
+    :raises ValueError: if the steps are not positive integers in ascending order, or ``shrink`` is out of range
     """
 
-    def __init__(self, steps: Sequence[int] = ()):
+    def __init__(self, steps: Sequence[int] | int = (), shrink: float = 0.0):
         super().__init__()
-        is_sequence = isinstance(steps, (Sequence, np.ndarray))
-        if not is_sequence or not all(_is_integer(step) and step >= 1 for step in steps):
-            raise ValueError(f"resets must be a sequence of environment steps, integers of at least 1, not {steps!r}")
-        steps = tuple(steps)
-        if any(late <= early for early, late in itertools.pairwise(steps)):
-            raise ValueError(f"resets must be strictly ascending environment steps, not {steps}")
-        self.steps = steps
+        if not 0 <= shrink < 1:
+            raise ValueError(f"reset_shrink must lie in [0, 1), not {shrink}")
+        self.shrink = shrink
+        self.period: int | None = None
         self.n_done = 0
         self._reached = 0
+        if _is_integer(steps):
+            if not steps >= 1:  # type: ignore[operator]  # a number here
+                raise ValueError(f"resets must be at least 1 environment step apart, not {steps}")
+            self.period, self.steps = int(steps), ()  # type: ignore[arg-type]
+            return
+        is_sequence = isinstance(steps, (Sequence, np.ndarray))
+        if not is_sequence or not all(_is_integer(step) and step >= 1 for step in steps):  # type: ignore[union-attr]
+            raise ValueError(
+                "resets must be a sequence of environment steps, integers of at least 1, or one integer for every so "
+                f"many, not {steps!r}"
+            )
+        self.steps: tuple[int, ...] = tuple(steps)  # type: ignore[arg-type]
+        if any(late <= early for early, late in itertools.pairwise(self.steps)):
+            raise ValueError(f"resets must be strictly ascending environment steps, not {self.steps}")
 
     def before_updates(self, agent: "SAC") -> None:
-        """
-        Called before the gradient steps that follow an environment step.
-
-        :param agent: the algorithm
-        """
-        due = any(self._reached < step <= agent.num_transitions for step in self.steps)
-        self._reached = agent.num_transitions
+        now = agent.num_transitions
+        if self.period is None:
+            due = any(self._reached < step <= now for step in self.steps)
+        else:
+            due = now // self.period > self._reached // self.period
+        self._reached = now
         if due:
-            agent.reinitialize()
+            agent.reinitialize(self.shrink)
             self.n_done += 1
             if agent.verbose >= 1:
-                print(f"Reset of all parameters at {agent.num_transitions} environment steps")
+                print(f"Reset of all parameters at {now} environment steps")
 
     def get_extra_state(self) -> dict[str, Any]:
         return {"reached": self._reached, "n_done": self.n_done}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self._reached, self.n_done = state["reached"], state["n_done"]
+
+
+class ReDo(Part):
+    """
+    Recycling of dormant neurons (Sokar et al. 2023, algorithm 1) in the critics: every ``period`` gradient steps,
+    hidden neurons whose score on a batch is at most ``threshold`` get fresh incoming and zero outgoing weights. The
+    score is the mean absolute activation over that of the layer's average neuron, each critic by itself.
+
+    The targets keep their weights and follow by Polyak averaging, as after any other step.
+
+    :param period: gradient steps between two recyclings; 1,000 as in the original for DQN
+    :param threshold: score up to which a neuron is dormant; 0.025 as in the original at the default replay ratio
+    :raises ValueError: if an argument is out of range
+    """
+
+    def __init__(self, period: int = 1_000, threshold: float = 0.025):
+        super().__init__()
+        if not _is_integer(period) or period < 1:
+            raise ValueError(f"redo_period must be an integer of at least 1, or None for no recycling, not {period!r}")
+        if not threshold >= 0:
+            raise ValueError(f"redo_threshold must be at least 0, not {threshold}")
+        self.period, self.threshold = period, threshold
+
+    def after_update(self, agent: "SAC", batch: "Batch") -> dict[str, torch.Tensor]:
+        """
+        Called after every gradient step.
+
+        :param agent: the algorithm
+        :param batch: the step's batch, on which the neurons are judged
+        :return: what to log, by name, scalars
+        """
+        if agent._n_updates % self.period:
+            return {}
+        with torch.no_grad():
+            inputs = agent.critic.inputs(batch.observations, batch.actions)
+            critic = agent.critic
+            return {
+                "plasticity/n_recycled": recycle(critic.trunk, critic.head, inputs, self.threshold, critic.optimizer)
+            }
 
 
 def _is_integer(value: Any) -> bool:

@@ -1,7 +1,9 @@
 """Actor, critic ensemble and target ensemble of the off-policy family, as Stable-Baselines3 policies."""
 
+import copy
+import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -20,7 +22,7 @@ from torch import nn
 
 from sb3_sample.networks import NETWORKS, Network, linear
 from sb3_sample.optim import AdamW
-from sb3_sample.sac.losses import tanh_gaussian_log_prob
+from sb3_sample.sac.losses import gaussian_kl, tanh_gaussian_log_prob
 
 # The log standard deviation is squashed into this interval by a tanh.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
@@ -40,6 +42,8 @@ class Actor(BasePolicy):
     """
 
     action_space: spaces.Box
+    #: Whether the policy is a distribution, with an entropy that can be rewarded.
+    has_entropy: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -93,6 +97,42 @@ class Actor(BasePolicy):
         x = mean + log_std.exp() * noise
         return torch.tanh(x), tanh_gaussian_log_prob(x, noise, log_std)
 
+    def act(self, mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """
+        The action that a Gaussian stands for while exploring.
+
+        :param mean: pre-tanh mean, (B, A)
+        :param std: (B, A)
+        :param noise: standard normal noise, (B, A)
+        :return: action in [-1, 1], (B, A)
+        """
+        return torch.tanh(mean + std * noise)
+
+    def learned_action(self, mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """
+        The action through which an actor's gradient goes.
+
+        :param mean: pre-tanh mean, (B, A)
+        :param std: (B, A)
+        :param noise: standard normal noise, (B, A)
+        :return: action in [-1, 1], (B, A)
+        """
+        return self.act(mean, std, noise)
+
+    def kl(
+        self, mean: torch.Tensor, std: torch.Tensor, reference_mean: torch.Tensor, reference_std: torch.Tensor
+    ) -> torch.Tensor:
+        """
+        KL divergence of two such policies, between their pre-tanh Gaussians (the same as between the actions).
+
+        :param mean: pre-tanh mean, (B, A)
+        :param std: (B, A)
+        :param reference_mean: pre-tanh mean of the other one, (B, A)
+        :param reference_std: (B, A)
+        :return: summed over the dimensions, (B, 1)
+        """
+        return gaussian_kl(mean, std, reference_mean, reference_std)
+
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
         """
         :param obs: observations, (B, O), or a dict of them
@@ -100,10 +140,90 @@ class Actor(BasePolicy):
         :return: actions in [-1, 1], (B, A)
         """
         mean, log_std = self.gaussian(self.features(obs))
-        return torch.tanh(mean if deterministic else mean + log_std.exp() * torch.randn_like(mean))
+        return torch.tanh(mean) if deterministic else self.act(mean, log_std.exp(), torch.randn_like(mean))
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
         return self(observation, deterministic)
+
+
+class DeterministicActor(Actor):
+    """
+    Deterministic actor ``a = tanh(mean)`` of TD3 (Fujimoto et al. 2018): exploration adds Gaussian noise to the
+    action, the TD target's action is smoothed by clipped noise, and there is no entropy.
+
+    :param exploration_noise: standard deviation of the noise while exploring, in actions of [-1, 1]
+    :param target_noise: standard deviation of the noise on the target's action
+    :param target_noise_clip: bound of that noise
+    :raises ValueError: if one of them is out of range
+    """
+
+    has_entropy: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        *args: Any,
+        exploration_noise: float = 0.1,
+        target_noise: float = 0.2,
+        target_noise_clip: float = 0.5,
+        **kwargs: Any,
+    ):
+        super().__init__(*args, **kwargs)
+        if not 0 < exploration_noise < math.inf:
+            raise ValueError(f"exploration_noise must be above 0 and finite, not {exploration_noise}")
+        for name, value in (("target_noise", target_noise), ("target_noise_clip", target_noise_clip)):
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name} must be at least 0 and finite, not {value}")
+        self.log_exploration_noise = math.log(exploration_noise)
+        self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
+        del self.log_std
+
+    def gaussian(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        mean = self.mean(self.trunk(features))
+        return mean, torch.full_like(mean, self.log_exploration_noise)
+
+    def sample(self, obs: PyTorchObs, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        The action that the actor learns through: no noise, and 0 for the log-probability that it has not.
+
+        :param obs: observations, (B, O), or a dict of them
+        :param noise: ignored, there is none
+        :return: action in [-1, 1], (B, A), and zeros, (B, 1)
+        """
+        action = torch.tanh(self.mean(self.trunk(self.features(obs))))
+        return action, action.new_zeros(len(action), 1)
+
+    def smoothed(self, obs: PyTorchObs, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        The action of a TD target (TD3's target policy smoothing).
+
+        :param obs: observations, (B, O), or a dict of them
+        :param noise: standard normal noise, (B, A); drawn if None
+        :return: action in [-1, 1], (B, A), and zeros, (B, 1)
+        """
+        action, log_prob = self.sample(obs)
+        noise = torch.randn_like(action) if noise is None else noise
+        smoothing = (self.target_noise * noise).clamp(-self.target_noise_clip, self.target_noise_clip)
+        return (action + smoothing).clamp(-1, 1), log_prob
+
+    def act(self, mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        return (torch.tanh(mean) + std * noise).clamp(-1, 1)
+
+    def learned_action(self, mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        return torch.tanh(mean)
+
+    def kl(
+        self, mean: torch.Tensor, std: torch.Tensor, reference_mean: torch.Tensor, reference_std: torch.Tensor
+    ) -> torch.Tensor:
+        """
+        KL divergence of two such policies, between Gaussians of the exploration noise around the actions.
+
+        :param mean: pre-tanh mean, (B, A)
+        :param std: of the exploration noise, (B, A)
+        :param reference_mean: pre-tanh mean of the other one, (B, A)
+        :param reference_std: (B, A)
+        :return: summed over the dimensions, (B, 1)
+        """
+        return gaussian_kl(torch.tanh(mean), std, torch.tanh(reference_mean), reference_std)
 
 
 class CriticEnsemble(BaseModel):
@@ -140,15 +260,28 @@ class CriticEnsemble(BaseModel):
         self.trunk = network(in_features, n_copies=n_critics, **network_kwargs)
         self.head = linear(self.trunk.out_features, n_outputs, n_critics)
 
+    def inputs(self, obs: PyTorchObs, actions: torch.Tensor) -> torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them
+        :param actions: actions in [-1, 1], (B, A)
+        :return: what the trunk takes, (B, F + A)
+        """
+        assert isinstance(self.features_extractor, BaseFeaturesExtractor)
+        return torch.cat((self.extract_features(obs, self.features_extractor), actions), dim=1)
+
     def forward(self, obs: PyTorchObs, actions: torch.Tensor) -> torch.Tensor:
         """
         :param obs: observations, (B, O), or a dict of them
         :param actions: actions in [-1, 1], (B, A)
         :return: (E, B, K)
         """
-        assert isinstance(self.features_extractor, BaseFeaturesExtractor)
-        features = self.extract_features(obs, self.features_extractor)
-        return self.head(self.trunk(torch.cat((features, actions), dim=1)))
+        return self.head(self.trunk(self.inputs(obs, actions)))
+
+    def copied_parameters(self) -> list[nn.Parameter]:
+        """
+        :return: the parameters that each critic has a copy of, (E, ...) each: all but the features extractor's
+        """
+        return [*self.trunk.parameters(), *self.head.parameters()]
 
 
 class SACPolicy(BasePolicy):
@@ -170,8 +303,12 @@ class SACPolicy(BasePolicy):
     :param features_extractor_class: features extractor; actor and critics get one each
     :param features_extractor_kwargs: its arguments
     :param normalize_images: whether images are divided by 255
+    :param backbone: "sac" for a tanh-Gaussian actor, "td3" for a deterministic one with a target actor
+    :param actor_kwargs: arguments of the actor: with "td3" ``exploration_noise``, ``target_noise``,
+        ``target_noise_clip``
     :param optimizer_class: optimizer of actor and critics
     :param optimizer_kwargs: its arguments, but for the learning rate
+    :param critic_optimizer_kwargs: arguments of the critics' optimizer alone, over ``optimizer_kwargs``
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
@@ -196,8 +333,11 @@ class SACPolicy(BasePolicy):
         features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
         features_extractor_kwargs: dict[str, Any] | None = None,
         normalize_images: bool = True,
+        backbone: str = "sac",
+        actor_kwargs: dict[str, Any] | None = None,
         optimizer_class: type[torch.optim.Optimizer] = AdamW,
         optimizer_kwargs: dict[str, Any] | None = None,
+        critic_optimizer_kwargs: dict[str, Any] | None = None,
     ):
         super().__init__(
             observation_space,
@@ -231,19 +371,27 @@ class SACPolicy(BasePolicy):
                 normalize_images=normalize_images,
             )
 
-        self.actor = Actor(
-            observation_space,
-            action_space,
-            *actor_args,
-            features_extractor=self.make_features_extractor(),
-            normalize_images=normalize_images,
-        )
+        if backbone not in BACKBONES:
+            raise ValueError(f"backbone must be one of {sorted(BACKBONES)}, not {backbone!r}")
+        actor_kwargs = dict(actor_kwargs or {})
+        allowed = ("exploration_noise", "target_noise", "target_noise_clip") if backbone == "td3" else ()
+        for name in actor_kwargs:
+            if name not in allowed:
+                raise ValueError(f"actor_kwargs has {name!r}, but backbone={backbone!r} takes {allowed or 'none'}")
+        self._actor_class, self._actor_args = BACKBONES[backbone], (actor_args, actor_kwargs)
+        self.actor = self.make_actor()
+        #: The actor of the TD targets: a Polyak average with "td3", the actor itself with "sac".
+        self.actor_target: Actor | None = None
+        if isinstance(self.actor, DeterministicActor):
+            self.actor_target = copy.deepcopy(self.actor).requires_grad_(False)
         self.critic = critics()
         self.critic_target = critics()
         self.critic_target.load_state_dict(self.critic.state_dict())
         self.critic_target.requires_grad_(False)
         self.actor.optimizer = self.make_optimizer(self.actor.parameters(), lr_schedule)
-        self.critic.optimizer = self.make_optimizer(self.critic.parameters(), lr_schedule)
+        self.critic.optimizer = self.make_optimizer(
+            self.critic.parameters(), lr_schedule, **(critic_optimizer_kwargs or {})
+        )
         self._constructor_args: dict[str, Any] = dict(
             lr_schedule=self._dummy_schedule,
             net_arch=net_arch,
@@ -256,17 +404,48 @@ class SACPolicy(BasePolicy):
             n_quantiles=n_quantiles,
             features_extractor_class=features_extractor_class,
             features_extractor_kwargs=self.features_extractor_kwargs,
+            backbone=backbone,
+            actor_kwargs=actor_kwargs,
             optimizer_class=optimizer_class,
             optimizer_kwargs=self.optimizer_kwargs,
+            critic_optimizer_kwargs=critic_optimizer_kwargs,
         )
 
-    def make_optimizer(self, parameters: Any, lr_schedule: Schedule) -> torch.optim.Optimizer:
+    def make_actor(self) -> Actor:
+        """
+        :return: an actor of the policy's class and settings, with parameters of its own
+        """
+        args, kwargs = self._actor_args
+        return self._actor_class(
+            self.observation_space,
+            self.action_space,
+            *args,
+            features_extractor=self.make_features_extractor(),
+            normalize_images=self.normalize_images,
+            **kwargs,
+        )
+
+    def make_optimizer(self, parameters: Any, lr_schedule: Schedule, **kwargs: Any) -> torch.optim.Optimizer:
         """
         :param parameters: what to optimise
         :param lr_schedule: learning rate schedule
+        :param kwargs: settings over the policy's
         :return: an optimizer of the policy's class and settings
         """
-        return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+        settings = {**self.optimizer_kwargs, **kwargs}
+        return self.optimizer_class(parameters, lr=lr_schedule(1), **settings)  # type: ignore[call-arg]
+
+    def next_actions(self, obs: PyTorchObs, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        Actions of a TD target.
+
+        :param obs: next observations, (B, O), or a dict of them
+        :param noise: standard normal noise, (B, A); drawn if None
+        :return: actions in [-1, 1], (B, A), and their log-probability (0 for a deterministic actor), (B, 1)
+        """
+        if isinstance(self.actor_target, DeterministicActor):
+            return self.actor_target.smoothed(obs, noise)
+        return self.actor.sample(obs, noise)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), **self._constructor_args}
@@ -291,12 +470,17 @@ class SACPolicy(BasePolicy):
 
     def set_training_mode(self, mode: bool) -> None:
         """
-        :param mode: training (True) or evaluation mode of actor and critics; the targets stay in evaluation mode
+        :param mode: training (True) or evaluation mode of actor and critics. Of the targets, the features extractors
+            stay in evaluation mode, the rest follows: dropout is active in the target critics too (DroQ)
         """
         self.actor.set_training_mode(mode)
         self.critic.set_training_mode(mode)
+        self.critic_target.trunk.train(mode)
         self.training = mode
 
+
+#: The actor's class by the name that the policy's ``backbone`` takes.
+BACKBONES: dict[str, type[Actor]] = {"sac": Actor, "td3": DeterministicActor}
 
 MlpPolicy = SACPolicy
 

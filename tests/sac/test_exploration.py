@@ -50,7 +50,7 @@ def test_starts_near_the_pessimistic_actor() -> None:
     with torch.no_grad():
         features = model.actor.features(observations)
         mean, _log_std = model.actor.gaussian(features)
-        shift = exploration._mean(features, mean) - mean
+        shift = exploration._gaussian(None, features, mean, mean)[0] - mean
     # Kernel gain 0.01 and no bias. The trunk's width is 8, its features of order 3.
     assert 0 < shift.abs().max() < 0.15
 
@@ -99,7 +99,7 @@ def test_kl_is_the_squared_shift_alone(multiplier: float) -> None:
     with torch.no_grad():
         features = model.actor.features(batch.observations)
         mean, log_std = model.actor.gaussian(features)
-        shift = exploration._mean(features, mean) - mean
+        shift = exploration._gaussian(None, features, mean, mean)[0] - mean
     expected = (shift / log_std.exp()).square().mean() / 2
     assert metrics["exploration/kl"].item() == pytest.approx(expected.item(), rel=1e-4)
 
@@ -148,7 +148,7 @@ def test_shift_climbs_the_optimistic_value() -> None:
     with torch.no_grad():
         features = model.actor.features(batch.observations)
         mean, _ = model.actor.gaussian(features)
-        shift = exploration._mean(features, mean) - mean
+        shift = exploration._gaussian(None, features, mean, mean)[0] - mean
     assert shift[:, 0].mean() > 0.1 and shift[:, 1].mean() > 0.1, shift
     assert metrics["exploration/q_std"].item() > 5
 

@@ -17,13 +17,15 @@ import torch
 from gymnasium import spaces
 from torch import nn
 
-from sb3_sample import BRO
-from sb3_sample.networks import BroNet
+from sb3_sample import BRO, DAC
+from sb3_sample.networks import MLP, BroNet
+from sb3_sample.networks.ensemble import EnsembleLayerNorm, EnsembleLinear
+from sb3_sample.sac import SAC
 from sb3_sample.sac.batch import Batch, Noise
 
 OWN_FOLDER = Path(__file__).parents[1] / "golden"
 FOLDER = Path(os.environ.get("SB3_SAMPLE_GOLDEN") or OWN_FOLDER)
-FILES = sorted(path for path in FOLDER.glob("*.npz") if not path.stem.startswith("dac"))
+FILES = sorted(FOLDER.glob("*.npz"))
 
 INFO_TOLERANCE = 3e-5
 SCALAR_TOLERANCE = 2e-7
@@ -48,39 +50,58 @@ class Shapes(gym.Env):
         return self.observation_space.sample(), 0.0, False, False, {}
 
 
-def trunk_layers(trunk: BroNet, path: str) -> dict[str, nn.Module]:
+def trunk_layers(trunk: BroNet | MLP, path: str) -> dict[str, nn.Module]:
     """The trunk's layers by the names of the files."""
-    layers: dict[str, nn.Module] = {f"{path}/Dense_0": trunk.dense, f"{path}/LayerNorm_0": trunk.norm}
-    for k, block in enumerate(trunk.blocks):
-        layers[f"{path}/Dense_{2 * k + 1}"], layers[f"{path}/LayerNorm_{2 * k + 1}"] = block.dense1, block.norm1
-        layers[f"{path}/Dense_{2 * k + 2}"], layers[f"{path}/LayerNorm_{2 * k + 2}"] = block.dense2, block.norm2
-    return layers
+    if isinstance(trunk, BroNet):
+        layers: dict[str, nn.Module] = {f"{path}/Dense_0": trunk.dense, f"{path}/LayerNorm_0": trunk.norm}
+        for k, block in enumerate(trunk.blocks):
+            layers[f"{path}/Dense_{2 * k + 1}"], layers[f"{path}/LayerNorm_{2 * k + 1}"] = block.dense1, block.norm1
+            layers[f"{path}/Dense_{2 * k + 2}"], layers[f"{path}/LayerNorm_{2 * k + 2}"] = block.dense2, block.norm2
+        return layers
+    dense = [layer for layer in trunk.modules() if isinstance(layer, (nn.Linear, EnsembleLinear))]
+    norms = [layer for layer in trunk.modules() if isinstance(layer, (nn.LayerNorm, EnsembleLayerNorm))]
+    return {f"{path}/Dense_{k}": layer for k, layer in enumerate(dense)} | {
+        f"{path}/LayerNorm_{k}": layer for k, layer in enumerate(norms)
+    }
 
 
-def named_parameters(model: BRO) -> dict[str, torch.Tensor]:
+def named_parameters(model: SAC) -> dict[str, torch.Tensor]:
     """Views of every parameter of the model by its name and in its layout in the files."""
+    is_bro = isinstance(model, BRO)
+    network = "BroNet_0" if is_bro else "MLP_0"
     single = {"actor/Dense_0": model.actor.mean, "actor/Dense_1": model.actor.log_std}
-    single.update(trunk_layers(model.actor.trunk, "actor/BroNet_0"))
-    single.update(trunk_layers(model.explorer.trunk, "actor_o/BroNet_0"))
-    single["actor_o/Dense_0"] = model.explorer.shift
+    single.update(trunk_layers(model.actor.trunk, f"actor/{network}"))
+    explorer: Any = model.explorer
+    if is_bro:
+        single.update(trunk_layers(explorer.trunk, f"actor_o/{network}"))
+        single["actor_o/Dense_0"] = explorer.shift
+    else:
+        single.update(trunk_layers(explorer.actor.trunk, f"actor_o/{network}"))
+        single["actor_o/Dense_0"], single["actor_o/Dense_1"] = explorer.actor.mean, explorer.actor.log_std
     named: dict[str, torch.Tensor] = {}
     for name, layer in single.items():
         is_norm = isinstance(layer, nn.LayerNorm)
         named[f"{name}/{'scale' if is_norm else 'kernel'}"] = layer.weight if is_norm else layer.weight.T
         if layer.bias is not None:
             named[f"{name}/bias"] = layer.bias
+    path = "Critic_{}/BroNet_0" if is_bro else "CriticLN_{}/MLPLN_0"
     for module, critic in (("critic", model.critic), ("target_critic", model.critic_target)):
-        n_blocks = len(critic.trunk.blocks)
-        layers = {**trunk_layers(critic.trunk, "BroNet_0"), f"BroNet_0/Dense_{2 * n_blocks + 1}": critic.head}
+        layers = trunk_layers(critic.trunk, path)
+        n_dense = sum("Dense" in name for name in layers)
+        layers[f"{path}/Dense_{n_dense}"] = critic.head
         for name, layer in layers.items():
             for e in range(2):
-                norm = "LayerNorm" in name
-                weight = layer.weight[e, 0] if norm else layer.weight[e]
-                named[f"{module}/Critic_{e}/{name}/{'scale' if norm else 'kernel'}"] = weight
-                named[f"{module}/Critic_{e}/{name}/bias"] = layer.bias[e, 0]
+                is_norm = "LayerNorm" in name
+                weight = layer.weight[e, 0] if is_norm else layer.weight[e]
+                named[f"{module}/{name.format(e)}/{'scale' if is_norm else 'kernel'}"] = weight
+                named[f"{module}/{name.format(e)}/bias"] = layer.bias[e, 0]
     named["temp/log_temp"] = model.temperature.log_value
-    named["optimism/log_value"] = model.explorer.optimism.raw_value
-    named["regularizer/log_value"] = model.explorer.kl_weight.raw_value
+    if is_bro:
+        named["optimism/log_value"] = explorer.optimism.raw_value
+        named["regularizer/log_value"] = explorer.kl_weight.raw_value
+    else:
+        named["optimism/log_temp"] = explorer.optimism_distance.log_value
+        named["regularizer/log_temp"] = explorer.kl_weight.log_value
     return named
 
 
@@ -88,39 +109,73 @@ def norm(tensors: list[torch.Tensor]) -> float:
     return float(torch.stack([t.detach().double().square().sum() for t in tensors]).sum().sqrt())
 
 
-def mean_std(model: BRO, observations: torch.Tensor) -> float:
+def mean_std(actor: Any, observations: torch.Tensor) -> float:
     with torch.no_grad():
-        return float(model.actor.gaussian(model.actor.features(observations))[1].exp().mean())
+        return float(actor.gaussian(actor.features(observations))[1].exp().mean())
 
 
-def build(meta: dict[str, Any]) -> BRO:
-    dims, hp = meta["dims"], meta["hyperparameters"]
-    return BRO(
-        "MlpPolicy",
-        Shapes(dims["obs_dim"], dims["act_dim"]),
+def build(meta: dict[str, Any]) -> SAC:
+    dims, hp, optimizers = meta["dims"], meta["hyperparameters"], meta["optimizers"]
+    shared: dict[str, Any] = dict(
         gamma=hp["discount"],
         tau=hp["tau"],
-        model_size=(dims["critic_depth"], dims["critic_hidden"]),
-        n_quantiles=dims["n_quantiles"] if hp["distributional"] else None,
-        pessimism=hp["pessimism"],
         kl_target=hp["kl_target"],
         std_multiplier=hp["std_multiplier"],
         target_entropy=hp["target_entropy"],
-        weight_decay=meta["optimizers"]["critic"]["weight_decay"],
-        learning_rate=meta["optimizers"]["critic"]["lr"],
-        adjustment_learning_rate=meta["optimizers"]["optimism"]["lr"],
-        policy_kwargs={"actor_network_kwargs": {"width": dims["actor_hidden"], "n_blocks": dims["actor_depth"]}},
-        exploration_kwargs={"network_kwargs": {"width": dims["actor_o_hidden"], "n_blocks": dims["actor_o_depth"]}},
+        learning_rate=optimizers["critic"]["lr"],
+        adjustment_learning_rate=optimizers["optimism"]["lr"],
         buffer_size=1,
         device="cpu",
     )
+    env = Shapes(dims["obs_dim"], dims["act_dim"])
+    if "beta_lb" in hp:
+        assert hp["beta_lb"] == hp["beta_critic"], "one pessimism for critics and actor"
+        return DAC(
+            "MlpPolicy",
+            env,
+            pessimism=hp["beta_lb"],
+            policy_kwargs={
+                "net_arch": {"pi": dims["actor_hidden"], "qf": dims["critic_hidden"]},
+                "critic_network_kwargs": {"layer_norm": True},
+            },
+            **shared,
+        )
+    return BRO(
+        "MlpPolicy",
+        env,
+        model_size=(dims["critic_depth"], dims["critic_hidden"]),
+        n_quantiles=dims["n_quantiles"] if hp["distributional"] else None,
+        pessimism=hp["pessimism"],
+        weight_decay=optimizers["critic"]["weight_decay"],
+        policy_kwargs={"actor_network_kwargs": {"width": dims["actor_hidden"], "n_blocks": dims["actor_depth"]}},
+        exploration_kwargs={"network_kwargs": {"width": dims["actor_o_hidden"], "n_blocks": dims["actor_o_depth"]}},
+        **shared,
+    )
 
 
-def replay(path: Path) -> tuple[BRO, dict[str, np.ndarray], dict[int, dict[str, float]]]:
+#: Names of the reported numbers in both kinds of file, and in ours.
+SHARED_NAMES = {
+    "critic_loss": "train/critic_loss",
+    "actor_loss": "train/actor_loss",
+    "entropy": "train/entropy",
+    "temperature": "train/ent_coef",
+    "temp_loss": "train/ent_coef_loss",
+    "actor_o_loss": "exploration/actor_loss",
+    "optimism_loss": "exploration/optimism_loss",
+    "kl_weight": "exploration/kl_weight",
+    "regularizer_loss": "exploration/kl_weight_loss",
+    "Q_mean": "exploration/q_mean",
+    "Q_std": "exploration/q_std",
+}
+
+
+def replay(path: Path) -> tuple[SAC, dict[str, np.ndarray], dict[int, dict[str, float]]]:
     """Run the file's updates; return the model, the file, and what the updates reported."""
     data = dict(np.load(path))
     meta = json.loads(str(data["meta"]))
     model = build(meta)
+    is_bro = isinstance(model, BRO)
+    explorer: Any = model.explorer
     named = named_parameters(model)
     stored = {key.removeprefix("init/"): value for key, value in data.items() if key.startswith("init/")}
     assert named.keys() == stored.keys()
@@ -139,37 +194,41 @@ def replay(path: Path) -> tuple[BRO, dict[str, np.ndarray], dict[int, dict[str, 
         groups = {
             "critic": list(model.critic.parameters()),
             "actor": list(model.actor.parameters()),
-            "actor_o": model.explorer.actor_optimizer.param_groups[0]["params"],
+            "actor_o": explorer.actor_optimizer.param_groups[0]["params"],
         }
         reported = {f"{name}_pnorm": norm(parameters) for name, parameters in groups.items()}
         a = actions.clone().requires_grad_()
         q = model.critic(observations, a)
         q1, q2 = q.mean(dim=(1, 2))
         reported["critic_agnorm"] = float(torch.autograd.grad(0.5 * (q1 + q2), a)[0].norm(dim=1).mean())
-        reported.update(q1=q1.item(), q2=q2.item(), r=rewards.mean().item(), std=mean_std(model, observations))
+        reported.update(q1=q1.item(), q2=q2.item(), r=rewards.mean().item(), std=mean_std(model.actor, observations))
+        with torch.no_grad():
+            reported["actor_action"] = model.actor.sample(observations, noise.actor)[0].abs().mean().item()
+            if not is_bro:
+                reported["std_e"] = mean_std(explorer.actor, observations)
+                optimistic_mean = torch.tanh(explorer.actor.gaussian(explorer.actor.features(observations))[0])
 
         metrics = {name: value.item() for name, value in model._update(batch, noise).items()}
-        for theirs, ours in {
-            "critic_loss": "train/critic_loss",
-            "actor_loss": "train/actor_loss",
-            "entropy": "train/entropy",
-            "temperature": "train/ent_coef",
-            "temp_loss": "train/ent_coef_loss",
-            "actor_o_loss": "exploration/actor_loss",
-            "optimism": "exploration/optimism",
-            "optimism_loss": "exploration/optimism_loss",
-            "kl_weight": "exploration/kl_weight",
-            "regularizer_loss": "exploration/kl_weight_loss",
-            "Q_mean": "exploration/q_mean",
-            "Q_std": "exploration/q_std",
-        }.items():
-            reported[theirs] = metrics[ours]
-        reported["kl"] = metrics["exploration/kl"] * meta["dims"]["act_dim"]
-        reported.update({f"{name}_gnorm": norm([p.grad for p in ps]) for name, ps in groups.items()})
-        # The optimistic actor started from the new actor's standard deviation.
-        reported["std_c"] = mean_std(model, observations)
-        reported["std_o"] = reported["std_c"] * model.explorer.std_multiplier
-        info[i] = reported
+        reported.update({theirs: metrics[ours] for theirs, ours in SHARED_NAMES.items()})
+        gradient_norms = {f"{name}_gnorm": norm([p.grad for p in ps]) for name, ps in groups.items()}
+        if is_bro:
+            reported["optimism"] = metrics["exploration/optimism"]
+            reported["kl"] = metrics["exploration/kl"] * meta["dims"]["act_dim"]
+            # The optimistic actor started from the new actor's standard deviation.
+            reported["std_c"] = mean_std(model.actor, observations)
+            reported["std_o"] = reported["std_c"] * explorer.std_multiplier
+        else:
+            reported["beta_ub"] = metrics["exploration/optimism"]
+            reported["kl"] = metrics["exploration/kl"]
+            reported["KLoss"] = reported["kl"] * meta["dims"]["act_dim"]
+            reported["Qloss"] = -(metrics["exploration/q_mean"] + reported["beta_ub"] * metrics["exploration/q_std"])
+            gradient_norms["actor_c_gnorm"] = gradient_norms.pop("actor_gnorm")
+            # The optimistic actor was compared with the new actor.
+            reported["std"] = mean_std(model.actor, observations)
+            with torch.no_grad():
+                mean = torch.tanh(model.actor.gaussian(model.actor.features(observations))[0])
+            reported["actor_mu_diff"] = (mean - optimistic_mean).abs().mean().item()
+        info[i] = {**reported, **gradient_norms}
 
         if i < meta["dims"]["n_updates"] - 1 and f"after/{i}/temp/log_temp" in data:
             check_parameters(named, data, f"after/{i}/", i + 1, model)
@@ -177,13 +236,13 @@ def replay(path: Path) -> tuple[BRO, dict[str, np.ndarray], dict[int, dict[str, 
 
 
 def check_parameters(
-    named: dict[str, torch.Tensor], data: dict[str, np.ndarray], prefix: str, n_updates: int, model: BRO
+    named: dict[str, torch.Tensor], data: dict[str, np.ndarray], prefix: str, n_updates: int, model: SAC
 ) -> None:
-    learned_numbers = {"temp/log_temp", "optimism/log_value", "regularizer/log_value"}
+    learned_numbers = ("temp/", "optimism/", "regularizer/")
     dot = square = 0.0
     for name, value in named.items():
         ours, theirs = value.detach().double().numpy(), data[prefix + name].astype(np.float64)
-        limit = SCALAR_TOLERANCE if name in learned_numbers else parameter_tolerance(n_updates)
+        limit = SCALAR_TOLERANCE if name.startswith(learned_numbers) else parameter_tolerance(n_updates)
         error = np.abs(ours - theirs).max()
         assert error <= limit, f"{prefix}{name}: off by {error:.2e}, allowed {limit:.0e}"
         if name.split("/")[0] in {"actor", "actor_o", "critic"}:
@@ -194,11 +253,13 @@ def check_parameters(
 
 
 def test_files_are_there() -> None:
-    assert FILES, f"no file of BRO's updates in {FOLDER}"
+    assert FILES, f"no file of updates in {FOLDER}"
+    kinds = {path.stem.split("_")[0] for path in OWN_FOLDER.glob("*.npz")}
+    assert kinds == {"bro", "dac"}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_golden_bro(path: Path) -> None:
+def test_golden(path: Path) -> None:
     model, data, info = replay(path)
     n_updates = len(info)
     check_parameters(named_parameters(model), data, "final/", n_updates, model)

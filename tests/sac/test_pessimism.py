@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sb3_sample.sac.pessimism import FixedPessimism, epistemic_std
+from sb3_sample.sac.pessimism import Pessimism, epistemic_std
 from tests.sac.common import bro, random_batch, sac
 
 Q = torch.tensor([[[1.0, 2.0], [3.0, 0.0]], [[3.0, -2.0], [3.0, 4.0]]])  # (E, B, K) = (2, 2, 2)
@@ -37,13 +37,13 @@ def test_spread_of_agreeing_critics_has_a_finite_gradient(n_critics: int) -> Non
     ],
 )
 def test_value_by_hand(beta: float, expected: list[list[float]]) -> None:
-    torch.testing.assert_close(FixedPessimism(beta).value(Q), torch.tensor(expected))
+    torch.testing.assert_close(Pessimism(beta).value(Q), torch.tensor(expected))
 
 
 def test_three_critics_by_hand() -> None:
     q = torch.tensor([1.0, 2.0, 6.0]).reshape(3, 1, 1)
     # Mean 3, population variance (4 + 1 + 9) / 3.
-    value = FixedPessimism(1.0).value(q)
+    value = Pessimism(1.0).value(q)
     assert value.item() == pytest.approx(3 - (14 / 3) ** 0.5, rel=1e-6)
 
 
@@ -51,14 +51,14 @@ def test_shortcuts_are_the_formula() -> None:
     q = torch.randn(2, 5, 4)
     for beta in (0.0, 1.0):
         torch.testing.assert_close(
-            FixedPessimism(beta).value(q), q.mean(dim=0) - beta * q.std(dim=0, unbiased=False), rtol=1e-5, atol=1e-6
+            Pessimism(beta).value(q), q.mean(dim=0) - beta * q.std(dim=0, unbiased=False), rtol=1e-5, atol=1e-6
         )
 
 
 @pytest.mark.parametrize("beta", [-0.1, float("nan")])
 def test_bad_beta(beta: float) -> None:
     with pytest.raises(ValueError, match=f"pessimism.*{beta}"):
-        FixedPessimism(beta)
+        Pessimism(beta)
     with pytest.raises(ValueError, match=f"pessimism.*{beta}"):
         bro(pessimism=beta)
 

@@ -149,7 +149,7 @@ def test_resets_depend_on_the_seed_alone() -> None:
 def test_the_log_tells(capsys: pytest.CaptureFixture[str]) -> None:
     model = sac(resets=(20,), verbose=1)
     model.learn(30, log_interval=1)
-    assert "n_resets" in capsys.readouterr().out
+    assert "reset " in capsys.readouterr().out
     assert model.logger.name_to_value is not None
     model.dump_logs()
 
@@ -161,7 +161,7 @@ def test_logged_value(tmp_path: Path) -> None:
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(35, log_interval=1)
     header, *rows = (tmp_path / "progress.csv").read_text().splitlines()
-    column = header.split(",").index("plasticity/n_resets")
+    column = header.split(",").index("plasticity/reset")
     # Episodes of 7 steps end at 7, 14, 21, 28 and 35; the log of 21 is written before the update of 21.
     assert [float(row.split(",")[column]) for row in rows] == [0, 0, 1, 1, 1]
 

@@ -414,7 +414,7 @@ def test_tensorboard(tmp_path: Path) -> None:
     tags = set(events.Tags()["scalars"])
     assert {
         "rollout/ep_rew_mean", "train/critic_loss", "train/actor_loss", "train/ent_coef", "train/ent_coef_loss",
-        "train/learning_rate", "exploration/optimism", "exploration/kl", "plasticity/n_resets",
+        "train/learning_rate", "exploration/optimism", "exploration/kl", "plasticity/reset",
     } <= tags  # fmt: skip
     assert all(np.isfinite(e.value) for tag in tags for e in events.Scalars(tag))
 

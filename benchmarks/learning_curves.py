@@ -1,0 +1,73 @@
+"""
+Train one agent with the settings of the papers' comparison, evaluating as it learns.
+
+    OMP_NUM_THREADS=1 python benchmarks/learning_curves.py --agent SAC --seed 0 --output runs
+
+Every agent has the papers' shared settings: two hidden layers of 256, batch 256, two gradient steps a transition, 10,000
+random steps, target entropy -|A|/2, Adam 3e-4. SRSAC takes eight gradient steps and is reset every 10,000 steps, the
+papers' 16 and 160,000 scaled to a short run. The run goes to ``OUTPUT/AGENT/seed_SEED`` (``evaluations.npz``, Monitor
+files), ``learning_summary.py`` makes a table and a picture of all of them.
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import stable_baselines3
+import torch
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+
+import sb3_sample
+
+#: Arguments that differ from the class's defaults.
+AGENTS: dict[str, dict[str, Any]] = {
+    "SAC": {},
+    "DAC": {},
+    "VPLSAC": {},
+    "TOPSAC": {},
+    "GPLSAC": {},
+    "OPLSAC": {},
+    "OAC": {},
+    "SRSAC": {"replay_ratio": 8, "resets": 10_000},
+}
+#: stable_baselines3.SAC with the same settings.
+SB3 = "SAC (stable_baselines3)"
+
+
+def build(agent: str, env_id: str, seed: int) -> Any:
+    env = make_vec_env(env_id, seed=seed)
+    if agent == SB3:
+        return stable_baselines3.SAC(
+            "MlpPolicy", env, learning_starts=10_000, gradient_steps=2, target_entropy=-env.action_space.shape[0] / 2,
+            seed=seed, device="cpu",
+        )  # fmt: skip
+    return getattr(sb3_sample, agent)("MlpPolicy", env, seed=seed, device="cpu", **AGENTS[agent])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--agent", required=True, choices=[SB3, *AGENTS])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--env", default="dmc/cartpole-swingup-v0")
+    parser.add_argument("--steps", type=int, default=30_000)
+    parser.add_argument("--eval-freq", type=int, default=5_000)
+    parser.add_argument("--output", type=Path, default=Path("runs"))
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+
+    folder = args.output / args.agent / f"seed_{args.seed}"
+    folder.mkdir(parents=True, exist_ok=True)
+    model = build(args.agent, args.env, args.seed)
+    evaluation = EvalCallback(
+        make_vec_env(args.env, seed=args.seed + 1_000), n_eval_episodes=5, eval_freq=args.eval_freq,
+        log_path=str(folder), verbose=0,
+    )  # fmt: skip
+    model.set_logger(configure(str(folder), ["csv"]))
+    model.learn(args.steps, callback=evaluation)
+    model.save(folder / "model")
+
+
+if __name__ == "__main__":
+    main()

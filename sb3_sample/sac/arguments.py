@@ -1,0 +1,151 @@
+"""Checks of the off-policy family's arguments, and the defaults that follow from others."""
+
+import inspect
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.type_aliases import TrainFreq
+
+from sb3_sample.sac.buffers import ValidationSplit
+from sb3_sample.sac.exploration import EXPLORATIONS
+from sb3_sample.sac.pessimism import PESSIMISMS, check_beta
+
+if TYPE_CHECKING:
+    from sb3_sample.sac.algorithm import SAC
+
+
+def check(agent: "SAC") -> None:
+    """
+    :param agent: an algorithm whose arguments are stored and whose networks do not exist yet
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+    for name, low in (
+        ("buffer_size", 1),
+        ("learning_starts", 0),
+        ("batch_size", 1),
+        ("target_update_interval", 1),
+        ("policy_delay", 1),
+        ("n_steps", 1),
+    ):
+        if not getattr(agent, name) >= low:
+            raise ValueError(f"{name} must be at least {low}, not {getattr(agent, name)}")
+    if (
+        not callable(agent.learning_rate)
+        and not 0 <= number("learning_rate", agent.learning_rate, "a schedule") < math.inf
+    ):
+        raise ValueError(f"learning_rate must be at least 0 and finite, or a schedule, not {agent.learning_rate}")
+    if isinstance(agent.replay_ratio, str) or not (agent.replay_ratio is None or 0 <= agent.replay_ratio < math.inf):
+        raise ValueError(f"replay_ratio must be at least 0 and finite, not {agent.replay_ratio!r}")
+    if not 0 < agent.tau <= 1:
+        raise ValueError(f"tau must lie in (0, 1], not {agent.tau}")
+    if not 0 <= agent.gamma <= 1:
+        raise ValueError(f"gamma must lie in [0, 1], not {agent.gamma}")
+    if agent.target_entropy != "auto" and not math.isfinite(number("target_entropy", agent.target_entropy, "'auto'")):
+        raise ValueError(f"target_entropy must be finite, or 'auto', not {agent.target_entropy}")
+    if agent.exploration not in EXPLORATIONS:
+        raise ValueError(f"exploration must be one of {sorted(EXPLORATIONS)}, not {agent.exploration!r}")
+    if agent.sam_radius is not None and not 0 < agent.sam_radius < math.inf:
+        raise ValueError(f"sam_radius must be above 0 and finite, or None for no SAM, not {agent.sam_radius}")
+    for name in ("n_quantiles", "backbone"):
+        if name in agent.policy_kwargs:
+            raise ValueError(f"{name} is an argument of the algorithm, not of policy_kwargs")
+    _check_backbone(agent)
+    _check_pessimism(agent)
+    _check_replay(agent)
+    _check_train_freq(agent)
+
+
+def _check_backbone(agent: "SAC") -> None:
+    if agent.backbone == "td3":
+        for name in ("ent_coef", "target_entropy"):
+            if getattr(agent, name) != "auto":
+                raise ValueError(
+                    f"{name}={getattr(agent, name)!r} asks for an entropy, which a deterministic actor "
+                    f"(backbone='td3') has not: leave {name} out"
+                )
+
+
+def _check_pessimism(agent: "SAC") -> None:
+    if isinstance(agent.pessimism, str):
+        if agent.pessimism not in PESSIMISMS:
+            raise ValueError(f"pessimism must be a number, or one of {sorted(PESSIMISMS)}, not {agent.pessimism!r}")
+    else:
+        check_beta("pessimism", agent.pessimism)
+        if agent.pessimism_kwargs:
+            raise ValueError(
+                f"pessimism_kwargs={agent.pessimism_kwargs} are arguments of a rule that moves pessimism, but "
+                f"pessimism={agent.pessimism} is fixed: pass pessimism as one of {sorted(PESSIMISMS)}"
+            )
+    if agent.actor_pessimism is not None:
+        check_beta("actor_pessimism", agent.actor_pessimism)
+    if agent.target_subset is not None:
+        n_critics = agent.policy_kwargs.get("n_critics", 2)
+        if not 1 <= agent.target_subset <= n_critics:
+            raise ValueError(
+                f"target_subset must lie between 1 and the number of critics, {n_critics} "
+                f"(policy_kwargs['n_critics']), or be None for all, not {agent.target_subset}"
+            )
+
+
+def _check_replay(agent: "SAC") -> None:
+    if not 0 <= agent.validation_proportion < 1:
+        raise ValueError(f"validation_proportion must lie in [0, 1), not {agent.validation_proportion}")
+    if agent.validation_proportion > 0:
+        cls = agent.replay_buffer_class
+        if cls is not None and cls not in (ReplayBuffer, DictReplayBuffer) and not issubclass(cls, ValidationSplit):
+            raise ValueError(
+                f"validation_proportion={agent.validation_proportion} holds single transitions out, and "
+                f"{cls.__name__} makes its samples of several (relabelled goals, n-step returns), which would carry "
+                "them into training: leave replay_buffer_class out, or pass validation_proportion=0"
+            )
+        if agent.n_steps > 1:
+            raise ValueError(
+                f"validation_proportion={agent.validation_proportion} holds single transitions out, which "
+                f"n_steps={agent.n_steps} would carry into training: pass n_steps=1, or validation_proportion=0"
+            )
+        if agent.optimize_memory_usage:
+            raise ValueError("optimize_memory_usage=True cannot be combined with validation_proportion above 0")
+
+
+def _check_train_freq(agent: "SAC") -> None:
+    train_freq: Any = agent.train_freq
+    if not isinstance(train_freq, TrainFreq):
+        every, unit = train_freq if isinstance(train_freq, tuple) else (train_freq, "step")
+        if not isinstance(every, int) or every < 1 or unit not in ("step", "episode"):
+            raise ValueError(f"train_freq must be at least 1, or (n, 'step' or 'episode'), not {train_freq!r}")
+        if unit == "episode" and agent.env is not None and agent.n_envs > 1:
+            raise ValueError(
+                f"train_freq={train_freq!r} counts episodes, which needs one environment, not {agent.n_envs}"
+            )
+
+
+def check_names(argument: str, choice: str, make: Callable[..., Any], kwargs: dict[str, Any]) -> None:
+    """
+    :param argument: name of the argument that chose a part
+    :param choice: its value
+    :param make: what builds the part, from the algorithm and these arguments
+    :param kwargs: arguments for it
+    :raises ValueError: if one of them is none that it takes
+    """
+    allowed = [name for name in inspect.signature(make).parameters if name not in ("self", "agent")]
+    for name in kwargs:
+        if name not in allowed:
+            raise ValueError(f"{argument}_kwargs has {name!r}, but {argument}={choice!r} takes {allowed or 'none'}")
+
+
+def number(name: str, value: Any, otherwise: str, shown: Any = None) -> float:
+    """
+    :param name: name of an argument
+    :param value: its value
+    :param otherwise: what else is allowed, for the error
+    :param shown: the value as the error shows it, if that is another
+    :return: the value as a number
+    :raises ValueError: if it is not one
+    """
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        shown = value if shown is None else shown
+        raise ValueError(f"{name} must be a number, or {otherwise}, not {shown!r}") from None

@@ -1,0 +1,167 @@
+"""Replay: transitions by their place in a buffer, and buffers that hold some transitions out for validation."""
+
+# The generator that Stable-Baselines3 seeds and its buffers draw from:
+# ruff: noqa: NPY002
+
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+
+def samples_at(
+    buffer: ReplayBuffer, positions: np.ndarray, env_indices: np.ndarray, vec_normalize: VecNormalize | None = None
+) -> ReplayBufferSamples | DictReplayBufferSamples:
+    """
+    Named transitions of a replay buffer, each one step, whatever the buffer's own ``sample`` makes of them
+    (n-step returns, relabelled goals).
+
+    :param buffer: Stable-Baselines3's replay buffer or a subclass
+    :param positions: places in the buffer, (N,)
+    :param env_indices: which environment's transition, (N,)
+    :param vec_normalize: normalises observations and rewards
+    :return: N transitions, as the buffer's ``sample`` gives them
+    """
+
+    def rows(arrays: Any, at: np.ndarray) -> Any:
+        if isinstance(arrays, dict):
+            return {key: array[at, env_indices] for key, array in arrays.items()}
+        return arrays[at, env_indices]
+
+    def tensors(observations: Any) -> Any:
+        normalized = buffer._normalize_obs(observations, vec_normalize)
+        if isinstance(normalized, dict):
+            return {key: buffer.to_torch(array) for key, array in normalized.items()}
+        return buffer.to_torch(normalized)
+
+    if buffer.optimize_memory_usage:
+        next_observations = rows(buffer.observations, (positions + 1) % buffer.buffer_size)
+    else:
+        next_observations = rows(buffer.next_observations, positions)
+    dones = rows(buffer.dones, positions) * (1 - rows(buffer.timeouts, positions))
+    rewards = buffer._normalize_reward(rows(buffer.rewards, positions).reshape(-1, 1), vec_normalize)
+    columns: tuple[Any, ...] = (
+        tensors(rows(buffer.observations, positions)),
+        buffer.to_torch(rows(buffer.actions, positions)),
+        tensors(next_observations),
+        buffer.to_torch(dones.reshape(-1, 1)),
+        buffer.to_torch(rewards),
+    )
+    if isinstance(buffer.observations, dict):
+        return DictReplayBufferSamples(*columns)
+    return ReplayBufferSamples(*columns)
+
+
+class ValidationSplit:
+    """
+    What a replay buffer gains that holds transitions out (P4, section 4.1 and algorithm 1, lines 4-10): each
+    transition of each environment goes to the validation side with a given probability, for as long as it is in the
+    buffer. ``sample`` never gives such a transition, ``sample_validation`` nothing else.
+
+    Nothing is stored twice: the split is a mask, and a list of the places that it marks.
+
+    :param validation_proportion: probability of the validation side, in (0, 1)
+    """
+
+    buffer_size: int
+    n_envs: int
+    pos: int
+    full: bool
+
+    def __init__(self, *args: Any, validation_proportion: float, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.validation_proportion = validation_proportion
+        #: Which transitions are held out, (buffer_size, n_envs).
+        self.held_out = np.zeros((self.buffer_size, self.n_envs), dtype=bool)
+        # The places held out (position * n_envs + environment) as a ring, oldest first: the buffer overwrites them in
+        # the same order. The two counters are never reduced.
+        self._ring = np.zeros(self.buffer_size * self.n_envs, dtype=np.int64)
+        self._first = self._last = 0
+
+    @property
+    def n_validation(self) -> int:
+        """Transitions held out."""
+        return self._last - self._first
+
+    @property
+    def n_training(self) -> int:
+        """Transitions to train on."""
+        return (self.buffer_size if self.full else self.pos) * self.n_envs - self.n_validation
+
+    def add(self, *args: Any, **kwargs: Any) -> None:
+        """Store one transition of each environment, as in Stable-Baselines3, and draw its side."""
+        held_out = np.random.random(self.n_envs) < self.validation_proportion
+        self._first += int(self.held_out[self.pos].sum())
+        self.held_out[self.pos] = held_out
+        new = self.pos * self.n_envs + np.flatnonzero(held_out)
+        self._ring[(self._last + np.arange(len(new))) % len(self._ring)] = new
+        self._last += len(new)
+        super().add(*args, **kwargs)  # type: ignore[misc]  # the buffer's
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
+        """
+        Training transitions, uniformly with replacement.
+
+        :param batch_size: how many
+        :param env: normalises observations and rewards
+        :return: the transitions
+        :raises ValueError: if there is none
+        """
+        if self.n_training == 0:
+            raise ValueError(f"there is no transition to train on: all {self.n_validation} are held out")
+        n = (self.buffer_size if self.full else self.pos) * self.n_envs
+        mask = self.held_out.reshape(-1)
+        places = np.random.randint(n, size=batch_size)
+        again = np.flatnonzero(mask[places])
+        while len(again):
+            places[again] = np.random.randint(n, size=len(again))
+            again = again[mask[places[again]]]
+        return self._at(places, env)
+
+    def sample_validation(self, batch_size: int, env: VecNormalize | None = None) -> Any:
+        """
+        Transitions held out, uniformly with replacement.
+
+        :param batch_size: how many
+        :param env: normalises observations and rewards
+        :return: the transitions
+        :raises ValueError: if there is none
+        """
+        if self.n_validation == 0:
+            raise ValueError("no transition is held out yet")
+        drawn = np.random.randint(self._first, self._last, size=batch_size)
+        return self._at(self._ring[drawn % len(self._ring)], env)
+
+    def _at(self, places: np.ndarray, env: VecNormalize | None) -> Any:
+        assert isinstance(self, ReplayBuffer)
+        return samples_at(self, *np.divmod(places, self.n_envs), env)
+
+
+class ValidationReplayBuffer(ValidationSplit, ReplayBuffer):
+    """A replay buffer that holds transitions out."""
+
+
+class ValidationDictReplayBuffer(ValidationSplit, DictReplayBuffer):
+    """The same for dict observations."""
+
+
+def latest(buffer: ReplayBuffer, n_steps: int, vec_normalize: VecNormalize | None = None) -> tuple[Any, torch.Tensor]:
+    """
+    The latest steps of every environment.
+
+    :param buffer: replay buffer
+    :param n_steps: T, steps of each environment
+    :param vec_normalize: normalises observations and rewards
+    :return: T * n_envs transitions, the oldest step of every environment first; and where an episode ended with the
+        step, for whatever reason (1), (T, n_envs)
+    :raises ValueError: if the buffer holds fewer steps
+    """
+    if buffer.size() < n_steps:
+        raise ValueError(f"the replay buffer holds {buffer.size()} steps, not {n_steps}")
+    positions = np.arange(buffer.pos - n_steps, buffer.pos) % buffer.buffer_size
+    steps, envs = np.meshgrid(positions, np.arange(buffer.n_envs), indexing="ij")
+    transitions = samples_at(buffer, steps.ravel(), envs.ravel(), vec_normalize)
+    return transitions, buffer.to_torch(buffer.dones[positions])

@@ -1,0 +1,219 @@
+"""The rivals of the papers: rules of pessimism (TOP, GPL, OPL), OAC's exploration, SR-SAC's resets."""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from sb3_sample.sac.algorithm import SAC
+from sb3_sample.sac.policies import SACPolicy
+
+
+class _RuleSAC(SAC):
+    """SAC with one rule that moves pessimism, by the name that ``pessimism`` would take."""
+
+    rule: ClassVar[str]
+
+    def __init__(
+        self,
+        policy: str | type[SACPolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        *,
+        pessimism: float | str | None = None,
+        **kwargs: Any,
+    ):
+        if pessimism not in (None, self.rule):
+            raise ValueError(
+                f"{type(self).__name__} moves the pessimism itself (pessimism={self.rule!r}), which "
+                f"pessimism={pessimism!r} contradicts: leave it out, or use SAC"
+            )
+        super().__init__(policy, env, learning_rate, pessimism=self.rule, **kwargs)
+
+    def _check_arguments(self) -> None:
+        # Also where it is changed by load.
+        if self.pessimism != self.rule:
+            raise ValueError(f"{type(self).__name__} has pessimism={self.rule!r}, not {self.pessimism!r}: use SAC")
+        super()._check_arguments()
+
+
+class TOPSAC(_RuleSAC):
+    """
+    Soft actor-critic with tactical optimism and pessimism (Moskovitz et al. 2021): a bandit chooses the pessimism of
+    each episode. With P2's and P4's settings; :class:`~sb3_sample.sac.pessimism.TOP` has the details.
+
+    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
+    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
+    :param learning_rate: of actor, critics and temperature
+    :param arms: the pessimisms to choose among
+    :param bandit_learning_rate: of the bandit, for returns of up to 1000
+    :param kwargs: every other argument of :class:`SAC`, by name
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    rule = "top"
+
+    def __init__(
+        self,
+        policy: str | type[SACPolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        *,
+        arms: Sequence[float] = (0.0, 1.0),
+        bandit_learning_rate: float = 0.1,
+        **kwargs: Any,
+    ):
+        self.arms = arms
+        self.bandit_learning_rate = bandit_learning_rate
+        super().__init__(policy, env, learning_rate, **kwargs)
+
+    def _full_pessimism_kwargs(self) -> dict[str, Any]:
+        own = {"arms": self.arms, "learning_rate": self.bandit_learning_rate}
+        return {**own, **super()._full_pessimism_kwargs()}
+
+
+class GPLSAC(_RuleSAC):
+    """
+    Soft actor-critic with generalized pessimism learning (Cetin and Celiktutan 2023): the dual step on replay
+    transitions.
+    :class:`~sb3_sample.sac.pessimism.LearnedPessimism` has the details.
+
+    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
+    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
+    :param learning_rate: of actor, critics and temperature
+    :param initial_pessimism: pessimism at the start and after a reset
+    :param pessimism_learning_rate: of the pessimism; 5e-5 as in P4 (P2: 1e-5)
+    :param kwargs: every other argument of :class:`SAC`, by name
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    rule = "gpl"
+
+    def __init__(
+        self,
+        policy: str | type[SACPolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        *,
+        initial_pessimism: float = 1.0,
+        pessimism_learning_rate: float = 5e-5,
+        **kwargs: Any,
+    ):
+        self.initial_pessimism = initial_pessimism
+        self.pessimism_learning_rate = pessimism_learning_rate
+        super().__init__(policy, env, learning_rate, **kwargs)
+
+    def _full_pessimism_kwargs(self) -> dict[str, Any]:
+        own = {"initial_pessimism": self.initial_pessimism, "learning_rate": self.pessimism_learning_rate}
+        return {**own, **super()._full_pessimism_kwargs()}
+
+
+class OPLSAC(_RuleSAC):
+    """
+    Soft actor-critic with on-policy pessimism learning (Kuznetsov et al. 2021): the dual step against the TD(lambda)
+    returns of the latest steps. :class:`~sb3_sample.sac.pessimism.LearnedPessimism` has the details.
+
+    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
+    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
+    :param learning_rate: of actor, critics and temperature
+    :param initial_pessimism: pessimism at the start and after a reset
+    :param pessimism_learning_rate: of the pessimism
+    :param segment_length: steps of each environment that it looks back
+    :param td_lambda: lambda of the returns
+    :param kwargs: every other argument of :class:`SAC`, by name
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    rule = "opl"
+
+    def __init__(
+        self,
+        policy: str | type[SACPolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        *,
+        initial_pessimism: float = 1.0,
+        pessimism_learning_rate: float = 5e-5,
+        segment_length: int = 8,
+        td_lambda: float = 0.95,
+        **kwargs: Any,
+    ):
+        self.initial_pessimism = initial_pessimism
+        self.pessimism_learning_rate = pessimism_learning_rate
+        self.segment_length = segment_length
+        self.td_lambda = td_lambda
+        super().__init__(policy, env, learning_rate, **kwargs)
+
+    def _full_pessimism_kwargs(self) -> dict[str, Any]:
+        own = {
+            "initial_pessimism": self.initial_pessimism,
+            "learning_rate": self.pessimism_learning_rate,
+            "segment_length": self.segment_length,
+            "td_lambda": self.td_lambda,
+        }
+        return {**own, **super()._full_pessimism_kwargs()}
+
+
+class OAC(SAC):
+    """
+    Optimistic actor-critic (Ciosek et al. 2019): soft actor-critic that explores with its actor's mean shifted along
+    the gradient of an upper bound. With the settings of P3's comparison;
+    :class:`~sb3_sample.sac.exploration.OptimisticGradient` has the details.
+
+    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
+    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
+    :param learning_rate: of actor, critics and temperature
+    :param optimism: weight of the critics' spread in the upper bound
+    :param kl_radius: KL divergence to the actor, summed over the action's dimensions, that the shift may cost
+    :param kwargs: every other argument of :class:`SAC`, by name
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    def __init__(
+        self,
+        policy: str | type[SACPolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        *,
+        optimism: float = 4.36,
+        kl_radius: float = 3.69**2 / 2,
+        exploration: str = "oac",
+        **kwargs: Any,
+    ):
+        self.optimism = optimism
+        self.kl_radius = kl_radius
+        super().__init__(policy, env, learning_rate, exploration=exploration, **kwargs)
+
+    def _full_exploration_kwargs(self) -> dict[str, Any]:
+        kwargs = super()._full_exploration_kwargs()
+        if self.exploration == "oac":
+            kwargs = {"optimism": self.optimism, "kl_radius": self.kl_radius, **kwargs}
+        return kwargs
+
+
+class SRSAC(SAC):
+    """
+    SR-SAC: soft actor-critic scaled by resetting (D'Oro et al. 2022), with the settings of P2 to P4: sixteen gradient
+    steps a transition, and full-parameter resets every 160,000 environment steps. (P5 compares with
+    ``replay_ratio=32``.)
+
+    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
+    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
+    :param learning_rate: of actor, critics and temperature
+    :param replay_ratio: gradient steps per environment transition
+    :param resets: environment steps between two resets, or the steps of all of them
+    :param kwargs: every other argument of :class:`SAC`, by name
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    def __init__(
+        self,
+        policy: str | type[SACPolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        *,
+        replay_ratio: float = 16,
+        resets: Sequence[int] | int = 160_000,
+        **kwargs: Any,
+    ):
+        super().__init__(policy, env, learning_rate, replay_ratio=replay_ratio, resets=resets, **kwargs)
