@@ -3,10 +3,10 @@ Train one agent with the settings of the papers' comparison, evaluating as it le
 
     OMP_NUM_THREADS=1 python benchmarks/learning_curves.py --agent SAC --seed 0 --output runs
 
-Every agent has the papers' shared settings: two hidden layers of 256, batch 256, two gradient steps a transition, 10,000
-random steps, target entropy -|A|/2, Adam 3e-4. SRSAC takes eight gradient steps and is reset every 10,000 steps, the
-papers' 16 and 160,000 scaled to a short run. The run goes to ``OUTPUT/AGENT/seed_SEED`` (``evaluations.npz``, Monitor
-files), ``learning_summary.py`` makes a table and a picture of all of them.
+Every agent has the papers' shared settings: two hidden layers of 256, batch 256, two gradient steps a transition,
+10,000 random steps, target entropy -|A|/2, Adam 3e-4. SRSAC takes eight gradient steps and is reset every 10,000
+steps, the papers' 16 and 160,000 scaled to a short run. The run goes to ``OUTPUT/AGENT/seed_SEED``
+(``evaluations.npz``, Monitor files), ``learning_summary.py`` makes a table and a picture of all of them.
 """
 
 import argparse

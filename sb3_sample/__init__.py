@@ -1,11 +1,13 @@
 """Sample-efficient reinforcement learning for users of Stable-Baselines3."""
 
+from sb3_sample.diagnostics import DiagnosticsCallback
 from sb3_sample.envs import make_env
-from sb3_sample.sac import BRO, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast
+from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
 from sb3_sample.version import __version__
 
 __all__ = [
     "BRO",
+    "BROTD3",
     "DAC",
     "GPLSAC",
     "OAC",
@@ -15,6 +17,8 @@ __all__ = [
     "TOPSAC",
     "VPLSAC",
     "BROFast",
+    "DiagnosticsCallback",
+    "RegularizedSAC",
     "__version__",
     "make_env",
 ]

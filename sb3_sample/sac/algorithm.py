@@ -364,6 +364,29 @@ class SAC(OffPolicyAlgorithm):
                 ) from error
             raise
 
+    def set_parameters(
+        self,
+        load_path_or_dict: str | dict[str, Any],
+        exact_match: bool = True,
+        device: torch.device | str = "auto",
+    ) -> None:
+        """
+        Load parameters, as in Stable-Baselines3. The optimizers' moments are loaded, their settings (learning rate,
+        weight decay, ...) stay this model's, so that ``load`` with other ones has them in force.
+
+        :param load_path_or_dict: a file, or parameters as ``get_parameters`` gives them
+        :param exact_match: whether parameters for every module must be there, and no others
+        :param device: "auto", "cpu", "cuda", ...
+        """
+        settings = {
+            name: [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
+            for name, optimizer in self._optimizers().items()
+        }
+        super().set_parameters(load_path_or_dict, exact_match, device)
+        for name, optimizer in self._optimizers().items():
+            for group, own in zip(optimizer.param_groups, settings[name], strict=True):
+                group.update(own)
+
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         space = env.action_space

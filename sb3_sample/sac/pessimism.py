@@ -338,7 +338,7 @@ class TOP(Pessimism):
         #: The bandit, on the host, where it lives.
         self.log_weights = [0.0] * len(self.arms)
         self.arm = 0
-        self.register_buffer("weight", torch.tensor(0.0))
+        self.register_buffer("weight", torch.tensor(0.0), persistent=False)
         # By environment: the last episode's return, and the improvements under the arm in force.
         self._previous: dict[int, float] = {}
         self._improvements: dict[int, list[float]] = {}
@@ -384,7 +384,10 @@ class TOP(Pessimism):
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
+        if len(state["log_weights"]) != len(self.arms):
+            raise ValueError(f"arms={self.arms} are not as many as the {len(state['log_weights'])} of the saved bandit")
         self.arm, self.log_weights = state["arm"], list(state["log_weights"])
+        self.weight.fill_(self.arms[self.arm])
         self._previous, self._improvements = dict(state["previous"]), dict(state["improvements"])
 
     def update(

@@ -41,20 +41,20 @@ class Resets(Part):
             raise ValueError(f"reset_shrink must lie in [0, 1), not {shrink}")
         self.shrink = shrink
         self.period: int | None = None
+        self.steps: tuple[int, ...] = ()
         self.n_done = 0
         self._reached = 0
-        if _is_integer(steps):
-            if not steps >= 1:  # type: ignore[operator]  # a number here
+        if isinstance(steps, Integral) and not isinstance(steps, bool):
+            self.period = int(steps)
+            if self.period < 1:
                 raise ValueError(f"resets must be at least 1 environment step apart, not {steps}")
-            self.period, self.steps = int(steps), ()  # type: ignore[arg-type]
             return
-        is_sequence = isinstance(steps, (Sequence, np.ndarray))
-        if not is_sequence or not all(_is_integer(step) and step >= 1 for step in steps):  # type: ignore[union-attr]
+        if not isinstance(steps, (Sequence, np.ndarray)) or not all(_is_integer(step) and step >= 1 for step in steps):
             raise ValueError(
                 "resets must be a sequence of environment steps, integers of at least 1, or one integer for every so "
                 f"many, not {steps!r}"
             )
-        self.steps: tuple[int, ...] = tuple(steps)  # type: ignore[arg-type]
+        self.steps = tuple(steps)
         if any(late <= early for early, late in itertools.pairwise(self.steps)):
             raise ValueError(f"resets must be strictly ascending environment steps, not {self.steps}")
 

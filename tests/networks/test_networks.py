@@ -12,16 +12,10 @@ from torch import nn
 from sb3_sample import BRO
 from sb3_sample.networks import MLP, BroNet, EnsembleLayerNorm, EnsembleLinear, init_orthogonal, linear
 from sb3_sample.sac.exploration import OptimisticShift
+from tests.networks.common import randomize
 from tests.sac.common import Toy
 
 E, B = 2, 5
-
-
-def randomize(module: nn.Module) -> None:
-    """Every parameter at random, so that no zero bias or unit scale hides a mistake."""
-    with torch.no_grad():
-        for p in module.parameters():
-            p.copy_(torch.randn_like(p))
 
 
 def copy_linear(stack: EnsembleLinear, e: int) -> nn.Linear:

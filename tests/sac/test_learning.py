@@ -8,7 +8,7 @@ import pytest
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_sample import BRO
+from sb3_sample import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SRSAC, TOPSAC, VPLSAC, RegularizedSAC
 from sb3_sample.sac import SAC
 
 #: Mean return over ten episodes: a random policy has about -1200, a good one about -150.
@@ -25,17 +25,17 @@ def score(model: SAC) -> float:
     return float(np.mean(evaluate_policy(model, env, 10, deterministic=True)[0]))
 
 
-def small_bro(seed: int, **kwargs: Any) -> BRO:
+def small_bro(seed: int, cls: type[BRO] = BRO, **kwargs: Any) -> BRO:
     small = {"width": 64, "n_blocks": 1}
-    return BRO(
+    return cls(
         "MlpPolicy", "Pendulum-v1", model_size="0.55M", n_quantiles=20, batch_size=64, seed=seed,
         policy_kwargs={"actor_network_kwargs": small}, exploration_kwargs={"network_kwargs": small},
         **{**SHARED, "resets": (), **kwargs},
     )  # fmt: skip
 
 
-def small_sac(seed: int, **kwargs: Any) -> SAC:
-    return SAC(
+def small_sac(seed: int, cls: type[SAC] = SAC, **kwargs: Any) -> SAC:
+    return cls(
         "MlpPolicy", "Pendulum-v1", batch_size=128, seed=seed, policy_kwargs={"net_arch": [64, 64]},
         **{**SHARED, **kwargs},
     )  # fmt: skip
@@ -52,6 +52,34 @@ def test_sac_learns_pendulum() -> None:
 
 def test_bro_learns_pendulum() -> None:
     assert score(small_bro(0).learn(2_500)) > GOOD
+
+
+@pytest.mark.parametrize("cls", [DAC, VPLSAC])
+def test_dac_and_vpl_sac_learn_pendulum(cls: type[SAC]) -> None:
+    assert score(small_sac(0, cls).learn(3_000)) > GOOD
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("cls", "kwargs"),
+    [
+        (OAC, {}),
+        (TOPSAC, {}),
+        (GPLSAC, {}),
+        (OPLSAC, {}),
+        (SRSAC, {"replay_ratio": 3, "resets": (1_500,)}),
+        (RegularizedSAC, {"network_regularization": "layer_norm", "plasticity_regularization": ("sam", "redo")}),
+        (RegularizedSAC, {"network_regularization": "spectral_norm", "plasticity_regularization": "crelu"}),
+        (SAC, {"backbone": "td3", "policy_delay": 2, "target_update_interval": 2}),
+    ],
+)
+def test_the_others_learn_pendulum(cls: type[SAC], kwargs: dict[str, Any]) -> None:
+    assert score(small_sac(0, cls, **kwargs).learn(4_000)) > GOOD
+
+
+@pytest.mark.slow
+def test_bro_td3_learns_pendulum() -> None:
+    assert score(small_bro(0, BROTD3).learn(4_000)) > GOOD
 
 
 @pytest.mark.slow

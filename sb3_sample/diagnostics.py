@@ -1,0 +1,445 @@
+"""
+Diagnostics of the papers for a run of the off-policy family: overestimation, overfitting and what shows a loss of
+plasticity (P2, section 3; P4, appendix E.2), measured by a callback that leaves the training as it is.
+
+Shapes use the letters E critics, B batch, K quantiles, N neurons, A action.
+"""
+
+import contextlib
+import math
+import random
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
+
+from sb3_sample.networks import neuron_scores
+from sb3_sample.sac import SAC, losses
+from sb3_sample.sac.batch import Batch
+from sb3_sample.sac.buffers import samples_at
+from sb3_sample.sac.pessimism import epistemic_std
+
+
+class Rollout(NamedTuple):
+    """What followed a state and action: n steps of the policy, in the critic's units."""
+
+    #: the critics' mean at the first state and action
+    value: float
+    #: (n,), the first one that of the first state and action
+    rewards: np.ndarray
+    #: (n,), of the actions taken
+    log_probs: np.ndarray
+    #: whether the last step ended the episode, other than by a time limit
+    terminated: bool
+
+
+def discounted_return(rewards: np.ndarray, gamma: float, terminated: bool) -> float:
+    """
+    The discounted return of a rollout. After a termination nothing follows. Where a rollout was merely cut (by a time
+    limit, or by its own length) its mean reward goes on for ever, with the weight ``gamma ** n / (1 - gamma)``.
+
+    :param rewards: (n,)
+    :param gamma: discount factor, below 1
+    :param terminated: whether the episode ended with the last reward, other than by a time limit
+    :return: the return
+    """
+    n = len(rewards)
+    seen = float(np.sum(rewards * gamma ** np.arange(n)))
+    return seen if terminated else seen + gamma**n / (1 - gamma) * float(rewards.mean())
+
+
+def average_value(rewards: np.ndarray, log_probs: np.ndarray, alpha: float, gamma: float, terminated: bool) -> float:
+    """
+    P4, equation 22: ``(mean reward - alpha * mean log pi) / (1 - gamma)``. The factor is the sum of the geometric
+    series of a task without end; if the episode terminated, the sum of its first n terms takes its place.
+
+    :param rewards: (n,)
+    :param log_probs: log-probabilities of the actions, (n,)
+    :param alpha: temperature
+    :param gamma: discount factor, below 1
+    :param terminated: whether the episode ended with the last reward, other than by a time limit
+    :return: the value
+    """
+    horizon = (1 - gamma ** len(rewards) if terminated else 1) / (1 - gamma)
+    return float(horizon * (rewards.mean() - alpha * log_probs.mean()))
+
+
+def effective_rank(features: torch.Tensor, delta: float = 0.01) -> torch.Tensor:
+    """
+    Effective rank of feature matrices (Kumar et al. 2020): the least k such that the k largest singular values sum to
+    at least ``1 - delta`` of the sum of all of them. 0 for a matrix of zeros; at most the smaller of B and N.
+
+    :param features: (..., B, N)
+    :param delta: the share that may be missing, in (0, 1)
+    :return: (...), NaN for a matrix that is not finite
+    """
+    finite = torch.isfinite(features).all(dim=-1).all(dim=-1)
+    # On the CPU since not every device has float64; the sums need it.
+    features = torch.where(finite[..., None, None], features, 0.0).cpu().double()
+    sums = torch.linalg.svdvals(features).cumsum(dim=-1)
+    # sums[k - 1] is the sum of k values, and that of none is 0.
+    total = sums[..., -1:]
+    rank = (sums < (1 - delta) * total).sum(dim=-1) + (total[..., 0] > 0)
+    return torch.where(finite.cpu(), rank.double(), torch.nan)
+
+
+def dormant_shares(scores: dict[str, torch.Tensor], threshold: float) -> dict[str, float]:
+    """
+    Share of the neurons whose score is at most the threshold (Sokar et al. 2023), copies taken together.
+
+    :param scores: scores of a network by layer, (E, N) or (N,)
+    :param threshold: up to which score a neuron is dormant
+    :return: the share by layer, and under "" that of all neurons together; nothing if there is no layer
+    """
+    dormant = {name: (layer <= threshold).double().flatten() for name, layer in scores.items()}
+    if dormant:
+        dormant[""] = torch.cat(list(dormant.values()))
+    return {name: layer.mean().item() for name, layer in dormant.items()}
+
+
+def global_norm(tensors: list[torch.Tensor]) -> float:
+    """
+    :param tensors: parameters or gradients
+    :return: the L2 norm of all their elements together
+    """
+    return torch.stack([torch.linalg.vector_norm(tensor.detach()) for tensor in tensors]).norm().item()
+
+
+class DiagnosticsCallback(BaseCallback):
+    """
+    Measures, every ``every`` environment steps, how wrong the critics are, how much they overfit and how much
+    plasticity the networks have left, and writes it to the logger under ``diagnostics/``.
+
+    Each measurement takes ``n_start_states`` rollouts of at most ``rollout_length`` steps in ``eval_env``, each from a
+    reset, with samples of the actor, whose value the critics estimate (not with its mean action, and not with an
+    optimistic actor). All that the networks are asked, they are asked in evaluation mode.
+
+    *Overestimation* is the critics' value minus a Monte-Carlo reference, averaged over the start pairs; the critics'
+    value is the mean over ensemble and quantiles. An arbitrary environment cannot be put into a state of the replay
+    buffer. Hence the start pair is a visited state and action of the rollout itself, drawn from its first half, and
+    what the rollout did from there on is the reference. ``overestimation`` compares with the discounted return (P2);
+    ``overestimation_soft`` with P4's equation 22, which also counts the entropy that a soft critic contains. The
+    paper writes the entropy target for the policy's entropy; here it is the one measured in the rollout, which is
+    also right where the temperature is fixed or has not reached its target. As printed in the paper, the first
+    action's own log-probability counts too. Without entropy (temperature 0, deterministic actor) that part vanishes.
+
+    *Overfitting* is P4's equation 23: the mean squared TD error, of the critics' mean to the target under the
+    pessimism in force, on transitions of the rollouts that were never trained on, divided by that on transitions of
+    the replay buffer. Both are single steps as they were experienced, also if the algorithm learns from n-step returns
+    or relabelled goals; transitions that the buffer holds out for validation are left out.
+
+    All in the units in which the critics learn: with ``VecNormalize`` around the training environment, observations
+    and rewards of ``eval_env`` are normalised by the training environment's statistics of the moment; the statistics
+    of a ``VecNormalize`` around ``eval_env`` are neither used nor changed.
+
+    Training is bit for bit the same with the callback and without: its random numbers are its own, the global
+    generators, which an environment may use, are put back, and so are the modules' modes.
+
+    Nothing is measured while the algorithm still acts at random (``learning_starts``).
+
+    :param eval_env: environment for the rollouts, a single one, not the training environment; its normalisation, if
+        any, has to be as that of the training environment
+    :param every: environment steps between two measurements, taken at the first step at or after each multiple
+    :param n_start_states: rollouts a measurement, each with one start pair (5 in P4)
+    :param rollout_length: most steps of a rollout. With the default a measurement adds up to 5,000 validation
+        transitions, as in P4
+    :param soft: whether to log ``overestimation_soft``
+    :param batch_size: transitions from each side, training and validation; fewer if there are not as many
+    :param dormant_threshold: up to which score a neuron is called dormant
+    :param validation_size: validation transitions kept; the oldest give way
+    :param seed: of the rollouts' noise and of ``eval_env``; the model's if None
+    :param verbose: 0 nothing, 1 a line for each measurement
+    :raises TypeError: if ``eval_env`` is no environment, or, when training starts, the model no ``SAC`` of this package
+    :raises ValueError: if an argument is out of range, or, when training starts, ``eval_env`` does not fit the model
+    """
+
+    model: SAC
+
+    def __init__(
+        self,
+        eval_env: GymEnv,
+        every: int = 10_000,
+        n_start_states: int = 5,
+        rollout_length: int = 1_000,
+        soft: bool = True,
+        batch_size: int = 256,
+        dormant_threshold: float = 0.025,
+        validation_size: int = 100_000,
+        seed: int | None = None,
+        verbose: int = 0,
+    ):
+        super().__init__(verbose)
+        if not isinstance(eval_env, (gym.Env, VecEnv)):
+            raise TypeError(f"eval_env must be a gymnasium.Env or a VecEnv, not {eval_env!r}")
+        if isinstance(eval_env, VecEnv) and eval_env.num_envs != 1:
+            raise ValueError(f"eval_env must hold one environment, not {eval_env.num_envs}")
+        for name, value in (
+            ("every", every),
+            ("n_start_states", n_start_states),
+            ("rollout_length", rollout_length),
+            ("batch_size", batch_size),
+            ("validation_size", validation_size),
+        ):
+            if not isinstance(value, (int, np.integer)) or value < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1, not {value!r}")
+        if not 0 <= dormant_threshold < math.inf:
+            raise ValueError(f"dormant_threshold must be at least 0 and finite, not {dormant_threshold}")
+        self.eval_env = eval_env
+        self.every = every
+        self.n_start_states = n_start_states
+        self.rollout_length = rollout_length
+        self.soft = soft
+        self.batch_size = batch_size
+        self.dormant_threshold = dormant_threshold
+        self.validation_size = validation_size
+        self.seed = seed
+        #: What was measured last, by name, without the prefix ``diagnostics/``.
+        self.last_results: dict[str, float] = {}
+        self._next = every
+        self._store: ReplayBuffer | None = None
+        self._measured_model: SAC | None = None
+
+    # ---------------------------------------------------------------- construction
+
+    def _init_callback(self) -> None:
+        model = self.model
+        if not isinstance(model, SAC):
+            raise TypeError(f"DiagnosticsCallback needs a model of sb3_sample.sac.SAC, not a {type(model).__name__}")
+        if not model.gamma < 1:
+            raise ValueError(f"gamma must be below 1 for the Monte-Carlo reference, not {model.gamma}")
+        env = self._checked_env()
+        if model is self._measured_model:  # a second call of learn
+            return
+        self._env, self._measured_model = env, model
+        seed = model.seed if self.seed is None else self.seed
+        self._rng = np.random.default_rng(seed)
+        if seed is not None:
+            # Not the model's own seed: the episodes would start as those of the training.
+            self._env.seed(int(self._rng.integers(2**31)))
+        store: Any = DictReplayBuffer if isinstance(model.observation_space, spaces.Dict) else ReplayBuffer
+        self._store = store(self.validation_size, model.observation_space, model.action_space, device=model.device)
+
+    def _checked_env(self) -> VecEnv:
+        """The environment of the rollouts, vectorised and below its normalisation."""
+        if _environments(self.eval_env) & _environments(self.training_env):
+            raise ValueError("eval_env is the training environment: its rollouts need an environment of their own")
+        env = self.model._wrap_env(self.eval_env, monitor_wrapper=False)
+        normalize = unwrap_vec_normalize(env)
+        if normalize is not None:
+            if self.model.get_vec_normalize_env() is None:
+                raise ValueError("eval_env is wrapped in VecNormalize, but the training environment is not")
+            env = normalize.venv
+        for name in ("observation_space", "action_space"):
+            ours, theirs = getattr(self.model, name), getattr(env, name)
+            if ours != theirs:
+                raise ValueError(f"eval_env has the {name} {theirs}, but the model has {ours}")
+        return env
+
+    # ---------------------------------------------------------------- when
+
+    def _on_training_start(self) -> None:
+        self._next = (self.num_timesteps // self.every + 1) * self.every
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps < self._next:
+            return True
+        self._next = (self.num_timesteps // self.every + 1) * self.every
+        # The transitions of the present step are stored after this call.
+        if self.model.num_transitions + self.model.n_envs < self.model.learning_starts:
+            return True
+        results = self.measure()
+        for name, value in results.items():
+            self.logger.record(f"diagnostics/{name}", value)
+        # Written at once, as by EvalCallback, so that the values stand at the step at which they were measured.
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
+        if self.verbose >= 1:
+            shown = ", ".join(
+                f"{name} {results[name]:.3g}" for name in ("overestimation", "overfitting") if name in results
+            )
+            print(f"Diagnostics at {self.num_timesteps} steps: {shown}")
+        return True
+
+    # ---------------------------------------------------------------- what
+
+    def measure(self) -> dict[str, float]:
+        """
+        Measure now. Outside of ``learn`` call ``init_callback(model)`` first.
+
+        :return: the quantities by name; without those that there is nothing to measure by (an empty replay buffer, no
+            gradient step yet, a single critic)
+        """
+        if self._store is None:
+            raise ValueError("the callback knows no model yet: call init_callback(model) first")
+        with _untouched(self.model), torch.no_grad():
+            results = self._overestimation()
+            training = self._training_batch()
+            if training is not None:
+                results |= self._overfitting(training) | self._networks(training)
+            results |= self._norms()
+        self.last_results = results
+        return results
+
+    def _overestimation(self) -> dict[str, float]:
+        rollouts = [self._rollout() for _ in range(self.n_start_states)]
+        alpha, gamma = self.model.temperature().item(), self.model.gamma
+        results = {
+            "critic_value": np.mean([r.value for r in rollouts]),
+            "overestimation": np.mean([r.value - discounted_return(r.rewards, gamma, r.terminated) for r in rollouts]),
+        }
+        if self.soft:
+            results["overestimation_soft"] = np.mean(
+                [r.value - average_value(r.rewards, r.log_probs, alpha, gamma, r.terminated) for r in rollouts]
+            )
+        return {name: float(value) for name, value in results.items()}
+
+    def _rollout(self) -> Rollout:
+        """Follow the actor from a reset, keep the transitions, and look at the rollout from its start pair on."""
+        assert self._store is not None and isinstance(self.model.action_space, spaces.Box)
+        steps = []
+        rewards, log_probs = [], []
+        terminated = False
+        observation: Any = self._env.reset()
+        for _ in range(self.rollout_length):
+            tensors = self._to_tensors(observation)
+            action, log_prob = self.model.actor.sample(tensors, self._noise(1))
+            scaled = action.cpu().numpy().reshape(1, *self.model.action_space.shape)
+            next_observation, reward, done, infos = self._env.step(self.model.policy.unscale_action(scaled))
+            last: Any = next_observation
+            if done[0]:
+                last = infos[0]["terminal_observation"]
+                last = {k: np.asarray(v)[None] for k, v in last.items()} if isinstance(last, dict) else np.array([last])
+            self._store.add(observation, last, scaled, reward, done, infos)
+            steps.append((tensors, action))
+            rewards.append(reward[0])
+            log_probs.append(log_prob.item())
+            observation = next_observation
+            if done[0]:
+                terminated = not infos[0].get("TimeLimit.truncated", False)
+                break
+        start = int(self._rng.integers((len(steps) + 1) // 2))
+        normalize = self.model.get_vec_normalize_env()
+        following = np.array(rewards[start:])
+        if normalize is not None:
+            following = normalize.normalize_reward(following)
+        value = self.model.critic(*steps[start]).mean().item()
+        return Rollout(value, following.astype(np.float64), np.array(log_probs[start:]), terminated)
+
+    def _overfitting(self, training: Batch) -> dict[str, float]:
+        assert self._store is not None
+        n = self._store.size()
+        positions = self._rng.choice(n, min(self.batch_size, n), replace=False)
+        on_validation = self._td_error(self._batch(self._store, positions, np.zeros_like(positions)))
+        on_training = self._td_error(training)
+        results = {"td_error_validation": on_validation, "td_error_training": on_training}
+        if on_training != 0:
+            results["overfitting"] = on_validation / on_training
+        return results
+
+    def _td_error(self, batch: Batch) -> float:
+        """Mean squared TD error of the critics' mean."""
+        model = self.model
+        actions, log_prob = model.policy.next_actions(batch.next_observations, self._noise(len(batch.actions)))
+        next_q = model.critic_target(batch.next_observations, actions)
+        if model.target_subset is not None:
+            next_q = next_q[self._rng.permutation(len(next_q))[: model.target_subset]]
+        next_values = model.pessimism_rule.value(next_q)
+        entropy_bonus = -model.temperature() * log_prob
+        target = losses.td_target(batch.rewards, batch.dones, batch.discounts, next_values, entropy_bonus)
+        q = model.critic(batch.observations, batch.actions)
+        return (q.mean(dim=(0, 2)) - target.mean(dim=1)).square().mean().item()
+
+    def _networks(self, batch: Batch) -> dict[str, float]:
+        """Disagreement, dormant neurons and rank, on a batch of the replay buffer."""
+        actor, critic = self.model.actor, self.model.critic
+        results: dict[str, float] = {}
+        q = critic(batch.observations, batch.actions)
+        if len(q) > 1:
+            results["critic_disagreement"] = epistemic_std(q).mean().item()
+        extractor: Any = critic.features_extractor
+        x = torch.cat((critic.extract_features(batch.observations, extractor), batch.actions), dim=1)
+        for who, scores in (
+            ("critic", neuron_scores(critic.trunk, critic.head, x)),
+            ("actor", neuron_scores(actor.trunk, None, actor.features(batch.observations))),
+        ):
+            for layer, share in dormant_shares(scores, self.dormant_threshold).items():
+                results[f"dormant_{who}/{layer}".rstrip("/")] = share
+        features = critic.trunk(x)
+        ranks = effective_rank(features.expand(len(q), *features.shape[-2:]))
+        results["effective_rank"] = ranks.mean().item()
+        results.update({f"effective_rank/critic_{i}": rank.item() for i, rank in enumerate(ranks)})
+        return results
+
+    def _norms(self) -> dict[str, float]:
+        """Norms of the parameters, and of the gradients that the last gradient step left."""
+        results: dict[str, float] = {}
+        for who, module in (("critic", self.model.critic), ("actor", self.model.actor)):
+            parameters = list(module.parameters())
+            gradients = [p.grad for p in parameters if p.grad is not None]
+            if gradients:
+                results[f"gradient_norm_{who}"] = global_norm(gradients)
+            results[f"parameter_norm_{who}"] = global_norm(list(parameters))
+        return results
+
+    # ---------------------------------------------------------------- data
+
+    def _noise(self, n: int) -> torch.Tensor:
+        noise = self._rng.standard_normal((n, self.model.actor.action_dim), dtype=np.float32)
+        return torch.as_tensor(noise, device=self.model.device)
+
+    def _to_tensors(self, observation: Any) -> Any:
+        normalize = self.model.get_vec_normalize_env()
+        if normalize is not None:
+            observation = normalize.normalize_obs(observation)
+        return self.model.policy.obs_to_tensor(observation)[0]
+
+    def _training_batch(self) -> Batch | None:
+        """Transitions that the algorithm trains on, none twice; None if there are none yet."""
+        buffer = self.model.replay_buffer
+        assert buffer is not None
+        usable = np.ones((buffer.size(), buffer.n_envs), dtype=bool)
+        held_out = getattr(buffer, "held_out", None)
+        if held_out is not None:
+            usable &= ~held_out[: len(usable)]
+        if buffer.optimize_memory_usage and buffer.full:
+            usable[buffer.pos] = False  # its next observation is overwritten
+        places = np.flatnonzero(usable)
+        if len(places) == 0:
+            return None
+        places = self._rng.choice(places, min(self.batch_size, len(places)), replace=False)
+        return self._batch(buffer, *np.divmod(places, buffer.n_envs))
+
+    def _batch(self, buffer: ReplayBuffer, positions: np.ndarray, env_indices: np.ndarray) -> Batch:
+        samples = samples_at(buffer, positions, env_indices, self.model.get_vec_normalize_env())
+        return Batch.of(samples, self.model.gamma)
+
+
+def _environments(env: GymEnv) -> set[int]:
+    """The identities of the environments in an environment, below all wrappers that can be looked through."""
+    innermost = env.unwrapped
+    inside = [e.unwrapped for e in innermost.envs] if isinstance(innermost, DummyVecEnv) else []
+    return {id(e) for e in [innermost, *inside]}
+
+
+@contextlib.contextmanager
+def _untouched(model: SAC) -> Iterator[None]:
+    """The model's networks in evaluation mode; afterwards their modes and the global generators are as before."""
+    modes = {module: module.training for module in model.policy.modules()}
+    python_state, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002
+    cuda = [model.device] if model.device.type == "cuda" else []
+    try:
+        with torch.random.fork_rng(devices=cuda):
+            model.policy.eval()
+            yield
+    finally:
+        random.setstate(python_state)
+        np.random.set_state(numpy_state)  # noqa: NPY002
+        for module, mode in modes.items():
+            module.training = mode

@@ -1,0 +1,146 @@
+"""The regularized agents of P2."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from sb3_sample.networks import CReLU
+from sb3_sample.sac.algorithm import SAC
+from sb3_sample.sac.policies import SACPolicy
+
+#: The groups of P2, section 3, each with what it may hold.
+CRITIC_REGULARIZATIONS = ("none", "cdq", "gpl", "top")
+NETWORK_REGULARIZATIONS = ("none", "layer_norm", "spectral_norm", "weight_decay")
+PLASTICITY_REGULARIZATIONS = ("none", "crelu", "redo", "resets", "sam")
+
+
+class RegularizedSAC(SAC):
+    """
+    The regularized soft actor-critic agents of P2 (Nauman et al. 2024, "Overestimation, overfitting, and plasticity in
+    actor-critic", https://arxiv.org/abs/2403.00514, section 3): one choice from each of three groups makes the 64
+    agents of the paper, and the last two groups take any mixture, ReDo included.
+
+    All of them but the resets concern the critics only (P2, appendix B). The settings are P2's where it gives them:
+    layer norm on every hidden layer, spectral norm on the last one, weight decay on every parameter, CReLU with twice
+    the width, GPL's learning rate of 1e-5. Where it refers to the original papers, their values are taken and are
+    arguments here: SAM's radius 0.05 (Foret et al. 2021), a weight decay of 0.01 (Loshchilov and Hutter 2019, the
+    common default of AdamW), resets every 160,000 environment steps (P4), ReDo every 1,000 gradient steps at a
+    threshold of 0.025 (Sokar et al. 2023). The low replay regime is the default; ``replay_ratio=16`` is the high one.
+
+    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
+    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
+    :param learning_rate: of actor, critics and temperature
+    :param critic_regularization: "none" (the mean of the critics), "cdq" (their minimum), "gpl" or "top"
+    :param network_regularization: "none", or any of "layer_norm", "spectral_norm", "weight_decay", one or several
+    :param plasticity_regularization: "none", or any of "crelu", "redo", "resets", "sam", one or several
+    :param weight_decay: for "weight_decay", its coefficient; None: 0.01
+    :param sam_radius: for "sam"; None: 0.05
+    :param resets: for "resets", environment steps between two, or the steps of all; None: 160,000
+    :param redo_period: for "redo", gradient steps between two recyclings; None: 1,000
+    :param kwargs: every other argument of :class:`SAC`, by name
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    def __init__(
+        self,
+        policy: str | type[SACPolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        *,
+        critic_regularization: str = "cdq",
+        network_regularization: str | Sequence[str] = "none",
+        plasticity_regularization: str | Sequence[str] = "none",
+        weight_decay: float | None = None,
+        sam_radius: float | None = None,
+        resets: Sequence[int] | int | None = None,
+        redo_period: int | None = None,
+        **kwargs: Any,
+    ):
+        for name in ("pessimism", "pessimism_kwargs"):
+            if name in kwargs:
+                raise ValueError(f"{name} is what critic_regularization chooses: pass that alone, or use SAC")
+        self.critic_regularization = critic_regularization
+        self.network_regularization = network_regularization
+        self.plasticity_regularization = plasticity_regularization
+        network = _check_group("network_regularization", network_regularization, NETWORK_REGULARIZATIONS)
+        chosen = _check_group("plasticity_regularization", plasticity_regularization, PLASTICITY_REGULARIZATIONS)
+
+        def setting(name: str, given: Any, default: Any, of: str, group: tuple[str, ...]) -> Any:
+            if of in group:
+                return default if given is None else given
+            if given is not None:
+                raise ValueError(f"{name}={given!r} is a setting of {of!r}, which is not among the regularizations")
+            return None
+
+        self.weight_decay = setting("weight_decay", weight_decay, 0.01, "weight_decay", network)
+        resets = setting("resets", resets, 160_000, "resets", chosen)
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            pessimism=_pessimism(critic_regularization),
+            pessimism_kwargs={"learning_rate": 1e-5} if critic_regularization == "gpl" else None,
+            sam_radius=setting("sam_radius", sam_radius, 0.05, "sam", chosen),
+            resets=() if resets is None else resets,
+            redo_period=setting("redo_period", redo_period, 1_000, "redo", chosen),
+            **kwargs,
+        )
+
+    def _check_arguments(self) -> None:
+        network = _check_group("network_regularization", self.network_regularization, NETWORK_REGULARIZATIONS)
+        chosen = _check_group("plasticity_regularization", self.plasticity_regularization, PLASTICITY_REGULARIZATIONS)
+        # What the constructor made of the groups; load may have changed one of the two.
+        in_force = {
+            "critic_regularization": self.pessimism == _pessimism(self.critic_regularization),
+            "network_regularization": (self.weight_decay is not None) == ("weight_decay" in network),
+            "plasticity_regularization": (
+                (self.sam_radius is not None) == ("sam" in chosen)
+                and (self.redo_period is not None) == ("redo" in chosen)
+                and (self.resets != ()) == ("resets" in chosen)
+            ),
+        }
+        for name, agrees in in_force.items():
+            if not agrees:
+                raise ValueError(
+                    f"{name}={getattr(self, name)!r} is not what the other arguments say: load cannot change the "
+                    "regularizations of a model, and an argument of one needs its name among them"
+                )
+        super()._check_arguments()
+
+    def _full_policy_kwargs(self) -> dict[str, Any]:
+        network = _check_group("network_regularization", self.network_regularization, NETWORK_REGULARIZATIONS)
+        plasticity = _check_group(
+            "plasticity_regularization", self.plasticity_regularization, PLASTICITY_REGULARIZATIONS
+        )
+        kwargs = super()._full_policy_kwargs()
+        critic: dict[str, Any] = {}
+        for name in ("layer_norm", "spectral_norm"):
+            if name in network:
+                critic[name] = True
+        if "crelu" in plasticity:
+            critic["activation_fn"] = CReLU
+        kwargs["critic_network_kwargs"] = {**critic, **(kwargs.get("critic_network_kwargs") or {})}
+        if "weight_decay" in network:
+            optimizer = {"weight_decay": self.weight_decay, **(kwargs.get("critic_optimizer_kwargs") or {})}
+            kwargs["critic_optimizer_kwargs"] = optimizer
+        return kwargs
+
+
+def _pessimism(critic_regularization: str) -> float | str:
+    """The family's name of a choice."""
+    if critic_regularization not in CRITIC_REGULARIZATIONS:
+        raise ValueError(
+            f"critic_regularization must be one of {list(CRITIC_REGULARIZATIONS)}, not {critic_regularization!r}"
+        )
+    return {"none": 0.0, "cdq": 1.0}.get(critic_regularization, critic_regularization)
+
+
+def _check_group(name: str, chosen: str | Sequence[str], allowed: Sequence[str]) -> tuple[str, ...]:
+    """The members chosen from a group, "none" left out."""
+    members = (chosen,) if isinstance(chosen, str) else tuple(chosen)
+    if len(set(members)) != len(members) or not set(members) <= set(allowed):
+        raise ValueError(f"{name} must be of {list(allowed)}, each at most once, not {chosen!r}")
+    if "none" in members and len(members) > 1:
+        raise ValueError(f"{name}={chosen!r} names 'none' beside others")
+    return tuple(member for member in members if member != "none")
