@@ -156,7 +156,7 @@ def sharpness_aware_gradients(
         saved = [p.detach().clone() for p in parameters]
         for p, gradient, copies in zip(parameters, gradients, n_copies, strict=True):
             scale = scales[copies]
-            p.add_(gradient * (scale if copies is None else scale.view(-1, *[1] * (p.dim() - 1))))
+            p.add_(gradient * (scale[0] if copies is None else scale.view(-1, *[1] * (p.dim() - 1))))
     try:
         uphill = torch.autograd.grad(evaluate(), parameters)
     finally:

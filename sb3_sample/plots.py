@@ -28,6 +28,8 @@ DATA = Path(__file__).parent / "data" / "published_curves.csv.gz"
 PUBLISHED = ("BRO", "BRO Fast", "SAC")
 #: What a table of a curve has, by environment step, over the seeds. The standard deviation is the sample's (n - 1).
 COLUMNS = ["env_step", "n_seeds", "mean", "std", "min", "max", "iqm"]
+#: The zoo's name of our algorithm, where it is not the published one's.
+ZOO_NAMES = {"sac": "sac_sample"}
 METRICS = {"return": "return", "success_rate": "success rate"}
 #: Rows of the printed table per curve.
 MAX_TABLE_STEPS = 10
@@ -281,6 +283,8 @@ def draw(env_id: str, curves: Sequence[Curve], metric: str, xlim: tuple[float, f
         shown = curve.data[curve.data["env_step"].between(*xlim)]
         # A published curve has the colour of ours of the same algorithm ("bro_fast" is "BRO Fast (RR=2)").
         name = curve.label.partition(" (")[0].lower().replace(" ", "_")
+        if curve.published and ZOO_NAMES.get(name) in colors_of_ours:
+            name = ZOO_NAMES[name]
         color = colors_of_ours.pop(name) if curve.published and name in colors_of_ours else next(palette)
         if not curve.published:
             colors_of_ours[name] = color

@@ -11,6 +11,7 @@ what was suggested, and ``--trial-id`` sends the stored parameters through the c
 import functools
 import importlib
 import inspect
+import itertools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +26,12 @@ except ModuleNotFoundError as error:
     ) from error
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_sample.sac import BRO, BROFast
+from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
+from sb3_sample.sac.regularized_sac import (
+    CRITIC_REGULARIZATIONS,
+    NETWORK_REGULARIZATIONS,
+    PLASTICITY_REGULARIZATIONS,
+)
 
 #: The files ``<algorithm>.yml``, read when ``--conf-file`` is not given.
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
@@ -55,6 +61,13 @@ def _choice(*options: Any) -> Suggest:
     return lambda trial, name: trial.suggest_categorical(name, options)
 
 
+def _mixture(*group: str) -> Suggest:
+    """None or any members of a group: "none", "a", "a+b" and so on, since Optuna stores no lists."""
+    members = [member for member in group if member != "none"]
+    mixtures = ["+".join(mixture) for n in range(1, len(members) + 1) for mixture in itertools.combinations(members, n)]
+    return _choice("none", *mixtures)
+
+
 # ---------------------------------------------------------------- search spaces
 # ``one_minus_<x>`` and ``<x>_pow`` are 1 - x and log2(x): the scales on which a change by the same amount means as much
 # anywhere in the range. The ranges contain the defaults of the classes.
@@ -80,6 +93,61 @@ BRO_SPACE: Space = {
     "std_multiplier": _float(0.5, 1.0),
     "weight_decay": _float(1e-5, 1e-2, log=True),
 }
+#: With TD3 the noise has numbers of its own, so that no multiplier is needed.
+BRO_TD3_SPACE: Space = {
+    **{name: suggest for name, suggest in BRO_SPACE.items() if name != "std_multiplier"},
+    "exploration_noise": _float(0.03, 0.4, log=True),
+    "target_noise": _float(0.05, 0.5, log=True),
+    "policy_delay": _int(1, 4),
+    "replay_ratio": _int(1, 16, log=True),
+}
+# The replay ratio and the resets of the agents below are a regime that the papers compare them in: not searched, so
+# that a search stays in the one that it was started in.
+SAC_SPACE: Space = {**OFF_POLICY_SPACE, "pessimism": _float(0.0, 1.0)}
+#: Replay ratio and resets are what makes this agent.
+SR_SAC_SPACE: Space = {
+    **SAC_SPACE,
+    "replay_ratio": _int(4, 32, log=True),
+    "resets": _int(10_000, 320_000, log=True),
+}
+DAC_SPACE: Space = {
+    **SAC_SPACE,
+    "kl_target": _float(0.05, 2.0, log=True),
+    "std_multiplier": _float(0.75, 2.0),
+}
+OAC_SPACE: Space = {
+    **SAC_SPACE,
+    "optimism": _float(0.5, 10.0, log=True),
+    "kl_radius": _float(0.1, 20.0, log=True),
+}
+TOP_SPACE: Space = {**OFF_POLICY_SPACE, "bandit_learning_rate": _float(1e-4, 1.0, log=True)}
+#: Pessimism that is learned by gradient descent.
+GPL_SPACE: Space = {
+    **OFF_POLICY_SPACE,
+    "initial_pessimism": _float(0.0, 2.0),
+    "pessimism_learning_rate": _float(1e-6, 1e-3, log=True),
+}
+OPL_SPACE: Space = {
+    **GPL_SPACE,
+    "segment_length": _int(4, 32, log=True),
+    "one_minus_td_lambda": _float(0.01, 0.3, log=True),
+}
+VPL_SPACE: Space = {**GPL_SPACE, "validation_proportion": _float(1 / 128, 1 / 4, log=True)}
+#: What each setting of a regularization belongs to, by its argument: the group, the regularization, and the range.
+REGULARIZATION_SETTINGS: dict[str, tuple[str, str, Suggest]] = {
+    "weight_decay": ("network_regularization", "weight_decay", _float(1e-5, 1e-1, log=True)),
+    "sam_radius": ("plasticity_regularization", "sam", _float(5e-3, 0.5, log=True)),
+    "resets": ("plasticity_regularization", "resets", _int(10_000, 320_000, log=True)),
+    "redo_period": ("plasticity_regularization", "redo", _int(100, 10_000, log=True)),
+}
+#: The settings are always suggested, so that all trials have the same parameters; only what is chosen uses them.
+REGULARIZED_SPACE: Space = {
+    **OFF_POLICY_SPACE,
+    "critic_regularization": _choice(*CRITIC_REGULARIZATIONS),
+    "network_regularization": _mixture(*NETWORK_REGULARIZATIONS),
+    "plasticity_regularization": _mixture(*PLASTICITY_REGULARIZATIONS),
+    **{name: suggest for name, (_, _, suggest) in REGULARIZATION_SETTINGS.items()},
+}
 
 
 def decode(params: dict[str, Any]) -> dict[str, Any]:
@@ -101,16 +169,33 @@ def decode(params: dict[str, Any]) -> dict[str, Any]:
     return arguments
 
 
-def sampler(space: Space) -> Sampler:
+def decode_regularized(params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param params: suggested parameters of ``REGULARIZED_SPACE``, as Optuna stores them
+    :return: arguments of ``RegularizedSAC``: as ``decode``, a mixture "a+b" as the list of its members, and None for
+        the setting of a regularization that is not chosen
+    """
+    arguments = decode(params)
+    for name in ("network_regularization", "plasticity_regularization"):
+        members = arguments[name].split("+")
+        arguments[name] = members if len(members) > 1 else members[0]
+    for name, (group, regularization, _) in REGULARIZATION_SETTINGS.items():
+        if regularization not in params[group].split("+"):
+            arguments[name] = None
+    return arguments
+
+
+def sampler(space: Space, convert: Converter = decode) -> Sampler:
     """
     :param space: search space of an algorithm
+    :param convert: what turns its parameters into arguments
     :return: the zoo's sampler of it
     """
 
     def sample(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
         uses_her = additional_args["using_her_replay_buffer"]
         params = {name: suggest(trial, name) for name, suggest in {**space, **(HER_SPACE if uses_her else {})}.items()}
-        arguments = decode(params)
+        arguments = convert(params)
         for name in arguments.keys() - params.keys() - {"replay_buffer_kwargs"}:
             trial.set_user_attr(name, arguments[name])  # so that reports show the value itself, not its code
         if uses_her:
@@ -131,19 +216,30 @@ class ZooAlgorithm(NamedTuple):
     An algorithm as the zoo needs it.
 
     :param algorithm: the class
-    :param sample: suggests arguments for a trial of the search
-    :param convert: turns a stored trial's parameters into the same arguments
+    :param space: its search space
+    :param convert: turns suggested parameters, of a trial under way or a stored one, into arguments
     """
 
     algorithm: type[BaseAlgorithm]
-    sample: Sampler
+    space: Space
     convert: Converter = decode
 
 
-#: The algorithms by their names in the zoo (``--algo``, log folders, ``hyperparams/<name>.yml``).
+#: The algorithms by their names in the zoo (``--algo``, log folders, ``hyperparams/<name>.yml``). "sac" is the zoo's
+#: own, Stable-Baselines3's.
 ALGORITHMS: dict[str, ZooAlgorithm] = {
-    "bro": ZooAlgorithm(BRO, sampler({**BRO_SPACE, "replay_ratio": _int(1, 16, log=True)})),
-    "bro_fast": ZooAlgorithm(BROFast, sampler({**BRO_SPACE, "replay_ratio": _int(1, 4)})),
+    "bro": ZooAlgorithm(BRO, {**BRO_SPACE, "replay_ratio": _int(1, 16, log=True)}),
+    "bro_fast": ZooAlgorithm(BROFast, {**BRO_SPACE, "replay_ratio": _int(1, 4)}),
+    "bro_td3": ZooAlgorithm(BROTD3, BRO_TD3_SPACE),
+    "dac": ZooAlgorithm(DAC, DAC_SPACE),
+    "gpl_sac": ZooAlgorithm(GPLSAC, GPL_SPACE),
+    "oac": ZooAlgorithm(OAC, OAC_SPACE),
+    "opl_sac": ZooAlgorithm(OPLSAC, OPL_SPACE),
+    "regularized_sac": ZooAlgorithm(RegularizedSAC, REGULARIZED_SPACE, decode_regularized),
+    "sac_sample": ZooAlgorithm(SAC, SAC_SPACE),
+    "sr_sac": ZooAlgorithm(SRSAC, SR_SAC_SPACE),
+    "top_sac": ZooAlgorithm(TOPSAC, TOP_SPACE),
+    "vpl_sac": ZooAlgorithm(VPLSAC, VPL_SPACE),
 }
 
 
@@ -159,7 +255,7 @@ def register() -> None:
     for name, entry in ALGORITHMS.items():
         # In place: the zoo's other modules hold these same dicts.
         rl_zoo3.utils.ALGOS[name] = entry.algorithm
-        samplers[name] = entry.sample
+        samplers[name] = sampler(entry.space, entry.convert)
         converters[name] = entry.convert
     _adapt_experiment_manager()
 

@@ -1,6 +1,7 @@
 """The command line, run in this process where that is enough."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -92,6 +93,66 @@ def test_train_continue_enjoy_and_plot_an_id_with_a_slash(zoo_run, capsys: pytes
     assert "| 505 |" in capsys.readouterr().out
 
 
+#: What runs in a few seconds and still takes gradient steps, in the cheapest of each algorithm's networks.
+SHORT = ["--env", "Pendulum-v1", "--eval-freq", "-1", "--device", "cpu"]
+QUICK = ("dac", "vpl_sac")
+NAMES = [
+    "bro", "bro_fast", "bro_td3", "dac", "gpl_sac", "oac", "opl_sac", "regularized_sac", "sac_sample", "sr_sac",
+    "top_sac", "vpl_sac",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in NAMES])
+def test_every_algorithm_trains_in_two_environments_goes_on_and_is_shown(
+    zoo_run, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    params = ["-params", "learning_starts:20", "buffer_size:2000", "replay_ratio:1", "n_envs:2"]
+    file = f"logs/{name}/Pendulum-v1_1/Pendulum-v1.zip"
+    zoo_run("train", "--algo", name, *SHORT, "-n", "60", "--save-replay-buffer", *params)
+    assert Path(f"logs/{name}/Pendulum-v1_1/1.monitor.csv").exists()
+    zoo_run("train", "--algo", name, *SHORT, "-n", "40", "-i", file, *params)
+    assert "Loading replay buffer" in capsys.readouterr().out
+    for run_id in ("1", "2"):
+        zoo_run(
+            "enjoy", "--algo", name, "--env", "Pendulum-v1", "-f", "logs", "--exp-id", run_id, "--no-render",
+            "-n", "210", "--device", "cpu",
+        )  # fmt: skip
+    assert capsys.readouterr().out.count("1 Episodes") == 2
+
+    from rl_zoo3 import ALGOS
+
+    first, second = (ALGOS[name].load(file.replace("_1/", f"_{run_id}/"), device="cpu") for run_id in "12")
+    # Transitions of both environments; gradient steps for those after the warm-up.
+    assert (first.num_transitions, first._n_updates) == (60, 40)
+    assert (second.num_transitions, second._n_updates) == (100, 80)
+
+
+def test_every_algorithm_is_run() -> None:
+    pytest.importorskip("rl_zoo3")
+    from sb3_sample.zoo import ALGORITHMS
+
+    assert list(ALGORITHMS) == NAMES
+
+
+@pytest.mark.slow
+def test_regularizations_and_the_high_replay_ratio_stay_when_a_run_goes_on(zoo_run) -> None:
+    small = ["learning_starts:20", "buffer_size:2000"]
+    zoo_run(
+        "train", "--algo", "regularized_sac", *SHORT, "-n", "40", "--save-replay-buffer", "-params", *small,
+        "replay_ratio:16", "critic_regularization:'gpl'", "network_regularization:['layer_norm', 'weight_decay']",
+        "plasticity_regularization:['resets', 'sam']", "sam_radius:0.1",
+    )  # fmt: skip
+    file = "logs/regularized_sac/Pendulum-v1_1/Pendulum-v1.zip"
+    zoo_run("train", "--algo", "regularized_sac", *SHORT, "-n", "10", "-i", file, "-params", *small)
+
+    from sb3_sample import RegularizedSAC
+
+    model = RegularizedSAC.load(file.replace("_1/", "_2/"), device="cpu")
+    assert (model.replay_ratio, model.resets, model.sam_radius, model.weight_decay) == (16, 160_000, 0.1, 0.01)
+    assert model.network_regularization == ["layer_norm", "weight_decay"]
+    assert model._n_updates == 16 * (20 + 10)
+
+
 def test_the_algorithms_of_the_zoo_go_on_working(zoo_run, capsys: pytest.CaptureFixture[str]) -> None:
     zoo_run("train", "--algo", "sac", "--env", "Pendulum-v1", "-n", "110", "--eval-freq", "-1")
     assert "rl_zoo3/hyperparams/sac.yml" in capsys.readouterr().out
@@ -116,24 +177,30 @@ def test_a_broken_import_is_not_taken_for_a_missing_zoo(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("env_id", ["Pendulum-v1", ENV])
-def test_search_store_and_train_with_a_stored_trial(zoo_run, capsys: pytest.CaptureFixture[str], env_id: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "env_id"),
+    [("bro_fast", "Pendulum-v1"), ("bro_fast", ENV), ("regularized_sac", "Pendulum-v1"), ("vpl_sac", "Pendulum-v1")],
+)
+def test_search_store_and_train_with_a_stored_trial(
+    zoo_run, capsys: pytest.CaptureFixture[str], name: str, env_id: str
+) -> None:
     study = ["--storage", "sqlite:///study.db", "--study-name", "study"]
     zoo_run(
-        "train", "--algo", "bro_fast", "--env", env_id, "-n", "60", "-optimize", "--n-trials", "2",
+        "train", "--algo", name, "--env", env_id, "-n", "60", "-optimize", "--n-trials", "2",
         "--n-startup-trials", "1", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots", *study,
         "-params", "learning_starts:50",
     )  # fmt: skip
     import optuna
 
-    from sb3_sample.zoo import decode
+    from sb3_sample.zoo import ALGORITHMS
 
     trials = optuna.load_study(storage="sqlite:///study.db", study_name="study").trials
     assert len(trials) == 2
-    zoo_run("train", "--algo", "bro_fast", "--env", env_id, "-n", "30", "--eval-freq", "-1", *study, "--trial-id", "1")
+    zoo_run("train", "--algo", name, "--env", env_id, "-n", "30", "--eval-freq", "-1", *study, "--trial-id", "1")
     output = capsys.readouterr().out
-    assert f"('learning_rate', {decode(trials[1].params)['learning_rate']})" in output
-    assert f"('gamma', {decode(trials[1].params)['gamma']})" in output
+    assert len(trials[1].params) > 4
+    for argument, value in ALGORITHMS[name].convert(trials[1].params).items():
+        assert re.search(rf"\('{argument}',\s+{re.escape(repr(value))}\)", output)
 
 
 @pytest.mark.slow

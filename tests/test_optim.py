@@ -1,4 +1,4 @@
-"""AdamW against torch's Adam and against its definition in float64."""
+"""AdamW against torch's Adam and its definition in float64; sharpness-aware gradients against two by hand."""
 
 import copy
 import io
@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from sb3_sample import optim
-from sb3_sample.optim import AdamW
+from sb3_sample.networks import MLP
+from sb3_sample.optim import AdamW, sharpness_aware_gradients
 
 
 def parameters(shapes: list[tuple[int, ...]], seed: int = 0) -> list[torch.Tensor]:
@@ -317,3 +318,117 @@ def test_bad_arguments(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=name) as caught:
         AdamW(parameters([(1,)]), **{name: value})
     assert str(value) in str(caught.value)
+
+
+# ---------------------------------------------------------------- sharpness-aware gradients
+
+
+def test_uphill_gradient_by_hand() -> None:
+    """(x^2 + 2 y^2) / 2 at (3, 2): the gradient (3, 4) is 5 long; a radius of 1/2 leads to (3.3, 2.4)."""
+    x, y = torch.tensor([3.0], requires_grad=True), torch.tensor([2.0], requires_grad=True)
+
+    def loss() -> torch.Tensor:
+        return (x.square() + 2 * y.square()).sum() / 2
+
+    at: list[tuple[float, float]] = []
+
+    def evaluate() -> torch.Tensor:
+        at.append((x.item(), y.item()))
+        return loss()
+
+    gradients = sharpness_aware_gradients(loss(), evaluate, [x, y], 0.5, [None, None])
+    assert at == [pytest.approx((3.3, 2.4))]
+    assert [g.item() for g in gradients] == pytest.approx([3.3, 4.8])
+    assert (x.item(), y.item()) == (3.0, 2.0)
+    assert x.grad is None and y.grad is None
+
+
+def test_stacked_networks_move_by_the_radius_each() -> None:
+    """The second copy's gradient is (6, 0): it moves by 1/2 too, whatever the first one's gradient is."""
+    x, y = torch.tensor([[3.0], [6.0]], requires_grad=True), torch.tensor([[[2.0]], [[0.0]]], requires_grad=True)
+
+    def loss() -> torch.Tensor:
+        return x.square().sum() / 2 + y.square().sum()
+
+    gradients = sharpness_aware_gradients(loss(), loss, [x, y], 0.5, [2, 2])
+    torch.testing.assert_close(gradients[0], torch.tensor([[3.3], [6.5]]))
+    torch.testing.assert_close(gradients[1], torch.tensor([[[4.8]], [[0.0]]]))
+
+
+def test_stacked_beside_unstacked() -> None:
+    """
+    sum_e (w v_e)^2 / 2 at w = 1, v = (1, 2): the gradients are 5 and (1, 2), each by itself of the radius 0.1, and the
+    gradient at w = 1.1, v = (1.1, 2.1) is 1.1 (1.21 + 4.41) and 1.21 (1.1, 2.1).
+    """
+    w, v = torch.tensor([1.0], requires_grad=True), torch.tensor([1.0, 2.0], requires_grad=True)
+
+    def loss() -> torch.Tensor:
+        return (w * v).square().sum() / 2
+
+    dw, dv = sharpness_aware_gradients(loss(), loss, [w, v], 0.1, [None, 2])
+    torch.testing.assert_close(dw, torch.tensor([6.182]))
+    torch.testing.assert_close(dv, torch.tensor([1.331, 2.541]))
+
+
+def test_two_copies_are_two_networks() -> None:
+    torch.manual_seed(0)
+    both = MLP(3, (5, 4), n_copies=2)
+    alone = [MLP(3, (5, 4), n_copies=1) for _ in range(2)]
+    for e, network in enumerate(alone):
+        for own, shared in zip(network.parameters(), both.parameters(), strict=True):
+            own.data.copy_(shared[e : e + 1])
+    x, target = torch.randn(6, 3), torch.randn(2, 6, 4)
+    target[1] *= 100  # gradients of very different lengths
+
+    def loss(network: MLP, of: torch.Tensor) -> torch.Tensor:
+        return (network(x) - of).square().sum()
+
+    def gradients(network: MLP, of: torch.Tensor, copies: int) -> list[torch.Tensor]:
+        parameters = list(network.parameters())
+        return sharpness_aware_gradients(
+            loss(network, of), lambda: loss(network, of), parameters, 0.5, [copies] * len(parameters)
+        )
+
+    together = gradients(both, target, 2)
+    for e, network in enumerate(alone):
+        for ours, theirs in zip(together, gradients(network, target[e : e + 1], 1), strict=True):
+            torch.testing.assert_close(ours[e : e + 1], theirs, rtol=1e-4, atol=1e-4)
+    plain = torch.autograd.grad(loss(both, target), list(both.parameters()))
+    assert not torch.allclose(plain[0], together[0], rtol=1e-2), "the radius would not show"
+
+
+@pytest.mark.parametrize("radius", [1e-3, 0.05, 1e8])
+@pytest.mark.parametrize("fails", [False, True])
+def test_parameters_are_restored_bit_for_bit(radius: float, fails: bool) -> None:
+    params = parameters(SHAPES[1:])
+    before = copies(params)
+
+    def loss() -> torch.Tensor:
+        return sum((p.square() * 1.7).sum() for p in params)  # type: ignore[return-value]
+
+    def evaluate() -> torch.Tensor:
+        assert not any(torch.equal(a, b) for a, b in zip(params, before, strict=True)), "not moved"
+        if fails:
+            raise KeyError("the evaluation fails")
+        return loss()
+
+    if fails:
+        with pytest.raises(KeyError, match="the evaluation fails"):
+            sharpness_aware_gradients(loss(), evaluate, params, radius, [None] * len(params))
+    else:
+        sharpness_aware_gradients(loss(), evaluate, params, radius, [None] * len(params))
+    assert all(torch.equal(a, b) for a, b in zip(params, before, strict=True))
+
+
+@pytest.mark.parametrize("n_copies", [None, 2])
+def test_gradient_of_zero_stays_zero(n_copies: int | None) -> None:
+    p = torch.ones(2, 3, requires_grad=True)
+    (gradient,) = sharpness_aware_gradients((0 * p).sum(), lambda: (0 * p).sum(), [p], 0.05, [n_copies])
+    assert torch.equal(gradient, torch.zeros(2, 3)) and torch.equal(p.detach(), torch.ones(2, 3))
+
+
+def test_uphill_gradient_of_a_number() -> None:
+    """A parameter without axes: x^3 at 2 has the gradient 12, that at 2.5 is 18.75."""
+    x = torch.tensor(2.0, requires_grad=True)
+    (gradient,) = sharpness_aware_gradients(x**3, lambda: x**3, [x], 0.5, [None])
+    assert gradient.shape == () and gradient.item() == pytest.approx(18.75) and x.item() == 2

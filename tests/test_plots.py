@@ -151,6 +151,20 @@ def test_picture_has_a_line_a_curve_and_the_colour_tells_the_algorithm() -> None
     assert axes.get_ylabel()
 
 
+def test_published_sac_has_the_colour_of_the_papers_sac_where_it_is_drawn() -> None:
+    pytest.importorskip("matplotlib")
+    runs = [plots.Run(name, Path("1"), np.array([25_000]), np.ones(1)) for name in ("sac", "sac_sample")]
+    (published,) = plots.select_published(ENV, ["SAC"], "return")
+
+    def colours(*ours: plots.Run) -> list[str]:
+        curves = [*(plots.Curve(run.label, plots.summarize([run])) for run in ours), published]
+        return [str(line.get_color()) for line in plots.draw(ENV, curves, "return").axes[0].lines]
+
+    stock, paper, theirs = colours(*runs)
+    assert stock != paper == theirs
+    assert len(set(colours(runs[0]))) == len(set(colours(runs[1]))) == 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

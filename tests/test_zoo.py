@@ -4,6 +4,8 @@ import argparse
 import inspect
 import math
 import os
+import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -17,10 +19,13 @@ pytest.importorskip("rl_zoo3")
 import optuna
 import rl_zoo3
 import rl_zoo3.exp_manager
+import stable_baselines3
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from rl_zoo3.utils import StoreDict
 
-from sb3_sample import BRO, BROFast, zoo
+from sb3_sample import BRO, DAC, SAC, BROFast, RegularizedSAC, zoo
+from sb3_sample.sac.bro import BRO_RESETS
 
 ROOT = Path(__file__).parent.parent
 #: Keys that the zoo takes out of an entry, or turns into constructor arguments, before it builds the model.
@@ -42,6 +47,14 @@ def entries(name: str) -> dict[str, dict[str, Any]]:
 
 
 ALL_ENTRIES = [(name, env_id) for name in zoo.ALGORITHMS for env_id in entries(name)]
+#: One file of a kind; the others' entries are nearly the same.
+SAMPLE = ("bro", "bro_fast", "regularized_sac", "top_sac")
+BUILT = [
+    pytest.param(name, env_id, marks=() if name in SAMPLE or env_id == "default" else pytest.mark.slow)
+    for name, env_id in ALL_ENTRIES
+]
+#: Algorithms with the settings that P2 to P4 share.
+FAMILY = sorted(name for name, entry in zoo.ALGORITHMS.items() if not issubclass(entry.algorithm, BRO))
 
 
 def arguments_of(name: str) -> dict[str, Any]:
@@ -71,6 +84,9 @@ def test_register_puts_the_algorithms_into_the_zoo_once() -> None:
     assert (ExperimentManager.__init__, ExperimentManager.create_envs) == (init, create_envs)
     assert rl_zoo3.ALGOS["bro"] is rl_zoo3.exp_manager.ALGOS["bro"] is BRO
     assert rl_zoo3.ALGOS["bro_fast"] is BROFast
+    assert rl_zoo3.ALGOS["dac"] is DAC
+    assert rl_zoo3.ALGOS["sac_sample"] is SAC
+    assert rl_zoo3.ALGOS["sac"] is stable_baselines3.SAC
     assert zoo.ALGORITHMS.keys() <= HYPERPARAMS_SAMPLER.keys() & HYPERPARAMS_CONVERTER.keys()
 
 
@@ -111,12 +127,73 @@ def test_a_stored_trial_gives_the_arguments_it_was_run_with(name: str, additiona
 @pytest.mark.parametrize("name", zoo.ALGORITHMS)
 def test_the_defaults_lie_in_the_search_space(name: str) -> None:
     sample: Any = HYPERPARAMS_SAMPLER[name]
-    sampled = sample(optuna.create_study().ask(), 1, 1, NO_HER)
-    defaults = {key: arguments_of(name)[key] for key in sampled}
-    stored = {key: value for key, value in defaults.items() if key not in ("gamma", "batch_size")}
-    stored |= {"one_minus_gamma": 1 - defaults["gamma"], "batch_size_pow": round(math.log2(defaults["batch_size"]))}
+    trial = optuna.create_study().ask()
+    defaults = {key: arguments_of(name)[key] for key in sample(trial, 1, 1, NO_HER)}
+    if name == "vpl_sac":
+        defaults["validation_proportion"] = 1 / 32  # what its None stands for
+    # What stands for the default of a regularization's setting, which is None where the regularization is not chosen.
+    in_force = {"weight_decay": 0.01, "sam_radius": 0.05, "resets": 160_000, "redo_period": 1_000}
+
+    def encode(key: str) -> Any:
+        if key.startswith("one_minus_"):
+            return 1 - defaults[key.removeprefix("one_minus_")]
+        if key.endswith("_pow"):
+            return round(math.log2(defaults[key.removesuffix("_pow")]))
+        return in_force[key] if defaults[key] is None else defaults[key]
+
+    stored = {key: encode(key) for key in trial.params}
     # FixedTrial refuses a value outside of its range.
     assert sample(optuna.trial.FixedTrial(stored), 1, 1, NO_HER) == pytest.approx(defaults)
+
+
+@pytest.mark.parametrize("name", zoo.ALGORITHMS)
+def test_what_the_search_samples_builds_a_model(name: str) -> None:
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    for _ in range(3):
+        arguments = HYPERPARAMS_SAMPLER[name](study.ask(), 1, 1, dict(NO_HER))
+        model: Any = zoo.ALGORITHMS[name].algorithm(
+            "MlpPolicy", "Pendulum-v1", buffer_size=10, device="cpu", **arguments
+        )  # type: ignore[call-arg]
+        for argument in arguments.keys() - {"learning_rate"}:
+            if name != "regularized_sac" or arguments[argument] is not None:
+                assert getattr(model, argument) == arguments[argument]
+
+
+def test_regularizations_are_mixed_and_only_the_chosen_have_settings() -> None:
+    settings = {"weight_decay": 0.02, "sam_radius": 0.1, "resets": 20_000, "redo_period": 500}
+    groups = {
+        "critic_regularization": "gpl",
+        "network_regularization": "layer_norm+weight_decay",
+        "plasticity_regularization": "redo",
+    }
+    assert zoo.decode_regularized({**groups, **settings}) == {
+        "critic_regularization": "gpl",
+        "network_regularization": ["layer_norm", "weight_decay"],
+        "plasticity_regularization": "redo",
+        "weight_decay": 0.02,
+        "sam_radius": None,
+        "resets": None,
+        "redo_period": 500,
+    }
+
+
+def test_every_mixture_of_regularizations_can_be_drawn_and_built() -> None:
+    trial = optuna.create_study().ask()
+    HYPERPARAMS_SAMPLER["regularized_sac"](trial, 1, 1, dict(NO_HER))
+    choices = {
+        name: distribution.choices
+        for name, distribution in trial.distributions.items()
+        if isinstance(distribution, optuna.distributions.CategoricalDistribution)
+    }
+    assert {name: len(options) for name, options in choices.items()} == {
+        "critic_regularization": 4,
+        "network_regularization": 2**3,
+        "plasticity_regularization": 2**4,
+    }
+    for name, options in choices.items():
+        for option in options:
+            arguments = zoo.decode_regularized({**trial.params, name: option})
+            RegularizedSAC("MlpPolicy", "Pendulum-v1", buffer_size=10, device="cpu", **arguments)
 
 
 # ---------------------------------------------------------------- hyperparameter files
@@ -135,7 +212,7 @@ def test_an_entry_has_known_keys_and_repeats_no_default(name: str, env_id: str) 
     assert [key for key, value in entry.items() if key in arguments and arguments[key] == value] == []
 
 
-@pytest.mark.parametrize(("name", "env_id"), ALL_ENTRIES)
+@pytest.mark.parametrize(("name", "env_id"), BUILT)
 def test_an_entry_builds_a_model(name: str, env_id: str, tmp_path: Path) -> None:
     if env_id.startswith("Fetch"):
         pytest.importorskip("gymnasium_robotics")
@@ -151,6 +228,60 @@ def test_an_entry_builds_a_model(name: str, env_id: str, tmp_path: Path) -> None
     assert experiment.n_timesteps > model.learning_starts  # type: ignore[attr-defined]
     assert model.env is not None
     model.env.close()
+
+
+@pytest.mark.parametrize("name", FAMILY)
+def test_the_files_of_the_family_differ_in_nothing_but_what_they_say(name: str) -> None:
+    ours, shared = entries(name), entries("sac_sample")
+    for entry in ours.values():
+        if name == "top_sac":
+            entry.pop("bandit_learning_rate", None)
+    if name == "vpl_sac":
+        shared = {env_id: entry for env_id, entry in shared.items() if not env_id.startswith("Fetch")}
+    assert ours == shared
+
+
+#: The two commands at the head of each file: replay ratio and resets of the model.
+REGIMES = {
+    **dict.fromkeys(FAMILY, ((2, ()), (16, 160_000))),
+    "bro_td3": ((10, BRO_RESETS), (2, (15_000,))),
+}
+
+
+@pytest.mark.parametrize("name", REGIMES)
+def test_the_commands_in_the_file_give_the_regimes_of_the_papers(name: str, tmp_path: Path) -> None:
+    head = (zoo.HYPERPARAMS / f"{name}.yml").read_text().partition("default:")[0]
+    head = re.sub(r"\\\n#", "", head)
+    parser = argparse.ArgumentParser()
+    for option in ("--algo", "--env"):
+        parser.add_argument(option)
+    parser.add_argument("-params", nargs="+", action=StoreDict, default={})
+    found = []
+    for command in re.findall(r"sb3-sample train (.*)", head):
+        given = parser.parse_args(shlex.split(command))
+        assert (given.algo, given.env) == (name, "dmc/cheetah-run-v0")
+        # Pendulum's model is the smaller one; the regime is the same.
+        experiment = manager(name, "Pendulum-v1", tmp_path, hyperparams={"buffer_size": 1000, **given.params})
+        result = experiment.setup_experiment()
+        assert result is not None
+        model: Any = result[0]
+        found.append((model.replay_ratio, model.resets))
+        assert model.plasticity.period == (160_000 if model.resets == 160_000 else None)
+    assert tuple(found) == REGIMES[name]
+
+
+@pytest.mark.parametrize("name", [name for name in FAMILY if name != "sr_sac"])
+def test_a_search_keeps_the_replay_ratio(name: str) -> None:
+    space = zoo.ALGORITHMS[name].space
+    assert "replay_ratio" not in space
+    assert "resets" not in space or name == "regularized_sac"  # of which resets are a regularization
+
+
+def test_vpl_sac_refuses_relabelled_goals(tmp_path: Path) -> None:
+    pytest.importorskip("gymnasium_robotics")
+    her = {"policy": "MultiInputPolicy", "replay_buffer_class": "HerReplayBuffer", "buffer_size": 1000}
+    with pytest.raises(ValueError, match="leave replay_buffer_class out, or pass validation_proportion=0"):
+        manager("vpl_sac", "FetchReach-v4", tmp_path, hyperparams=her).setup_experiment()
 
 
 # ---------------------------------------------------------------- the stock zoo

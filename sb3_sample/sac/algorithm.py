@@ -22,12 +22,13 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from sb3_sample.envs.finite_check import FiniteCheck
+from sb3_sample.networks.spectral_norm import SpectralNorm
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 from sb3_sample.sac import arguments, losses
 from sb3_sample.sac.batch import Batch, CriticStep, Noise, draw_batches
 from sb3_sample.sac.buffers import ValidationDictReplayBuffer, ValidationReplayBuffer, ValidationSplit
 from sb3_sample.sac.exploration import EXPLORATIONS, Exploration
-from sb3_sample.sac.parts import Part
+from sb3_sample.sac.parts import ParametersDoNotFit, Part
 from sb3_sample.sac.pessimism import PESSIMISMS, Pessimism, pessimistic_value
 from sb3_sample.sac.plasticity import ReDo, Resets
 from sb3_sample.sac.policies import Actor, CnnPolicy, CriticEnsemble, MlpPolicy, MultiInputPolicy, SACPolicy
@@ -69,7 +70,7 @@ class SAC(OffPolicyAlgorithm):
     :param optimize_memory_usage: as in Stable-Baselines3's replay buffer
     :param n_steps: n-step returns, as in Stable-Baselines3
     :param ent_coef: temperature: "auto" learns it, "auto_0.1" from that start, a number fixes it
-    :param target_update_interval: gradient steps between two updates of the targets
+    :param target_update_interval: gradient steps between two updates of the targets; None: ``policy_delay``
     :param target_entropy: entropy that the learned temperature aims at; "auto" is -|A|/2
     :param replay_ratio: gradient steps per environment transition after the warm-up, whatever the number of
         environments; may be below 1
@@ -133,7 +134,7 @@ class SAC(OffPolicyAlgorithm):
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
         ent_coef: str | float = "auto",
-        target_update_interval: int = 1,
+        target_update_interval: int | None = 1,
         target_entropy: str | float = "auto",
         replay_ratio: float = 2,
         n_quantiles: int | None = None,
@@ -248,6 +249,7 @@ class SAC(OffPolicyAlgorithm):
         if isinstance(self.temperature, LogScalar):
             betas = (self.temperature_beta1, 0.999)
             self.temperature_optimizer = AdamW(self.temperature.parameters(), lr=self.lr_schedule(1), betas=betas)
+        self._set_training_mode(False)
 
     def _check_arguments(self) -> None:
         """
@@ -358,9 +360,10 @@ class SAC(OffPolicyAlgorithm):
         try:
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except RuntimeError as error:
-            if kwargs and "loading state_dict" in str(error):
+            if kwargs and ("loading state_dict" in str(error) or isinstance(error, ParametersDoNotFit)):
                 raise ValueError(
-                    f"{', '.join(sorted(kwargs))}: with these arguments the model has other networks than the file"
+                    f"{', '.join(sorted(kwargs))}: with these arguments the model has other networks or parts than the "
+                    f"file ({error})"
                 ) from error
             raise
 
@@ -382,7 +385,10 @@ class SAC(OffPolicyAlgorithm):
             name: [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
             for name, optimizer in self._optimizers().items()
         }
-        super().set_parameters(load_path_or_dict, exact_match, device)
+        try:
+            super().set_parameters(load_path_or_dict, exact_match, device)
+        except ValueError as error:
+            raise ParametersDoNotFit(str(error)) from error
         for name, optimizer in self._optimizers().items():
             for group, own in zip(optimizer.param_groups, settings[name], strict=True):
                 group.update(own)
@@ -408,14 +414,8 @@ class SAC(OffPolicyAlgorithm):
         return self.policy.make_optimizer(parameters, self.lr_schedule)
 
     def _parts(self) -> dict[str, Part]:
-        parts: dict[str, Part] = {
-            "explorer": self.explorer,
-            "pessimism_rule": self.pessimism_rule,
-            "plasticity": self.plasticity,
-        }
-        if self.redo is not None:
-            parts["redo"] = self.redo
-        return parts
+        # ReDo has no state and hears of gradient steps only.
+        return {"explorer": self.explorer, "pessimism_rule": self.pessimism_rule, "plasticity": self.plasticity}
 
     def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Every optimizer by its path from the algorithm."""
@@ -466,6 +466,11 @@ class SAC(OffPolicyAlgorithm):
             for name, parameter in module.named_parameters():
                 state[name] = torch.lerp(state[name].to(parameter.device), parameter.detach(), shrink)
         module.load_state_dict(state)
+        if shrink > 0:
+            # The directions along which kernels are normalised are neither the old nor the fresh ones.
+            for layer in module.modules():
+                if isinstance(layer, SpectralNorm):
+                    layer.find_direction()
         if isinstance(module, Part):
             for optimizer in module.optimizers().values():
                 optimizer.state.clear()
@@ -507,6 +512,24 @@ class SAC(OffPolicyAlgorithm):
                 if "episode" in infos[index]:  # Monitor's entry; absent if the environment is not monitored
                     part.on_episode_end(self, int(index), infos[index]["episode"]["r"])
 
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Load a replay buffer, as in Stable-Baselines3.
+
+        :param path: where ``save_replay_buffer`` wrote it
+        :param truncate_last_traj: with ``HerReplayBuffer``, whether the last episode counts as ended
+        :raises ValueError: if it holds out another share of its transitions than ``validation_proportion``
+        """
+        before = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        share = self.replay_buffer.validation_proportion if isinstance(self.replay_buffer, ValidationSplit) else 0.0
+        if share != self.validation_proportion:
+            self.replay_buffer = before
+            raise ValueError(
+                f"the replay buffer of {path} holds out {share} of its transitions, but this model has "
+                f"validation_proportion={self.validation_proportion}"
+            )
+
     # ---------------------------------------------------------------- learning
 
     def learn(
@@ -529,9 +552,13 @@ class SAC(OffPolicyAlgorithm):
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
         :return: the trained model
         """
+        resets_environment = reset_num_timesteps or self._last_obs is None
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
+        if resets_environment:
+            for part in self._parts().values():
+                part.on_environment_reset(self)
         callback.on_training_start(locals(), globals())
         assert self.env is not None and self.replay_buffer is not None
         while self.num_timesteps < total_timesteps:
@@ -582,7 +609,7 @@ class SAC(OffPolicyAlgorithm):
         :param batch_size: transitions a step
         """
         assert self.replay_buffer is not None
-        self.policy.set_training_mode(True)
+        self._set_training_mode(True)
         rate = self.lr_schedule(self._current_progress_remaining)
         for optimizer in self._optimizers().values():
             for group in optimizer.param_groups:
@@ -594,6 +621,13 @@ class SAC(OffPolicyAlgorithm):
             n_batches = min(MAX_BATCHES_AT_ONCE, gradient_steps - first)
             for batch in draw_batches(self.replay_buffer, n_batches, batch_size, self.gamma, self._vec_normalize_env):
                 self._metrics.update(self._update(batch))
+        self._set_training_mode(False)
+
+    def _set_training_mode(self, mode: bool) -> None:
+        """Dropout and power iterations: on during gradient steps, off whoever acts."""
+        self.policy.set_training_mode(mode)
+        for part in self._parts().values():
+            part.train(mode)
 
     def _update(self, batch: Batch, noise: Noise | None = None) -> dict[str, torch.Tensor]:
         """
@@ -627,7 +661,7 @@ class SAC(OffPolicyAlgorithm):
 
         # Targets, by Polyak averaging.
         self._n_updates += 1
-        if self._n_updates % self.target_update_interval == 0:
+        if self._n_updates % (self.target_update_interval or self.policy_delay) == 0:
             self._follow(self.critic_target, self.critic)
 
         if self._n_updates % self.policy_delay == 0:
@@ -665,10 +699,15 @@ class SAC(OffPolicyAlgorithm):
             return self.pessimism_rule.value(q)
         return pessimistic_value(q, float(self.actor_pessimism))
 
-    def _follow(self, target: nn.Module, online: nn.Module) -> None:
+    def _follow(self, target: Actor | CriticEnsemble, online: Actor | CriticEnsemble) -> None:
         """One step of Polyak averaging; with ``tau=1`` the target is the online network."""
         with torch.no_grad():
             torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), weight=self.tau)
+            # Running statistics of a features extractor, as in Stable-Baselines3.
+            assert target.features_extractor is not None and online.features_extractor is not None
+            statistics = zip(target.features_extractor.buffers(), online.features_extractor.buffers(), strict=True)
+            for ours, theirs in statistics:
+                ours.copy_(theirs)
 
     def _sharpness_aware_step(self, loss: torch.Tensor, batch: Batch, target: torch.Tensor) -> None:
         """One step of the critics' optimizer with the gradient from ``sam_radius`` uphill."""

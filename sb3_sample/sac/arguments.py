@@ -29,8 +29,11 @@ def check(agent: "SAC") -> None:
         ("policy_delay", 1),
         ("n_steps", 1),
     ):
-        if not getattr(agent, name) >= low:
-            raise ValueError(f"{name} must be at least {low}, not {getattr(agent, name)}")
+        value = getattr(agent, name)
+        if name == "target_update_interval" and value is None:
+            continue
+        if not value >= low or (name == "policy_delay" and value != int(value)):
+            raise ValueError(f"{name} must be at least {low}, not {value}")
     if (
         not callable(agent.learning_rate)
         and not 0 <= number("learning_rate", agent.learning_rate, "a schedule") < math.inf
@@ -82,7 +85,7 @@ def _check_pessimism(agent: "SAC") -> None:
         check_beta("actor_pessimism", agent.actor_pessimism)
     if agent.target_subset is not None:
         n_critics = agent.policy_kwargs.get("n_critics", 2)
-        if not 1 <= agent.target_subset <= n_critics:
+        if not 1 <= agent.target_subset <= n_critics or agent.target_subset != int(agent.target_subset):
             raise ValueError(
                 f"target_subset must lie between 1 and the number of critics, {n_critics} "
                 f"(policy_kwargs['n_critics']), or be None for all, not {agent.target_subset}"
@@ -90,15 +93,16 @@ def _check_pessimism(agent: "SAC") -> None:
 
 
 def _check_replay(agent: "SAC") -> None:
-    if not 0 <= agent.validation_proportion < 1:
+    if not 0 <= number("validation_proportion", agent.validation_proportion, "None in VPLSAC") < 1:
         raise ValueError(f"validation_proportion must lie in [0, 1), not {agent.validation_proportion}")
     if agent.validation_proportion > 0:
         cls = agent.replay_buffer_class
         if cls is not None and cls not in (ReplayBuffer, DictReplayBuffer) and not issubclass(cls, ValidationSplit):
             raise ValueError(
-                f"validation_proportion={agent.validation_proportion} holds single transitions out, and "
-                f"{cls.__name__} makes its samples of several (relabelled goals, n-step returns), which would carry "
-                "them into training: leave replay_buffer_class out, or pass validation_proportion=0"
+                f"validation_proportion={agent.validation_proportion} holds single transitions out, which is known of "
+                f"ReplayBuffer and DictReplayBuffer only, not of {cls.__name__} (samples of several transitions, as "
+                "relabelled goals are, would carry them into training): leave replay_buffer_class out, or pass "
+                "validation_proportion=0"
             )
         if agent.n_steps > 1:
             raise ValueError(

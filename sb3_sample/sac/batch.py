@@ -95,7 +95,7 @@ def draw_batches(
     data = Batch.of(buffer.sample(n_batches * batch_size, env=vec_normalize), gamma)
 
     def cut(x: Any) -> list[Any]:
-        if isinstance(x, float):
+        if isinstance(x, (int, float)):
             return [x] * n_batches
         if isinstance(x, dict):
             pieces = {key: value.split(batch_size) for key, value in x.items()}

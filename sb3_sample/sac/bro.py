@@ -56,7 +56,7 @@ class BRO(SAC):
     :param optimize_memory_usage: as in Stable-Baselines3's replay buffer
     :param n_steps: n-step returns, as in Stable-Baselines3
     :param ent_coef: temperature: "auto" learns it from 1, "auto_0.1" from that start, a number fixes it
-    :param target_update_interval: gradient steps between two updates of the targets
+    :param target_update_interval: gradient steps between two updates of the targets; None: ``policy_delay``
     :param target_entropy: entropy that the learned temperature aims at; "auto" is -|A|/2
     :param replay_ratio: gradient steps per environment transition after the warm-up, whatever the number of
         environments; may be below 1
@@ -107,7 +107,7 @@ class BRO(SAC):
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
         ent_coef: str | float = "auto",
-        target_update_interval: int = 1,
+        target_update_interval: int | None = 1,
         target_entropy: str | float = "auto",
         replay_ratio: float = 10,
         model_size: str | Sequence[int] | None = "4.92M",
@@ -291,7 +291,7 @@ class BROTD3(BRO):
             env,
             learning_rate,
             policy_delay=policy_delay,
-            target_update_interval=policy_delay if target_update_interval is None else target_update_interval,
+            target_update_interval=target_update_interval,
             std_multiplier=std_multiplier,
             backbone=backbone,
             **kwargs,

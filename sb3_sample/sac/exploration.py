@@ -314,6 +314,9 @@ class OptimisticActor(OptimisticExploration):
         super().__init__(agent, kl_target, std_multiplier, uncertainty, adjustment_learning_rate)
         beta = float(agent.pessimism_rule.beta())
         distance = 0.5 if initial_optimism is None else initial_optimism + beta
+        if agent.num_transitions > 0:
+            # A start in the midst of training, when a pessimism that moves may have come below initial_optimism.
+            distance = max(distance, self.BARRIER)
         if not 0 < distance < math.inf:
             raise ValueError(f"initial_optimism must be above minus the pessimism, {-beta}, not {initial_optimism}")
         if not 0 < initial_kl_weight < math.inf:
@@ -331,20 +334,19 @@ class OptimisticActor(OptimisticExploration):
         self._make_optimizers(
             agent, self.actor.parameters(), self.optimism_distance.parameters(), self.kl_weight.parameters()
         )
-        self._n_intervals = self._intervals(agent)
-
-    def _intervals(self, agent: "SAC") -> int:
-        return 0 if self.reinitialize_every is None else agent.num_transitions // self.reinitialize_every
+        self._reached = agent.num_transitions
 
     def before_updates(self, agent: "SAC") -> None:
-        if self._intervals(agent) > self._n_intervals:
+        every, before, now = self.reinitialize_every, self._reached, agent.num_transitions
+        self._reached = now
+        if every is not None and now // every > before // every:
             agent.restart(self, agent.make_explorer())
 
     def get_extra_state(self) -> dict[str, Any]:
-        return {"n_intervals": self._n_intervals}
+        return {"reached": self._reached}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self._n_intervals = state["n_intervals"]
+        self._reached = state["reached"]
 
     def _gaussian(
         self, observations: Any, features: torch.Tensor, mean: torch.Tensor, std: torch.Tensor

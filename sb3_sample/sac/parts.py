@@ -17,6 +17,13 @@ if TYPE_CHECKING:
     from sb3_sample.sac.algorithm import SAC
 
 
+class ParametersDoNotFit(ValueError, RuntimeError):
+    """
+    Parameters that are loaded are not those of this model. Also a ``RuntimeError``, as torch's own, since
+    Stable-Baselines3's ``load`` takes a mere ``ValueError`` for a file of an old version of its own.
+    """
+
+
 class Part(nn.Module):
     """A part of an off-policy agent; its subclasses override what they need."""
 
@@ -30,6 +37,13 @@ class Part(nn.Module):
     def before_updates(self, agent: "SAC") -> None:
         """
         Called before the gradient steps that follow an environment step.
+
+        :param agent: the algorithm
+        """
+
+    def on_environment_reset(self, agent: "SAC") -> None:
+        """
+        Called when ``learn`` has reset the environments, whose episodes so far have no end in the replay buffer.
 
         :param agent: the algorithm
         """

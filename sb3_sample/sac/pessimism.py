@@ -8,8 +8,10 @@ Q-learning (the minimum) and 0 the mean.
 
 import math
 from collections.abc import Sequence
+from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import nn
 from torch.optim import Optimizer
@@ -17,7 +19,7 @@ from torch.optim import Optimizer
 from sb3_sample.optim import AdamW
 from sb3_sample.sac import buffers, losses
 from sb3_sample.sac.batch import Batch, CriticStep
-from sb3_sample.sac.parts import Part
+from sb3_sample.sac.parts import ParametersDoNotFit, Part
 
 if TYPE_CHECKING:
     from sb3_sample.sac.algorithm import SAC
@@ -148,12 +150,17 @@ class LearnedPessimism(Pessimism):
         sources = ("replay", "validation", "recent", "on_policy")
         if source not in sources:
             raise ValueError(f"source of the pessimism's transitions must be one of {sources}, not {source!r}")
-        if not 0 <= learning_rate < math.inf:
-            raise ValueError(f"learning_rate of the pessimism must be at least 0 and finite, not {learning_rate}")
-        if segment_length < 1:
-            raise ValueError(f"segment_length must be at least 1, not {segment_length}")
-        if not 0 <= td_lambda <= 1:
-            raise ValueError(f"td_lambda must lie in [0, 1], not {td_lambda}")
+        if not _is_number(learning_rate) or not 0 <= learning_rate < math.inf:
+            raise ValueError(f"learning_rate of the pessimism must be at least 0 and finite, not {learning_rate!r}")
+        if not _is_integer(segment_length) or segment_length < 1:
+            raise ValueError(f"segment_length must be an integer of at least 1, not {segment_length!r}")
+        if source in ("recent", "on_policy") and segment_length > max(agent.buffer_size // agent.n_envs, 1):
+            raise ValueError(
+                f"segment_length={segment_length} is more than a replay buffer of buffer_size={agent.buffer_size} "
+                f"holds of each of {agent.n_envs} environments"
+            )
+        if not _is_number(td_lambda) or not 0 <= td_lambda <= 1:
+            raise ValueError(f"td_lambda must lie in [0, 1], not {td_lambda!r}")
         if source == "validation" and agent.validation_proportion == 0:
             raise ValueError(
                 "the pessimism learns from transitions held out, and validation_proportion=0 holds none out: "
@@ -187,6 +194,10 @@ class LearnedPessimism(Pessimism):
     def on_step(self, agent: "SAC", rewards: Any, dones: Any, infos: list[dict[str, Any]]) -> None:
         # The actions of the warm-up are random.
         self._n_steps = self._n_steps + 1 if agent.num_transitions - len(dones) >= agent.learning_starts else 0
+
+    def on_environment_reset(self, agent: "SAC") -> None:
+        # The step before belongs to an episode that was broken off, which the buffer does not show.
+        self._n_steps = 0
 
     def get_extra_state(self) -> dict[str, Any]:
         return {"n_steps": self._n_steps}
@@ -326,12 +337,12 @@ class TOP(Pessimism):
     weight: torch.Tensor
 
     def __init__(self, agent: "SAC", arms: Sequence[float] = (0.0, 1.0), learning_rate: float = 0.1):
-        if isinstance(arms, str) or len(arms) < 2:
+        if isinstance(arms, str) or not isinstance(arms, (Sequence, np.ndarray)) or len(arms) < 2:
             raise ValueError(f"arms must be at least two values of the pessimism, not {arms!r}")
         for beta in arms:
             check_beta("each of arms", beta)
-        if not 0 <= learning_rate < math.inf:
-            raise ValueError(f"learning_rate of the bandit must be at least 0 and finite, not {learning_rate}")
+        if not _is_number(learning_rate) or not 0 <= learning_rate < math.inf:
+            raise ValueError(f"learning_rate of the bandit must be at least 0 and finite, not {learning_rate!r}")
         super().__init__(arms[0])
         self.arms = tuple(float(beta) for beta in arms)
         self.learning_rate = learning_rate
@@ -361,7 +372,18 @@ class TOP(Pessimism):
     def beta(self) -> torch.Tensor:
         return self.weight
 
+    def on_step(self, agent: "SAC", rewards: Any, dones: Any, infos: list[dict[str, Any]]) -> None:
+        for index in np.flatnonzero(dones):
+            if "episode" not in infos[index]:
+                raise ValueError(
+                    f"TOP learns from episodic returns, and environment {index} reports none: wrap it in "
+                    "stable_baselines3.common.monitor.Monitor, as make_vec_env does"
+                )
+
     def on_episode_end(self, agent: "SAC", env_index: int, episode_return: float) -> None:
+        # A loaded model may have had more environments.
+        for gone in [index for index in self._improvements if index >= agent.n_envs]:
+            del self._improvements[gone]
         improvements = self._improvements.setdefault(env_index, [])
         if env_index in self._previous:
             improvements.append(episode_return - self._previous[env_index])
@@ -380,20 +402,23 @@ class TOP(Pessimism):
             "arm": self.arm,
             "log_weights": list(self.log_weights),
             "previous": list(self._previous.items()),
-            "improvements": list(self._improvements.items()),
+            "improvements": [(index, list(values)) for index, values in self._improvements.items()],
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         if len(state["log_weights"]) != len(self.arms):
-            raise ValueError(f"arms={self.arms} are not as many as the {len(state['log_weights'])} of the saved bandit")
+            raise ParametersDoNotFit(
+                f"arms={self.arms} are not as many as the {len(state['log_weights'])} of the saved bandit"
+            )
         self.arm, self.log_weights = state["arm"], list(state["log_weights"])
         self.weight.fill_(self.arms[self.arm])
-        self._previous, self._improvements = dict(state["previous"]), dict(state["improvements"])
+        self._previous = dict(state["previous"])
+        self._improvements = {index: list(values) for index, values in state["improvements"]}
 
     def update(
         self, agent: "SAC", batch: Batch, step: CriticStep, noise: torch.Tensor | None = None
     ) -> dict[str, torch.Tensor]:
-        return {"pessimism/beta": self.weight}
+        return {"pessimism/beta": self.weight.clone()}
 
 
 def check_beta(name: str, beta: Any) -> None:
@@ -402,8 +427,16 @@ def check_beta(name: str, beta: Any) -> None:
     :param beta: a weight of pessimism
     :raises ValueError: if it is not a finite number of at least 0
     """
-    if isinstance(beta, str) or not 0 <= beta < math.inf:
+    if not _is_number(beta) or not 0 <= beta < math.inf:
         raise ValueError(f"{name} must be at least 0 and finite (0 is the mean, 1 the minimum of two), not {beta!r}")
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def gpl(agent: "SAC", initial_pessimism: float = 1.0, learning_rate: float = 5e-5) -> LearnedPessimism:

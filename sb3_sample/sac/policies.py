@@ -1,6 +1,7 @@
 """Actor, critic ensemble and target ensemble of the off-policy family, as Stable-Baselines3 policies."""
 
 import copy
+import inspect
 import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -384,10 +385,12 @@ class SACPolicy(BasePolicy):
         self.actor_target: Actor | None = None
         if isinstance(self.actor, DeterministicActor):
             self.actor_target = copy.deepcopy(self.actor).requires_grad_(False)
+            self.actor_target.set_training_mode(False)
         self.critic = critics()
         self.critic_target = critics()
         self.critic_target.load_state_dict(self.critic.state_dict())
         self.critic_target.requires_grad_(False)
+        self.critic_target.set_training_mode(False)
         self.actor.optimizer = self.make_optimizer(self.actor.parameters(), lr_schedule)
         self.critic.optimizer = self.make_optimizer(
             self.critic.parameters(), lr_schedule, **(critic_optimizer_kwargs or {})
@@ -523,4 +526,10 @@ def _network_args(
         if key in kwargs:
             raise ValueError(f"{name} and {who}_network_kwargs[{key!r}] say the same thing: give one of them")
         kwargs[key] = value
+    allowed = [
+        name for name in inspect.signature(NETWORKS[network]).parameters if name not in ("in_features", "n_copies")
+    ]
+    for name in kwargs:
+        if name not in allowed:
+            raise ValueError(f"{who}_network_kwargs has {name!r}, but {who}_network={network!r} takes {allowed}")
     return NETWORKS[network], kwargs

@@ -1,8 +1,10 @@
 """The regularized agents of P2."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_sample.networks import CReLU
@@ -97,7 +99,7 @@ class RegularizedSAC(SAC):
             "plasticity_regularization": (
                 (self.sam_radius is not None) == ("sam" in chosen)
                 and (self.redo_period is not None) == ("redo" in chosen)
-                and (self.resets != ()) == ("resets" in chosen)
+                and (isinstance(self.resets, int | np.integer) or len(self.resets) > 0) == ("resets" in chosen)
             ),
         }
         for name, agrees in in_force.items():
@@ -106,6 +108,13 @@ class RegularizedSAC(SAC):
                     f"{name}={getattr(self, name)!r} is not what the other arguments say: load cannot change the "
                     "regularizations of a model, and an argument of one needs its name among them"
                 )
+        if self.weight_decay is not None and not 0 <= self.weight_decay < math.inf:
+            raise ValueError(f"weight_decay must be at least 0 and finite, not {self.weight_decay}")
+        if "crelu" in chosen and "activation_fn" in self.policy_kwargs:
+            raise ValueError(
+                "plasticity_regularization names 'crelu', the critics' activation, and policy_kwargs have another "
+                "activation_fn: for the actor's alone use policy_kwargs['actor_network_kwargs']"
+            )
         super()._check_arguments()
 
     def _full_policy_kwargs(self) -> dict[str, Any]:

@@ -18,17 +18,16 @@ class VPLSAC(SAC):
     resets=160_000`` it is the paper's SR-SAC-VPL.
 
     :class:`~sb3_sample.sac.pessimism.LearnedPessimism` says what the paper leaves open and how it is decided. The
-        paper's variants are arguments: ``pessimism_source="replay"`` or ``"recent"``, ``pessimism_loss="dual"``,
-        ``validation_proportion``, and ``pessimism=1.0`` for the "regret" run, which holds the transitions out and
-        leaves the
-    pessimism fixed.
+    paper's variants are arguments: ``pessimism_source="replay"`` or ``"recent"``, ``pessimism_loss="dual"``,
+    ``validation_proportion``, and ``pessimism=1.0`` for the "regret" run, which holds the transitions out and leaves
+    the pessimism fixed.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
     :param learning_rate: of actor, critics and temperature; a number or a function of the remaining progress
         (from 1 to 0)
     :param validation_proportion: share of the transitions that is held out, in [0, 1); the validation batch has the
-        same proportion to ``batch_size``
+        same proportion to ``batch_size``. None: 1/32, or 0 if the pessimism learns from another source
     :param initial_pessimism: pessimism at the start and after a reset
     :param pessimism_learning_rate: of the pessimism
     :param pessimism_source: where the pessimism learns: "validation", "replay" or "recent"
@@ -44,7 +43,7 @@ class VPLSAC(SAC):
         env: GymEnv | str | None,
         learning_rate: float | Schedule = 3e-4,
         *,
-        validation_proportion: float = 1 / 32,
+        validation_proportion: float | None = None,
         initial_pessimism: float = 1.0,
         pessimism_learning_rate: float = 5e-5,
         pessimism_source: str = "validation",
@@ -56,9 +55,16 @@ class VPLSAC(SAC):
         self.pessimism_learning_rate = pessimism_learning_rate
         self.pessimism_source = pessimism_source
         self.pessimism_loss = pessimism_loss
+        if validation_proportion is None:
+            validation_proportion = 1 / 32 if pessimism_source == "validation" else 0.0
         super().__init__(
             policy, env, learning_rate, validation_proportion=validation_proportion, pessimism=pessimism, **kwargs
         )
+
+    def _check_arguments(self) -> None:
+        if isinstance(self.pessimism, str) and self.pessimism != "vpl":
+            raise ValueError(f"VPLSAC has pessimism='vpl' or a fixed number, not {self.pessimism!r}: use SAC")
+        super()._check_arguments()
 
     def _full_pessimism_kwargs(self) -> dict[str, Any]:
         return {

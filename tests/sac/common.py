@@ -1,5 +1,6 @@
 """Tiny environments and models that the tests of the off-policy family share."""
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +12,19 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_sample import BRO
-from sb3_sample.sac import SAC, BROFast
+from sb3_sample.sac import (
+    BROTD3,
+    DAC,
+    GPLSAC,
+    OAC,
+    OPLSAC,
+    SAC,
+    SRSAC,
+    TOPSAC,
+    VPLSAC,
+    BROFast,
+    RegularizedSAC,
+)
 
 #: Arguments that make a model small and quick.
 TINY_BRO: dict[str, Any] = dict(
@@ -95,16 +108,39 @@ def bro(env: Any = None, cls: type[BRO] = BRO, policy: str = "MlpPolicy", **kwar
     return cls(policy, vec() if env is None else env, **{"seed": 0, **TINY_BRO, **kwargs})
 
 
-def sac(env: Any = None, policy: str = "MlpPolicy", **kwargs: Any) -> SAC:
-    """A tiny SAC; arguments given replace the tiny ones."""
-    return SAC(policy, vec() if env is None else env, **{"seed": 0, **TINY_SAC, **kwargs})
+def sac(env: Any = None, cls: type[SAC] = SAC, policy: str = "MlpPolicy", **kwargs: Any) -> Any:
+    """A tiny SAC, or an algorithm of its family on MLPs; arguments given replace the tiny ones."""
+    return cls(policy, vec() if env is None else env, **{"seed": 0, **TINY_SAC, **kwargs})
 
 
+def _maker(make: Callable[..., Any], cls: type[SAC], **defaults: Any) -> Callable[..., Any]:
+    return lambda env=None, **kwargs: make(env, **{"cls": cls, **defaults, **kwargs})
+
+
+#: Every algorithm, by its name: tiny, and with what it does happening within a few steps.
 MAKERS: dict[str, Callable[..., Any]] = {
     "SAC": sac,
     "BRO": bro,
-    "BROFast": lambda env=None, **kwargs: bro(env, cls=BROFast, **kwargs),
+    "BROFast": _maker(bro, BROFast),
+    "BROTD3": _maker(bro, BROTD3),
+    "DAC": _maker(sac, DAC, reinitialize_every=25),
+    "VPLSAC": _maker(sac, VPLSAC, validation_proportion=0.25, pessimism_learning_rate=1e-2),
+    "SRSAC": _maker(sac, SRSAC, resets=20),
+    "OAC": _maker(sac, OAC),
+    "TOPSAC": _maker(sac, TOPSAC),
+    "GPLSAC": _maker(sac, GPLSAC, pessimism_learning_rate=1e-2),
+    "OPLSAC": _maker(sac, OPLSAC, pessimism_learning_rate=1e-2, segment_length=4),
+    "RegularizedSAC": _maker(
+        sac,
+        RegularizedSAC,
+        critic_regularization="gpl",
+        network_regularization=("layer_norm", "spectral_norm", "weight_decay"),
+        plasticity_regularization=("crelu", "redo", "resets", "sam"),
+        redo_period=5,
+    ),
 }
+#: One of each kind of part, for the slower tests.
+REPRESENTATIVE = ["SAC", "BRO", "BROTD3", "DAC", "VPLSAC", "OPLSAC", "TOPSAC", "RegularizedSAC"]
 
 
 def state(model: SAC) -> dict[str, torch.Tensor]:
@@ -131,6 +167,16 @@ def state(model: SAC) -> dict[str, torch.Tensor]:
 def differing(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> list[str]:
     """Names of the tensors that are not equal bit for bit, or that only one of the two has."""
     return sorted(set(a) ^ set(b)) + sorted(k for k in set(a) & set(b) if not torch.equal(a[k], b[k]))
+
+
+def taken_or_refused(load: Callable[[], Any], words: str) -> Any:
+    """What ``load`` gives; None where it is refused with a ValueError whose message holds the words."""
+    try:
+        return load()
+    except ValueError as error:
+        message = str(error)
+    assert re.search(words, message), message
+    return None
 
 
 def random_batch(model: SAC, n: int = 8, seed: int = 0) -> Any:

@@ -85,7 +85,7 @@ def test_bro_td3_learns_pendulum() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_other_seeds(seed: int) -> None:
-    assert score(small_sac(seed).learn(4_000)) > GOOD
+    assert score(small_sac(seed).learn(6_000)) > GOOD
     assert score(small_bro(seed).learn(4_000)) > GOOD
 
 

@@ -3,8 +3,10 @@
 import pytest
 import torch
 
-from sb3_sample.sac.pessimism import Pessimism, epistemic_std
-from tests.sac.common import bro, random_batch, sac
+from sb3_sample.sac import VPLSAC
+from sb3_sample.sac.batch import Noise
+from sb3_sample.sac.pessimism import Pessimism, epistemic_std, pessimistic_value
+from tests.sac.common import TINY_SAC, bro, differing, random_batch, sac, state, vec
 
 Q = torch.tensor([[[1.0, 2.0], [3.0, 0.0]], [[3.0, -2.0], [3.0, 4.0]]])  # (E, B, K) = (2, 2, 2)
 
@@ -84,3 +86,65 @@ def test_other_ensemble_sizes_learn(n_critics: int) -> None:
         metrics = model._update(random_batch(model))
         assert all(torch.isfinite(value).all() for value in metrics.values())
         assert model.critic(torch.zeros(4, 3), torch.zeros(4, 2)).shape[0] == n_critics
+
+
+# ------------------------------------------------------------------ what fixed pessimism is equal to
+
+
+@pytest.mark.parametrize("beta", [0.0, 0.3, 1.0, 2.5])
+@pytest.mark.parametrize("n_critics", [1, 2, 3])
+def test_a_tensor_weighs_as_a_number(beta: float, n_critics: int) -> None:
+    q = torch.randn(n_critics, 5, 4, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(pessimistic_value(q, torch.tensor(beta)), pessimistic_value(q, beta))
+
+
+@pytest.mark.parametrize("beta", [0.0, 1.0])
+@pytest.mark.parametrize("n_quantiles", [None, 5])
+def test_one_is_the_minimum_and_zero_the_mean_in_both_losses(beta: float, n_quantiles: int | None) -> None:
+    """The critics' target and the actor's objective of a step, assembled from the networks."""
+    # With learning rate 0 the actor sees the critics that the test sees.
+    model = sac(pessimism=beta, n_quantiles=n_quantiles, gamma=0.9, ent_coef=0.3, learning_rate=0.0)
+    batch = random_batch(model)
+    noise = Noise(torch.randn(8, 2), torch.randn(8, 2))
+
+    def value(q: torch.Tensor) -> torch.Tensor:
+        return q.min(dim=0).values if beta == 1 else q.mean(dim=0)
+
+    with torch.no_grad():
+        action, log_prob = model.actor.sample(batch.next_observations, noise.critic)
+        next_value = value(model.critic_target(batch.next_observations, action))
+        target = batch.rewards + 0.9 * (1 - batch.dones) * (next_value - 0.3 * log_prob)
+        critic_loss = model._critic_loss(model.critic(batch.observations, batch.actions), target)
+        action, log_prob = model.actor.sample(batch.observations, noise.actor)
+        actor_loss = (0.3 * log_prob.flatten() - value(model.critic(batch.observations, action)).mean(dim=1)).mean()
+    metrics = model._update(batch, noise)
+    assert metrics["train/critic_loss"].item() == pytest.approx(critic_loss.item(), rel=1e-5)
+    assert metrics["train/actor_loss"].item() == pytest.approx(actor_loss.item(), rel=1e-5)
+
+
+@pytest.mark.parametrize("beta", [0.0, 0.5, 1.0])
+def test_vpl_with_fixed_pessimism_and_nothing_held_out_is_sac_step_for_step(beta: float) -> None:
+    plain = sac(pessimism=beta)
+    ours = VPLSAC("MlpPolicy", vec(), **TINY_SAC, seed=0, validation_proportion=0, pessimism=beta)
+    assert not differing(state(ours), state(plain))
+    for seed in range(10):
+        metrics = []
+        for model in (ours, plain):
+            torch.manual_seed(seed)
+            metrics.append(model._update(random_batch(model, seed=seed)))
+        assert metrics[0] == metrics[1]
+        assert not differing(state(ours), state(plain))
+
+
+def test_the_actors_own_pessimism() -> None:
+    """``actor_pessimism`` changes the actor's objective, and nothing of the critics' first step."""
+    batch = random_batch(sac())
+    rows = []
+    for kwargs in ({}, {"actor_pessimism": 1.0}, {"actor_pessimism": 0.0}, {"pessimism": 0.0}):
+        model = sac(learning_rate=0.0, **kwargs)
+        torch.manual_seed(0)
+        metrics = model._update(batch)
+        rows.append([metrics[f"train/{name}_loss"].item() for name in ("critic", "actor")])
+    assert rows[0] == rows[1]
+    assert rows[2][0] == rows[0][0] != rows[3][0]
+    assert rows[2][1] == rows[3][1] < rows[0][1]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from sb3_sample import DAC, SRSAC
 from sb3_sample.sac.plasticity import Resets
 from tests.sac.common import MAKERS, bro, sac, vec
 
@@ -18,9 +19,9 @@ class Recorder:
         self.at: list[int] = []
         original = model.reinitialize
 
-        def reinitialize() -> None:
+        def reinitialize(shrink: float = 0.0) -> None:
             self.at.append(model.num_transitions)
-            original()
+            original(shrink)
 
         model.reinitialize = reinitialize
 
@@ -209,9 +210,126 @@ def test_integers_of_any_kind() -> None:
 
 
 @pytest.mark.parametrize(
-    "steps", [(0,), (-5, 10), (20, 10), (10, 10), (1.5,), (True,), (float("nan"),), (float("inf"),), ("10",), 10]
+    "steps",
+    [(0,), (-5, 10), (20, 10), (10, 10), (1.5,), (True,), (float("nan"),), (float("inf"),), ("10",), 0, -10, 1.5, True],
 )
 def test_bad_schedules(steps: Any) -> None:
     with pytest.raises(ValueError, match="resets") as caught:
         sac(resets=steps)
     assert str(steps) in str(caught.value)
+
+
+# ---------------------------------------------------------------- every so many steps
+
+
+@pytest.mark.parametrize(("n_envs", "expected"), [(1, [15, 30, 45]), (4, [16, 32, 48]), (20, [20, 40, 60])])
+def test_a_period(n_envs: int, expected: list[int]) -> None:
+    model = sac(vec(n_envs), cls=SRSAC, resets=15)
+    recorder = Recorder(model)
+    model.learn(50)
+    assert recorder.at == expected and model.plasticity.n_done == 3
+
+
+def test_a_period_is_counted_over_the_models_life(tmp_path: Path) -> None:
+    model = sac(cls=SRSAC, resets=15)
+    recorder = Recorder(model)
+    model.learn(20)
+    model.learn(16)
+    assert recorder.at == [15, 30]
+    del model.reinitialize
+    model.save(tmp_path / "m")
+    model.save_replay_buffer(tmp_path / "b")
+    loaded = SRSAC.load(tmp_path / "m", env=vec())
+    loaded.load_replay_buffer(tmp_path / "b")
+    assert loaded.plasticity.period == 15 and loaded.plasticity.n_done == 2
+    recorder = Recorder(loaded)
+    loaded.learn(25)
+    assert recorder.at == [45, 60] and loaded.plasticity.n_done == 4
+
+
+@pytest.mark.parametrize(("resets", "expected"), [(40, [40]), (10, [40, 50]), ((45,), [45]), ((), [])])
+def test_another_schedule_at_loading(resets: Any, expected: list[int], tmp_path: Path) -> None:
+    """What lies behind is not made up for."""
+    model = sac(cls=SRSAC, resets=15).learn(36)
+    model.save(tmp_path / "m")
+    model.save_replay_buffer(tmp_path / "b")
+    loaded = SRSAC.load(tmp_path / "m", env=vec(), resets=resets)
+    loaded.load_replay_buffer(tmp_path / "b")
+    recorder = Recorder(loaded)
+    loaded.learn(16)
+    assert recorder.at == expected
+
+
+def test_numbers_of_a_period() -> None:
+    assert Resets(7).period == 7 and Resets(np.int64(7)).period == 7  # type: ignore[arg-type]
+    assert Resets(7).steps == () and Resets((7,)).period is None
+
+
+# ---------------------------------------------------------------- shrink and perturb
+
+
+@pytest.mark.parametrize("shrink", [0.0, 0.3, 0.8])
+@pytest.mark.parametrize("maker", ["SAC", "BRO"])
+def test_shrink_and_perturb_by_hand(maker: str, shrink: float) -> None:
+    """Every parameter, target networks and learned numbers included: shrink * old + (1 - shrink) * fresh."""
+    model = MAKERS[maker](learning_rate=1e-2, tau=0.3).learn(16)
+    old = {name: p.detach().clone() for name, p in model.policy.named_parameters()}
+    log_alpha = model.temperature.log_value.item()
+    assert log_alpha != 0
+    identities = [id(p) for p in model.policy.parameters()]
+    torch.manual_seed(7)
+    fresh = model.policy_class(
+        model.observation_space, model.action_space, model.lr_schedule, **model._full_policy_kwargs()
+    )
+    torch.manual_seed(7)
+    model.reinitialize(shrink)
+    for (name, value), new in zip(model.policy.named_parameters(), fresh.parameters(), strict=True):
+        if shrink == 0:
+            assert torch.equal(value, new), name
+        else:
+            torch.testing.assert_close(value, shrink * old[name] + (1 - shrink) * new, rtol=1e-6, atol=1e-7)
+    assert any("critic_target" in name for name in old)
+    assert model.temperature.log_value.item() == pytest.approx(shrink * log_alpha, rel=1e-5, abs=1e-7)
+    assert [id(p) for p in model.policy.parameters()] == identities
+    assert not any(optimizer.state for optimizer in model._optimizers().values())
+
+
+def test_shrinks_the_explorers_numbers() -> None:
+    model = sac(cls=DAC, adjustment_learning_rate=0.1, initial_kl_weight=2.0).learn(16)
+    old = model.explorer.kl_weight.log_value.item()
+    assert old != pytest.approx(np.log(2), rel=1e-2)
+    model.reinitialize(0.25)
+    assert model.explorer.kl_weight.log_value.item() == pytest.approx(0.25 * old + 0.75 * np.log(2), rel=1e-5)
+
+
+@pytest.mark.parametrize("shrink", [0.0, 0.5, 0.8])
+def test_shrunk_kernels_have_spectral_norm_one(shrink: float) -> None:
+    """The directions of a spectral norm belong to its kernel, which has just been mixed of two."""
+    kwargs = {"critic_network_kwargs": {"hidden_sizes": [16, 16], "spectral_norm": True}}
+    model = sac(policy_kwargs=kwargs, learning_rate=1e-2).learn(30)
+    model.reinitialize(shrink)
+    model.policy.set_training_mode(False)
+    for critic in (model.critic, model.critic_target):
+        values = torch.linalg.svdvals(critic.trunk.layers[2].normalized_weight().detach())
+        torch.testing.assert_close(values[:, 0], torch.ones(2), rtol=0.05, atol=0)
+
+
+def test_shrink_is_what_the_resets_use() -> None:
+    shrinks = []
+    model = sac(resets=(20,), reset_shrink=0.4)
+    reinitialize = model.reinitialize
+    model.reinitialize = lambda shrink: shrinks.append(shrink) or reinitialize(shrink)
+    model.learn(25)
+    assert shrinks == [0.4]
+
+
+@pytest.mark.parametrize("shrink", [1.0, -0.1, 1.5, float("nan")])
+def test_bad_shrink(shrink: float) -> None:
+    with pytest.raises(ValueError, match="reset_shrink") as caught:
+        sac(reset_shrink=shrink)
+    assert str(shrink) in str(caught.value)
+
+
+def test_shrink_at_loading(tmp_path: Path) -> None:
+    sac(resets=(20,)).save(tmp_path / "m")
+    assert type(sac()).load(tmp_path / "m", env=vec(), reset_shrink=0.5).plasticity.shrink == 0.5

@@ -16,7 +16,7 @@ from torch import nn
 from sb3_sample import BRO
 from sb3_sample.sac import SAC, BROFast
 from sb3_sample.sac.policies import SACPolicy
-from tests.sac.common import MAKERS, bro, differing, sac, state, vec
+from tests.sac.common import MAKERS, REPRESENTATIVE, bro, differing, sac, state, vec
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(16, 3)).astype(np.float32)
 
@@ -61,7 +61,7 @@ def test_loaded_model_trains_on_identically(maker: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(model.replay_buffer.actions, loaded.replay_buffer.actions)
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", REPRESENTATIVE)
 def test_through_memory_and_a_second_time(maker: str) -> None:
     model = MAKERS[maker]().learn(20)
     for _ in range(2):
@@ -276,7 +276,7 @@ def test_replay_buffer(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", REPRESENTATIVE)
 def test_seeds(maker: str, n_envs: int) -> None:
     first, same, different = (MAKERS[maker](vec(n_envs), seed=s, resets=(20,)).learn(36) for s in (4, 4, 5))
     assert not differing(state(first), state(same))
