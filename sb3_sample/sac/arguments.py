@@ -2,7 +2,7 @@
 
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
@@ -137,6 +137,20 @@ def check_names(argument: str, choice: str, make: Callable[..., Any], kwargs: di
     for name in kwargs:
         if name not in allowed:
             raise ValueError(f"{argument}_kwargs has {name!r}, but {argument}={choice!r} takes {allowed or 'none'}")
+
+
+def check_unused(agent: "SAC", names: Sequence[str], choice: str) -> None:
+    """
+    :param agent: the algorithm
+    :param names: arguments of its constructor that mean nothing under a choice
+    :param choice: that choice, for the error
+    :raises ValueError: if one of them is not at its default
+    """
+    for name in names:
+        signatures = (inspect.signature(cls).parameters for cls in type(agent).__mro__)
+        default = next(parameters[name].default for parameters in signatures if name in parameters)
+        if getattr(agent, name) != default:
+            raise ValueError(f"{name}={getattr(agent, name)!r} means nothing with {choice}: leave it out")
 
 
 def number(name: str, value: Any, otherwise: str, shown: Any = None) -> float:

@@ -9,6 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
+from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
 
@@ -24,6 +25,15 @@ MODEL_SIZES: dict[str, tuple[int, int]] = {
 #: Environment steps at which all parameters are reset.
 BRO_RESETS = (15_000, 50_000, 250_000, 500_000, 750_000, 1_000_000, 1_500_000, 2_000_000)
 BRO_FAST_RESETS = (15_000,)
+
+#: Arguments that are the optimistic actor's.
+OPTIMISTIC_SHIFT_SETTINGS = (
+    "kl_target",
+    "std_multiplier",
+    "initial_optimism",
+    "initial_kl_weight",
+    "adjustment_learning_rate",
+)
 
 
 class BRO(SAC):
@@ -71,7 +81,8 @@ class BRO(SAC):
     :param initial_kl_weight: weight of the divergence in the optimistic actor's loss, at the start
     :param adjustment_learning_rate: learning rate of optimism and of the divergence's weight
     :param weight_decay: decoupled weight decay of critics and both actors
-    :param exploration: who acts while training: "optimistic_shift", or "actor" for no optimistic actor
+    :param exploration: who acts while training: "optimistic_shift", "actor" for no optimistic actor, or another of
+        :class:`SAC`'s
     :param exploration_kwargs: further arguments of the exploration
     :param resets: environment steps at which all parameters start anew, counted in transitions over the model's life;
         or one integer for every so many
@@ -177,6 +188,8 @@ class BRO(SAC):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
+        if self.exploration != "optimistic_shift":
+            arguments.check_unused(self, OPTIMISTIC_SHIFT_SETTINGS, f"exploration={self.exploration!r}")
         if not 0 <= self.weight_decay < math.inf:
             raise ValueError(f"weight_decay must be at least 0 and finite, not {self.weight_decay}")
         described = sorted({"critic_network", "critic_network_kwargs"} & self.policy_kwargs.keys())
@@ -206,14 +219,7 @@ class BRO(SAC):
     def _full_exploration_kwargs(self) -> dict[str, Any]:
         kwargs = super()._full_exploration_kwargs()
         if self.exploration == "optimistic_shift":
-            for name in (
-                "kl_target",
-                "std_multiplier",
-                "initial_optimism",
-                "initial_kl_weight",
-                "adjustment_learning_rate",
-            ):
-                kwargs.setdefault(name, getattr(self, name))
+            kwargs = {**{name: getattr(self, name) for name in OPTIMISTIC_SHIFT_SETTINGS}, **kwargs}
         return kwargs
 
 

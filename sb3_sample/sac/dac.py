@@ -4,8 +4,21 @@ from typing import Any
 
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
+from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
+
+#: Arguments that are the optimistic actor's.
+OPTIMISTIC_ACTOR_SETTINGS = (
+    "kl_target",
+    "std_multiplier",
+    "uncertainty",
+    "initial_optimism",
+    "initial_kl_weight",
+    "adjustment_learning_rate",
+    "kl_direction",
+    "reinitialize_every",
+)
 
 
 class DAC(SAC):
@@ -66,18 +79,13 @@ class DAC(SAC):
         self.reinitialize_every = reinitialize_every
         super().__init__(policy, env, learning_rate, exploration=exploration, **kwargs)
 
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        if self.exploration != "optimistic_actor":
+            arguments.check_unused(self, OPTIMISTIC_ACTOR_SETTINGS, f"exploration={self.exploration!r}")
+
     def _full_exploration_kwargs(self) -> dict[str, Any]:
         kwargs = super()._full_exploration_kwargs()
         if self.exploration == "optimistic_actor":
-            for name in (
-                "kl_target",
-                "std_multiplier",
-                "uncertainty",
-                "initial_optimism",
-                "initial_kl_weight",
-                "adjustment_learning_rate",
-                "kl_direction",
-                "reinitialize_every",
-            ):
-                kwargs.setdefault(name, getattr(self, name))
+            kwargs = {**{name: getattr(self, name) for name in OPTIMISTIC_ACTOR_SETTINGS}, **kwargs}
         return kwargs

@@ -295,9 +295,10 @@ class SACPolicy(BasePolicy):
     :param net_arch: widths of the hidden layers as in Stable-Baselines3, a list or ``dict(pi=[...], qf=[...])``;
         for the network "mlp" only, the same as ``hidden_sizes`` in the network's arguments
     :param activation_fn: activation of the network "mlp"
-    :param critic_network: trunk of the critics, "mlp" or "bronet"
-    :param critic_network_kwargs: its arguments (``hidden_sizes``, ``layer_norm``; ``width``, ``n_blocks``)
-    :param actor_network: trunk of the actor, "mlp" or "bronet"
+    :param critic_network: trunk of the critics, "mlp", "bronet" or "spectral"
+    :param critic_network_kwargs: its arguments (``hidden_sizes``, ``layer_norm``, ``dropout``, ...; ``width``,
+        ``n_blocks``)
+    :param actor_network: trunk of the actor, the same
     :param actor_network_kwargs: its arguments
     :param n_critics: E, the number of critics
     :param n_quantiles: K quantiles a critic; None for scalar critics

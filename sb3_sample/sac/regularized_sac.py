@@ -40,6 +40,7 @@ class RegularizedSAC(SAC):
     :param sam_radius: for "sam"; None: 0.05
     :param resets: for "resets", environment steps between two, or the steps of all; None: 160,000
     :param redo_period: for "redo", gradient steps between two recyclings; None: 1,000
+    :param pessimism_kwargs: for "gpl" and "top", arguments of the rule
     :param kwargs: every other argument of :class:`SAC`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -57,11 +58,11 @@ class RegularizedSAC(SAC):
         sam_radius: float | None = None,
         resets: Sequence[int] | int | None = None,
         redo_period: int | None = None,
+        pessimism_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ):
-        for name in ("pessimism", "pessimism_kwargs"):
-            if name in kwargs:
-                raise ValueError(f"{name} is what critic_regularization chooses: pass that alone, or use SAC")
+        if "pessimism" in kwargs:
+            raise ValueError("pessimism is what critic_regularization chooses: pass that alone, or use SAC")
         self.critic_regularization = critic_regularization
         self.network_regularization = network_regularization
         self.plasticity_regularization = plasticity_regularization
@@ -75,6 +76,7 @@ class RegularizedSAC(SAC):
                 raise ValueError(f"{name}={given!r} is a setting of {of!r}, which is not among the regularizations")
             return None
 
+        gpl = {"learning_rate": 1e-5} if critic_regularization == "gpl" else {}
         self.weight_decay = setting("weight_decay", weight_decay, 0.01, "weight_decay", network)
         resets = setting("resets", resets, 160_000, "resets", chosen)
         super().__init__(
@@ -82,7 +84,7 @@ class RegularizedSAC(SAC):
             env,
             learning_rate,
             pessimism=_pessimism(critic_regularization),
-            pessimism_kwargs={"learning_rate": 1e-5} if critic_regularization == "gpl" else None,
+            pessimism_kwargs={**gpl, **(pessimism_kwargs or {})} or None,
             sam_radius=setting("sam_radius", sam_radius, 0.05, "sam", chosen),
             resets=() if resets is None else resets,
             redo_period=setting("redo_period", redo_period, 1_000, "redo", chosen),

@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
+from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
 
@@ -183,6 +184,11 @@ class OAC(SAC):
         self.optimism = optimism
         self.kl_radius = kl_radius
         super().__init__(policy, env, learning_rate, exploration=exploration, **kwargs)
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        if self.exploration != "oac":
+            arguments.check_unused(self, ("optimism", "kl_radius"), f"exploration={self.exploration!r}")
 
     def _full_exploration_kwargs(self) -> dict[str, Any]:
         kwargs = super()._full_exploration_kwargs()

@@ -55,8 +55,16 @@ def test_predictions() -> None:
     np.testing.assert_allclose(noisy, (expected + 0.1 * noise).clamp(-1, 1), atol=1e-6)
 
 
-@pytest.mark.parametrize("exploration", ["actor", "optimistic_shift"])
-@pytest.mark.parametrize(("exploration_noise", "std_multiplier"), [(0.1, 1.0), (0.05, 2.0), (0.2, 0.5)])
+@pytest.mark.parametrize(
+    ("exploration", "exploration_noise", "std_multiplier"),
+    [
+        ("actor", 0.1, 1.0),
+        ("actor", 0.05, 1.0),
+        ("optimistic_shift", 0.1, 1.0),
+        ("optimistic_shift", 0.05, 2.0),
+        ("optimistic_shift", 0.2, 0.5),
+    ],
+)
 def test_exploration_noise(exploration: str, exploration_noise: float, std_multiplier: float) -> None:
     """Gaussian around the action, not before the tanh, and clipped to the bounds."""
     model = td3(exploration=exploration, exploration_noise=exploration_noise, std_multiplier=std_multiplier,

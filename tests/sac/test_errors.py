@@ -10,7 +10,7 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_sample.sac import SAC
+from sb3_sample.sac import BROTD3, DAC, OAC, SAC, VPLSAC
 from tests.sac.common import MAKERS, Toy, bro, sac, vec
 
 NAN, INF = float("nan"), float("inf")
@@ -269,3 +269,24 @@ def test_infinite_bounds_are_not_infinite_values() -> None:
     space = spaces.Box(-INF, INF, (3,), np.float32)
     assert bro(vec(2, obs_space=space)).learn(30)._n_updates > 0
     assert isinstance(bro("Pendulum-v1").env.action_space, gym.spaces.Box)
+
+
+@pytest.mark.parametrize(
+    ("cls", "kwargs", "named"),
+    [
+        (DAC, {"exploration": "actor", "kl_target": 0.3}, "kl_target=0.3"),
+        (DAC, {"exploration": "oac", "reinitialize_every": None}, "reinitialize_every=None"),
+        (OAC, {"exploration": "actor", "optimism": 1.0}, "optimism=1.0"),
+        (VPLSAC, {"pessimism": 1.0, "pessimism_learning_rate": 1.0}, "pessimism_learning_rate=1.0"),
+    ],
+)
+def test_settings_that_would_do_nothing(cls: Any, kwargs: dict[str, Any], named: str) -> None:
+    with pytest.raises(ValueError, match=f"{named} means nothing with"):
+        sac(cls=cls, **kwargs)
+
+
+def test_settings_of_a_shift_that_is_not_there() -> None:
+    with pytest.raises(ValueError, match="kl_target=0.3 means nothing with exploration='actor'"):
+        bro(exploration="actor", exploration_kwargs=None, kl_target=0.3)
+    # The default of the class itself is none that was given.
+    assert bro(cls=BROTD3, exploration="actor", exploration_kwargs=None).std_multiplier == 1

@@ -229,7 +229,15 @@ def test_critic_regularization_of_another_type(critic: Any) -> None:
         chosen(critic)
 
 
-@pytest.mark.parametrize("kwargs", [{"pessimism": 0.5}, {"pessimism": 1.0}, {"pessimism_kwargs": {}}])
+def test_arguments_of_the_rule() -> None:
+    assert regularized(critic_regularization="gpl").pessimism_rule.optimizer.param_groups[0]["lr"] == 1e-5
+    other = regularized(critic_regularization="gpl", pessimism_kwargs={"learning_rate": 1e-3})
+    assert other.pessimism_rule.optimizer.param_groups[0]["lr"] == 1e-3
+    with pytest.raises(ValueError, match="pessimism_kwargs"):
+        regularized(critic_regularization="cdq", pessimism_kwargs={"learning_rate": 1e-3})
+
+
+@pytest.mark.parametrize("kwargs", [{"pessimism": 0.5}, {"pessimism": 1.0}])
 def test_pessimism_is_chosen_by_name(kwargs: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(kwargs))}.*critic_regularization"):
         regularized(**kwargs)
