@@ -284,3 +284,12 @@ def test_torch_adamw_would_fail(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def _torch_adamw(policy: Any, parameters: Any, lr_schedule: Any) -> torch.optim.Optimizer:
     return torch.optim.AdamW(parameters, lr=lr_schedule(1), weight_decay=policy.optimizer_kwargs["weight_decay"])
+
+
+def test_layer_norm_epsilon_of_dac() -> None:
+    """torch's default epsilon, 1e-5 instead of 1e-6, lies within the tolerance above, but not within this one."""
+    _, data, info = replay(OWN_FOLDER / "dac_public.npz")
+    for key, value in data.items():
+        if key.startswith("info/"):
+            _, i, name = key.split("/")
+            assert abs(info[int(i)][name] - float(value)) <= 4e-6 * max(1, abs(float(value))), key
