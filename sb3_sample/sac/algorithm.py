@@ -347,11 +347,13 @@ class SAC(OffPolicyAlgorithm):
         :param custom_objects: objects that replace what the file holds under their names
         :param print_system_info: whether to print the saved and the present versions
         :param force_reset: whether the environment is reset before training goes on
-        :param kwargs: arguments of the constructor that shall differ from the saved ones
+        :param kwargs: arguments of the constructor that shall differ from the saved ones. What a learned number starts
+            from (``initial_...``, ``ent_coef="auto_..."``) counts from the next reset on: the file has its value
         :return: the model
         :raises ValueError: if ``kwargs`` holds something else, or values that are not allowed
         """
-        known = {name for c in cls.__mro__ if issubclass(c, SAC) for name in inspect.signature(c.__init__).parameters}
+        known = {name for c in cls.__mro__ if issubclass(c, SAC) for name in inspect.signature(c).parameters}
+        known -= {"policy", "env", "kwargs", "_init_setup_model"}
         unknown = sorted(kwargs.keys() - known)
         if unknown:
             raise ValueError(f"{', '.join(unknown)}: not an argument of {cls.__name__}, so load cannot change it")
@@ -363,7 +365,7 @@ class SAC(OffPolicyAlgorithm):
             if kwargs and ("loading state_dict" in str(error) or isinstance(error, ParametersDoNotFit)):
                 raise ValueError(
                     f"{', '.join(sorted(kwargs))}: with these arguments the model has other networks or parts than the "
-                    f"file ({error})"
+                    f"file ({str(error).splitlines()[0]})"
                 ) from error
             raise
 

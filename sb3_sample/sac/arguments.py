@@ -3,6 +3,7 @@
 import inspect
 import math
 from collections.abc import Callable, Sequence
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
@@ -30,6 +31,8 @@ def check(agent: "SAC") -> None:
         ("n_steps", 1),
     ):
         value = getattr(agent, name)
+        if name == "batch_size" and not isinstance(value, Integral):
+            raise ValueError(f"batch_size must be an integer, not {value!r}")
         if name == "target_update_interval" and value is None:
             continue
         if not value >= low or (name == "policy_delay" and value != int(value)):
@@ -49,6 +52,14 @@ def check(agent: "SAC") -> None:
         raise ValueError(f"target_entropy must be finite, or 'auto', not {agent.target_entropy}")
     if agent.exploration not in EXPLORATIONS:
         raise ValueError(f"exploration must be one of {sorted(EXPLORATIONS)}, not {agent.exploration!r}")
+    n_critics = agent.policy_kwargs.get("n_critics", 2)
+    if n_critics == 1 and (isinstance(agent.pessimism, str) or agent.exploration == "oac"):
+        what = f"pessimism={agent.pessimism!r}" if isinstance(agent.pessimism, str) else "exploration='oac'"
+        raise ValueError(f"{what} weighs the critics' spread, which n_critics=1 has not")
+    if agent.redo_period is None:
+        check_unused(agent, ["redo_threshold"], "redo_period=None")
+    if isinstance(agent.resets, Sequence) and not agent.resets:
+        check_unused(agent, ["reset_shrink"], "no resets")
     if agent.sam_radius is not None and not 0 < agent.sam_radius < math.inf:
         raise ValueError(f"sam_radius must be above 0 and finite, or None for no SAM, not {agent.sam_radius}")
     for name in ("n_quantiles", "backbone"):
@@ -83,6 +94,10 @@ def _check_pessimism(agent: "SAC") -> None:
             )
     if agent.actor_pessimism is not None:
         check_beta("actor_pessimism", agent.actor_pessimism)
+    if agent.target_subset == 1 and isinstance(agent.pessimism, str):
+        raise ValueError(
+            f"pessimism={agent.pessimism!r} weighs the spread of the targets, and target_subset=1 leaves none"
+        )
     if agent.target_subset is not None:
         n_critics = agent.policy_kwargs.get("n_critics", 2)
         if not 1 <= agent.target_subset <= n_critics or agent.target_subset != int(agent.target_subset):
@@ -151,6 +166,18 @@ def check_unused(agent: "SAC", names: Sequence[str], choice: str) -> None:
         default = next(parameters[name].default for parameters in signatures if name in parameters)
         if getattr(agent, name) != default:
             raise ValueError(f"{name}={getattr(agent, name)!r} means nothing with {choice}: leave it out")
+
+
+def check_once(kwargs_name: str, kwargs: dict[str, Any] | None, arguments: dict[str, str]) -> None:
+    """
+    :param kwargs_name: name of an argument that is a dict
+    :param kwargs: its value
+    :param arguments: by key of the dict, the argument of the class that is the same setting
+    :raises ValueError: if the dict has such a key
+    """
+    for key in kwargs or {}:
+        if key in arguments:
+            raise ValueError(f"{kwargs_name} has {key!r}, which is the argument {arguments[key]} here: pass that")
 
 
 def number(name: str, value: Any, otherwise: str, shown: Any = None) -> float:

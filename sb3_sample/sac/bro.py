@@ -188,7 +188,10 @@ class BRO(SAC):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        if self.exploration != "optimistic_shift":
+        if self.exploration == "optimistic_shift":
+            same = {name: name for name in OPTIMISTIC_SHIFT_SETTINGS}
+            arguments.check_once("exploration_kwargs", self.exploration_kwargs, same)
+        else:
             arguments.check_unused(self, OPTIMISTIC_SHIFT_SETTINGS, f"exploration={self.exploration!r}")
         if not 0 <= self.weight_decay < math.inf:
             raise ValueError(f"weight_decay must be at least 0 and finite, not {self.weight_decay}")
@@ -305,6 +308,9 @@ class BROTD3(BRO):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
+        noise = ("exploration_noise", "target_noise", "target_noise_clip")
+        given = self.policy_kwargs.get("actor_kwargs")
+        arguments.check_once("policy_kwargs['actor_kwargs']", given, {name: name for name in noise})
         if self.backbone != "td3":
             raise ValueError(f"BROTD3 has backbone='td3', not {self.backbone!r}: use BRO")
 

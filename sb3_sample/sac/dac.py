@@ -81,6 +81,12 @@ class DAC(SAC):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
+        if self.exploration == "optimistic_actor":
+            same = {name: name for name in OPTIMISTIC_ACTOR_SETTINGS}
+            arguments.check_once("exploration_kwargs", self.exploration_kwargs, same)
+        start, beta = self.initial_optimism, self.pessimism
+        if start is not None and not isinstance(beta, str) and not start > -beta:
+            raise ValueError(f"initial_optimism must be above minus the pessimism, {-beta}, not {start}")
         if self.exploration != "optimistic_actor":
             arguments.check_unused(self, OPTIMISTIC_ACTOR_SETTINGS, f"exploration={self.exploration!r}")
 

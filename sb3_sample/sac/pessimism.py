@@ -107,7 +107,8 @@ class LearnedPessimism(Pessimism):
 
     - ``loss="squared"`` is VPL's ``mean(e^2)`` (P4, eq. 12); the gradient goes through the beta of ``V_lb``;
     - ``loss="dual"`` is ``beta * mean(e)`` with the error as a constant (P4, eq. 6): beta rises where the lower bound
-      promises more than the critics' mean gave.
+      of the next state promises more than the critics' mean gives; for "on_policy", where ``e`` is the return minus
+      the lower bound of its state and action, where that bound promises more than the return kept.
 
     - ``source="replay"`` takes the gradient step's own batch (GPL), and what the critics' step has computed of it;
     - ``source="validation"`` takes transitions that are held out of training (VPL), ``round(validation_proportion *
@@ -163,7 +164,7 @@ class LearnedPessimism(Pessimism):
             raise ValueError(f"td_lambda must lie in [0, 1], not {td_lambda!r}")
         if source == "validation" and agent.validation_proportion == 0:
             raise ValueError(
-                "the pessimism learns from transitions held out, and validation_proportion=0 holds none out: "
+                "pessimism='vpl' learns from transitions held out, and validation_proportion=0 holds none out: "
                 "pass validation_proportion=1/32, or another source of its transitions"
             )
         if source == "on_policy":
@@ -171,11 +172,11 @@ class LearnedPessimism(Pessimism):
                 raise ValueError(f"source='on_policy' goes with loss='dual' only, not {loss!r}")
             if agent.exploration != "actor":
                 raise ValueError(
-                    f"OPL's segments must be on-policy, but exploration={agent.exploration!r}: "
+                    f"the segments of pessimism='opl' must be on-policy, but exploration={agent.exploration!r}: "
                     "it goes with exploration='actor' only"
                 )
             if agent.action_noise is not None:
-                raise ValueError("OPL's segments must be on-policy: it cannot be combined with action_noise")
+                raise ValueError("the segments of pessimism='opl' must be on-policy: leave action_noise out")
         self.loss, self.source = loss, source
         self.segment_length, self.td_lambda = segment_length, td_lambda
         self.n_validation = max(1, round(agent.validation_proportion * agent.batch_size))

@@ -206,6 +206,14 @@ class DeterministicActor(Actor):
         smoothing = (self.target_noise * noise).clamp(-self.target_noise_clip, self.target_noise_clip)
         return (action + smoothing).clamp(-1, 1), log_prob
 
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them
+        :param deterministic: without meaning, the actor always is, as in stable_baselines3's TD3
+        :return: actions in [-1, 1], (B, A)
+        """
+        return self.sample(obs)[0]
+
     def act(self, mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         return (torch.tanh(mean) + std * noise).clamp(-1, 1)
 

@@ -131,10 +131,18 @@ class RegularizedSAC(SAC):
                 critic[name] = True
         if "crelu" in plasticity:
             critic["activation_fn"] = CReLU
-        kwargs["critic_network_kwargs"] = {**critic, **(kwargs.get("critic_network_kwargs") or {})}
-        if "weight_decay" in network:
-            optimizer = {"weight_decay": self.weight_decay, **(kwargs.get("critic_optimizer_kwargs") or {})}
-            kwargs["critic_optimizer_kwargs"] = optimizer
+        if critic and kwargs.get("critic_network", "mlp") != "mlp":
+            raise ValueError(
+                f"network_regularization={self.network_regularization!r} and plasticity_regularization="
+                f"{self.plasticity_regularization!r} regularize an MLP, not critic_network={kwargs['critic_network']!r}"
+            )
+        optimizer = {"weight_decay": self.weight_decay} if "weight_decay" in network else {}
+        for name, own in (("critic_network_kwargs", critic), ("critic_optimizer_kwargs", optimizer)):
+            given = dict(kwargs.get(name) or {})
+            for key in own.keys() & given.keys():
+                raise ValueError(f"policy_kwargs[{name!r}] has {key!r}, which the regularizations choose: leave it out")
+            if own:
+                kwargs[name] = {**own, **given}
         return kwargs
 
 

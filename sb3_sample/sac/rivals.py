@@ -14,6 +14,8 @@ class _RuleSAC(SAC):
     """SAC with one rule that moves pessimism, by the name that ``pessimism`` would take."""
 
     rule: ClassVar[str]
+    #: The rule's arguments by their names here.
+    rule_arguments: ClassVar[dict[str, str]]
 
     def __init__(
         self,
@@ -24,17 +26,19 @@ class _RuleSAC(SAC):
         pessimism: float | str | None = None,
         **kwargs: Any,
     ):
-        if pessimism not in (None, self.rule):
-            raise ValueError(
-                f"{type(self).__name__} moves the pessimism itself (pessimism={self.rule!r}), which "
-                f"pessimism={pessimism!r} contradicts: leave it out, or use SAC"
-            )
-        super().__init__(policy, env, learning_rate, pessimism=self.rule, **kwargs)
+        super().__init__(policy, env, learning_rate, pessimism=self.rule if pessimism is None else pessimism, **kwargs)
+
+    def _full_pessimism_kwargs(self) -> dict[str, Any]:
+        own = {name: getattr(self, argument) for name, argument in self.rule_arguments.items()}
+        return {**own, **super()._full_pessimism_kwargs()}
 
     def _check_arguments(self) -> None:
-        # Also where it is changed by load.
         if self.pessimism != self.rule:
-            raise ValueError(f"{type(self).__name__} has pessimism={self.rule!r}, not {self.pessimism!r}: use SAC")
+            raise ValueError(
+                f"{type(self).__name__} moves the pessimism itself, pessimism={self.rule!r}, "
+                f"not {self.pessimism!r}: leave pessimism={self.pessimism!r} out, or use SAC"
+            )
+        arguments.check_once("pessimism_kwargs", self.pessimism_kwargs, self.rule_arguments)
         super()._check_arguments()
 
 
@@ -53,6 +57,7 @@ class TOPSAC(_RuleSAC):
     """
 
     rule = "top"
+    rule_arguments: ClassVar[dict[str, str]] = {"arms": "arms", "learning_rate": "bandit_learning_rate"}
 
     def __init__(
         self,
@@ -67,10 +72,6 @@ class TOPSAC(_RuleSAC):
         self.arms = arms
         self.bandit_learning_rate = bandit_learning_rate
         super().__init__(policy, env, learning_rate, **kwargs)
-
-    def _full_pessimism_kwargs(self) -> dict[str, Any]:
-        own = {"arms": self.arms, "learning_rate": self.bandit_learning_rate}
-        return {**own, **super()._full_pessimism_kwargs()}
 
 
 class GPLSAC(_RuleSAC):
@@ -89,6 +90,10 @@ class GPLSAC(_RuleSAC):
     """
 
     rule = "gpl"
+    rule_arguments: ClassVar[dict[str, str]] = {
+        "initial_pessimism": "initial_pessimism",
+        "learning_rate": "pessimism_learning_rate",
+    }
 
     def __init__(
         self,
@@ -103,10 +108,6 @@ class GPLSAC(_RuleSAC):
         self.initial_pessimism = initial_pessimism
         self.pessimism_learning_rate = pessimism_learning_rate
         super().__init__(policy, env, learning_rate, **kwargs)
-
-    def _full_pessimism_kwargs(self) -> dict[str, Any]:
-        own = {"initial_pessimism": self.initial_pessimism, "learning_rate": self.pessimism_learning_rate}
-        return {**own, **super()._full_pessimism_kwargs()}
 
 
 class OPLSAC(_RuleSAC):
@@ -126,6 +127,12 @@ class OPLSAC(_RuleSAC):
     """
 
     rule = "opl"
+    rule_arguments: ClassVar[dict[str, str]] = {
+        "initial_pessimism": "initial_pessimism",
+        "learning_rate": "pessimism_learning_rate",
+        "segment_length": "segment_length",
+        "td_lambda": "td_lambda",
+    }
 
     def __init__(
         self,
@@ -144,15 +151,6 @@ class OPLSAC(_RuleSAC):
         self.segment_length = segment_length
         self.td_lambda = td_lambda
         super().__init__(policy, env, learning_rate, **kwargs)
-
-    def _full_pessimism_kwargs(self) -> dict[str, Any]:
-        own = {
-            "initial_pessimism": self.initial_pessimism,
-            "learning_rate": self.pessimism_learning_rate,
-            "segment_length": self.segment_length,
-            "td_lambda": self.td_lambda,
-        }
-        return {**own, **super()._full_pessimism_kwargs()}
 
 
 class OAC(SAC):
@@ -187,7 +185,10 @@ class OAC(SAC):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        if self.exploration != "oac":
+        if self.exploration == "oac":
+            same = {"optimism": "optimism", "kl_radius": "kl_radius"}
+            arguments.check_once("exploration_kwargs", self.exploration_kwargs, same)
+        else:
             arguments.check_unused(self, ("optimism", "kl_radius"), f"exploration={self.exploration!r}")
 
     def _full_exploration_kwargs(self) -> dict[str, Any]:

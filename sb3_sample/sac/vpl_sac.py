@@ -56,15 +56,30 @@ class VPLSAC(SAC):
         self.pessimism_learning_rate = pessimism_learning_rate
         self.pessimism_source = pessimism_source
         self.pessimism_loss = pessimism_loss
-        if validation_proportion is None:
-            validation_proportion = 1 / 32 if pessimism_source == "validation" else 0.0
         super().__init__(
-            policy, env, learning_rate, validation_proportion=validation_proportion, pessimism=pessimism, **kwargs
+            policy,
+            env,
+            learning_rate,
+            validation_proportion=validation_proportion,  # type: ignore[arg-type]  # None until it is checked
+            pessimism=pessimism,
+            **kwargs,
         )
 
     def _check_arguments(self) -> None:
         if isinstance(self.pessimism, str) and self.pessimism != "vpl":
             raise ValueError(f"VPLSAC has pessimism='vpl' or a fixed number, not {self.pessimism!r}: use SAC")
+        if self.validation_proportion is None:
+            self.validation_proportion = 1 / 32 if self.pessimism_source == "validation" else 0.0
+        arguments.check_once(
+            "pessimism_kwargs",
+            self.pessimism_kwargs,
+            {
+                "initial_pessimism": "initial_pessimism",
+                "learning_rate": "pessimism_learning_rate",
+                "source": "pessimism_source",
+                "loss": "pessimism_loss",
+            },
+        )
         super()._check_arguments()
         if self.pessimism != "vpl":
             own = ("initial_pessimism", "pessimism_learning_rate", "pessimism_source", "pessimism_loss")

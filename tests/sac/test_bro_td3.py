@@ -48,11 +48,8 @@ def test_predictions() -> None:
         actor = model.actor
         expected = torch.tanh(actor.mean(actor.trunk(torch.as_tensor(observations))))
     np.testing.assert_allclose(model.predict(observations, deterministic=True)[0], expected, atol=1e-6)
-    torch.manual_seed(0)
-    noise = torch.randn(6, 2)
-    torch.manual_seed(0)
-    noisy, _ = model.predict(observations, deterministic=False)
-    np.testing.assert_allclose(noisy, (expected + 0.1 * noise).clamp(-1, 1), atol=1e-6)
+    # The noise is the explorer's, not the policy's, as in stable_baselines3's TD3.
+    np.testing.assert_allclose(model.predict(observations, deterministic=False)[0], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -329,7 +329,7 @@ def in_force(model: Any, name: str) -> Any:
         ("SAC", "actor_pessimism", 0.25),
         ("SAC", "policy_delay", 3),
         ("SAC", "sam_radius", 0.2),
-        ("SAC", "reset_shrink", 0.5),
+        ("SRSAC", "reset_shrink", 0.5),
         ("SAC", "target_entropy", -3.0),
         ("SAC", "ent_coef", 0.125),
         ("BRO", "adjustment_learning_rate", 0.02),

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
 
-from sb3_sample.sac import BROTD3, DAC, OAC, SAC, VPLSAC
+from sb3_sample.sac import BROTD3, DAC, GPLSAC, OAC, SAC, TOPSAC, VPLSAC, RegularizedSAC
 from tests.sac.common import MAKERS, Toy, bro, sac, vec
 
 NAN, INF = float("nan"), float("inf")
@@ -277,6 +279,8 @@ def test_infinite_bounds_are_not_infinite_values() -> None:
         (DAC, {"exploration": "actor", "kl_target": 0.3}, "kl_target=0.3"),
         (DAC, {"exploration": "oac", "reinitialize_every": None}, "reinitialize_every=None"),
         (OAC, {"exploration": "actor", "optimism": 1.0}, "optimism=1.0"),
+        (SAC, {"reset_shrink": 0.5}, "reset_shrink=0.5"),
+        (SAC, {"redo_threshold": 0.1}, "redo_threshold=0.1"),
         (VPLSAC, {"pessimism": 1.0, "pessimism_learning_rate": 1.0}, "pessimism_learning_rate=1.0"),
     ],
 )
@@ -290,3 +294,74 @@ def test_settings_of_a_shift_that_is_not_there() -> None:
         bro(exploration="actor", exploration_kwargs=None, kl_target=0.3)
     # The default of the class itself is none that was given.
     assert bro(cls=BROTD3, exploration="actor", exploration_kwargs=None).std_multiplier == 1
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda: sac(cls=DAC, kl_target=0.1, exploration_kwargs={"kl_target": 0.9}), "argument kl_target here"),
+        (lambda: sac(cls=OAC, exploration_kwargs={"kl_radius": 0.9}), "argument kl_radius here"),
+        (lambda: bro(exploration_kwargs={"kl_target": 0.9}), "argument kl_target here"),
+        (lambda: sac(cls=GPLSAC, pessimism_kwargs={"learning_rate": 0.9}), "argument pessimism_learning_rate here"),
+        (lambda: sac(cls=TOPSAC, pessimism_kwargs={"arms": (0, 2)}), "argument arms here"),
+        (lambda: sac(cls=VPLSAC, pessimism_kwargs={"source": "replay"}), "argument pessimism_source here"),
+        (
+            lambda: bro(cls=BROTD3, policy_kwargs={"actor_kwargs": {"exploration_noise": 0.3}}),
+            "argument exploration_noise here",
+        ),
+    ],
+)
+def test_the_same_setting_twice(make: Callable[[], Any], named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "named"),
+    [
+        ({"network_regularization": "layer_norm", "critic_network_kwargs": {"layer_norm": False}}, "layer_norm"),
+        ({"plasticity_regularization": "crelu", "critic_network_kwargs": {"activation_fn": nn.Tanh}}, "activation_fn"),
+        ({"network_regularization": "weight_decay", "critic_optimizer_kwargs": {"weight_decay": 0}}, "weight_decay"),
+        ({"network_regularization": "spectral_norm", "critic_network": "bronet"}, "critic_network='bronet'"),
+    ],
+)
+def test_a_regularization_is_not_switched_off(kwargs: dict[str, Any], named: str) -> None:
+    policy_kwargs = {key: kwargs.pop(key) for key in list(kwargs) if key.startswith("critic_")}
+    with pytest.raises(ValueError, match=named):
+        sac(cls=RegularizedSAC, policy_kwargs=policy_kwargs, **kwargs)
+
+
+@pytest.mark.parametrize("kwargs", [{"cls": GPLSAC}, {"cls": OAC}, {"pessimism": "top"}])
+def test_no_spread_of_one_critic(kwargs: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="n_critics=1"):
+        sac(policy_kwargs={"net_arch": [8], "n_critics": 1}, **kwargs)
+
+
+def test_no_spread_of_one_target() -> None:
+    with pytest.raises(ValueError, match="target_subset=1 leaves none"):
+        sac(pessimism="gpl", target_subset=1)
+
+
+@pytest.mark.parametrize("batch_size", [None, 16.5, "16"])
+def test_batch_size_is_an_integer(batch_size: Any) -> None:
+    with pytest.raises(ValueError, match="batch_size must be an integer"):
+        sac(batch_size=batch_size)
+
+
+def test_dac_starts_above_the_bound_also_when_loaded(tmp_path: Path) -> None:
+    sac(cls=DAC).learn(30).save(tmp_path / "m")
+    with pytest.raises(ValueError, match="initial_optimism must be above"):
+        DAC.load(tmp_path / "m", initial_optimism=-5.0)
+
+
+def test_what_load_does_not_take(tmp_path: Path) -> None:
+    sac().save(tmp_path / "m")
+    for name in ("kwargs", "policy"):
+        with pytest.raises(ValueError, match=f"{name}: not an argument"):
+            SAC.load(tmp_path / "m", **{name: 1})
+
+
+def test_vpl_default_at_loading(tmp_path: Path) -> None:
+    sac(cls=VPLSAC).save(tmp_path / "m")
+    assert VPLSAC.load(tmp_path / "m", env=vec(), validation_proportion=None).validation_proportion == 1 / 32
+    assert sac(cls=VPLSAC, pessimism_source="replay").validation_proportion == 0

@@ -676,7 +676,7 @@ def test_three_environments_learn(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", RULES)
-@pytest.mark.parametrize("kwargs", [{"backbone": "td3"}, {"n_quantiles": 5}, {"policy_delay": 2, "target_subset": 1},
+@pytest.mark.parametrize("kwargs", [{"backbone": "td3"}, {"n_quantiles": 5}, {"policy_delay": 2, "target_subset": 2},
                                     {"policy_kwargs": {"n_critics": 3, "net_arch": [8]}}])  # fmt: skip
 def test_every_rule_in_other_company(name: str, kwargs: dict[str, Any]) -> None:
     model = make(name, **kwargs).learn(40)

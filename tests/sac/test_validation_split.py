@@ -74,7 +74,9 @@ class Written(KVWriter):
 
 def vpl(env: Any = None, **kwargs: Any) -> VPLSAC:
     """A tiny VPL-SAC that holds out a quarter and moves its pessimism quickly."""
-    own = {"seed": 0, **TINY_SAC, "validation_proportion": 1 / 4, "pessimism_learning_rate": 1e-2}
+    own = {"seed": 0, **TINY_SAC, "validation_proportion": 1 / 4}
+    if kwargs.get("pessimism", "vpl") == "vpl":
+        own["pessimism_learning_rate"] = 1e-2
     return VPLSAC(kwargs.pop("policy", "MlpPolicy"), vec() if env is None else env, **{**own, **kwargs})
 
 
