@@ -3,8 +3,9 @@ Table and picture of the runs that ``learning_curves.py`` made.
 
     python benchmarks/learning_summary.py runs --picture agents.png
 
-For each agent, over its seeds: interquartile mean and 95% stratified bootstrap interval (rliable) of the return, of the
-last evaluations and of all of them. With few seeds the interval says little more than how far apart they lie.
+It needs rliable, which comes with the extra [zoo]. For each agent, over its seeds: interquartile mean and 95%
+stratified bootstrap interval (rliable) of the return, of the last evaluations and of all of them. With few seeds the
+interval says little more than how far apart they lie.
 """
 
 import argparse
