@@ -1,18 +1,25 @@
 """
-Time of one gradient step, beside what the machine can do and beside Stable-Baselines3, all in one run.
+Time of one gradient step, beside what the machine can do and beside the peers, all in one run.
 
-    python benchmarks/update_speed.py [--threads 2] [--rounds 7]
+    python benchmarks/update_speed.py [--threads 2] [--rounds 5] [--only SAC]
+
+Peers are measured where they are installed: ``pip install sb3-contrib`` (TQC, CrossQ) and ``pip install sbx-rl`` (SAC,
+TQC, CrossQ in JAX). All have the same networks (two layers of 256), the same batch of 256 and the same task shapes. A
+gradient step includes drawing its batch; BRO has its own networks and its batch of 128.
 
 The contenders take turns, so that a drift of the machine's speed touches all alike; figures are medians over the
-rounds, with the range. Leave the machine alone meanwhile: with a busy second core, two threads can be ten times slower
-than one. "x matmul" is the time over the time of the step's matrix multiplications at the rate at which this machine
-multiplies 2 x 128 x 512 by 2 x 512 x 512 (FLOPs counted by torch).
+rounds, with the range, and the ratios medians of each round's ratio. Leave the machine alone meanwhile: with a busy
+second core, two threads can be ten times slower than one. "x matmul" is the time over the time of the step's matrix
+multiplications at the rate at which this machine multiplies 2 x 128 x 512 by 2 x 512 x 512 (FLOPs counted by torch),
+"rate" its inverse.
 """
 
 import argparse
+import importlib
 import platform
 import statistics
 import time
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -24,11 +31,31 @@ from gymnasium import spaces
 from stable_baselines3.common.logger import Logger
 from torch.utils.flop_counter import FlopCounterMode
 
-from sb3_sample import BRO, SAC
+import sb3_sample
 from sb3_sample.sac.bro import MODEL_SIZES
 from sb3_sample.sac.losses import quantile_huber
 
 OBSERVATION, ACTION = 17, 6  # cheetah-run
+#: Peers by label: module, class.
+PEERS = {
+    "SAC (stable_baselines3)": ("stable_baselines3", "SAC"),
+    "TQC (sb3_contrib)": ("sb3_contrib", "TQC"),
+    "CrossQ (sb3_contrib)": ("sb3_contrib", "CrossQ"),
+    "SAC (sbx)": ("sbx", "SAC"),
+    "TQC (sbx)": ("sbx", "TQC"),
+    "CrossQ (sbx)": ("sbx", "CrossQ"),
+}
+#: What was aimed at: label, numerator, denominator (None: the step's matrix multiplications), ratio.
+AIMS = [
+    ("BRO 4.92M / its matmul", "BRO 4.92M, compiled", None, 1 / 0.7),
+    ("BRO 0.55M / its matmul", "BRO 0.55M, compiled", None, 2.0),
+    ("SAC / SAC of stable_baselines3", "SAC, compiled", "SAC (stable_baselines3)", 0.5),
+    ("SAC / SAC of sbx", "SAC, compiled", "SAC (sbx)", 0.8),
+    ("DAC / SAC", "DAC, compiled", "SAC, compiled", 1.15),
+    ("VPL-SAC / SAC", "VPLSAC, compiled", "SAC, compiled", 1.05),
+    ("acting / gradient step, BRO 4.92M", "acting: BRO 4.92M", "BRO 4.92M, compiled", 0.1),
+    ("acting / gradient step, SAC", "acting: SAC", "SAC, compiled", 0.1),
+]
 
 
 class Shapes(gym.Env):
@@ -92,7 +119,7 @@ def measure(contenders: dict[str, Callable[[], Any]], rounds: int) -> dict[str, 
             call()
         start = time.perf_counter()
         call()
-        repeats[name] = max(3, int(0.1 / (time.perf_counter() - start)))
+        repeats[name] = max(3, int(0.2 / (time.perf_counter() - start)))
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(rounds):
         for name, call in contenders.items():
@@ -106,52 +133,108 @@ def measure(contenders: dict[str, Callable[[], Any]], rounds: int) -> dict[str, 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--only", nargs="*", help="contenders whose name begins with one of these")
     parser.add_argument("--device", default="cpu", help="of the models; the ratios to matmul are a CPU's")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
+    warnings.simplefilter("ignore")
 
-    bros = {name: build(BRO, model_size=name, device=args.device) for name in MODEL_SIZES if name != "26.31M"}
-    sac = build(SAC, device=args.device)
-    theirs = build(stable_baselines3.SAC, device=args.device)
+    def wanted(name: str) -> bool:
+        return args.only is None or name.startswith(tuple(args.only))
+
+    def synchronised(call: Callable[[], Any]) -> Callable[[], Any]:
+        return call if args.device == "cpu" else lambda: (call(), torch.cuda.synchronize())
+
+    steps: dict[str, Callable[[], Any]] = {}
+    flops: dict[str, int] = {}
+    compiling: dict[str, float] = {}
+    models: dict[str, Any] = {}
+    agents = {f"BRO {size}": ("BRO", {"model_size": size}, 128) for size in MODEL_SIZES}
+    agents |= {name: (name, {}, 256) for name in ("SAC", "DAC", "VPLSAC")}
+    for name, (cls, kwargs, batch_size) in agents.items():
+        for how, compile in (("eager", False), ("compiled", True)):
+            label = f"{name}, {how}"
+            if not wanted(label):
+                continue
+            model = build(getattr(sb3_sample, cls), compile=compile, device=args.device, **kwargs)
+            models[label], steps[label] = model, training_step(model, batch_size)
+            start = time.perf_counter()
+            steps[label]()
+            if compile:
+                compiling[label] = time.perf_counter() - start
+                flops[label] = flops.get(f"{name}, eager", 0)
+            else:
+                with FlopCounterMode(display=False) as counter:
+                    steps[label]()
+                flops[label] = counter.get_total_flops()
+    versions = [f"torch {torch.__version__}", f"stable_baselines3 {stable_baselines3.__version__}"]
+    for label, (module, cls) in PEERS.items():
+        if not wanted(label):
+            continue
+        try:
+            peer = getattr(importlib.import_module(module), cls)
+        except ImportError:
+            print(f"not installed: {module}")
+            continue
+        versions.append(f"{module} {importlib.import_module(module).__version__}")
+        device = {} if module == "sbx" else {"device": args.device}
+        net = {"pi": [256, 256], "qf": [256, 256]}
+        steps[label] = training_step(build(peer, policy_kwargs={"net_arch": net}, **device), 256)
+        if module != "sbx":
+            with FlopCounterMode(display=False) as counter:
+                steps[label]()
+            flops[label] = counter.get_total_flops()
+
     x, w = torch.randn(2, 128, 512), torch.randn(2, 512, 512)
-    steps = {f"BRO {name}": training_step(model, 128) for name, model in bros.items()}
-    steps["SAC (sb3_sample)"] = training_step(sac, 256)
-    steps["SAC (stable_baselines3)"] = training_step(theirs, 256)
-    flops = {}
-    for name, step in steps.items():
-        with FlopCounterMode(display=False) as counter:
-            step()
-        flops[name] = counter.get_total_flops()
-
-    contenders: dict[str, Callable[[], Any]] = {"matmul": lambda: torch.bmm(x, w), **steps}
-    contenders["acting: BRO 4.92M"] = acting(bros["4.92M"])
-    contenders["acting: SAC (sb3_sample)"] = acting(sac)
-    contenders["acting: SAC (stable_baselines3)"] = acting(theirs)
-    contenders["quantile Huber, sorted"] = loss_step(quantile_huber)
-    contenders["quantile Huber, pairs"] = loss_step(pairwise_quantile_huber)
+    contenders: dict[str, Callable[[], Any]] = {"matmul": lambda: torch.bmm(x, w)}
+    contenders |= {name: synchronised(step) for name, step in steps.items()}
+    for name in ("BRO 4.92M", "SAC"):
+        if f"{name}, compiled" in models and wanted("acting"):
+            contenders[f"acting: {name}"] = acting(models[f"{name}, compiled"])
+    if wanted("quantile Huber"):
+        contenders["quantile Huber, sorted (eager)"] = loss_step(quantile_huber)
+        contenders["quantile Huber, by definition"] = loss_step(pairwise_quantile_huber)
     seconds = measure(contenders, args.rounds)
 
-    median = {name: statistics.median(values) for name, values in seconds.items()}
-    rate = 2 * 2 * 128 * 512 * 512 / median["matmul"]
-    print(f"{platform.processor() or platform.machine()}, {args.threads} threads, torch {torch.__version__}, "
-          f"stable_baselines3 {stable_baselines3.__version__}, device {args.device}")  # fmt: skip
+    matmul_flops = 2 * 2 * 128 * 512 * 512
+    #: Ratios of the times in one and the same round.
+    times_matmul = {
+        name: statistics.median(
+            t * matmul_flops / (flops[name] * m) for t, m in zip(seconds[name], seconds["matmul"], strict=True)
+        )
+        for name in seconds
+        if flops.get(name)
+    }
+    rate = matmul_flops / statistics.median(seconds["matmul"])
+    print(f"{platform.processor() or platform.machine()}, {args.threads} threads, device {args.device}")
+    print(", ".join(dict.fromkeys(versions)))
     print(f"matmul 2x128x512 by 2x512x512: {rate / 1e9:.0f} GFLOP/s\n")
-    print(f"{'':34}{'ms':>9}{'range':>18}{'GFLOP':>8}{'x matmul':>10}")
+    print(f"{'':32}{'ms':>9}{'range':>18}{'GFLOP':>8}{'x matmul':>10}{'rate':>6}{'compiling, s':>14}")
     for name, values in seconds.items():
-        line = f"{name:34}{1e3 * median[name]:9.3f}{1e3 * min(values):9.3f} -{1e3 * max(values):7.3f}"
-        if name in flops:
-            line += f"{flops[name] / 1e9:8.2f}{median[name] / (flops[name] / rate):10.2f}"
+        line = f"{name:32}{1e3 * statistics.median(values):9.3f}{1e3 * min(values):9.3f} -{1e3 * max(values):7.3f}"
+        if name in times_matmul:
+            line += f"{flops[name] / 1e9:8.2f}{times_matmul[name]:10.2f}{1 / times_matmul[name]:6.0%}"
+        if name in compiling:
+            line += f"{compiling[name]:{14 if name in times_matmul else 38}.1f}"
         print(line)
-    print()
 
-    def ratio(label: str, name: str, other: str) -> None:
-        print(f"{label}: {median[name] / median[other]:.2f}")
-
-    ratio("SAC, sb3_sample / stable_baselines3", "SAC (sb3_sample)", "SAC (stable_baselines3)")
-    ratio("BRO 4.92M, acting / gradient step", "acting: BRO 4.92M", "BRO 4.92M")
-    ratio("SAC, acting / gradient step", "acting: SAC (sb3_sample)", "SAC (sb3_sample)")
-    ratio("quantile Huber, pairs / sorted", "quantile Huber, pairs", "quantile Huber, sorted")
+    same = [name for name in seconds if name in PEERS]
+    if same:
+        best = min(same, key=lambda name: statistics.median(seconds[name]))
+        print(f"\nAt the same networks and batch, over {best}, the fastest peer:")
+        for name in [n for n in seconds if n.startswith(("SAC", "DAC", "VPL", "TQC", "CrossQ"))]:
+            ratio = statistics.median(a / b for a, b in zip(seconds[name], seconds[best], strict=True))
+            print(f"{name:32}{ratio:9.2f}")
+    print(f"\n{'':40}{'aim':>8}{'measured':>10}")
+    for label, name, other, aim in AIMS:
+        if name in seconds and ((other is None and name in times_matmul) or other in seconds):
+            ratio = (
+                times_matmul[name]
+                if other is None
+                else statistics.median(a / b for a, b in zip(seconds[name], seconds[other], strict=True))
+            )
+            print(f"{label:40}{aim:8.2f}{ratio:10.2f}")
 
 
 if __name__ == "__main__":

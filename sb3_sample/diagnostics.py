@@ -248,6 +248,9 @@ class DiagnosticsCallback(BaseCallback):
         self._next = (self.num_timesteps // self.every + 1) * self.every
 
     def _on_step(self) -> bool:
+        # The step after this call's is the last before a measurement, which then finds its gradients.
+        if self._next <= self.num_timesteps + self.model.n_envs:
+            self.model.keep_next_gradients = True
         if self.num_timesteps < self._next:
             return True
         self._next = (self.num_timesteps // self.every + 1) * self.every
@@ -382,7 +385,7 @@ class DiagnosticsCallback(BaseCallback):
         results: dict[str, float] = {}
         for who, module in (("critic", self.model.critic), ("actor", self.model.actor)):
             parameters = list(module.parameters())
-            gradients = [p.grad for p in parameters if p.grad is not None]
+            gradients = [p.grad for p in parameters if p.grad is not None and not self.model.gradients_are_stale]
             if gradients:
                 results[f"gradient_norm_{who}"] = global_norm(gradients)
             results[f"parameter_norm_{who}"] = global_norm(list(parameters))

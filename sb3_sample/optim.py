@@ -45,6 +45,13 @@ class AdamW(Optimizer):
         if not weight_decay >= 0:
             raise ValueError(f"weight_decay must be at least 0, not {weight_decay}")
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps, "weight_decay": weight_decay})
+        #: Whether steps read the learning rates from tensors, as one that is captured must; numbers are quicker.
+        self.capturable = False
+        # The groups' learning rates as a tensor, and the numbers that it holds.
+        self._rates: torch.Tensor | None = None
+        self._rates_held: list[float] = []
+        # By group, how many steps each parameter has taken.
+        self._steps: list[torch.Tensor] = []
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -58,33 +65,102 @@ class AdamW(Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        for group in self.param_groups:
-            params = [p for p in group["params"] if p.grad is not None]
-            if not params:
+        self.prepare()
+        self.apply([p.grad for group in self.param_groups for p in group["params"]])
+        return loss
+
+    @torch.no_grad()
+    def prepare(self) -> None:
+        """
+        Bring everything that :meth:`apply` reads up to date: the moments exist, and the learning rates of the groups
+        stand in tensors. Compiled and captured steps, which know tensors only, then find both.
+        """
+        rates = [group["lr"] for group in self.param_groups]
+        device = self.param_groups[0]["params"][0].device
+        if self._rates is None or self._rates.device != device:
+            self._rates, self._rates_held = torch.tensor(rates, dtype=torch.float32, device=device), rates
+        elif self._rates_held != rates:
+            self._rates.copy_(torch.tensor(rates, dtype=torch.float32))
+            self._rates_held = rates
+        for i, group in enumerate(self.param_groups):
+            params = group["params"]
+            if i < len(self._steps) and all("step" in self.state[p] for p in params):
                 continue
-            states = [self._state_of(p) for p in params]
+            # A parameter's number of steps is its place in one vector, so that all are counted at once.
+            steps = torch.tensor(
+                [float(self.state[p].get("step", 0)) for p in params], dtype=torch.float32, device=device
+            )
+            self._steps[i:] = [steps, *self._steps[i + 1 :]]
+            for p, step in zip(params, steps.unbind(), strict=True):
+                self.state[p]["step"] = step
+                for name in ("exp_avg", "exp_avg_sq"):
+                    if name not in self.state[p]:
+                        self.state[p][name] = torch.zeros_like(p)
+
+    def read_tensors(self) -> list[torch.Tensor]:
+        """
+        :return: what a step reads besides parameters, gradients and state: learning rates and numbers of steps
+        """
+        return [*([] if self._rates is None else [self._rates]), *self._steps]
+
+    def load_state_dict(self, state_dict: Any) -> None:
+        """
+        Load moments and settings, as in torch.
+
+        :param state_dict: what ``state_dict`` gave
+        """
+        super().load_state_dict(state_dict)
+        self._steps = []
+
+    @torch.no_grad()
+    def apply(self, gradients: Sequence[torch.Tensor | None]) -> None:
+        """
+        Take one step with gradients that are given; ``prepare`` comes first.
+
+        :param gradients: in the order of the parameters, group by group; a parameter without one is left alone
+        """
+        assert self._rates is not None
+        of_parameter = iter(gradients)
+        for i, group in enumerate(self.param_groups):
+            params, steps = group["params"], self._steps[i]
+            used = [(j, p, g) for j, (p, g) in enumerate(zip(params, of_parameter, strict=False)) if g is not None]
+            if not used:
+                continue
+            if len(used) == len(params):
+                steps.add_(1)
+            else:
+                steps[[j for j, _, _ in used]] += 1
             rows: list[tuple[torch.Tensor, ...]] = [
-                (p, _laid_out_like(p, p.grad), s["exp_avg"], s["exp_avg_sq"], s["step"])
-                for p, s in zip(params, states, strict=True)
+                (p, _laid_out_like(p, g), self.state[p]["exp_avg"], self.state[p]["exp_avg_sq"], steps[j])
+                for j, p, g in used
             ]
-            torch._foreach_add_([row[-1] for row in rows], 1)
+            if torch.compiler.is_compiling():
+                _plain_adamw(group, rows, self._rates[i])
+                continue
+            rate = self._rates[i] if self.capturable else group["lr"]
             if group["weight_decay"] == 0:
-                _adam(group, *zip(*rows, strict=True))
+                _adam(group, rate, *zip(*rows, strict=True))
                 continue
             for p, *others in _cache_sized(rows):
                 # Start from the decay, let Adam add its direction, then change the parameters once.
-                change = torch._foreach_mul(p, -group["lr"] * group["weight_decay"])
-                _adam(group, change, *others)
-                torch._foreach_add_(p, change)
-        return loss
+                change = torch._foreach_mul(list(p), -rate * group["weight_decay"])
+                _adam(group, rate, change, *others)
+                torch._foreach_add_(list(p), change)
 
-    def _state_of(self, p: torch.Tensor) -> dict[str, Any]:
-        state = self.state[p]
-        if not state:
-            state["step"] = torch.zeros((), dtype=torch.float32, device=p.device)
-            state["exp_avg"] = torch.zeros_like(p)
-            state["exp_avg_sq"] = torch.zeros_like(p)
-        return state
+
+def _plain_adamw(group: dict[str, Any], rows: list[tuple[torch.Tensor, ...]], rate: torch.Tensor) -> None:
+    """The step written out, for a compiler to fuse. The corrections, 1 minus nearly 1, need float64."""
+    beta1, beta2 = group["betas"]
+    for p, grad, exp_avg, exp_avg_sq, step in rows:
+        n = step.double()
+        size = (rate / (1 - beta1**n)).float()
+        root = (1 - beta2**n).rsqrt().float()
+        exp_avg.lerp_(grad, 1 - beta1)
+        exp_avg_sq.lerp_(grad * grad, 1 - beta2)
+        change = size * (exp_avg / (exp_avg_sq.sqrt() * root + group["eps"]))
+        if group["weight_decay"] != 0:
+            change = change + rate * group["weight_decay"] * p
+        p.sub_(change)
 
 
 def _laid_out_like(p: torch.Tensor, grad: torch.Tensor) -> torch.Tensor:
@@ -92,12 +168,12 @@ def _laid_out_like(p: torch.Tensor, grad: torch.Tensor) -> torch.Tensor:
     return grad if grad.stride() == p.stride() else torch.empty_like(p).copy_(grad)
 
 
-def _adam(group: dict[str, Any], params: Any, grads: Any, exp_avgs: Any, exp_avg_sqs: Any, steps: Any) -> None:
+def _adam(group: dict[str, Any], rate: Any, params: Any, grads: Any, m: Any, v: Any, steps: Any) -> None:
     """Adam's step for matching lists of tensors, in place, by one fused kernel."""
     beta1, beta2 = group["betas"]
     torch._fused_adam_(
-        list(params), list(grads), list(exp_avgs), list(exp_avg_sqs), [], list(steps),
-        lr=group["lr"], beta1=beta1, beta2=beta2, weight_decay=0.0, eps=group["eps"], amsgrad=False, maximize=False,
+        list(params), list(grads), list(m), list(v), [], list(steps),
+        lr=rate, beta1=beta1, beta2=beta2, weight_decay=0.0, eps=group["eps"], amsgrad=False, maximize=False,
     )  # fmt: skip
 
 

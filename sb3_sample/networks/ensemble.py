@@ -44,6 +44,9 @@ class EnsembleLinear(nn.Module):
             x = x.expand(self.n_copies, -1, -1)
         if self.bias is None:
             return torch.bmm(x, weight)
+        if torch.compiler.is_compiling():
+            # As two operations, of which the second is fused with what follows.
+            return torch.bmm(x, weight) + self.bias
         return torch.baddbmm(self.bias, x, weight)
 
     def extra_repr(self) -> str:

@@ -1,7 +1,7 @@
 """
 The off-policy family: soft actor-critic with exchangeable parts, and its one update.
 
-``SAC._update`` is the whole gradient step, in the order of BRO's pseudo-code (P5, algorithm 2).
+``SAC._gradient_step`` is the whole gradient step, in the order of BRO's pseudo-code (P5, algorithm 2).
 """
 
 import inspect
@@ -17,7 +17,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
@@ -25,13 +25,14 @@ from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.networks.spectral_norm import SpectralNorm
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 from sb3_sample.sac import arguments, losses
-from sb3_sample.sac.batch import Batch, CriticStep, Noise, draw_batches
-from sb3_sample.sac.buffers import ValidationDictReplayBuffer, ValidationReplayBuffer, ValidationSplit
+from sb3_sample.sac.batch import Batch, CriticStep, Extra, Noise, draw_batches
+from sb3_sample.sac.buffers import BatchMemory, ValidationDictReplayBuffer, ValidationReplayBuffer, ValidationSplit
+from sb3_sample.sac.execution import PAYS_FROM, Execution, why_not_compiled
 from sb3_sample.sac.exploration import EXPLORATIONS, Exploration
 from sb3_sample.sac.parts import ParametersDoNotFit, Part
 from sb3_sample.sac.pessimism import PESSIMISMS, Pessimism, pessimistic_value
 from sb3_sample.sac.plasticity import ReDo, Resets
-from sb3_sample.sac.policies import Actor, CnnPolicy, CriticEnsemble, MlpPolicy, MultiInputPolicy, SACPolicy
+from sb3_sample.sac.policies import Actor, CnnPolicy, CriticEnsemble, MlpPolicy, ModeSwitch, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.scalars import FixedScalar, LogScalar
 
 Self = TypeVar("Self", bound="SAC")
@@ -100,6 +101,8 @@ class SAC(OffPolicyAlgorithm):
     :param verbose: 0 nothing, 1 info, 2 debug
     :param seed: seed of everything random
     :param device: "auto", "cpu", "cuda", ...
+    :param compile: whether ``torch.compile`` makes one program of the gradient step; "auto": where that pays back
+        within the run, on a CPU or a GPU with a compiler at hand, see docs/performance.md
     :param _init_setup_model: whether to build the networks at once
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -159,6 +162,7 @@ class SAC(OffPolicyAlgorithm):
         verbose: int = 0,
         seed: int | None = None,
         device: torch.device | str = "auto",
+        compile: bool | str = "auto",
         _init_setup_model: bool = True,
     ):
         if use_sde:
@@ -211,6 +215,14 @@ class SAC(OffPolicyAlgorithm):
         self.redo_period = redo_period
         self.redo_threshold = redo_threshold
         self.sam_radius = sam_radius
+        self.compile = compile
+        #: Whether the gradient step is compiled; None while that is not decided. Saved: a loaded model goes on with it.
+        self.compiled: bool | None = None
+        self._execution: Execution | None = None
+        #: A callback that wants the gradients of the next gradient step in ``.grad`` sets this: it is run eagerly.
+        self.keep_next_gradients = False
+        #: Whether ``.grad`` holds the gradients of another gradient step than the last, as a compiled one leaves none.
+        self.gradients_are_stale = False
         #: Transitions stored over the model's life; unlike ``num_timesteps`` never zeroed by ``learn``.
         self.num_transitions = 0
         # Gradient steps owed but not yet taken, the fraction that a replay ratio leaves over.
@@ -249,6 +261,11 @@ class SAC(OffPolicyAlgorithm):
         if isinstance(self.temperature, LogScalar):
             betas = (self.temperature_beta1, 0.999)
             self.temperature_optimizer = AdamW(self.temperature.parameters(), lr=self.lr_schedule(1), betas=betas)
+        if self.compile != "auto":
+            self.compiled = bool(self.compile)
+        self._execution = None
+        self._parts_mode = ModeSwitch(*self._parts().values())
+        self._batch_memory = BatchMemory()
         self._set_training_mode(False)
 
     def _check_arguments(self) -> None:
@@ -357,6 +374,8 @@ class SAC(OffPolicyAlgorithm):
         unknown = sorted(kwargs.keys() - known)
         if unknown:
             raise ValueError(f"{', '.join(unknown)}: not an argument of {cls.__name__}, so load cannot change it")
+        if "compile" in kwargs:
+            kwargs["compiled"] = None
         if "train_freq" in kwargs or "gradient_steps" in kwargs:
             kwargs.setdefault("replay_ratio", None)
         try:
@@ -435,7 +454,15 @@ class SAC(OffPolicyAlgorithm):
         return ["policy", "temperature", *self._parts(), *self._optimizers()], []
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor", "critic", "critic_target", "_metrics", "_critic_loss"]
+        return [
+            *super()._excluded_save_params(),
+            "actor",
+            "critic",
+            "critic_target",
+            "_metrics",
+            "_critic_loss",
+            "_execution",
+        ]
 
     def reinitialize(self, shrink: float = 0.0) -> None:
         """
@@ -561,6 +588,7 @@ class SAC(OffPolicyAlgorithm):
         if resets_environment:
             for part in self._parts().values():
                 part.on_environment_reset(self)
+        self._decide_compilation(total_timesteps - self.num_timesteps)
         callback.on_training_start(locals(), globals())
         assert self.env is not None and self.replay_buffer is not None
         while self.num_timesteps < total_timesteps:
@@ -580,6 +608,23 @@ class SAC(OffPolicyAlgorithm):
                 self.train(n_updates, self.batch_size)
         callback.on_training_end()
         return self
+
+    def _decide_compilation(self, n_steps: int) -> None:
+        """With ``compile="auto"``, once and for all: whether the coming environment steps pay it back."""
+        if self.compiled is not None:
+            return
+        n_steps -= max(self.learning_starts - self.num_transitions, 0)
+        if self.replay_ratio is not None:
+            n_updates = self.replay_ratio * n_steps
+        else:
+            assert isinstance(self.train_freq, TrainFreq)
+            # An episode's length is not known: at least a step.
+            n_updates = (
+                n_steps if self.gradient_steps < 0 else self.gradient_steps * n_steps / self.train_freq.frequency
+            )
+        # What keeps the step from being compiled is worth a warning only where it was asked for.
+        self.compiled = n_updates >= PAYS_FROM and why_not_compiled(self) is None
+        self._execution = None
 
     def _updates_due(self, n_collected: int) -> int:
         """
@@ -619,28 +664,66 @@ class SAC(OffPolicyAlgorithm):
                     group["lr"] = rate
         for part in self._parts().values():
             part.before_updates(self)
+        self._prepared_execution()
         for first in range(0, gradient_steps, MAX_BATCHES_AT_ONCE):
             n_batches = min(MAX_BATCHES_AT_ONCE, gradient_steps - first)
-            for batch in draw_batches(self.replay_buffer, n_batches, batch_size, self.gamma, self._vec_normalize_env):
+            for batch in self._draw_batches(n_batches, batch_size):
                 self._metrics.update(self._update(batch))
         self._set_training_mode(False)
 
     def _set_training_mode(self, mode: bool) -> None:
         """Dropout and power iterations: on during gradient steps, off whoever acts."""
         self.policy.set_training_mode(mode)
-        for part in self._parts().values():
-            part.train(mode)
+        self._parts_mode(mode)
+
+    def _draw_batches(self, n_batches: int, batch_size: int) -> list[Batch]:
+        assert self.replay_buffer is not None
+        return draw_batches(
+            self.replay_buffer, n_batches, batch_size, self.gamma, self._vec_normalize_env, self._batch_memory
+        )
+
+    def _prepared_execution(self) -> Execution:
+        if self._execution is None:
+            self._execution = Execution.of(self)
+        self._execution.prepare(self)
+        return self._execution
 
     def _update(self, batch: Batch, noise: Noise | None = None) -> dict[str, torch.Tensor]:
         """
-        One gradient step (P5, algorithm 2).
+        One gradient step: what is drawn and counted around it, and the step.
 
         :param batch: transitions
-        :param noise: noise of the sampled actions; drawn if None. A given noise reproduces a step exactly.
+        :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly.
         :return: what to log, by name, scalars on the model's device, computed with the parameters from before
             the update of the module in question
         """
-        noise = noise or Noise()
+        execution = self._execution or self._prepared_execution()
+        extra = self.pessimism_rule.draw(self)
+        subset = None if self.target_subset is None else (self.target_subset, self.critic.n_critics)
+        noise = (noise or Noise()).completed(batch, extra, subset)
+        self._n_updates += 1
+        moves_targets = self._n_updates % (self.target_update_interval or self.policy_delay) == 0
+        moves_actor = self._n_updates % self.policy_delay == 0
+        eager = self.keep_next_gradients
+        metrics = execution(self, batch, noise, extra, moves_targets, moves_actor, eager=eager)
+        self.gradients_are_stale, self.keep_next_gradients = execution.compiled and not eager, False
+        if self.redo is not None:
+            metrics.update(self.redo.after_update(self, batch))
+        return metrics
+
+    def _gradient_step(
+        self, batch: Batch, noise: Noise, extra: Extra | None, moves_targets: bool, moves_actor: bool
+    ) -> dict[str, torch.Tensor]:
+        """
+        The gradient step (P5, algorithm 2), of tensors only: it is what is compiled and captured.
+
+        :param batch: transitions
+        :param noise: all that is random
+        :param extra: further transitions for the rule of pessimism
+        :param moves_targets: whether the target critics follow in this step
+        :param moves_actor: whether actors and temperature learn in this step
+        :return: what to log, by name, scalars
+        """
         alpha = self.temperature()
         fixed_alpha = alpha.detach()
 
@@ -648,8 +731,8 @@ class SAC(OffPolicyAlgorithm):
         with torch.no_grad():
             next_actions, next_log_prob = self.policy.next_actions(batch.next_observations, noise.critic)
             next_q = self.critic_target(batch.next_observations, next_actions)
-            if self.target_subset is not None:
-                next_q = next_q[torch.randperm(len(next_q), device=next_q.device)[: self.target_subset]]
+            if noise.subset is not None:
+                next_q = next_q[noise.subset]
             entropy_bonus = -fixed_alpha * next_log_prob
             next_values = self.pessimism_rule.value(next_q)
             target = losses.td_target(batch.rewards, batch.dones, batch.discounts, next_values, entropy_bonus)
@@ -662,11 +745,10 @@ class SAC(OffPolicyAlgorithm):
         metrics = {"train/critic_loss": critic_loss, "train/q_mean": q.mean()}
 
         # Targets, by Polyak averaging.
-        self._n_updates += 1
-        if self._n_updates % (self.target_update_interval or self.policy_delay) == 0:
+        if moves_targets:
             self._follow(self.critic_target, self.critic)
 
-        if self._n_updates % self.policy_delay == 0:
+        if moves_actor:
             # Actor, on the new critics.
             actions, log_prob = self.actor.sample(batch.observations, noise.actor)
             value = self._actor_value(self.critic(batch.observations, actions))
@@ -688,11 +770,9 @@ class SAC(OffPolicyAlgorithm):
                     self.minimize(self.temperature_optimizer, temperature_loss)
                     metrics["train/ent_coef_loss"] = temperature_loss
 
-        # Pessimism, and neurons that have gone dormant.
+        # Pessimism.
         step = CriticStep(q.detach(), next_q, entropy_bonus)
-        metrics.update(self.pessimism_rule.update(self, batch, step, noise.pessimism))
-        if self.redo is not None:
-            metrics.update(self.redo.after_update(self, batch))
+        metrics.update(self.pessimism_rule.update(self, batch, step, noise.pessimism, extra))
         return {name: value.detach() for name, value in metrics.items()}
 
     def _actor_value(self, q: torch.Tensor) -> torch.Tensor:
@@ -723,9 +803,7 @@ class SAC(OffPolicyAlgorithm):
             self.sam_radius,
             [len(p) if id(p) in copied else None for p in parameters],
         )
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            parameter.grad = gradient
-        self.critic.optimizer.step()
+        self._descend(self.critic.optimizer, gradients)
 
     @staticmethod
     def minimize(optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:
@@ -736,7 +814,16 @@ class SAC(OffPolicyAlgorithm):
         :param loss: scalar
         """
         parameters = [p for group in optimizer.param_groups for p in group["params"]]
-        gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
+        SAC._descend(optimizer, torch.autograd.grad(loss, parameters, allow_unused=True))
+
+    @staticmethod
+    def _descend(optimizer: torch.optim.Optimizer, gradients: Sequence[torch.Tensor | None]) -> None:
+        """One step of an optimizer with gradients in the order of its parameters."""
+        if torch.compiler.is_compiling():
+            assert isinstance(optimizer, AdamW)
+            optimizer.apply(gradients)
+            return
+        parameters = [p for group in optimizer.param_groups for p in group["params"]]
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         optimizer.step()
@@ -749,6 +836,8 @@ class SAC(OffPolicyAlgorithm):
             self.logger.record(name, value.item())
         self.logger.record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if self._execution is not None and self._execution.seconds_compiling > 0:
+            self.logger.record("time/seconds_compiling", self._execution.seconds_compiling)
         self.logger.record("plasticity/reset", self.plasticity.n_done)
         if isinstance(self.replay_buffer, ValidationSplit):
             self.logger.record("validation/size", self.replay_buffer.n_validation)

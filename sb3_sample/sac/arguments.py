@@ -62,6 +62,8 @@ def check(agent: "SAC") -> None:
         check_unused(agent, ["reset_shrink"], "no resets")
     if agent.sam_radius is not None and not 0 < agent.sam_radius < math.inf:
         raise ValueError(f"sam_radius must be above 0 and finite, or None for no SAM, not {agent.sam_radius}")
+    if agent.compile not in (True, False, "auto") or not isinstance(agent.compile, (bool, str)):
+        raise ValueError(f"compile must be True, False or 'auto', not {agent.compile!r}")
     for name in ("n_quantiles", "backbone"):
         if name in agent.policy_kwargs:
             raise ValueError(f"{name} is an argument of the algorithm, not of policy_kwargs")

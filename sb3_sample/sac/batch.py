@@ -6,7 +6,7 @@ import torch
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_sample.sac.buffers import ValidationDictReplayBuffer, ValidationReplayBuffer
+from sb3_sample.sac.buffers import BatchMemory, ValidationDictReplayBuffer, ValidationReplayBuffer
 
 # Buffers whose every transition is drawn independently, so that one large draw can be cut into batches. Others compose
 # each batch (HerReplayBuffer: so many real, so many relabelled transitions) and are asked once a gradient step.
@@ -53,13 +53,50 @@ class Batch(NamedTuple):
         )
 
 
+class Extra(NamedTuple):
+    """
+    Transitions that the rule of pessimism judges besides the step's batch.
+
+    ``ends`` says where an episode ended with the step, for whatever reason (1), (T, N), if they are the latest T steps
+    of N environments in their order; None if they are in none.
+    """
+
+    batch: Batch
+    ends: torch.Tensor | None = None
+
+
 class Noise(NamedTuple):
-    """Standard normal noise of one gradient step's sampled actions, (B, A) each; drawn where it is None."""
+    """
+    Everything random of one gradient step: standard normal noise of its sampled actions, (B, A) each, and the critics
+    that make the TD target, (n,), if they are drawn. What is None is drawn by :meth:`completed`.
+    """
 
     critic: torch.Tensor | None = None
     actor: torch.Tensor | None = None
     exploration: torch.Tensor | None = None
     pessimism: torch.Tensor | None = None
+    subset: torch.Tensor | None = None
+
+    def completed(self, batch: Batch, extra: Extra | None, subset: tuple[int, int] | None) -> "Noise":
+        """
+        :param batch: the step's transitions
+        :param extra: those that the rule of pessimism judges besides, if any
+        :param subset: how many critics are drawn for the TD target, and from how many; None: no drawing
+        :return: the same noise, with what was None drawn
+        """
+        like = batch.actions
+        rows = {name: len(like) for name in ("critic", "actor", "exploration")}
+        if extra is not None:
+            rows["pessimism"] = len(extra.batch.actions)
+        missing = {name: n for name, n in rows.items() if getattr(self, name) is None}
+        drawn: dict[str, torch.Tensor] = {}
+        if missing:
+            values = torch.randn(sum(missing.values()), like.shape[1], dtype=like.dtype, device=like.device)
+            drawn.update(zip(missing, values.split(list(missing.values())), strict=True))
+        if subset is not None and self.subset is None:
+            n, of = subset
+            drawn["subset"] = torch.randperm(of, device=like.device)[:n]
+        return self._replace(**drawn)
 
 
 class CriticStep(NamedTuple):
@@ -78,7 +115,12 @@ class CriticStep(NamedTuple):
 
 
 def draw_batches(
-    buffer: ReplayBuffer, n_batches: int, batch_size: int, gamma: float, vec_normalize: VecNormalize | None
+    buffer: ReplayBuffer,
+    n_batches: int,
+    batch_size: int,
+    gamma: float,
+    vec_normalize: VecNormalize | None,
+    memory: BatchMemory | None = None,
 ) -> list[Batch]:
     """
     The batches of several gradient steps, drawn at once where that gives the same distribution.
@@ -88,11 +130,18 @@ def draw_batches(
     :param batch_size: transitions a step
     :param gamma: discount factor, where the buffer has none of its own
     :param vec_normalize: normalises observations and rewards as they are drawn
-    :return: the batches
+    :param memory: what the transitions are gathered into where that is possible
+    :return: the batches; with ``memory``, they hold until it is used again
     """
+    if memory is not None and memory.serves(buffer, vec_normalize):
+        return _cut(Batch.of(memory.gather(buffer, n_batches * batch_size), gamma), n_batches, batch_size)
     if n_batches > 1 and type(buffer) not in INDEPENDENT_BUFFERS:
         return [draw_batches(buffer, 1, batch_size, gamma, vec_normalize)[0] for _ in range(n_batches)]
-    data = Batch.of(buffer.sample(n_batches * batch_size, env=vec_normalize), gamma)
+    return _cut(Batch.of(buffer.sample(n_batches * batch_size, env=vec_normalize), gamma), n_batches, batch_size)
+
+
+def _cut(data: Batch, n_batches: int, batch_size: int) -> list[Batch]:
+    """One large batch as several."""
 
     def cut(x: Any) -> list[Any]:
         if isinstance(x, (int, float)):

@@ -110,16 +110,24 @@ class ValidationSplit:
         :return: the transitions
         :raises ValueError: if there is none
         """
+        return self._at(self.training_places(batch_size), env)
+
+    def training_places(self, n: int) -> np.ndarray:
+        """
+        :param n: how many
+        :return: places of training transitions (position * n_envs + environment), uniformly with replacement, (n,)
+        :raises ValueError: if there is none
+        """
         if self.n_training == 0:
             raise ValueError(f"there is no transition to train on: all {self.n_validation} are held out")
-        n = (self.buffer_size if self.full else self.pos) * self.n_envs
+        size = (self.buffer_size if self.full else self.pos) * self.n_envs
         mask = self.held_out.reshape(-1)
-        places = np.random.randint(n, size=batch_size)
+        places = np.random.randint(size, size=n)
         again = np.flatnonzero(mask[places])
         while len(again):
-            places[again] = np.random.randint(n, size=len(again))
+            places[again] = np.random.randint(size, size=len(again))
             again = again[mask[places[again]]]
-        return self._at(places, env)
+        return places
 
     def sample_validation(self, batch_size: int, env: VecNormalize | None = None) -> Any:
         """
@@ -165,3 +173,76 @@ def latest(buffer: ReplayBuffer, n_steps: int, vec_normalize: VecNormalize | Non
     steps, envs = np.meshgrid(positions, np.arange(buffer.n_envs), indexing="ij")
     transitions = samples_at(buffer, steps.ravel(), envs.ravel(), vec_normalize)
     return transitions, buffer.to_torch(buffer.dones[positions])
+
+
+#: Buffers that hold one transition a place, each of which can be drawn by itself.
+PLAIN_BUFFERS = (ReplayBuffer, DictReplayBuffer, ValidationReplayBuffer, ValidationDictReplayBuffer)
+
+
+class BatchMemory:
+    """
+    Memory that the transitions of gradient steps are gathered into, used again and again, and from which they are moved
+    to the device at once. On a CPU what was gathered holds until the next time.
+    """
+
+    def __init__(self) -> None:
+        self._columns: dict[Any, torch.Tensor] = {}
+        self._moved: torch.cuda.Event | None = None
+
+    @staticmethod
+    def serves(buffer: ReplayBuffer, vec_normalize: VecNormalize | None) -> bool:
+        """
+        :param buffer: replay buffer
+        :param vec_normalize: what normalises the samples
+        :return: whether transitions can be gathered from the buffer without asking it
+        """
+        return type(buffer) in PLAIN_BUFFERS and not buffer.optimize_memory_usage and vec_normalize is None
+
+    def gather(self, buffer: ReplayBuffer, n: int) -> ReplayBufferSamples | DictReplayBufferSamples:
+        """
+        Draw transitions to train on, uniformly with replacement: the same that ``buffer.sample(n)`` would give.
+
+        :param buffer: a buffer that this memory serves
+        :param n: how many
+        :return: the transitions, on the buffer's device
+        """
+        if isinstance(buffer, ValidationSplit):
+            places = buffer.training_places(n)
+        else:
+            positions = np.random.randint(0, buffer.size(), size=n)
+            places = positions * buffer.n_envs + np.random.randint(0, high=buffer.n_envs, size=n)
+        if self._moved is not None:
+            self._moved.synchronize()
+        to_cuda = buffer.device.type == "cuda"
+
+        def take(name: Any, array: np.ndarray, but: np.ndarray | None = None) -> torch.Tensor:
+            rows = array.reshape(-1, *(array.shape[2:] or (1,)))
+            if name not in self._columns or len(self._columns[name]) != n:
+                like = torch.from_numpy(rows[:0])
+                self._columns[name] = torch.empty((n, *like.shape[1:]), dtype=like.dtype, pin_memory=to_cuda)
+            column = self._columns[name]
+            out = column.numpy()
+            rows.take(places, axis=0, out=out, mode="clip")
+            if but is not None:
+                out *= 1 - but.reshape(-1, 1).take(places, axis=0)
+            return column.to(buffer.device, non_blocking=True) if to_cuda else column
+
+        def observations(name: str, arrays: Any) -> Any:
+            if isinstance(arrays, dict):
+                return {key: take((name, key), array) for key, array in arrays.items()}
+            return take(name, arrays)
+
+        columns: tuple[Any, ...] = (
+            observations("observations", buffer.observations),
+            take("actions", buffer.actions),
+            observations("next_observations", buffer.next_observations),
+            # A time limit does not end the bootstrap.
+            take("dones", buffer.dones, but=buffer.timeouts),
+            take("rewards", buffer.rewards),
+        )
+        if to_cuda:
+            # The memory is free again when the copies are done.
+            self._moved = torch.cuda.Event()
+            self._moved.record()
+        samples = DictReplayBufferSamples if isinstance(buffer.observations, dict) else ReplayBufferSamples
+        return samples(*columns)

@@ -99,6 +99,31 @@ class _QuantileHuber(torch.autograd.Function):
         return grad_output * grad, None
 
 
+class _QuantileHuberPairs(torch.autograd.Function):
+    """The same over all K x K pairs, which a compiler fuses into one pass without storing them."""
+
+    @staticmethod
+    def forward(ctx: Any, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+        _, batch_size, n_quantiles = q.shape
+        n_targets = target.shape[1]
+        # Views by strides: the compiler then computes both once, and not once for every pair.
+        x = q.contiguous().as_strided(q.shape, (batch_size * n_quantiles, n_quantiles, 1)).unsqueeze(-1)
+        y = target.contiguous().as_strided(target.shape, (n_targets, 1))[:, None, :]
+        t = ((torch.arange(n_quantiles, device=q.device, dtype=q.dtype) + 0.5) / n_quantiles).unsqueeze(-1)
+        difference = x - y
+        clipped = difference.clamp(-1, 1)
+        weighted = torch.where(difference > 0, 1 - t, t) * clipped
+        scale = 1 / (n_targets * batch_size)
+        ctx.save_for_backward(weighted.sum(dim=-1) * scale)
+        # u^2 / 2 within the threshold and |u| - 1/2 beyond it are both c (u - c / 2), c being u clipped.
+        return (weighted * (difference - 0.5 * clipped)).sum(dim=-1).sum() * scale
+
+    @staticmethod
+    def backward(ctx: Any, grad_output: torch.Tensor) -> tuple[torch.Tensor, None]:  # type: ignore[override]
+        (grad,) = ctx.saved_tensors
+        return grad_output * grad, None
+
+
 def quantile_huber(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """
     Quantile Huber loss, threshold 1: sum over the predicted quantiles, mean over the target quantiles and
@@ -109,7 +134,7 @@ def quantile_huber(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     :param target: target quantiles in any order, (B, K'), without gradient
     :return: scalar
     """
-    return _QuantileHuber.apply(q, target)
+    return (_QuantileHuberPairs if torch.compiler.is_compiling() else _QuantileHuber).apply(q, target)
 
 
 def actor_loss(log_prob: torch.Tensor, value: torch.Tensor, alpha: torch.Tensor | float) -> torch.Tensor:

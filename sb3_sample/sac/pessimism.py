@@ -18,7 +18,7 @@ from torch.optim import Optimizer
 
 from sb3_sample.optim import AdamW
 from sb3_sample.sac import buffers, losses
-from sb3_sample.sac.batch import Batch, CriticStep
+from sb3_sample.sac.batch import Batch, CriticStep, Extra
 from sb3_sample.sac.parts import ParametersDoNotFit, Part
 
 if TYPE_CHECKING:
@@ -83,16 +83,31 @@ class Pessimism(Part):
         """
         return pessimistic_value(q, self.beta())
 
+    def draw(self, agent: "SAC") -> Extra | None:
+        """
+        Draw the transitions that the next update needs besides the step's batch; called before the step.
+
+        :param agent: the algorithm
+        :return: the transitions, None if there are none
+        """
+        return None
+
     def update(
-        self, agent: "SAC", batch: Batch, step: CriticStep, noise: torch.Tensor | None = None
+        self,
+        agent: "SAC",
+        batch: Batch,
+        step: CriticStep,
+        noise: torch.Tensor | None = None,
+        extra: Extra | None = None,
     ) -> dict[str, torch.Tensor]:
         """
-        Move the weight; called last in every gradient step.
+        Move the weight; called last in every gradient step, and part of what is compiled.
 
         :param agent: the algorithm, its networks already updated
         :param batch: the step's batch
         :param step: what the critics' step computed of it
-        :param noise: standard normal noise of actions that the rule samples, one row each; drawn if None
+        :param noise: standard normal noise of the actions sampled for ``extra``, one row each; drawn if None
+        :param extra: what :meth:`draw` gave
         :return: what to log, by name, scalars
         """
         return {}
@@ -206,48 +221,63 @@ class LearnedPessimism(Pessimism):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self._n_steps = state["n_steps"]
 
-    def update(
-        self, agent: "SAC", batch: Batch, step: CriticStep, noise: torch.Tensor | None = None
-    ) -> dict[str, torch.Tensor]:
-        metrics = {"pessimism/beta": self.beta().clone()}
-        error = self._error(agent, batch, step, noise)
-        if error is not None:
-            loss = error.square().mean() if self.loss == "squared" else self.weight * error.detach().mean()
-            agent.minimize(self.optimizer, loss)
-            with torch.no_grad():
-                self.weight.clamp_(min=0)
-            metrics.update({"pessimism/loss": loss, "pessimism/error": error.mean()})
-        return metrics
-
-    def _error(self, agent: "SAC", batch: Batch, step: CriticStep, noise: torch.Tensor | None) -> torch.Tensor | None:
+    def draw(self, agent: "SAC") -> Extra | None:
         """
-        :return: error of the lower bound, (B,), its gradient through beta; None if there are too few transitions yet
+        :param agent: the algorithm
+        :return: the transitions of "validation", "recent" and "on_policy"; None if there are too few yet
         """
         if self.source == "replay":
-            return self._td_error(batch, step)
+            return None
         assert agent.replay_buffer is not None
+        normalize = agent.get_vec_normalize_env()
         if self.source == "validation":
             split = agent.replay_buffer
             assert isinstance(split, buffers.ValidationSplit)
             if split.n_validation < self.n_validation:
                 return None
-            samples = split.sample_validation(self.n_validation, env=agent.get_vec_normalize_env())
-            batch = Batch.of(samples, agent.gamma)
-            return self._td_error(batch, self._judge(agent, batch, noise))
+            return Extra(Batch.of(split.sample_validation(self.n_validation, env=normalize), agent.gamma))
         if agent.replay_buffer.size() < self.segment_length or (
             self.source == "on_policy" and self._n_steps < self.segment_length
         ):
             return None
-        samples, ends = buffers.latest(agent.replay_buffer, self.segment_length, agent.get_vec_normalize_env())
-        batch = Batch.of(samples, agent.gamma)
+        samples, ends = buffers.latest(agent.replay_buffer, self.segment_length, normalize)
+        return Extra(Batch.of(samples, agent.gamma), ends)
+
+    def update(
+        self,
+        agent: "SAC",
+        batch: Batch,
+        step: CriticStep,
+        noise: torch.Tensor | None = None,
+        extra: Extra | None = None,
+    ) -> dict[str, torch.Tensor]:
+        metrics = {"pessimism/beta": self.beta().clone()}
+        if self.source == "replay":
+            error = self._td_error(batch, step)
+        elif extra is None:
+            return metrics
+        else:
+            error = self._error(agent, extra, noise)
+        loss = error.square().mean() if self.loss == "squared" else self.weight * error.detach().mean()
+        agent.minimize(self.optimizer, loss)
+        with torch.no_grad():
+            self.weight.clamp_(min=0)
+        return {**metrics, "pessimism/loss": loss, "pessimism/error": error.mean()}
+
+    def _error(self, agent: "SAC", extra: Extra, noise: torch.Tensor | None) -> torch.Tensor:
+        """
+        :return: error of the lower bound on transitions other than the step's, (B,), its gradient through beta
+        """
+        batch = extra.batch
         judged = self._judge(agent, batch, noise)
-        if self.source == "recent":
+        if self.source != "on_policy":
             return self._td_error(batch, judged)
-        shape = ends.shape
+        assert extra.ends is not None
+        shape = extra.ends.shape
         returns = self.lambda_returns(
             batch.rewards.view(shape),
             batch.dones.view(shape),
-            ends,
+            extra.ends,
             self.value(judged.next_q).mean(dim=1).view(shape),
             judged.entropy_bonus.view(shape),
             agent.gamma,
@@ -417,7 +447,12 @@ class TOP(Pessimism):
         self._improvements = {index: list(values) for index, values in state["improvements"]}
 
     def update(
-        self, agent: "SAC", batch: Batch, step: CriticStep, noise: torch.Tensor | None = None
+        self,
+        agent: "SAC",
+        batch: Batch,
+        step: CriticStep,
+        noise: torch.Tensor | None = None,
+        extra: Extra | None = None,
     ) -> dict[str, torch.Tensor]:
         return {"pessimism/beta": self.weight.clone()}
 

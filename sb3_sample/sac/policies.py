@@ -29,6 +29,30 @@ from sb3_sample.sac.losses import gaussian_kl, tanh_gaussian_log_prob
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
 
 
+class ModeSwitch:
+    """
+    Training and evaluation mode of modules and all that is in them, without the detours of
+    ``nn.Module.train``, which takes as long as a small network's forward pass.
+
+    :param roots: the modules; what they hold must not change afterwards
+    """
+
+    def __init__(self, *roots: nn.Module):
+        # A module with a train of its own (one that keeps its batch norm in evaluation mode, say) is asked.
+        self._own = [root for root in roots if any(type(m).train is not nn.Module.train for m in root.modules())]
+        self._plain = [m for root in roots if root not in self._own for m in root.modules()]
+
+    def __call__(self, mode: bool) -> None:
+        """
+        :param mode: training (True) or evaluation mode
+        """
+        for module in self._plain:
+            # What nn.Module's own setattr comes to for this attribute, after looking for much else.
+            module.__dict__["training"] = mode
+        for root in self._own:
+            root.train(mode)
+
+
 class Actor(BasePolicy):
     """
     Tanh-Gaussian actor: ``a = tanh(mean + std * noise)``, the log standard deviation squashed by a tanh into
@@ -265,6 +289,7 @@ class CriticEnsemble(BaseModel):
         super().__init__(
             observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
         )
+        self.n_critics = n_critics
         in_features = features_extractor.features_dim + get_action_dim(action_space)
         self.trunk = network(in_features, n_copies=n_critics, **network_kwargs)
         self.head = linear(self.trunk.out_features, n_outputs, n_critics)
@@ -404,6 +429,7 @@ class SACPolicy(BasePolicy):
         self.critic.optimizer = self.make_optimizer(
             self.critic.parameters(), lr_schedule, **(critic_optimizer_kwargs or {})
         )
+        self._mode_switch = ModeSwitch(self.actor, self.critic, self.critic_target.trunk)
         self._constructor_args: dict[str, Any] = dict(
             lr_schedule=self._dummy_schedule,
             net_arch=net_arch,
@@ -485,9 +511,7 @@ class SACPolicy(BasePolicy):
         :param mode: training (True) or evaluation mode of actor and critics. Of the targets, the features extractors
             stay in evaluation mode, the rest follows: dropout is active in the target critics too (DroQ)
         """
-        self.actor.set_training_mode(mode)
-        self.critic.set_training_mode(mode)
-        self.critic_target.trunk.train(mode)
+        self._mode_switch(mode)
         self.training = mode
 
 

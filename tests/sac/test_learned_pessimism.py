@@ -249,7 +249,8 @@ def test_no_gradient_reaches_the_networks(name: str) -> None:
     batch = random_batch(model)
     with torch.no_grad():
         q = model.critic(batch.observations, batch.actions)
-    model.pessimism_rule.update(model, batch, CriticStep(q, q + 1, column(*[0.1] * 8)))
+    rule = model.pessimism_rule
+    rule.update(model, batch, CriticStep(q, q + 1, column(*[0.1] * 8)), None, rule.draw(model))
     assert not torch.equal(beta, model.pessimism_rule.beta())
     assert all(p.grad is None for p in networks(model))
     assert all(torch.equal(a, b) for a, b in zip(before, networks(model), strict=True))
@@ -279,7 +280,8 @@ def test_the_error_of_other_transitions_from_the_networks(name: str) -> None:
     error = expected_error(model, samples, noise)
     beta = model.pessimism_rule.beta().item()
     np.random.seed(3)
-    metrics = model.pessimism_rule.update(model, random_batch(model), STEP, noise)
+    rule = model.pessimism_rule
+    metrics = rule.update(model, random_batch(model), STEP, noise, rule.draw(model))
     wanted = error.square().mean() if "dual" not in name else beta * error.mean()
     assert metrics["pessimism/loss"].item() == pytest.approx(wanted.item(), rel=1e-4, abs=1e-5)
     assert metrics["pessimism/error"].item() == pytest.approx(error.mean().item(), rel=1e-4, abs=1e-5)
@@ -314,7 +316,7 @@ def test_waits_for_a_batch_and_takes_exactly_one(
     monkeypatch.setattr(np.random, "random", lambda size: np.array([0.0 if next(sides) else 1.0]))
     for i in range(n + 15):
         split.add(np.ones((1, 3)), np.ones((1, 3)), np.zeros((1, 2)), np.ones(1), np.zeros(1), [{}])
-        metrics = learned.update(model, random_batch(model), STEP)
+        metrics = learned.update(model, random_batch(model), STEP, None, learned.draw(model))
         if i < n + 9:
             assert split.n_validation < n and not judged
             assert learned.beta() == 1 and not learned.optimizer.state
@@ -329,7 +331,7 @@ def test_recent_waits_for_eight_steps() -> None:
     model = make("vpl recent", vec(3))
     learned = model.pessimism_rule
     for i in range(10):
-        metrics = learned.update(model, random_batch(model), STEP)
+        metrics = learned.update(model, random_batch(model), STEP, None, learned.draw(model))
         assert ("pessimism/loss" in metrics) == (i >= 8)
         model.replay_buffer.add(np.ones((3, 3)), np.ones((3, 3)), np.zeros((3, 2)), np.ones(3), np.zeros(3), [{}] * 3)
 
@@ -449,7 +451,8 @@ def test_opl_step_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     q = torch.tensor([[1.0, 2, 3, 4], [5.0, 6, 7, 8]]).unsqueeze(2)
     step = CriticStep(q, next_q, torch.ones(4, 1))
     monkeypatch.setattr(LearnedPessimism, "_judge", staticmethod(lambda *_: step))
-    metrics = model.pessimism_rule.update(model, random_batch(model), STEP)
+    rule = model.pessimism_rule
+    metrics = rule.update(model, random_batch(model), STEP, None, rule.draw(model))
     errors = [17.125 - 1, 12520.875 - 2, 24.5 - 3, 10029.5 - 4]
     assert metrics["pessimism/error"].item() == pytest.approx(np.mean(errors), rel=1e-6)
     assert metrics["pessimism/loss"].item() == pytest.approx(np.mean(errors), rel=1e-6)  # beta was 1

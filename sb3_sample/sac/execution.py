@@ -1,0 +1,318 @@
+"""
+How the gradient step is run: operation by operation, compiled by ``torch.compile``, or captured as a CUDA graph.
+
+All three run the same function, ``SAC._gradient_step``, which knows nothing of them: it takes the batch and all the
+noise as tensors, chooses nothing by the value of a tensor, and counts nothing outside of tensors.
+"""
+
+import time
+import types
+import warnings
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from sb3_sample.optim import AdamW
+
+if TYPE_CHECKING:
+    from sb3_sample.sac.algorithm import SAC
+
+
+#: With ``compile="auto"``, gradient steps in one ``learn`` from which on compiling pays: it takes the time of some
+#: thousand steps (docs/performance.md). A number of steps, not a measurement, so that a seed fixes the whole run.
+PAYS_FROM = 20_000
+
+Metrics = dict[str, torch.Tensor]
+#: Runs a function without its effects taking place, and gives back what repeats them, and its result, whose tensors
+#: each repetition fills anew.
+Recorder = Callable[[Callable[[], Metrics]], tuple[Callable[[], None], Metrics]]
+
+
+def why_not_compiled(agent: "SAC") -> str | None:
+    """
+    :param agent: the algorithm
+    :return: what keeps its gradient step from being compiled here; None if nothing does
+    """
+    foreign = _foreign_optimizers(agent)
+    if foreign:
+        return f"it knows the steps of sb3_sample.optim.AdamW only, not of {foreign}"
+    if agent.device.type not in ("cpu", "cuda"):
+        return f"it is not supported on the device {str(agent.device)!r}"
+    # Present from the first version on that compiles a whole step, gradients included.
+    if not hasattr(torch._dynamo.config, "trace_autograd_ops") or not hasattr(torch.compiler, "skip_all_guards_unsafe"):
+        return f"torch {torch.__version__} is too old for it"
+    if agent.device.type == "cpu":
+        from torch._inductor.cpp_builder import get_cpp_compiler
+        from torch._inductor.exc import InvalidCxxCompiler
+
+        try:
+            get_cpp_compiler()
+        except InvalidCxxCompiler:
+            return "there is no C++ compiler (install g++ or clang, or name one in the environment variable CXX)"
+    else:
+        from torch.utils._triton import has_triton
+
+        if not has_triton():
+            return "there is no Triton for this GPU"
+    return None
+
+
+def _foreign_optimizers(agent: "SAC") -> str:
+    return ", ".join(sorted({type(o).__name__ for o in agent._optimizers().values() if type(o) is not AdamW}))
+
+
+class Execution:
+    """
+    Runs the gradient steps of one model.
+
+    :param agent: the algorithm, its networks and parts built
+    :param compiled: whether to compile
+    :param fall_back: whether what cannot be compiled is run uncompiled, with a warning, instead of an error
+    :param recorder: what captures; a CUDA graph on a GPU, None elsewhere: no capture
+    """
+
+    def __init__(self, agent: "SAC", compiled: bool, fall_back: bool, recorder: Recorder | None = None):
+        self.compiled, self.fall_back = compiled, fall_back
+        #: Seconds spent on first calls of the compiled step, which compile it.
+        self.seconds_compiling = 0.0
+        self._step: Callable[..., Metrics] = type(agent)._gradient_step
+        if compiled:
+            # The compiler keeps what it made by the code object. With one for each model, models neither use each
+            # other's nor reach the limit of compilations together.
+            code = self._step.__code__.replace()  # type: ignore[attr-defined]  # a function
+            own = types.FunctionType(code, self._step.__globals__, code.co_name)  # type: ignore[attr-defined]
+            self._step = torch.compile(
+                own, fullgraph=True, dynamic=False, options={"guard_filter_fn": _settings_and_inputs}
+            )
+        self._seen: set[Any] = set()
+        self._captured = None if recorder is None else Captured(recorder)
+
+    @classmethod
+    def of(cls, agent: "SAC") -> "Execution":
+        """
+        :param agent: an algorithm whose ``compiled`` is decided
+        :return: what runs its gradient steps
+        """
+        if agent.compiled:
+            reason = why_not_compiled(agent)
+            if reason is not None:
+                warnings.warn(f"The gradient step is not compiled: {reason}", stacklevel=2)
+                agent.compiled = False
+        captures = agent.device.type == "cuda" and agent.compile is not False and not _foreign_optimizers(agent)
+        return cls(agent, bool(agent.compiled), agent.compile == "auto", cuda_graph if captures else None)
+
+    def prepare(self, agent: "SAC") -> None:
+        """
+        Called before the gradient steps that follow an environment step, when everything else is done.
+
+        :param agent: the algorithm
+        """
+        for optimizer in agent._optimizers().values():
+            if isinstance(optimizer, AdamW):
+                optimizer.capturable = self._captured is not None
+                optimizer.prepare()
+        if self._captured is not None:
+            self._captured.forget_if_stale(agent)
+
+    def __call__(self, agent: "SAC", *inputs: Any, eager: bool = False) -> Metrics:
+        """
+        One gradient step.
+
+        :param agent: the algorithm
+        :param inputs: the arguments of ``SAC._gradient_step``
+        :param eager: neither compiled nor captured this time, which leaves the gradients in ``.grad``
+        :return: its result; what a captured step gives holds until the next one
+        """
+        if eager:
+            return type(agent)._gradient_step(agent, *inputs)
+        if self._captured is not None:
+            return self._captured(self._run, agent, inputs)
+        return self._run(agent, *inputs)
+
+    def _run(self, agent: "SAC", *inputs: Any) -> Metrics:
+        if not self.compiled:
+            return self._step(agent, *inputs)
+        kind = _kind(inputs)
+        if kind in self._seen:
+            return self._compiled_step(agent, *inputs)
+        if agent.verbose >= 1:
+            print("Compiling the gradient step ...")
+        start = time.perf_counter()
+        try:
+            metrics = self._compiled_step(agent, *inputs)
+        except (torch._dynamo.exc.TorchDynamoException, torch._inductor.exc.InductorError) as error:
+            reason = str(error).strip().splitlines()[0]
+            if not self.fall_back:
+                raise RuntimeError(
+                    f"compile=True, but the gradient step cannot be compiled: {reason}. Pass compile=False, or 'auto'"
+                ) from error
+            warnings.warn(f"The gradient step is not compiled, as it cannot be: {reason}", stacklevel=2)
+            self.compiled = agent.compiled = False
+            self._step = type(agent)._gradient_step
+            return self._step(agent, *inputs)
+        self._seen.add(kind)
+        seconds = time.perf_counter() - start
+        self.seconds_compiling += seconds
+        if agent.verbose >= 1:
+            print(f"Compiled in {seconds:.1f} s")
+        return metrics
+
+    def _compiled_step(self, agent: "SAC", *inputs: Any) -> Metrics:
+        try:
+            return self._step(agent, *inputs)
+        except torch._dynamo.exc.Unsupported:
+            # Not compiled yet for these inputs or settings, which needs gradients to be traced.
+            with torch._dynamo.config.patch(trace_autograd_ops=True):
+                return self._step(agent, *inputs)
+
+
+def _settings_and_inputs(guards: Sequence[Any]) -> list[bool]:
+    """
+    Which of the conditions under which a compiled step holds are looked at before each step.
+
+    Those on parameters, modules and functions are most of them, and looking at them takes as long as a small network's
+    forward pass. They hold by construction: modules are changed in place only. A learning rate may change: it is read
+    from a tensor.
+    """
+    settings = ("CONSTANT_MATCH", "EQUALS_MATCH", "GRAD_MODE", "GLOBAL_STATE", "DETERMINISTIC_ALGORITHMS")
+    inputs = ("batch", "noise", "extra", "moves_targets", "moves_actor")
+
+    def matters(guard: Any) -> bool:
+        of_input = guard.name.removeprefix("L['").startswith(inputs)
+        return of_input or (guard.guard_type in settings and not guard.name.endswith("['lr']"))
+
+    return [matters(guard) for guard in guards]
+
+
+def _tensors(inputs: Any) -> list[torch.Tensor]:
+    """The tensors of nested tuples and dicts, in a fixed order."""
+    if isinstance(inputs, torch.Tensor):
+        return [inputs]
+    values = inputs.values() if isinstance(inputs, dict) else inputs if isinstance(inputs, tuple) else ()
+    return [tensor for value in values for tensor in _tensors(value)]
+
+
+def _kind(inputs: Any) -> Any:
+    """Everything about nested tuples and dicts of tensors but the tensors' values; hashable."""
+    if isinstance(inputs, torch.Tensor):
+        return tuple(inputs.shape), inputs.dtype, inputs.device
+    if isinstance(inputs, dict):
+        return tuple((key, _kind(value)) for key, value in inputs.items())
+    return tuple(map(_kind, inputs)) if isinstance(inputs, tuple) else inputs
+
+
+def _like(inputs: Any, make: Callable[[torch.Tensor], torch.Tensor]) -> Any:
+    """The same nested tuples and dicts with other tensors."""
+    if isinstance(inputs, torch.Tensor):
+        return make(inputs)
+    if isinstance(inputs, dict):
+        return {key: _like(value, make) for key, value in inputs.items()}
+    if isinstance(inputs, tuple):
+        values = [_like(value, make) for value in inputs]
+        return type(inputs)(*values) if hasattr(inputs, "_fields") else tuple(values)
+    return inputs
+
+
+def cuda_graph(run: Callable[[], Metrics]) -> tuple[Callable[[], None], Metrics]:
+    """
+    Capture as a CUDA graph.
+
+    :param run: what to capture
+    :return: what repeats it, and its result
+    """
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        metrics = run()
+    return graph.replay, metrics
+
+
+class Captured:
+    """
+    Gradient steps captured once and then repeated: one launch instead of some thousand.
+
+    A captured step reads and writes fixed places in memory. Its inputs are copied to theirs before each repetition;
+    parameters, moments, step counts and learning rates are changed in place by all that changes them, resets included.
+    Whatever puts one of them elsewhere (loading, a reinitialised optimizer), and whatever changes a number that is not
+    in a tensor, makes :meth:`forget_if_stale` drop the captured steps, and they are captured anew.
+
+    :param recorder: what captures
+    """
+
+    #: Steps of each kind that are run as they are before one is captured, as CUDA's libraries set themselves up.
+    WARM_UP = 3
+
+    def __init__(self, recorder: Recorder):
+        self._recorder = recorder
+        self._runs: dict[Any, int] = {}
+        self._recorded: dict[Any, tuple[Any, Callable[[], None], Metrics]] = {}
+        self._held: Any = None
+        self.n_captures = 0
+
+    def forget_if_stale(self, agent: "SAC") -> None:
+        """
+        Drop what was captured of a model that has other tensors or other settings now.
+
+        :param agent: the algorithm
+        """
+        now = _places(agent), _settings(agent)
+        if now != self._held:
+            self._recorded.clear()
+            self._held = now
+
+    def __call__(self, step: Callable[..., Metrics], agent: "SAC", inputs: tuple[Any, ...]) -> Metrics:
+        """
+        One gradient step, repeated if one of its kind is captured.
+
+        :param step: the step
+        :param agent: its first argument
+        :param inputs: its other arguments
+        :return: its result, which holds until the next step
+        """
+        kind = _kind(inputs)
+        runs = self._runs[kind] = self._runs.get(kind, 0) + 1
+        if runs <= self.WARM_UP:
+            return _aside(lambda: step(agent, *inputs)) if agent.device.type == "cuda" else step(agent, *inputs)
+        if kind not in self._recorded:
+            own = _like(inputs, torch.clone)
+            self._recorded[kind] = (own, *self._recorder(lambda: step(agent, *own)))
+            self.n_captures += 1
+        own, repeat, metrics = self._recorded[kind]
+        torch._foreach_copy_(_tensors(own), _tensors(inputs))
+        repeat()
+        return metrics
+
+
+def _aside(run: Callable[[], Metrics]) -> Metrics:
+    """Run on a stream of its own, as the last steps before a capture have to."""
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        metrics = run()
+    torch.cuda.current_stream().wait_stream(stream)
+    return metrics
+
+
+def _places(agent: "SAC") -> tuple[int, ...]:
+    """Addresses of every tensor that a gradient step reads or writes, but its inputs."""
+    modules = (agent.policy, agent.temperature, agent.explorer, agent.pessimism_rule)
+    tensors = [t for module in modules for t in (*module.parameters(), *module.buffers())]
+    for optimizer in agent._optimizers().values():
+        tensors += [t for state in optimizer.state.values() for t in state.values() if isinstance(t, torch.Tensor)]
+        if isinstance(optimizer, AdamW):
+            tensors += optimizer.read_tensors()
+    return tuple(t.data_ptr() for t in tensors)
+
+
+def _settings(agent: "SAC") -> list[Any]:
+    """Numbers and words that a gradient step may read: the model's, its parts' and its optimizers'."""
+    settings: list[Any] = [agent.batch_size, agent.target_subset, agent.policy_delay]
+    for holder in (agent, agent.explorer, agent.pessimism_rule):
+        # Integers count something, but for those above; what is private moves with the run, or follows from the rest.
+        settings.append(
+            {k: v for k, v in vars(holder).items() if isinstance(v, (float, str, bool)) and not k.startswith("_")}
+        )
+    for name, optimizer in agent._optimizers().items():
+        for group in optimizer.param_groups:
+            settings.append((name, {k: v for k, v in group.items() if k not in ("params", "lr")}))
+    return settings

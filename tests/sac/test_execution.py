@@ -1,0 +1,376 @@
+"""The three ways to run the gradient step give the same numbers: eager, compiled, captured."""
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from sb3_sample import BRO, DiagnosticsCallback
+from sb3_sample.sac import SAC, algorithm, execution
+from sb3_sample.sac.batch import draw_batches
+from sb3_sample.sac.buffers import BatchMemory, ValidationDictReplayBuffer, ValidationReplayBuffer
+from sb3_sample.sac.execution import Execution, why_not_compiled
+from tests.sac.common import MAKERS, Toy, bro, differing, sac, state, vec
+
+#: Largest difference of a parameter after 50 updates, each of which moves it by up to 3e-4. The same arithmetic in
+#: another order differs by rounding; Adam makes much of it where a gradient is nearly zero.
+TOLERANCE = 3e-5
+
+
+class Recording(TorchDispatchMode):
+    """Lists every operation, with the very tensors that it read and wrote."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.operations: list[tuple[Any, Any, Any, Any]] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        self.operations.append((func, args, kwargs or {}, out))
+        return out
+
+
+class Recorder:
+    """
+    In the place of CUDA's graphs: what is recorded takes no effect, and a repetition runs the same operations on the
+    same memory, whatever Python would do by then.
+    """
+
+    def __init__(self, model: SAC):
+        self.model = model
+        self.n_recordings = self.n_repetitions = 0
+
+    def _memory(self) -> list[torch.Tensor]:
+        modules = (self.model.policy, self.model.temperature, self.model.explorer, self.model.pessimism_rule)
+        tensors = [t for module in modules for t in (*module.parameters(), *module.buffers())]
+        for optimizer in self.model._optimizers().values():
+            tensors += [t for s in optimizer.state.values() for t in s.values() if isinstance(t, torch.Tensor)]
+        return tensors
+
+    def __call__(self, run: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
+        self.n_recordings += 1
+        memory = self._memory()
+        saved = [t.detach().clone() for t in memory]
+        with Recording() as recording:
+            result = run()
+        with torch.no_grad():
+            for tensor, value in zip(memory, saved, strict=True):
+                tensor.copy_(value)
+
+        def repeat() -> None:
+            self.n_repetitions += 1
+            with torch.no_grad():
+                for func, args, kwargs, out in recording.operations:
+                    new = func(*args, **kwargs)
+                    olds, news = (x if isinstance(x, (tuple, list)) else (x,) for x in (out, new))
+                    for old, fresh in zip(olds, news, strict=True):
+                        if isinstance(old, torch.Tensor) and old.data_ptr() != fresh.data_ptr():
+                            old.detach().copy_(fresh)
+
+        return repeat, result
+
+
+def captured(model: SAC) -> Recorder:
+    """Let a model's gradient steps be captured by a recorder."""
+    recorder = Recorder(model)
+    model._execution = Execution(model, False, False, recorder)
+    return recorder
+
+
+def largest_difference(a: SAC, b: SAC) -> float:
+    """Of any parameter or learned number; of the optimizers' moments, which are as large as gradients, relative."""
+    ours, theirs = state(a), state(b)
+    assert ours.keys() == theirs.keys()
+    largest = 0.0
+    for name, x in ours.items():
+        if x.numel() == 0:
+            continue
+        x, y = x.double(), theirs[name].double()
+        unit = max(float(y.abs().max()), 1.0) if "optimizer/" in name else 1.0
+        largest = max(largest, float((x - y).abs().max()) / unit)
+    return largest
+
+
+def pair(maker: str, **kwargs: Any) -> tuple[SAC, SAC]:
+    """Two equal models with filled buffers and no gradient step taken."""
+    models = []
+    for compile in (False, kwargs.pop("compile", False)):
+        model = MAKERS[maker](**{"learning_starts": 60, "compile": compile, **kwargs})
+        model.learn(60)
+        models.append(model)
+    assert not differing(state(models[0]), state(models[1]))
+    return models[0], models[1]
+
+
+def updates(model: SAC, n: int, seed: int = 0, each: Callable[[int], None] = lambda i: None) -> None:
+    np.random.seed(seed)
+    torch.manual_seed(seed)
+    for i in range(n):
+        each(i)
+        model.train(1, 8)
+
+
+FAST = ["BRO", "VPLSAC"]
+
+
+@pytest.mark.parametrize(
+    "maker", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in MAKERS]
+)
+def test_compiled_is_eager(maker: str) -> None:
+    model, compiled = pair(maker, compile=True)
+    updates(model, 50)
+    updates(compiled, 50)
+    assert compiled._execution is not None and compiled._execution.compiled
+    assert compiled._execution.seconds_compiling > 0
+    assert largest_difference(model, compiled) < TOLERANCE
+    for name, value in model._metrics.items():
+        assert compiled._metrics[name].item() == pytest.approx(value.item(), rel=1e-2, abs=1e-3), name
+
+
+@pytest.mark.parametrize("maker", list(MAKERS))
+def test_captured_is_eager(maker: str) -> None:
+    model, other = pair(maker)
+    recorder = captured(other)
+    updates(model, 50)
+    updates(other, 50)
+    # Learning rates are float32 there.
+    assert largest_difference(model, other) < TOLERANCE
+    # Every kind of step is warmed up three times.
+    n_kinds = 2 if maker == "BROTD3" else 1
+    assert recorder.n_recordings == n_kinds
+    assert recorder.n_repetitions == 50 - 3 * n_kinds
+
+
+def test_the_recorder_repeats_and_does_not_ask() -> None:
+    """What the test above rests on: without its inputs copied into place a step would repeat the first."""
+    _, model = pair("SAC")
+    recorder = captured(model)
+    updates(model, 5)
+    assert recorder.n_repetitions == 2
+    before = state(model)
+    _, (own, repeat, metrics) = next(iter(model._execution._captured._recorded.items()))
+    repeat()
+    first = metrics["train/critic_loss"].item()
+    after = state(model)
+    assert "policy/actor.mean.weight" in before
+    assert not torch.equal(before["policy/actor.mean.weight"], after["policy/actor.mean.weight"])
+    own[0].rewards.add_(10)
+    repeat()
+    assert metrics["train/critic_loss"].item() > first + 10
+
+
+def test_captured_survives_what_happens_in_training(tmp_path: Path) -> None:
+    """Resets, a schedule of the learning rate, settings changed on the way, saving and loading."""
+    kwargs: dict[str, Any] = {"learning_rate": lambda progress: 1e-3 * progress, "resets": (75,), "learning_starts": 20}
+    models = []
+    for i in range(2):
+        # Made one after the other, since the seed is that of all random numbers.
+        models.append(model := bro(compile=False, **kwargs))
+        if i == 1:
+            recorder = captured(model)
+        model.learn(100)
+        model.tau, model.explorer.kl_target = 0.5, 0.2
+        model.learn(20, reset_num_timesteps=False)
+    assert models[0].plasticity.n_done == models[1].plasticity.n_done == 1
+    assert largest_difference(*models) < 1e-3
+    # At first, after the reset, which clears moments, and after the change of settings.
+    assert recorder.n_recordings == 3
+    for i, model in enumerate(models):
+        model.save(tmp_path / f"{i}.zip")
+        models[i] = BRO.load(tmp_path / f"{i}.zip", env=vec(), learning_rate=1e-3)
+        models[i].set_random_seed(1)
+        if i == 1:
+            recorder = captured(models[i])
+        models[i].learn(60)
+    assert recorder.n_recordings == 1
+    assert largest_difference(*models) < 1e-3
+    # Parameters put into a model whose steps are captured already.
+    before = recorder.n_recordings
+    for model in models:
+        model.set_parameters(bro(seed=5).get_parameters())
+        updates(model, 10)
+    assert recorder.n_recordings == before + 1
+    assert largest_difference(*models) < 1e-4
+
+
+def test_learning_rates_of_a_schedule_compile_once() -> None:
+    model, compiled = pair("SAC", compile=True)
+    calls = torch._dynamo.utils.counters["stats"]["unique_graphs"]
+    for m in (model, compiled):
+        rates = np.linspace(1e-2, 1e-4, 20)
+        updates(m, 20, each=lambda i, m=m, rates=rates: setattr(m, "lr_schedule", lambda _: float(rates[i])))
+    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == calls + 1
+    assert largest_difference(model, compiled) < 1e-3
+
+
+def test_settings_changed_on_the_way_count_in_a_compiled_step() -> None:
+    model, compiled = pair("SAC", compile=True, learning_rate=1e-3)
+    for m in (model, compiled):
+        updates(m, 5)
+        m.tau, m.gamma, m._target_entropy = 0.7, 0.3, 5.0
+        updates(m, 5, seed=1)
+    assert largest_difference(model, compiled) < TOLERANCE
+
+
+def test_compiled_models_do_not_share() -> None:
+    """Two models of one class and one shape, which differ in a number that the compiled code holds."""
+    eager = [sac(tau=tau, learning_starts=60, compile=False).learn(60) for tau in (0.1, 0.9)]
+    compiled = [sac(tau=tau, learning_starts=60, compile=True).learn(60) for tau in (0.1, 0.9)]
+    for _ in range(2):
+        for model in (*eager, *compiled):
+            updates(model, 3)
+    for a, b in zip(eager, compiled, strict=True):
+        assert largest_difference(a, b) < TOLERANCE
+
+
+# ---------------------------------------------------------------- when
+
+
+def test_auto_compiles_where_it_pays_and_the_file_remembers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(algorithm, "PAYS_FROM", 50)
+    model = sac(learning_starts=20, replay_ratio=1)
+    assert model.compile == "auto" and model.compiled is None
+    assert sac(learning_starts=20, replay_ratio=1).learn(69).compiled is False
+    model.learn(70)
+    assert model.compiled is True and model._execution.compiled
+    model.save(tmp_path / "model.zip")
+    assert SAC.load(tmp_path / "model.zip").compiled is True
+    assert SAC.load(tmp_path / "model.zip", compile=False).compiled is False
+    undecided = SAC.load(tmp_path / "model.zip", env=vec(), compile="auto")
+    assert undecided.compiled is None and undecided.learn(10).compiled is False
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "n_updates"),
+    [
+        ({"replay_ratio": 0.5}, 40),
+        ({"train_freq": 4, "gradient_steps": 2}, 40),
+        ({"train_freq": 4, "gradient_steps": -1}, 80),
+        ({"train_freq": (1, "episode"), "gradient_steps": 2}, 160),
+    ],
+)
+def test_counts_the_gradient_steps_to_come(
+    kwargs: dict[str, Any], n_updates: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for threshold, expected in ((n_updates, True), (n_updates + 1, False)):
+        monkeypatch.setattr(algorithm, "PAYS_FROM", threshold)
+        model = sac(learning_starts=20, **kwargs)
+        model._decide_compilation(100)
+        assert model.compiled is expected
+
+
+@pytest.mark.parametrize("compile", [True, "auto"])
+def test_without_a_compiler_training_goes_on_uncompiled(compile: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(algorithm, "PAYS_FROM", 5)
+    model = sac(compile=compile)
+    without = torch._inductor.config.patch({"cpp.cxx": ("/nonexistent/c++",)})
+    with without, warnings.catch_warnings(record=True) as caught:
+        assert "C++ compiler" in (why_not_compiled(model) or "")
+        warnings.simplefilter("always")
+        model.learn(30)
+    said = [str(w.message) for w in caught if "not compiled" in str(w.message)]
+    assert len(said) == (1 if compile is True else 0)
+    assert model.compiled is False and model._n_updates == 20
+
+
+class Peeking(BaseFeaturesExtractor):
+    """Looks at a value on the host, which cannot be compiled."""
+
+    def __init__(self, observation_space: Any):
+        super().__init__(observation_space, 3)
+        self.layer = nn.Linear(3, 3)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        y = self.layer(observations)
+        return y if y.sum().item() > 1e9 else y + 1
+
+
+def test_what_cannot_be_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(algorithm, "PAYS_FROM", 5)
+    kwargs = {"policy_kwargs": {"net_arch": [8], "features_extractor_class": Peeking}}
+    model = sac(compile="auto", **kwargs)
+    with pytest.warns(UserWarning, match="not compiled, as it cannot be"):
+        model.learn(30)
+    assert model.compiled is False and model._n_updates == 20
+    eager = sac(compile=False, **kwargs).learn(30)
+    assert not differing(state(model), state(eager))
+    with pytest.raises(RuntimeError, match=r"compile=True, but .*compile=False"):
+        sac(compile=True, **kwargs).learn(30)
+
+
+def test_foreign_optimizers_stay_uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(algorithm, "PAYS_FROM", 5)
+    kwargs = {"policy_kwargs": {"net_arch": [8], "optimizer_class": torch.optim.RMSprop}}
+    assert sac(**kwargs).learn(30).compiled is False
+    with pytest.warns(UserWarning, match="AdamW only, not of RMSprop"):
+        assert sac(compile=True, **kwargs).learn(30).compiled is False
+
+
+def test_says_how_long_it_takes(capsys: pytest.CaptureFixture[str]) -> None:
+    model = sac(compile=True, verbose=1)
+    model.learn(30)
+    out = capsys.readouterr().out
+    assert "Compiling the gradient step ..." in out and "Compiled in" in out
+    assert out.count("Compiled in") == 1
+
+
+def test_diagnostics_find_gradients_of_a_compiled_model() -> None:
+    model = sac(compile=True, learning_starts=10)
+    callback = DiagnosticsCallback(Toy(), every=20)
+    model.learn(35, callback=callback)
+    assert model._execution.compiled
+    # Measured at 20 steps, of the gradient step after 19; the last left none.
+    assert callback.last_results["gradient_norm_critic"] > 0
+    assert not any(name.startswith("gradient_norm") for name in callback.measure())
+
+
+# ---------------------------------------------------------------- batches
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("cls", [ReplayBuffer, DictReplayBuffer, ValidationReplayBuffer, ValidationDictReplayBuffer])
+def test_gathers_what_the_buffer_would_give(cls: Any, n_envs: int) -> None:
+    from gymnasium import spaces
+
+    is_dict = issubclass(cls, DictReplayBuffer)
+    box = spaces.Box(-1, 1, (3,), np.float32)
+    space = spaces.Dict({"x": box, "image": spaces.Box(0, 255, (4, 4), np.uint8)}) if is_dict else box
+    kwargs = {"validation_proportion": 0.3} if "Validation" in cls.__name__ else {}
+    buffer = cls(20, space, spaces.Box(-1, 1, (2,), np.float32), n_envs=n_envs, device="cpu", **kwargs)
+    rng = np.random.default_rng(0)
+    memory = BatchMemory()
+    for i in range(30):
+        obs = {key: np.stack([sub.sample() for _ in range(n_envs)]) for key, sub in space.items()} if is_dict else (
+            rng.normal(size=(n_envs, 3)))  # fmt: skip
+        done = rng.random(n_envs) < 0.5
+        infos = [{"TimeLimit.truncated": bool(rng.random() < 0.5)} for _ in range(n_envs)]
+        buffer.add(obs, obs, rng.normal(size=(n_envs, 2)), rng.normal(size=n_envs), done, infos)
+        if i not in (10, 25):
+            continue
+        np.random.seed(i)
+        expected = draw_batches(buffer, 3, 16, 0.9, None)
+        np.random.seed(i)
+        got = draw_batches(buffer, 3, 16, 0.9, None, memory)
+        assert len(got) == 3
+        for ours, theirs in zip(got, expected, strict=True):
+            for a, b in zip(ours, theirs, strict=True):
+                pairs = [(a[k], b[k]) for k in b] if isinstance(b, dict) else [(a, b)]
+                for x, y in pairs:
+                    assert torch.equal(torch.as_tensor(x), torch.as_tensor(y))
+                    assert torch.as_tensor(x).dtype == torch.as_tensor(y).dtype
+    # The same memory, for as many.
+    places = [b.actions.data_ptr() for b in draw_batches(buffer, 3, 16, 0.9, None, memory)]
+    assert places == [b.actions.data_ptr() for b in draw_batches(buffer, 3, 16, 0.9, None, memory)]
+
+
+def test_pays_from_is_documented() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "performance.md").read_text()
+    assert f"{execution.PAYS_FROM:,}" in text
