@@ -3,6 +3,7 @@
 from sb3_sample.diagnostics import DiagnosticsCallback
 from sb3_sample.envs import make_env
 from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
+from sb3_sample.sac.buffers import DeviceReplayBuffer
 from sb3_sample.version import __version__
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "TOPSAC",
     "VPLSAC",
     "BROFast",
+    "DeviceReplayBuffer",
     "DiagnosticsCallback",
     "RegularizedSAC",
     "__version__",

@@ -27,7 +27,7 @@ from sb3_sample.optim import AdamW, sharpness_aware_gradients
 from sb3_sample.sac import arguments, losses
 from sb3_sample.sac.batch import Batch, CriticStep, Extra, Noise, draw_batches
 from sb3_sample.sac.buffers import BatchMemory, ValidationDictReplayBuffer, ValidationReplayBuffer, ValidationSplit
-from sb3_sample.sac.execution import PAYS_FROM, Execution, why_not_compiled
+from sb3_sample.sac.execution import PAYS_FROM, Execution, has_foreign_parts, why_not_compiled
 from sb3_sample.sac.exploration import EXPLORATIONS, Exploration
 from sb3_sample.sac.parts import ParametersDoNotFit, Part
 from sb3_sample.sac.pessimism import PESSIMISMS, Pessimism, pessimistic_value
@@ -623,7 +623,8 @@ class SAC(OffPolicyAlgorithm):
                 n_steps if self.gradient_steps < 0 else self.gradient_steps * n_steps / self.train_freq.frequency
             )
         # What keeps the step from being compiled is worth a warning only where it was asked for.
-        self.compiled = n_updates >= PAYS_FROM and why_not_compiled(self) is None
+        pays = n_updates >= PAYS_FROM and not has_foreign_parts(self)
+        self.compiled = pays and why_not_compiled(self) is None
         self._execution = None
 
     def _updates_due(self, n_collected: int) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
-from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import TrainFreq
 
 from sb3_sample.sac.buffers import ValidationSplit
@@ -70,6 +70,7 @@ def check(agent: "SAC") -> None:
     _check_backbone(agent)
     _check_pessimism(agent)
     _check_replay(agent)
+    _check_n_steps(agent)
     _check_train_freq(agent)
 
 
@@ -128,6 +129,15 @@ def _check_replay(agent: "SAC") -> None:
             )
         if agent.optimize_memory_usage:
             raise ValueError("optimize_memory_usage=True cannot be combined with validation_proportion above 0")
+
+
+def _check_n_steps(agent: "SAC") -> None:
+    cls = agent.replay_buffer_class
+    if agent.n_steps > 1 and cls is not None and not issubclass(cls, NStepReplayBuffer):
+        raise ValueError(
+            f"n_steps={agent.n_steps} needs a buffer that makes n-step returns, NStepReplayBuffer, not "
+            f"replay_buffer_class={cls.__name__}: leave replay_buffer_class out"
+        )
 
 
 def _check_train_freq(agent: "SAC") -> None:

@@ -6,7 +6,7 @@ import torch
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_sample.sac.buffers import BatchMemory, ValidationDictReplayBuffer, ValidationReplayBuffer
+from sb3_sample.sac.buffers import BatchMemory, DeviceReplayBuffer, ValidationDictReplayBuffer, ValidationReplayBuffer
 
 # Buffers whose every transition is drawn independently, so that one large draw can be cut into batches. Others compose
 # each batch (HerReplayBuffer: so many real, so many relabelled transitions) and are asked once a gradient step.
@@ -16,6 +16,7 @@ INDEPENDENT_BUFFERS = (
     NStepReplayBuffer,
     ValidationReplayBuffer,
     ValidationDictReplayBuffer,
+    DeviceReplayBuffer,
 )
 
 

@@ -175,6 +175,85 @@ def latest(buffer: ReplayBuffer, n_steps: int, vec_normalize: VecNormalize | Non
     return transitions, buffer.to_torch(buffer.dones[positions])
 
 
+class DeviceReplayBuffer(ReplayBuffer):
+    """
+    A replay buffer in the memory of the model's device: each transition is moved once, when it is stored, and batches
+    are gathered where they are needed. For a GPU; on a CPU it is the plain buffer with other arrays.
+
+    Pass ``replay_buffer_class=DeviceReplayBuffer``. For one observation, not a dict of them. It draws the same
+    transitions as ``ReplayBuffer`` with the same seed.
+
+    :param args: as in Stable-Baselines3
+    :param kwargs: as in Stable-Baselines3, but for ``optimize_memory_usage``
+    :raises ValueError: with ``optimize_memory_usage``
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        if self.optimize_memory_usage:
+            raise ValueError("optimize_memory_usage=True cannot be combined with DeviceReplayBuffer")
+        for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
+            # The host's array was never written to, so that it took no memory.
+            setattr(
+                self,
+                name,
+                torch.from_numpy(getattr(self, name)[:0]).new_zeros(getattr(self, name).shape).to(self.device),
+            )
+
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store one transition of each environment, as in Stable-Baselines3."""
+        timeouts = [info.get("TimeLimit.truncated", False) for info in infos]
+        for store, row in (
+            (self.observations, obs),
+            (self.next_observations, next_obs),
+            (self.actions, action),
+            (self.rewards, reward),
+            (self.dones, done),
+            (self.timeouts, timeouts if self.handle_timeout_termination else np.zeros(self.n_envs)),
+        ):
+            target: Any = store[self.pos]
+            target.copy_(torch.as_tensor(np.asarray(row)).reshape(target.shape))
+        self.pos += 1
+        if self.pos == self.buffer_size:
+            self.full, self.pos = True, 0
+
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        if env is not None:
+            raise ValueError("VecNormalize normalises on the host: use ReplayBuffer with it, not DeviceReplayBuffer")
+        env_indices = np.random.randint(0, high=self.n_envs, size=len(batch_inds))
+        places = torch.from_numpy(batch_inds * self.n_envs + env_indices).to(self.device)
+
+        def rows(array: Any) -> torch.Tensor:
+            return array.flatten(0, 1).index_select(0, places)
+
+        dones = rows(self.dones) * (1 - rows(self.timeouts))
+        return ReplayBufferSamples(
+            rows(self.observations),
+            rows(self.actions),
+            rows(self.next_observations),
+            dones.unsqueeze(1),
+            rows(self.rewards).unsqueeze(1),
+        )
+
+    def to_torch(self, array: Any, copy: bool = True) -> torch.Tensor:
+        """
+        :param array: rows of the buffer, or an array of the host
+        :param copy: whether the result has memory of its own
+        :return: the same as a tensor on the device
+        """
+        if isinstance(array, torch.Tensor):
+            return array.clone() if copy else array
+        return super().to_torch(array, copy)
+
+
 #: Buffers that hold one transition a place, each of which can be drawn by itself.
 PLAIN_BUFFERS = (ReplayBuffer, DictReplayBuffer, ValidationReplayBuffer, ValidationDictReplayBuffer)
 

@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
+import torch._dynamo
+import torch._inductor.exc
 
 from sb3_sample.optim import AdamW
 
@@ -22,6 +24,13 @@ if TYPE_CHECKING:
 #: With ``compile="auto"``, gradient steps in one ``learn`` from which on compiling pays: it takes the time of some
 #: thousand steps (docs/performance.md). A number of steps, not a measurement, so that a seed fixes the whole run.
 PAYS_FROM = 20_000
+
+#: What torch raises where it cannot compile, or has compiled the same for too many settings.
+COMPILATION_ERRORS = (
+    torch._dynamo.exc.TorchDynamoException,
+    torch._dynamo.exc.FailOnRecompileLimitHit,
+    torch._inductor.exc.InductorError,
+)
 
 Metrics = dict[str, torch.Tensor]
 #: Runs a function without its effects taking place, and gives back what repeats them, and its result, whose tensors
@@ -58,6 +67,16 @@ def why_not_compiled(agent: "SAC") -> str | None:
     return None
 
 
+def has_foreign_parts(agent: "SAC") -> bool:
+    """
+    :param agent: the algorithm
+    :return: whether it has parts from outside of this package, which may not be written to be compiled: a number that
+        they change at every step, say, would have the step compiled anew at every step
+    """
+    parts = (agent.explorer, agent.pessimism_rule)
+    return any(type(part).__module__.split(".")[0] != __name__.split(".")[0] for part in parts)
+
+
 def _foreign_optimizers(agent: "SAC") -> str:
     return ", ".join(sorted({type(o).__name__ for o in agent._optimizers().values() if type(o) is not AdamW}))
 
@@ -74,7 +93,7 @@ class Execution:
 
     def __init__(self, agent: "SAC", compiled: bool, fall_back: bool, recorder: Recorder | None = None):
         self.compiled, self.fall_back = compiled, fall_back
-        #: Seconds spent on first calls of the compiled step, which compile it.
+        #: Seconds spent on compiling, over all inputs and settings that the step was compiled for.
         self.seconds_compiling = 0.0
         self._step: Callable[..., Metrics] = type(agent)._gradient_step
         if compiled:
@@ -85,7 +104,6 @@ class Execution:
             self._step = torch.compile(
                 own, fullgraph=True, dynamic=False, options={"guard_filter_fn": _settings_and_inputs}
             )
-        self._seen: set[Any] = set()
         self._captured = None if recorder is None else Captured(recorder)
 
     @classmethod
@@ -133,15 +151,14 @@ class Execution:
     def _run(self, agent: "SAC", *inputs: Any) -> Metrics:
         if not self.compiled:
             return self._step(agent, *inputs)
-        kind = _kind(inputs)
-        if kind in self._seen:
-            return self._compiled_step(agent, *inputs)
-        if agent.verbose >= 1:
-            print("Compiling the gradient step ...")
-        start = time.perf_counter()
         try:
-            metrics = self._compiled_step(agent, *inputs)
-        except (torch._dynamo.exc.TorchDynamoException, torch._inductor.exc.InductorError) as error:
+            try:
+                return self._step(agent, *inputs)
+            except torch._dynamo.exc.Unsupported:
+                # Not compiled yet for these inputs or settings: to trace gradients needs a switch.
+                return self._compile(agent, *inputs)
+        except COMPILATION_ERRORS as error:
+            # Raised before anything of the step has been run.
             reason = str(error).strip().splitlines()[0]
             if not self.fall_back:
                 raise RuntimeError(
@@ -151,20 +168,18 @@ class Execution:
             self.compiled = agent.compiled = False
             self._step = type(agent)._gradient_step
             return self._step(agent, *inputs)
-        self._seen.add(kind)
+
+    def _compile(self, agent: "SAC", *inputs: Any) -> Metrics:
+        if agent.verbose >= 1:
+            print("Compiling the gradient step ...")
+        start = time.perf_counter()
+        with torch._dynamo.config.patch(trace_autograd_ops=True):
+            metrics = self._step(agent, *inputs)
         seconds = time.perf_counter() - start
         self.seconds_compiling += seconds
         if agent.verbose >= 1:
             print(f"Compiled in {seconds:.1f} s")
         return metrics
-
-    def _compiled_step(self, agent: "SAC", *inputs: Any) -> Metrics:
-        try:
-            return self._step(agent, *inputs)
-        except torch._dynamo.exc.Unsupported:
-            # Not compiled yet for these inputs or settings, which needs gradients to be traced.
-            with torch._dynamo.config.patch(trace_autograd_ops=True):
-                return self._step(agent, *inputs)
 
 
 def _settings_and_inputs(guards: Sequence[Any]) -> list[bool]:

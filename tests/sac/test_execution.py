@@ -10,13 +10,14 @@ import pytest
 import torch
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_sample import BRO, DiagnosticsCallback
 from sb3_sample.sac import SAC, algorithm, execution
 from sb3_sample.sac.batch import draw_batches
-from sb3_sample.sac.buffers import BatchMemory, ValidationDictReplayBuffer, ValidationReplayBuffer
+from sb3_sample.sac.buffers import BatchMemory, DeviceReplayBuffer, ValidationDictReplayBuffer, ValidationReplayBuffer
 from sb3_sample.sac.execution import Execution, why_not_compiled
 from tests.sac.common import MAKERS, Toy, bro, differing, sac, state, vec
 
@@ -78,10 +79,12 @@ class Recorder:
         return repeat, result
 
 
-def captured(model: SAC) -> Recorder:
-    """Let a model's gradient steps be captured by a recorder."""
+def captured(model: SAC, warm_up: int = 3) -> Recorder:
+    """Let a model's gradient steps be captured by a recorder, after some that are run as they are."""
     recorder = Recorder(model)
     model._execution = Execution(model, False, False, recorder)
+    assert model._execution._captured is not None and model._execution._captured.WARM_UP == 3
+    model._execution._captured.WARM_UP = warm_up
     return recorder
 
 
@@ -374,3 +377,20 @@ def test_gathers_what_the_buffer_would_give(cls: Any, n_envs: int) -> None:
 def test_pays_from_is_documented() -> None:
     text = (Path(__file__).parents[2] / "docs" / "performance.md").read_text()
     assert f"{execution.PAYS_FROM:,}" in text
+
+
+def test_device_buffer_gives_what_the_plain_one_gives() -> None:
+    models = [sac(vec(2), replay_buffer_class=cls, buffer_size=60, compile=False) for cls in (None, DeviceReplayBuffer)]
+    for model in models:
+        model.set_random_seed(0)
+        model.learn(100)
+    plain, on_device = (model.replay_buffer for model in models)
+    assert isinstance(on_device, DeviceReplayBuffer) and isinstance(on_device.observations, torch.Tensor)
+    for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
+        assert np.array_equal(getattr(plain, name), getattr(on_device, name).numpy())
+    assert plain.full and on_device.full and plain.pos == on_device.pos
+    assert not differing(state(models[0]), state(models[1]))
+    with pytest.raises(ValueError, match="VecNormalize"):
+        sac(VecNormalize(vec()), replay_buffer_class=DeviceReplayBuffer).learn(30)
+    with pytest.raises(ValueError, match="optimize_memory_usage"):
+        sac(replay_buffer_class=DeviceReplayBuffer, optimize_memory_usage=True)

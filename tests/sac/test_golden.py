@@ -22,6 +22,7 @@ from sb3_sample.networks import MLP, BroNet
 from sb3_sample.networks.ensemble import EnsembleLayerNorm, EnsembleLinear
 from sb3_sample.sac import SAC
 from sb3_sample.sac.batch import Batch, Noise
+from tests.sac.test_execution import captured
 
 OWN_FOLDER = Path(__file__).parents[1] / "golden"
 FOLDER = Path(os.environ.get("SB3_SAMPLE_GOLDEN") or OWN_FOLDER)
@@ -114,7 +115,7 @@ def mean_std(actor: Any, observations: torch.Tensor) -> float:
         return float(actor.gaussian(actor.features(observations))[1].exp().mean())
 
 
-def build(meta: dict[str, Any]) -> SAC:
+def build(meta: dict[str, Any], compile: bool = False) -> SAC:
     dims, hp, optimizers = meta["dims"], meta["hyperparameters"], meta["optimizers"]
     shared: dict[str, Any] = dict(
         gamma=hp["discount"],
@@ -126,6 +127,7 @@ def build(meta: dict[str, Any]) -> SAC:
         adjustment_learning_rate=optimizers["optimism"]["lr"],
         buffer_size=1,
         device="cpu",
+        compile=compile,
     )
     env = Shapes(dims["obs_dim"], dims["act_dim"])
     if "beta_lb" in hp:
@@ -169,11 +171,16 @@ SHARED_NAMES = {
 }
 
 
-def replay(path: Path) -> tuple[SAC, dict[str, np.ndarray], dict[int, dict[str, float]]]:
+#: How the gradient step is run.
+EXECUTIONS = ("eager", "compiled", "captured")
+
+
+def replay(path: Path, execution: str = "eager") -> tuple[SAC, dict[str, np.ndarray], dict[int, dict[str, float]]]:
     """Run the file's updates; return the model, the file, and what the updates reported."""
     data = dict(np.load(path))
     meta = json.loads(str(data["meta"]))
-    model = build(meta)
+    model = build(meta, compile=execution == "compiled")
+    recorder = captured(model, warm_up=0) if execution == "captured" else None
     is_bro = isinstance(model, BRO)
     explorer: Any = model.explorer
     named = named_parameters(model)
@@ -208,9 +215,12 @@ def replay(path: Path) -> tuple[SAC, dict[str, np.ndarray], dict[int, dict[str, 
                 reported["std_e"] = mean_std(explorer.actor, observations)
                 optimistic_mean = torch.tanh(explorer.actor.gaussian(explorer.actor.features(observations))[0])
 
+        model._prepared_execution()
         metrics = {name: value.item() for name, value in model._update(batch, noise).items()}
         reported.update({theirs: metrics[ours] for theirs, ours in SHARED_NAMES.items()})
-        gradient_norms = {f"{name}_gnorm": norm([p.grad for p in ps]) for name, ps in groups.items()}
+        # A compiled step leaves no gradients.
+        left = {} if execution == "compiled" else groups
+        gradient_norms = {f"{name}_gnorm": norm([p.grad for p in ps]) for name, ps in left.items()}
         if is_bro:
             reported["optimism"] = metrics["exploration/optimism"]
             reported["kl"] = metrics["exploration/kl"] * meta["dims"]["act_dim"]
@@ -222,7 +232,8 @@ def replay(path: Path) -> tuple[SAC, dict[str, np.ndarray], dict[int, dict[str, 
             reported["kl"] = metrics["exploration/kl"]
             reported["KLoss"] = reported["kl"] * meta["dims"]["act_dim"]
             reported["Qloss"] = -(metrics["exploration/q_mean"] + reported["beta_ub"] * metrics["exploration/q_std"])
-            gradient_norms["actor_c_gnorm"] = gradient_norms.pop("actor_gnorm")
+            if left:
+                gradient_norms["actor_c_gnorm"] = gradient_norms.pop("actor_gnorm")
             # The optimistic actor was compared with the new actor.
             reported["std"] = mean_std(model.actor, observations)
             with torch.no_grad():
@@ -232,6 +243,10 @@ def replay(path: Path) -> tuple[SAC, dict[str, np.ndarray], dict[int, dict[str, 
 
         if i < meta["dims"]["n_updates"] - 1 and f"after/{i}/temp/log_temp" in data:
             check_parameters(named, data, f"after/{i}/", i + 1, model)
+    if execution == "compiled":
+        assert model._execution is not None and model._execution.seconds_compiling > 0
+    if recorder is not None:
+        assert recorder.n_repetitions == len(info)
     return model, data, info
 
 
@@ -258,9 +273,25 @@ def test_files_are_there() -> None:
     assert kinds == {"bro", "dac"}
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_golden(path: Path) -> None:
-    model, data, info = replay(path)
+#: Compiled here in the short tests too; the other files in the long ones.
+COMPILED_IN_SHORT = {"bro_quantile_public", "dac_edge"}
+
+
+@pytest.mark.parametrize(
+    ("path", "execution"),
+    [
+        pytest.param(
+            path,
+            execution,
+            id=f"{path.stem}-{execution}",
+            marks=[pytest.mark.slow] if execution == "compiled" and path.stem not in COMPILED_IN_SHORT else [],
+        )
+        for path in FILES
+        for execution in EXECUTIONS
+    ],
+)
+def test_golden(path: Path, execution: str) -> None:
+    model, data, info = replay(path, execution)
     n_updates = len(info)
     check_parameters(named_parameters(model), data, "final/", n_updates, model)
     compared = 0
@@ -268,6 +299,8 @@ def test_golden(path: Path) -> None:
         if not key.startswith("info/"):
             continue
         _, i, name = key.split("/")
+        if execution == "compiled" and name.endswith("_gnorm"):
+            continue
         theirs = float(value)
         ours = info[int(i)][name]
         assert abs(ours - theirs) <= INFO_TOLERANCE * max(1, abs(theirs)), f"{key}: {ours} instead of {theirs}"
