@@ -19,6 +19,7 @@ from sb3_sample.sac import SAC, algorithm, execution
 from sb3_sample.sac.batch import draw_batches
 from sb3_sample.sac.buffers import BatchMemory, DeviceReplayBuffer, ValidationDictReplayBuffer, ValidationReplayBuffer
 from sb3_sample.sac.execution import Execution, why_not_compiled
+from sb3_sample.sac.pessimism import PESSIMISMS, Pessimism
 from tests.sac.common import MAKERS, Toy, bro, differing, sac, state, vec
 
 #: Largest difference of a parameter after 50 updates, each of which moves it by up to 3e-4. The same arithmetic in
@@ -309,6 +310,29 @@ def test_what_cannot_be_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
         sac(compile=True, **kwargs).learn(30)
 
 
+def test_parts_of_ones_own_are_compiled_when_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Own(Pessimism):
+        def __init__(self, agent: SAC):
+            super().__init__(1.0)
+
+    class Counting(Own):
+        """Not made to be compiled: its number changes at every step."""
+
+        def before_updates(self, agent: SAC) -> None:
+            self._beta += 0.01
+
+    monkeypatch.setattr(algorithm, "PAYS_FROM", 5)
+    monkeypatch.setitem(PESSIMISMS, "own", Own)
+    monkeypatch.setitem(PESSIMISMS, "counting", Counting)
+    assert sac(pessimism="own").learn(20).compiled is False
+    assert sac(pessimism="own", compile=True).learn(20)._execution.compiled
+    with (
+        torch._dynamo.config.patch(recompile_limit=2),
+        pytest.raises(RuntimeError, match=r"compile=True, but .*compile=False"),
+    ):
+        sac(pessimism="counting", compile=True).learn(20)
+
+
 def test_foreign_optimizers_stay_uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(algorithm, "PAYS_FROM", 5)
     kwargs = {"policy_kwargs": {"net_arch": [8], "optimizer_class": torch.optim.RMSprop}}
@@ -372,6 +396,17 @@ def test_gathers_what_the_buffer_would_give(cls: Any, n_envs: int) -> None:
     # The same memory, for as many.
     places = [b.actions.data_ptr() for b in draw_batches(buffer, 3, 16, 0.9, None, memory)]
     assert places == [b.actions.data_ptr() for b in draw_batches(buffer, 3, 16, 0.9, None, memory)]
+
+
+def test_n_step_returns_need_their_buffer() -> None:
+    with pytest.raises(ValueError, match=r"n_steps=3 .*NStepReplayBuffer.*DeviceReplayBuffer"):
+        sac(n_steps=3, replay_buffer_class=DeviceReplayBuffer)
+
+
+@pytest.mark.parametrize("value", ["yes", 1, None])
+def test_compile_is_checked(value: Any) -> None:
+    with pytest.raises(ValueError, match=f"compile must be True, False or 'auto', not {value!r}"):
+        sac(compile=value)
 
 
 def test_pays_from_is_documented() -> None:

@@ -1,5 +1,6 @@
 """Training that ends in a policy that can do something: broken learning fails here whatever else passes."""
 
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -52,6 +53,13 @@ def test_sac_learns_pendulum() -> None:
 
 def test_bro_learns_pendulum() -> None:
     assert score(small_bro(0).learn(2_500)) > GOOD
+
+
+@pytest.mark.parametrize("make", [small_sac, small_bro])
+def test_compiled_step_learns_pendulum(make: Callable[..., SAC]) -> None:
+    model = make(0, compile=True).learn(3_000)
+    assert model._execution is not None and model._execution.compiled
+    assert score(model) > GOOD
 
 
 @pytest.mark.parametrize("cls", [DAC, VPLSAC])
