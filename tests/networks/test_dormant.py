@@ -346,8 +346,7 @@ def test_nothing_is_read_on_the_host(name: str) -> None:
     """Tensors of the meta device have no values that could be read."""
     trunk, head, x = build(name, E)
     optimizer = AdamW([*trunk.to("meta").parameters(), *head.to("meta").parameters()])
-    for p in optimizer.param_groups[0]["params"]:
-        optimizer._state_of(p)
+    optimizer.prepare()
     assert recycle(trunk, head, x.to("meta"), 0.1, optimizer).is_meta
 
 
