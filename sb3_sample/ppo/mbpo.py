@@ -49,7 +49,7 @@ class MBPOPPO(ModelBasedPPO):
     ) -> SimulatedSamples:
         """Noise: (H, N, A), of the actions in the rollouts."""
         self._check_horizon(n_simulated)
-        pieces = []
+        pieces, ends = [], False
         for piece in torch.arange(len(observations), device=observations.device).split(self._rows_at_once()):
             starts = observations[piece]
             first = draw(self.distribution_at(starts), None if noise is None else noise[0, piece])
@@ -57,13 +57,15 @@ class MBPOPPO(ModelBasedPPO):
             rolled = self.roll_out(starts, first, later, n_kept=n_simulated)
             q_values = rolled.q_values[1 : n_simulated + 1]
             advantages = q_values - rolled.values[:n_simulated]
+            # Without terminations every state is reached.
             reached = torch.ones_like(q_values)
             if rolled.continues is not None:
                 reached = rolled.continues[:n_simulated].cumprod(dim=0)
+            ends = rolled.continues is not None
             assert rolled.observations is not None and rolled.actions is not None and rolled.log_probs is not None
             columns = (rolled.observations, rolled.actions, rolled.log_probs, q_values, advantages, reached)
             pieces.append([column.transpose(0, 1) for column in columns])
         joined = [torch.cat(column) for column in zip(*pieces, strict=True)]
         self._check_finite(joined[3])
         samples = SimulatedSamples(*joined)
-        return samples if self.predict_termination else samples._replace(weights=None)
+        return samples if ends else samples._replace(weights=None)

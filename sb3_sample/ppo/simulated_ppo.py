@@ -23,6 +23,7 @@ from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import CategoricalDistribution, DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
@@ -358,6 +359,31 @@ class SimulatedPPO(PPO):
                     f"({str(error).splitlines()[0]})"
                 ) from error
             raise
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | dict[str, Any],
+        exact_match: bool = True,
+        device: torch.device | str = "auto",
+    ) -> None:
+        """
+        Load parameters, as in Stable-Baselines3. The optimizers' moments are loaded, their settings (learning rate,
+        epsilon, ...) stay this model's, so that ``load`` with other ones has them in force.
+
+        :param load_path_or_dict: a file, or parameters as ``get_parameters`` gives them
+        :param exact_match: whether parameters for every module must be there, and no others
+        :param device: "auto", "cpu", "cuda", ...
+        """
+        named = {name: recursive_getattr(self, name) for name in self._get_torch_save_params()[0]}
+        optimizers = [value for value in named.values() if isinstance(value, torch.optim.Optimizer)]
+        settings = [
+            [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
+            for optimizer in optimizers
+        ]
+        super().set_parameters(load_path_or_dict, exact_match, device)
+        for optimizer, own_groups in zip(optimizers, settings, strict=True):
+            for group, own in zip(optimizer.param_groups, own_groups, strict=True):
+                group.update(own)
 
     # ---------------------------------------------------------------- the iteration
 

@@ -60,9 +60,9 @@ class FlatObservations:
 class ModelActions:
     """
     Actions as the models see them. Those of a Box are clipped to its bounds, as the environment receives them, and
-    scaled to [-1, 1] where the bounds are finite; those of a Discrete space are one-hot vectors.
+    scaled to [-1, 1]; those of a Discrete space are one-hot vectors.
 
-    :param space: a Box or a Discrete space
+    :param space: a bounded Box or a Discrete space
     :param device: where the models are
     """
 
@@ -75,9 +75,8 @@ class ModelActions:
         assert isinstance(space, spaces.Box)
         self.size = int(np.prod(space.shape))
         low, high = space.low.astype(np.float64).ravel(), space.high.astype(np.float64).ravel()
-        bounded = np.isfinite(low) & np.isfinite(high) & (low < high)
-        middle = np.where(bounded, (np.where(bounded, low, 0) + np.where(bounded, high, 0)) / 2, 0)
-        half = np.where(bounded, (np.where(bounded, high, 1) - np.where(bounded, low, 0)) / 2, 1)
+        middle, half = (low + high) / 2, (high - low) / 2
+        half[half == 0] = 1  # an entry with one value
 
         def tensor(x: np.ndarray) -> torch.Tensor:
             return torch.as_tensor(x, dtype=torch.float32, device=device)
