@@ -135,7 +135,7 @@ def matmul_seconds(device: str, x: torch.Tensor, w: torch.Tensor) -> float:
 def peak_memory(args: argparse.Namespace) -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     contender = Contender(
-        MBMAPPO, n_steps=4096, n_simulated=16, anneal_until=None, simulation_horizon=args.horizon, n_epochs=args.epochs,
+        MBMAPPO, n_steps=4096, n_simulated=16, warm_up_until=0, simulation_horizon=args.horizon, n_epochs=args.epochs,
         device="cpu",
     )  # fmt: skip
     contender.iterate()
@@ -163,7 +163,7 @@ def main() -> None:
         return
 
     sizes: dict[str, Any] = dict(n_steps=args.steps, n_epochs=args.epochs, device=args.device)
-    ours: dict[str, Any] = {**sizes, "anneal_until": None}
+    ours: dict[str, Any] = {**sizes, "warm_up_until": 0}
     rollouts: dict[str, Any] = {**ours, "simulation_horizon": args.horizon}
     contenders = {
         PPO: Contender(

@@ -20,8 +20,9 @@ class MBMAPPO(ModelBasedPPO):
     :param learning_rate: of actor and critic; a number or a function of the remaining progress (from 1 to 0)
     :param n_simulated: X, extra actions at each real state; 0 for PPO. Actions of a Discrete space are not drawn but
         all taken, weighted as X draws count in expectation
-    :param anneal_until: share of the training from which on nothing is simulated any more; None for no annealing. How
-        X falls until then: :class:`SimulatedPPO`
+    :param anneal_until: share of the training from which on nothing is simulated any more; None for no decline
+    :param warm_up_until: share of the training over which X rises from 0; None: 0.15, or 0 if ``anneal_until`` is
+        given. Both in full: :class:`SimulatedPPO`
     :param simulation_horizon: H, steps of a rollout of the model
     :param dynamics_buffer_size: transitions that the model learns from
     :param dynamics_batch_size: transitions in a batch of the model

@@ -21,8 +21,9 @@ class MBPOPPO(ModelBasedPPO):
     :param env: the environment, an id, or a vectorised environment
     :param learning_rate: of actor and critic; a number or a function of the remaining progress (from 1 to 0)
     :param n_simulated: X, simulated states for each real one; 0 for PPO
-    :param anneal_until: share of the training from which on nothing is simulated any more; None for no annealing. How
-        X falls until then: :class:`SimulatedPPO`
+    :param anneal_until: share of the training from which on nothing is simulated any more; None for no decline
+    :param warm_up_until: share of the training over which X rises from 0; None: 0.15, or 0 if ``anneal_until`` is
+        given. Both in full: :class:`SimulatedPPO`
     :param simulation_horizon: H, steps of a rollout of the model, above X
     :param dynamics_buffer_size: transitions that the model learns from
     :param dynamics_batch_size: transitions in a batch of the model

@@ -76,8 +76,9 @@ class QMAPPO(SimulatedPPO):
     :param learning_rate: of actor and critic; a number or a function of the remaining progress (from 1 to 0)
     :param n_simulated: X, extra actions at each real state; 0 for PPO. Actions of a Discrete space are not drawn but
         all taken, weighted as X draws count in expectation
-    :param anneal_until: share of the training from which on nothing is simulated any more; None for no annealing. How
-        X falls until then: :class:`SimulatedPPO`
+    :param anneal_until: share of the training from which on nothing is simulated any more; None for no decline
+    :param warm_up_until: share of the training over which X rises from 0; None: 0.15, or 0 if ``anneal_until`` is
+        given. Both in full: :class:`SimulatedPPO`
     :param q_kwargs: the Q-networks: ``width`` (1024) and ``depth`` (2) of the hidden layers, ``learning_rate`` (3e-4),
         ``epochs`` over each rollout (None: ``n_epochs``), and ``normalize`` (True): whether observations are
         standardised by the rollout

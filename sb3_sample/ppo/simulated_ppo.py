@@ -36,6 +36,8 @@ Self = TypeVar("Self", bound="SimulatedPPO")
 
 #: Hidden widths of actor and critic (P1, appendix B.2), of the policies that are given by these names.
 NET_ARCH: dict[str, list[int]] = {"pi": [512, 512], "vf": [1024, 1024]}
+#: Share of the training over which the number of samples rises (P1, section 5.1).
+WARM_UP = 0.15
 NAMED_POLICIES = ("MlpPolicy", "MultiInputPolicy")
 
 
@@ -119,14 +121,15 @@ class SimulatedPPO(PPO):
     :param _init_setup_model: whether to build the networks at once
     :param n_simulated: X, simulated samples for each real one, at the height of the schedule below; 0 for PPO. With
         a Discrete space: see ``simulate``
-    :param anneal_until: share of the training, of ``total_timesteps``, from which on nothing is simulated any more;
-        None if X stays. P1 anneals "the number of additional samples until 15% step of the training": read here as a
-        linear decline to 0 that begins with the first step. At an iteration whose rollout began at the share p of
-        the training, X = ceil(``n_simulated`` (1 - p / ``anneal_until``)). A second ``learn`` counts anew, or goes on
-        with ``reset_num_timesteps=False``
-    :param warm_up_until: share of the training over which X rises linearly from 0 instead, while the models learn; the
-        other way in which P1's sentence can be read is ``anneal_until=None, warm_up_until=0.15``. With both, the two
-        factors are multiplied
+    :param anneal_until: share of the training, of ``total_timesteps``, from which on nothing is simulated any more: at
+        an iteration whose rollout began at the share p of the training, X = ceil(``n_simulated`` (1 - p /
+        ``anneal_until``)). None: X does not decline. A second ``learn`` counts anew, or goes on with
+        ``reset_num_timesteps=False``
+    :param warm_up_until: share of the training over which X rises linearly from 0 to ``n_simulated`` while the models
+        learn, rounded up too; 0 for no rise. None: 0.15, or 0 if ``anneal_until`` is given. With both, the two factors
+        are multiplied. P1, section 5.1: "We anneal the number of additional samples until 15% step of the training for
+        all methods". The default reads it as a rise that ends at 15%; ``anneal_until=0.15`` is the other reading, a
+        decline to none that ends there, with which nothing is left of the gain over PPO (docs/many_actions.md)
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
@@ -163,8 +166,8 @@ class SimulatedPPO(PPO):
         _init_setup_model: bool = True,
         *,
         n_simulated: int = 8,
-        anneal_until: float | None = 0.15,
-        warm_up_until: float = 0.0,
+        anneal_until: float | None = None,
+        warm_up_until: float | None = None,
     ):
         super().__init__(
             policy,
@@ -244,15 +247,16 @@ class SimulatedPPO(PPO):
         :raises ValueError: if an argument is out of range or contradicts another
         """
         check_integer("n_simulated", self.n_simulated, 0)
-        if not _is_number(self.warm_up_until) or not 0 <= self.warm_up_until < 1:
-            raise ValueError(
-                f"warm_up_until must be at least 0 and below 1, a share of the training, not {self.warm_up_until!r}"
-            )
         if self.anneal_until is not None and (not _is_number(self.anneal_until) or not 0 < self.anneal_until <= 1):
             raise ValueError(
                 f"anneal_until must lie in (0, 1], a share of the training, or be None, not {self.anneal_until!r}"
             )
-        if self.anneal_until is not None and self.warm_up_until >= self.anneal_until:
+        if self.warm_up_until is not None and (not _is_number(self.warm_up_until) or not 0 <= self.warm_up_until < 1):
+            raise ValueError(
+                "warm_up_until must be at least 0 and below 1, a share of the training, or be None, not "
+                f"{self.warm_up_until!r}"
+            )
+        if self.anneal_until is not None and (self.warm_up_until or 0) >= self.anneal_until:
             raise ValueError(f"warm_up_until must be below anneal_until={self.anneal_until}, not {self.warm_up_until}")
         if self.n_simulated == 0:
             self._check_unused(self.simulation_arguments, "n_simulated=0")
@@ -444,8 +448,11 @@ class SimulatedPPO(PPO):
         share = 1.0
         if self.anneal_until is not None:
             share *= max(0.0, 1 - self._progress / self.anneal_until)
-        if self.warm_up_until > 0:
-            share *= min(1.0, self._progress / self.warm_up_until)
+        warm_up = self.warm_up_until
+        if warm_up is None:
+            warm_up = WARM_UP if self.anneal_until is None else 0.0
+        if warm_up > 0:
+            share *= min(1.0, self._progress / warm_up)
         # The tolerance keeps 8 times 0.5 from being rounded up to 5 by rounding errors.
         return math.ceil(self.n_simulated * share - 1e-9)
 

@@ -215,7 +215,7 @@ def test_the_models_are_trained_while_the_number_rises_and_not_after_it_has_fall
         return seen
 
     assert fits(anneal_until=0.5) == [0.0, 0.2, 0.4]
-    assert fits(anneal_until=None, warm_up_until=0.5) == [0.0, 0.2, 0.4, 0.6, 0.8]
+    assert fits(warm_up_until=0.5) == [0.0, 0.2, 0.4, 0.6, 0.8]
 
 
 class Ends(gym.Env):

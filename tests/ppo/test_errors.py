@@ -51,7 +51,7 @@ def test_what_is_refused(kwargs: dict[str, Any], words: str) -> None:
     ("cls", "argument"),
     [
         *((cls, {"anneal_until": 0.5}) for cls in ALGORITHMS),
-        *((cls, {"anneal_until": None, "warm_up_until": 0.5}) for cls in ALGORITHMS),
+        *((cls, {"warm_up_until": 0.5}) for cls in ALGORITHMS),
         (MBMAPPO, {"simulation_horizon": 5}),
         (MBMAPPO, {"dynamics_buffer_size": 5}),
         (MBPOPPO, {"dynamics_batch_size": 5}),
@@ -124,7 +124,7 @@ def test_the_defaults_are_the_papers(cls: Any) -> None:
     assert (model.gamma, model.gae_lambda, model.max_grad_norm, model.vf_coef) == (0.99, 0.95, 0.5, 0.5)
     assert model.clip_range(1) == 0.2 and model.clip_range_vf is None and model.ent_coef == 0
     assert model.normalize_advantage is False
-    assert (model.n_simulated, model.anneal_until) == (8, 0.15)
+    assert (model.n_simulated, model.anneal_until, model.warm_up_until) == (8, None, None)
     group = model.policy.optimizer.param_groups[0]
     assert (group["lr"], group["eps"]) == (3e-4, 1e-5)
     widths = {

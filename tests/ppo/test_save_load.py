@@ -122,9 +122,7 @@ def test_load_refuses(kwargs: dict[str, Any], words: str, tmp_path: Path) -> Non
 
 
 def test_plain_ppo_of_a_file_with_models(tmp_path: Path) -> None:
-    tiny(dynamics_kwargs=None, simulation_horizon=12, dynamics_buffer_size=25_000, anneal_until=0.15).save(
-        tmp_path / "m"
-    )
+    MBMAPPO("MlpPolicy", vec(), policy_kwargs={"net_arch": [8]}, device="cpu").save(tmp_path / "m")
     with pytest.raises(ValueError, match="n_simulated, predict_termination: with these arguments the model has other"):
         MBMAPPO.load(tmp_path / "m", env=vec(), n_simulated=0, predict_termination=None)
 

@@ -242,15 +242,16 @@ def test_a_diverged_model_is_an_error() -> None:
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ({}, {0.0: 8, 0.01: 8, 0.075: 4, 0.14: 1, 0.15: 0, 1.0: 0}),
-        ({"anneal_until": None}, {0.0: 8, 0.5: 8, 1.0: 8}),
+        ({}, {0.0: 0, 0.01: 1, 0.075: 4, 0.15: 8, 1.0: 8}),
+        ({"warm_up_until": 0.0}, {0.0: 8, 0.5: 8, 1.0: 8}),
+        ({"warm_up_until": 0.5}, {0.0: 0, 0.25: 4, 0.5: 8, 1.0: 8}),
+        ({"anneal_until": 0.15}, {0.0: 8, 0.01: 8, 0.075: 4, 0.14: 1, 0.15: 0, 1.0: 0}),
         ({"anneal_until": 1.0}, {0.0: 8, 0.5: 4, 0.99: 1, 1.0: 0}),
-        ({"anneal_until": None, "warm_up_until": 0.15}, {0.0: 0, 0.01: 1, 0.075: 4, 0.15: 8, 1.0: 8}),
         ({"anneal_until": 1.0, "warm_up_until": 0.5}, {0.0: 0, 0.25: 3, 0.5: 4, 0.75: 2, 1.0: 0}),
     ],
 )
 def test_the_number_of_samples_follows_the_training(arguments: dict[str, Any], expected: dict[float, int]) -> None:
-    agent = tiny(**{"n_simulated": 8, "anneal_until": 0.15, **arguments})
+    agent = tiny(**{"n_simulated": 8, "warm_up_until": None, **arguments})
     for progress, n in expected.items():
         agent._progress = progress
         assert agent.current_n_simulated() == n, progress

@@ -76,7 +76,7 @@ def test_any_space_of_ppo_will_do_without_samples() -> None:
 
 def no_models() -> dict[str, Any]:
     """Arguments of the models at their defaults."""
-    return dict(dynamics_kwargs=None, simulation_horizon=12, dynamics_buffer_size=25_000, anneal_until=0.15)
+    return dict(dynamics_kwargs=None, simulation_horizon=12, dynamics_buffer_size=25_000, warm_up_until=None)
 
 
 @pytest.mark.parametrize("cls", ALGORITHMS)
@@ -110,7 +110,7 @@ def test_samples_of_weight_zero_change_nothing(arguments: dict[str, Any]) -> Non
     warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
     policy_kwargs = {"net_arch": [8], "optimizer_kwargs": {"eps": 1e-5, "fused": True}}
     arguments = {**PPO_ARGUMENTS, "policy_kwargs": policy_kwargs, "normalize_advantage": False, **arguments}
-    ours = Weightless("MlpPolicy", vec(2), anneal_until=None, n_simulated=3, dynamics_kwargs={"width": 8}, **arguments)
+    ours = Weightless("MlpPolicy", vec(2), warm_up_until=0.0, n_simulated=3, dynamics_kwargs={"width": 8}, **arguments)
     theirs = PPO("MlpPolicy", vec(2), **arguments)
     for model in (ours, theirs):
         model.set_random_seed(5)
