@@ -120,8 +120,10 @@ class GradientSamples:
             )
 
         def value(samples: "GradientSamples") -> float:
-            values = [getattr(samples, quantity)(name) for name in (first, second)]
-            return float(np.subtract(*(v.value if isinstance(v, Interval) else v for v in values)))
+            of_first, of_second = (getattr(samples, quantity)(name) for name in (first, second))
+            if isinstance(of_first, Interval):
+                return of_first.value - of_second.value
+            return of_first - of_second
 
         names = {first, second, self.oracle}
         kept = np.ones(self.n_estimates, bool)

@@ -241,6 +241,7 @@ def draw(title: str, estimate: Estimate, question: Question, confidence: float =
     costs.axhline(1.0, color="grey", linewidth=0.8)
     costs.set_title(f"variance at equal cost, an action costing {question.action_cost:g}", fontsize=10)
     costs.set_xlabel("actions at each state")
+    costs.set_xticks([1, *range(2, MAX_ACTIONS + 1, 2)])
     for axes in (parts, lags, costs):
         axes.axhline(0.0, color="black", linewidth=0.6)
         axes.grid(alpha=0.3)

@@ -113,13 +113,17 @@ def check_restorable(env: gym.Env, other: gym.Env | None = None, n_steps: int = 
     actions = [random_action(env.action_space, rng) for _ in range(n_steps)]
     first = list(_follow(env, actions))
     other = env if other is None else other
+    message = (
+        f"env must be an environment whose state can be saved and restored, as those of dmc/, Gymnasium's MuJoCo and "
+        f"classic control, not {env}: "
+    )
     restore_state(other, state)
-    second = list(_follow(other, actions))
+    try:
+        second = list(_follow(other, actions))
+    except Exception as error:  # whatever an environment raises whose state is only in part what it should be
+        raise ValueError(f"{message}it fails after its state was restored ({error!r})") from error
     if not _equal(first, second):
-        raise ValueError(
-            f"env must be an environment whose state can be saved and restored, not {env}: the same actions gave "
-            "something else after its state was restored. Such are dmc/, Gymnasium's MuJoCo and classic control"
-        )
+        raise ValueError(f"{message}the same actions gave something else after its state was restored")
 
 
 def random_action(space: gym.Space, rng: np.random.Generator) -> Any:
@@ -144,7 +148,11 @@ def _layers(env: gym.Env) -> list[Any]:
     while isinstance(layers[-1], gym.Wrapper):
         layers.append(layers[-1].env)
     dm_env = getattr(layers[-1], "dm_env", None)
-    return layers if dm_env is None else [*layers, dm_env, dm_env.task]
+    if dm_env is not None:
+        return [*layers, dm_env, dm_env.task]
+    # An environment around one of another library, such as metaworld/.
+    inside = [layer for value in vars(layers[-1]).values() if isinstance(value, gym.Env) for layer in _layers(value)]
+    return layers + inside
 
 
 def _simulator(env: gym.Env) -> tuple[Any, Any] | None:
@@ -153,8 +161,11 @@ def _simulator(env: gym.Env) -> tuple[Any, Any] | None:
     if hasattr(base, "dm_env"):
         physics = base.dm_env.physics
         return physics.model.ptr, physics.data.ptr
-    model, data = getattr(base, "model", None), getattr(base, "data", None)
-    return (model, data) if type(model).__module__.startswith("mujoco") else None
+    for layer in reversed(_layers(env)):
+        model, data = vars(layer).get("model"), vars(layer).get("data")
+        if type(model).__module__.startswith("mujoco"):
+            return model, data
+    return None
 
 
 @functools.cache

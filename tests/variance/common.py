@@ -168,3 +168,31 @@ def tabular_model(env: gym.Env) -> PPO:
         model.policy.value_net.weight.copy_(torch.as_tensor(Exact(tabular, policy).values)[None])
         model.policy.value_net.bias.zero_()
     return model
+
+
+class Regulator(gym.Env):
+    """
+    A linear-quadratic task in one dimension, quick to simulate and quick to learn a model of: keep x at 0.
+
+    :param noise: standard deviation of what is added to x
+    """
+
+    observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = spaces.Box(-10, 10, (1,), np.float32)
+
+    def __init__(self, noise: float = 0.0):
+        self.noise = noise
+        self.x = 0.0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.x = float(self.np_random.normal())
+        return self._observation(), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
+        reward = -(self.x**2) - 0.1 * float(action[0]) ** 2
+        self.x = 0.9 * self.x + 0.3 * float(action[0]) + self.noise * float(self.np_random.normal())
+        return self._observation(), reward, False, False, {}
+
+    def _observation(self) -> np.ndarray:
+        return np.array([self.x], np.float32)

@@ -24,7 +24,7 @@ DMC = [
     "manipulator-bring_ball",
     "humanoid-run",
 ]
-GYMNASIUM = ["Hopper-v5", "Humanoid-v5", "Reacher-v5", "Pendulum-v1", "CartPole-v1"]
+OTHERS = ["Hopper-v5", "Humanoid-v5", "Reacher-v5", "Pendulum-v1", "CartPole-v1", "metaworld/push-v3"]
 
 
 def make(env_id: str) -> gym.Env:
@@ -54,7 +54,7 @@ def random_actions(env: gym.Env, n: int, seed: int = 0) -> list[Any]:
     return [random_action(env.action_space, rng) for _ in range(n)]
 
 
-@pytest.mark.parametrize("env_id", DMC + GYMNASIUM)
+@pytest.mark.parametrize("env_id", DMC + OTHERS)
 def test_restored_in_the_same_environment_and_in_another(env_id: str) -> None:
     env, other = make(env_id), make(env_id)
     env.reset(seed=1)
@@ -162,7 +162,7 @@ def test_new_randomness_of_a_dmc_task_is_that_of_its_resets() -> None:
     assert (starts[0] != starts[2]).any()
 
 
-@pytest.mark.parametrize("env_id", [*DMC[:2], *GYMNASIUM])
+@pytest.mark.parametrize("env_id", [*DMC[:2], *OTHERS])
 def test_check_restorable(env_id: str) -> None:
     check_restorable(make(env_id))
     check_restorable(make(env_id), make(env_id))
