@@ -93,7 +93,7 @@ class ModelBasedPPO(SimulatedPPO):
         and in the errors, by the transitions that it learns from
     :param predict_termination: whether the model predicts that episodes terminate: off suits tasks whose episodes end
         by time limits only. None: off for the tasks of the DeepMind Control suite, ``dmc/...``, none of which
-        terminates (P1's setting), on for all others
+        terminates (P1's setting), and for other environments with a true attribute ``never_terminates``; else on
     :param kwargs: every other argument of :class:`SimulatedPPO`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -139,7 +139,7 @@ class ModelBasedPPO(SimulatedPPO):
 
     def _setup_models(self) -> None:
         if self.predict_termination is None:
-            self.predict_termination = not self._is_dmc()
+            self.predict_termination = not self._never_terminates()
         self._model_kwargs = check_network_kwargs("dynamics_kwargs", self.dynamics_kwargs or {}, DYNAMICS_DEFAULTS)
         network = {name: value for name, value in self._model_kwargs.items() if name != "epochs"}
         sizes = self.flat_observations.size, self.model_actions.size
@@ -150,14 +150,10 @@ class ModelBasedPPO(SimulatedPPO):
         # Transitions that are in the buffer but that the model has not been trained on.
         self._n_new = 0
 
-    def _is_dmc(self) -> bool:
-        if self.env is None:
-            return False
-        try:
-            specs = self.env.get_attr("spec")
-        except AttributeError:  # an environment that is no gymnasium.Env
-            return False
-        return all(spec is not None and spec.id.startswith("dmc/") for spec in specs)
+    def _never_terminates(self) -> bool:
+        # Asked first, since a worker of SubprocVecEnv does not survive the question for what is not there.
+        env = self.env
+        return env is not None and env.has_attr("never_terminates") and all(env.get_attr("never_terminates"))
 
     def _model_names(self) -> list[str]:
         return ["dynamics", "dynamics.optimizer", "transitions"]

@@ -8,7 +8,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.ppo.dynamics import Dynamics, Standardizer, TransitionBuffer, Transitions
@@ -236,7 +236,7 @@ class Ends(gym.Env):
 
 def test_ends_are_learned_and_the_return_is_cut_there() -> None:
     model = tiny(
-        env=Ends(), n_steps=256, n_epochs=20, gae_lambda=1.0, gamma=1.0, simulation_horizon=8,
+        env=Ends(), n_steps=256, batch_size=32, n_epochs=20, gae_lambda=1.0, gamma=1.0, simulation_horizon=8,
         dynamics_kwargs={"width": 64, "learning_rate": 3e-3}, dynamics_buffer_size=10_000,
     )  # fmt: skip
     assert model.predict_termination is True
@@ -248,6 +248,21 @@ def test_ends_are_learned_and_the_return_is_cut_there() -> None:
     q = model.simulate(starts, n_simulated=4).q_values.mean(dim=1)
     # One reward for each step until beyond 1.
     np.testing.assert_allclose(q, [1, 2, 3, 7], atol=0.5)
+
+
+def test_an_environment_can_say_that_it_never_terminates() -> None:
+    class Endless(Toy):
+        never_terminates = True
+
+    assert tiny(env=Endless(truncate=True)).predict_termination is False
+    assert tiny(env=DummyVecEnv([Endless, Toy])).predict_termination is True
+
+
+def test_subprocesses() -> None:
+    env = SubprocVecEnv([Toy, Toy], start_method="fork")
+    model = quiet(tiny(env=env)).learn(32)
+    assert model.predict_termination is True and model.transitions.size == 32
+    env.close()
 
 
 def test_the_default_of_termination() -> None:
