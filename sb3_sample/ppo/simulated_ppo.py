@@ -237,9 +237,12 @@ class SimulatedPPO(PPO):
         if self._has_named_policy:
             kwargs.setdefault("net_arch", {name: list(widths) for name, widths in NET_ARCH.items()})
         optimizer_class = kwargs.get("optimizer_class", torch.optim.Adam)
-        if self.n_simulated > 0 and optimizer_class is torch.optim.Adam:
-            # The fused kernel takes the same steps in a third of the time. The epsilon is Stable-Baselines3's and P1's.
-            kwargs["optimizer_kwargs"] = {"eps": 1e-5, "fused": True, **(kwargs.get("optimizer_kwargs") or {})}
+        # Without any, Stable-Baselines3's own, whose epsilon is P1's too.
+        given = kwargs.get("optimizer_kwargs") or {"eps": 1e-5}
+        fusible = optimizer_class is torch.optim.Adam and self.device.type in ("cpu", "cuda")
+        if self.n_simulated > 0 and fusible and not {"foreach", "differentiable"} & given.keys():
+            # The fused kernel takes the same steps in a third of the time.
+            kwargs["optimizer_kwargs"] = {"fused": True, **given}
         return kwargs
 
     def _check_arguments(self) -> None:
@@ -484,7 +487,9 @@ class SimulatedPPO(PPO):
     def current_rollout(self) -> Rollout:
         """
         :return: the rollout buffer's samples as tensors, the steps of one environment after those of another
+        :raises ValueError: with ``n_simulated=0``, which allows for observations that are no vectors
         """
+        self._check_simulates()
         buffer = self.rollout_buffer
 
         def tensor(values: np.ndarray) -> torch.Tensor:
@@ -504,6 +509,10 @@ class SimulatedPPO(PPO):
             actions.long().flatten() if self.model_actions.is_discrete else actions,
             *(tensor(x).flatten() for x in (buffer.log_probs, buffer.values, buffer.advantages, buffer.returns)),
         )
+
+    def _check_simulates(self) -> None:
+        if self.n_simulated == 0:
+            raise ValueError("n_simulated=0: this model has nothing to simulate with")
 
     def fit_models(self) -> None:
         """
@@ -533,8 +542,7 @@ class SimulatedPPO(PPO):
             given noise reproduces the samples exactly
         :return: N times X samples
         """
-        if self.n_simulated == 0:
-            raise ValueError("n_simulated=0: this model has nothing to simulate with")
+        self._check_simulates()
         n = self.current_n_simulated() if n_simulated is None else n_simulated
         check_integer("n_simulated", n, 1)
         self.policy.set_training_mode(False)

@@ -109,6 +109,8 @@ def test_simulating_with_nothing_to_simulate_with() -> None:
     model = MBMAPPO("MlpPolicy", vec(), n_simulated=0, device="cpu")
     with pytest.raises(ValueError, match="n_simulated=0: this model has nothing to simulate with"):
         model.simulate(None)
+    with pytest.raises(ValueError, match="n_simulated=0: this model has nothing to simulate with"):
+        model.current_rollout()
     model = tiny()
     with pytest.raises(ValueError, match="n_simulated must be an integer of at least 1, not 0"):
         model.simulate(None, n_simulated=0)

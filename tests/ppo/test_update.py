@@ -219,6 +219,11 @@ def test_the_fused_kernel_unless_the_user_says_otherwise() -> None:
     slow = {"net_arch": [8], "optimizer_kwargs": {"fused": False, "eps": 1e-7}}
     defaults = tiny(policy_kwargs=slow).policy.optimizer.defaults
     assert (defaults["fused"], defaults["eps"]) == (False, 1e-7)
+    decay = {"net_arch": [8], "optimizer_kwargs": {"weight_decay": 0.1}}
+    defaults = tiny(policy_kwargs=decay).policy.optimizer.defaults
+    assert (defaults["fused"], defaults["eps"], defaults["weight_decay"]) == (True, 1e-8, 0.1)
+    foreach = {"net_arch": [8], "optimizer_kwargs": {"foreach": True}}
+    assert not tiny(policy_kwargs=foreach).policy.optimizer.defaults["fused"]
     sgd = {"net_arch": [8], "optimizer_class": torch.optim.SGD}
     assert isinstance(tiny(policy_kwargs=sgd).policy.optimizer, torch.optim.SGD)
 
