@@ -79,7 +79,7 @@ def test_intervals_are_narrow_enough_to_say_something() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("limit", [None, 4])
 def test_coverage_is_95_percent(limit: int | None) -> None:
-    n_seeds, truth = 120, exact(limit)
+    n_seeds, truth = 80, exact(limit)
     covered = dict.fromkeys(QUANTITIES, 0)
     values: dict[str, list[float]] = {name: [] for name in QUANTITIES}
     for seed in range(n_seeds):
@@ -89,8 +89,8 @@ def test_coverage_is_95_percent(limit: int | None) -> None:
             covered[name] += interval.low <= quantity(truth) <= interval.high
             values[name].append(interval.value)
     for name, quantity in QUANTITIES.items():
-        # A standard error is 0.02; variances of 60 rollouts are skewed, which takes about as much off the coverage.
-        assert covered[name] / n_seeds >= 0.88, name
+        # A standard error is 0.024; variances of 60 rollouts are skewed, which takes as much off the coverage.
+        assert covered[name] / n_seeds >= 0.87, name
         error = (np.mean(values[name]) - quantity(truth)) / (np.std(values[name], ddof=1) / np.sqrt(n_seeds))
         assert abs(error) < 3.5, name
 
