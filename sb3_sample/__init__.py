@@ -2,6 +2,7 @@
 
 from sb3_sample.diagnostics import DiagnosticsCallback
 from sb3_sample.envs import make_env
+from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
 from sb3_sample.sac.buffers import DeviceReplayBuffer
 from sb3_sample.version import __version__
@@ -11,8 +12,11 @@ __all__ = [
     "BROTD3",
     "DAC",
     "GPLSAC",
+    "MBMAPPO",
+    "MBPOPPO",
     "OAC",
     "OPLSAC",
+    "QMAPPO",
     "SAC",
     "SRSAC",
     "TOPSAC",

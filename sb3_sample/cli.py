@@ -1,5 +1,5 @@
 """
-The command ``sb3-sample``: the zoo's commands with the algorithms of this package in them, and ``plot``.
+The command ``sb3-sample``: the zoo's commands with the algorithms of this package in them, ``plot`` and ``variance``.
 """
 
 import argparse
@@ -115,11 +115,18 @@ def _plot(arguments: list[str]) -> None:
     plot(arguments)
 
 
+def _variance(arguments: list[str]) -> None:
+    from sb3_sample.variance.command import main as variance
+
+    variance(arguments)
+
+
 COMMANDS: dict[str, Command] = {
     "train": Command(_zoo_function("rl_zoo3.train", "train"), "train an agent, or search for hyperparameters"),
     "enjoy": Command(_zoo_function("rl_zoo3.enjoy", "enjoy"), "run a trained agent"),
     "record_video": Command(_record_video, "write a video of a trained agent"),
     "plot": Command(_plot, "draw the runs of a task, mean and range over seeds, beside the published curves"),
+    "variance": Command(_variance, "measure a policy gradient's variance: more actions or a longer trajectory?"),
     "plot_train": Command(_zoo_plot("plot_train"), "draw the return of the training episodes"),
     "all_plots": Command(_zoo_plot("all_plots"), "draw and tabulate the evaluations of several runs"),
     "plot_from_file": Command(_zoo_plot("plot_from_file"), "draw what all_plots has saved"),

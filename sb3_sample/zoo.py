@@ -26,6 +26,7 @@ except ModuleNotFoundError as error:
     ) from error
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
 from sb3_sample.sac.regularized_sac import (
     CRITIC_REGULARIZATIONS,
@@ -133,6 +134,21 @@ OPL_SPACE: Space = {
     "one_minus_td_lambda": _float(0.01, 0.3, log=True),
 }
 VPL_SPACE: Space = {**GPL_SPACE, "validation_proportion": _float(1 / 128, 1 / 4, log=True)}
+#: PPO with simulated samples. The share of the training in which there are some is not searched: a trial is shorter
+#: than the training that its parameters are for.
+ON_POLICY_SPACE: Space = {
+    "learning_rate": _float(1e-5, 2e-3, log=True),
+    "one_minus_gamma": _float(1e-4, 0.03, log=True),
+    "one_minus_gae_lambda": _float(1e-3, 0.2, log=True),
+    "n_steps_pow": _int(9, 13),
+    "batch_size_pow": _int(5, 9),
+    "n_epochs": _int(3, 20),
+    "clip_range": _float(0.1, 0.4),
+    "n_simulated": _int(1, 16, log=True),
+}
+MBMA_SPACE: Space = {**ON_POLICY_SPACE, "simulation_horizon": _int(1, 24)}
+#: Its horizon lies above the number of simulated states.
+MBPO_SPACE: Space = {**ON_POLICY_SPACE, "n_simulated": _int(1, 11, log=True), "simulation_horizon": _int(12, 24)}
 #: What each setting of a regularization belongs to, by its argument: the group, the regularization, and the range.
 REGULARIZATION_SETTINGS: dict[str, tuple[str, str, Suggest]] = {
     "weight_decay": ("network_regularization", "weight_decay", _float(1e-5, 1e-1, log=True)),
@@ -233,8 +249,11 @@ ALGORITHMS: dict[str, ZooAlgorithm] = {
     "bro_td3": ZooAlgorithm(BROTD3, BRO_TD3_SPACE),
     "dac": ZooAlgorithm(DAC, DAC_SPACE),
     "gpl_sac": ZooAlgorithm(GPLSAC, GPL_SPACE),
+    "mbma_ppo": ZooAlgorithm(MBMAPPO, MBMA_SPACE),
+    "mbpo_ppo": ZooAlgorithm(MBPOPPO, MBPO_SPACE),
     "oac": ZooAlgorithm(OAC, OAC_SPACE),
     "opl_sac": ZooAlgorithm(OPLSAC, OPL_SPACE),
+    "qma_ppo": ZooAlgorithm(QMAPPO, ON_POLICY_SPACE),
     "regularized_sac": ZooAlgorithm(RegularizedSAC, REGULARIZED_SPACE, decode_regularized),
     "sac_sample": ZooAlgorithm(SAC, SAC_SPACE),
     "sr_sac": ZooAlgorithm(SRSAC, SR_SAC_SPACE),
@@ -262,8 +281,9 @@ def register() -> None:
 
 def _adapt_experiment_manager() -> None:
     """
-    Have the zoo's ``ExperimentManager`` take our hyperparameter files for our algorithms, and record successes in the
-    Monitor files of our environments that report them. The zoo has no option for either.
+    Have the zoo's ``ExperimentManager`` take our hyperparameter files for our algorithms, evaluate them in environments
+    with the ``env_kwargs`` of those files (the zoo does so with the command line's only), and record successes in the
+    Monitor files of our environments that report them. The zoo has no option for these.
     """
     # Not at the top: it imports custom_envs, and the custom_envs of this repository imports this module.
     module = importlib.import_module("rl_zoo3.exp_manager")
@@ -277,6 +297,7 @@ def _adapt_experiment_manager() -> None:
     manager._adapted_by_sb3_sample = True
     original_init = manager.__init__
     original_is_robotics_env = manager.is_robotics_env
+    original_read = manager.read_hyperparameters
     signature = inspect.signature(original_init)
 
     @functools.wraps(original_init)
@@ -292,9 +313,16 @@ def _adapt_experiment_manager() -> None:
                 )
         original_init(*given.args, **given.kwargs)
 
+    def read_hyperparameters(self: Any) -> Any:
+        hyperparams, saved = original_read(self)
+        if self.algo in ALGORITHMS and "env_kwargs" in hyperparams and self._eval_env_kwargs_args is None:
+            self.eval_env_kwargs = hyperparams["env_kwargs"]
+        return hyperparams, saved
+
     def is_robotics_env(env_id: str) -> bool:
         # The zoo asks this question only to decide whether Monitor records is_success.
         return env_id.startswith(SUCCESS_PREFIXES) or original_is_robotics_env(env_id)
 
     manager.__init__ = init
+    manager.read_hyperparameters = read_hyperparameters
     manager.is_robotics_env = staticmethod(is_robotics_env)

@@ -127,11 +127,38 @@ def test_every_algorithm_trains_in_two_environments_goes_on_and_is_shown(
     assert (second.num_transitions, second._n_updates) == (100, 80)
 
 
+#: What makes the models of P1's algorithms small.
+ON_POLICY = {
+    "mbma_ppo": "dynamics_kwargs:dict(width=8)",
+    "mbpo_ppo": "dynamics_kwargs:dict(width=8)",
+    "qma_ppo": "q_kwargs:dict(width=8)",
+}
+
+
+@pytest.mark.parametrize("name", ON_POLICY)
+def test_p1s_algorithms_train_in_two_environments_go_on_and_are_shown(
+    zoo_run, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    params = ["-params", "n_steps:16", "batch_size:8", "n_envs:2", "policy_kwargs:dict(net_arch=[8])", ON_POLICY[name]]
+    file = f"logs/{name}/Pendulum-v1_1/Pendulum-v1.zip"
+    zoo_run("train", "--algo", name, *SHORT, "-n", "64", *params)
+    zoo_run("train", "--algo", name, *SHORT, "-n", "32", "-i", file, *params)
+    zoo_run("enjoy", "--algo", name, "--env", "Pendulum-v1", "-f", "logs", "--no-render", "-n", "210")
+    assert "1 Episodes" in capsys.readouterr().out
+
+    from rl_zoo3 import ALGOS
+
+    first, second = (ALGOS[name].load(file.replace("_1/", f"_{run_id}/"), device="cpu") for run_id in "12")
+    assert second._n_updates > first._n_updates > 0
+    if name != "qma_ppo":
+        assert (first.transitions.size, second.transitions.size) == (64, 96)
+
+
 def test_every_algorithm_is_run() -> None:
     pytest.importorskip("rl_zoo3")
     from sb3_sample.zoo import ALGORITHMS
 
-    assert list(ALGORITHMS) == NAMES
+    assert list(ALGORITHMS) == sorted([*NAMES, *ON_POLICY])
 
 
 @pytest.mark.slow

@@ -24,7 +24,9 @@ from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import StoreDict
 
-from sb3_sample import BRO, DAC, SAC, BROFast, RegularizedSAC, zoo
+from sb3_sample import BRO, DAC, MBMAPPO, SAC, BROFast, RegularizedSAC, zoo
+from sb3_sample.envs import suites
+from sb3_sample.ppo import SimulatedPPO
 from sb3_sample.sac.bro import BRO_RESETS
 
 ROOT = Path(__file__).parent.parent
@@ -53,8 +55,12 @@ BUILT = [
     pytest.param(name, env_id, marks=() if name in SAMPLE or env_id == "default" else pytest.mark.slow)
     for name, env_id in ALL_ENTRIES
 ]
+#: Those of P1.
+ON_POLICY = sorted(name for name, entry in zoo.ALGORITHMS.items() if issubclass(entry.algorithm, SimulatedPPO))
 #: Algorithms with the settings that P2 to P4 share.
-FAMILY = sorted(name for name, entry in zoo.ALGORITHMS.items() if not issubclass(entry.algorithm, BRO))
+FAMILY = sorted(
+    name for name, entry in zoo.ALGORITHMS.items() if not issubclass(entry.algorithm, BRO) and name not in ON_POLICY
+)
 
 
 def arguments_of(name: str) -> dict[str, Any]:
@@ -68,6 +74,11 @@ def arguments_of(name: str) -> dict[str, Any]:
             named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
             arguments |= {name: p.default for name, p in parameters.items() if p.kind in named}
     return arguments
+
+
+def small_buffer(name: str) -> dict[str, Any]:
+    """What keeps a model's memory small."""
+    return {} if name in ON_POLICY else {"buffer_size": 1000}
 
 
 def manager(name: str, env_id: str, folder: Path, **kwargs: Any) -> ExperimentManager:
@@ -111,8 +122,10 @@ def test_successes_are_recorded_where_they_are_reported() -> None:
 # ---------------------------------------------------------------- search
 
 
-@pytest.mark.parametrize("name", zoo.ALGORITHMS)
-@pytest.mark.parametrize("additional_args", [NO_HER, HER], ids=["plain", "HER"])
+@pytest.mark.parametrize(
+    ("name", "additional_args"),
+    [(name, args) for name in zoo.ALGORITHMS for args in (NO_HER, HER) if args is NO_HER or name not in ON_POLICY],
+)
 def test_a_stored_trial_gives_the_arguments_it_was_run_with(name: str, additional_args: dict[str, Any]) -> None:
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     accepted = arguments_of(name)
@@ -152,11 +165,12 @@ def test_what_the_search_samples_builds_a_model(name: str) -> None:
     for _ in range(3):
         arguments = HYPERPARAMS_SAMPLER[name](study.ask(), 1, 1, dict(NO_HER))
         model: Any = zoo.ALGORITHMS[name].algorithm(
-            "MlpPolicy", "Pendulum-v1", buffer_size=10, device="cpu", **arguments
+            "MlpPolicy", "Pendulum-v1", device="cpu", **small_buffer(name), **arguments
         )  # type: ignore[call-arg]
         for argument in arguments.keys() - {"learning_rate"}:
             if name != "regularized_sac" or arguments[argument] is not None:
-                assert getattr(model, argument) == arguments[argument]
+                value = getattr(model, argument)
+                assert (value(1) if argument == "clip_range" else value) == arguments[argument]
 
 
 def test_regularizations_are_mixed_and_only_the_chosen_have_settings() -> None:
@@ -218,14 +232,16 @@ def test_an_entry_builds_a_model(name: str, env_id: str, tmp_path: Path) -> None
         pytest.importorskip("gymnasium_robotics")
     elif env_id.endswith("-v5"):
         pytest.importorskip("mujoco")
+    elif env_id.startswith("dmc/"):
+        pytest.importorskip("dm_control")
     # Any task without an entry has the default.
     env_id = "MountainCarContinuous-v0" if env_id == "default" else env_id
-    experiment = manager(name, env_id, tmp_path, hyperparams={"buffer_size": 1000})
+    experiment = manager(name, env_id, tmp_path, hyperparams=small_buffer(name))
     result = experiment.setup_experiment()
     assert result is not None
-    model, _ = result
+    model: Any = result[0]
     assert type(model) is zoo.ALGORITHMS[name].algorithm
-    assert experiment.n_timesteps > model.learning_starts  # type: ignore[attr-defined]
+    assert experiment.n_timesteps > (model.n_steps if name in ON_POLICY else model.learning_starts)
     assert model.env is not None
     model.env.close()
 
@@ -239,6 +255,63 @@ def test_the_files_of_the_family_differ_in_nothing_but_what_they_say(name: str) 
     if name == "vpl_sac":
         shared = {env_id: entry for env_id, entry in shared.items() if not env_id.startswith("Fetch")}
     assert ours == shared
+
+
+@pytest.mark.parametrize("name", ON_POLICY)
+def test_the_tasks_of_p1_have_entries_with_its_settings(name: str) -> None:
+    ours = entries(name)
+    for env_id in suites.MBMA + suites.MBMA_HARD:
+        assert ours[env_id]["env_kwargs"] == {"action_repeat": 4}
+    steps = {env_id: 4 * ours[env_id]["n_timesteps"] for env_id in suites.MBMA + suites.MBMA_HARD}
+    assert {steps[env_id] for env_id in suites.MBMA} == {1e6}
+    assert [steps[env_id] for env_id in suites.MBMA_HARD] == [3e6, 3e6, 6e6, 6e6]
+    for env_id in suites.MBMA_HARD:
+        assert (ours[env_id]["n_steps"], ours[env_id]["batch_size"]) == (4096, 128)
+        if name != "qma_ppo":
+            assert ours[env_id]["dynamics_buffer_size"] == 2_000_000 and ours[env_id]["dynamics_batch_size"] == 256
+
+
+@pytest.mark.parametrize("name", ON_POLICY)
+def test_the_commands_in_the_files_of_p1(name: str, tmp_path: Path) -> None:
+    pytest.importorskip("dm_control")
+    head = (zoo.HYPERPARAMS / f"{name}.yml").read_text().partition("default:")[0]
+    parser = argparse.ArgumentParser()
+    for option in ("--algo", "--env", "--eval-freq"):
+        parser.add_argument(option)
+    parser.add_argument("-params", nargs="+", action=StoreDict, default={})
+    found = []
+    for command in re.findall(r"sb3-sample train (.*)", head):
+        given = parser.parse_args(shlex.split(command))
+        assert given.algo == name
+        result = manager(name, given.env, tmp_path, hyperparams=given.params).setup_experiment()
+        assert result is not None
+        model: Any = result[0]
+        found.append((model.n_simulated, model.anneal_until))
+    assert found == [(8, None), (8, 0.15)]
+
+
+def test_action_repeat_of_the_file_holds_for_evaluation_too(tmp_path: Path) -> None:
+    pytest.importorskip("dm_control")
+    small = {"policy_kwargs": {"net_arch": [8]}, "dynamics_kwargs": {"width": 8}}
+    experiment = manager("mbma_ppo", "dmc/cartpole-swingup-v0", tmp_path, hyperparams=small)
+    result = experiment.setup_experiment()
+    assert result is not None
+    model: Any = result[0]
+    assert isinstance(model, MBMAPPO) and model.predict_termination is False
+    for env in (model.env, experiment.create_envs(1, eval_env=True)):
+        assert env.get_attr("action_repeat") == [4]
+    given = manager(
+        "mbma_ppo", "dmc/cartpole-swingup-v0", tmp_path, hyperparams=small, eval_env_kwargs={"action_repeat": 2}
+    )
+    given.setup_experiment()
+    assert given.create_envs(1, eval_env=True).get_attr("action_repeat") == [2]
+
+
+def test_the_search_space_of_mbpo_keeps_its_horizon_above_its_states() -> None:
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    for _ in range(50):
+        arguments = HYPERPARAMS_SAMPLER["mbpo_ppo"](study.ask(), 1, 1, dict(NO_HER))
+        assert arguments["simulation_horizon"] > arguments["n_simulated"]
 
 
 #: The two commands at the head of each file: replay ratio and resets of the model.

@@ -53,6 +53,8 @@ class DMCEnv(gym.Env[np.ndarray, np.ndarray]):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}
+    #: Says that episodes end by their time limit alone, so that a model of the environment need not predict their end.
+    never_terminates = True
 
     def __init__(
         self,

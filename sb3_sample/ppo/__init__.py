@@ -1,0 +1,8 @@
+"""The on-policy family: PPO whose policy gradient also sees simulated samples (P1)."""
+
+from sb3_sample.ppo.mbma import MBMAPPO
+from sb3_sample.ppo.mbpo import MBPOPPO
+from sb3_sample.ppo.qma import QMAPPO
+from sb3_sample.ppo.simulated_ppo import Rollout, SimulatedPPO, SimulatedSamples
+
+__all__ = ["MBMAPPO", "MBPOPPO", "QMAPPO", "Rollout", "SimulatedPPO", "SimulatedSamples"]

@@ -1,0 +1,317 @@
+"""The learned model of the environment: a transition and a reward network (P1, appendix E), and their transitions."""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from sb3_sample.networks.initialization import linear
+from sb3_sample.networks.mlp import MLP
+from sb3_sample.optim import AdamW
+
+#: Epsilon of Adam for every network of P1.
+ADAM_EPS = 1e-5
+
+
+class Transitions(NamedTuple):
+    """
+    Transitions, as arrays in the buffer and as tensors in a batch.
+
+    :param observations: (B, O)
+    :param actions: as the models see them, (B, D)
+    :param next_observations: (B, O), of the same episode: the last one of an episode is not the next one's first
+    :param rewards: (B,)
+    :param terminations: (B,), 1 where the episode terminated; a time limit is 0
+    """
+
+    observations: Any
+    actions: Any
+    next_observations: Any
+    rewards: Any
+    terminations: Any
+
+
+class TransitionBuffer:
+    """
+    The most recent transitions of all environments, in arrays that are filled round and round.
+
+    :param capacity: transitions kept
+    :param observation_size: O
+    :param action_size: D
+    """
+
+    def __init__(self, capacity: int, observation_size: int, action_size: int):
+        self.capacity = capacity
+        self.data = Transitions(
+            np.zeros((capacity, observation_size), np.float32),
+            np.zeros((capacity, action_size), np.float32),
+            np.zeros((capacity, observation_size), np.float32),
+            np.zeros(capacity, np.float32),
+            np.zeros(capacity, np.float32),
+        )
+        self.size = 0
+        self._next = 0
+
+    def add(self, new: Transitions) -> None:
+        """
+        :param new: transitions, oldest first; of more than the capacity the most recent stay
+        """
+        n = min(len(new.rewards), self.capacity)
+        rows = (self._next + np.arange(n)) % self.capacity
+        for kept, values in zip(self.data, new, strict=True):
+            kept[rows] = values[len(values) - n :]
+        self._next = int((self._next + n) % self.capacity)
+        self.size = min(self.size + n, self.capacity)
+
+    def _by_age(self, newest: int) -> np.ndarray:
+        """Rows of the most recent transitions, oldest of them first."""
+        return (self._next - newest + np.arange(newest)) % self.capacity
+
+    def recent(self, n: int) -> Transitions:
+        """
+        :param n: how many
+        :return: the most recent transitions, fewer if there are not so many
+        """
+        return self.take(self._by_age(min(n, self.size)))
+
+    def sample(self, n: int) -> Transitions:
+        """
+        :param n: how many
+        :return: transitions drawn uniformly with replacement, by NumPy's global generator
+        """
+        return self.take(np.random.randint(self.size, size=n))  # noqa: NPY002  # Stable-Baselines3 seeds this one
+
+    def take(self, rows: np.ndarray) -> Transitions:
+        """
+        :param rows: rows of the arrays
+        :return: copies of these transitions
+        """
+        return Transitions(*(kept[rows] for kept in self.data))
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """
+        :return: the transitions by name, oldest first
+        """
+        kept = self.take(self._by_age(self.size))
+        return {name: torch.from_numpy(values) for name, values in kept._asdict().items()}
+
+    def load_state_dict(self, state: Mapping[str, torch.Tensor], strict: bool = True) -> None:
+        """
+        :param state: transitions as ``state_dict`` gives them; of more than the capacity the most recent are taken
+        :param strict: there for Stable-Baselines3, which passes it
+        """
+        self.size = self._next = 0
+        self.add(Transitions(*(state[name].cpu().numpy() for name in Transitions._fields)))
+
+
+class Standardizer(nn.Module):
+    """
+    Shifts and scales numbers by the mean and standard deviation of what it was fitted to; at first it does nothing.
+
+    :param size: length of the vectors
+    """
+
+    mean: torch.Tensor
+    std: torch.Tensor
+
+    def __init__(self, size: int):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("std", torch.ones(size))
+
+    def fit(self, x: torch.Tensor) -> None:
+        """
+        :param x: (B, size)
+        """
+        self.mean.copy_(x.mean(dim=0))
+        std = x.std(dim=0, correction=0)
+        # What never changes is only shifted.
+        self.std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """
+        :param x: (..., size)
+        :return: (..., size)
+        """
+        return (x - self.mean) / self.std
+
+    def inverse(self, x: torch.Tensor) -> torch.Tensor:
+        """
+        :param x: what ``forward`` gave, (..., size)
+        :return: what ``forward`` got, (..., size)
+        """
+        return torch.addcmul(self.mean, x, self.std)
+
+
+class Prediction(NamedTuple):
+    """
+    What a model says of one step.
+
+    :param next_observations: (B, O)
+    :param rewards: (B,)
+    :param continues: probability that the episode does not terminate here, (B,); None if no episode terminates
+    """
+
+    next_observations: torch.Tensor
+    rewards: torch.Tensor
+    continues: torch.Tensor | None
+
+
+class Dynamics(nn.Module):
+    """
+    The model of P1, appendix E: "Transition model inputs concatenated state-action and outputs a state vector [...]
+    trained using MSE loss function with future state used as a target", and likewise the reward model. Two networks
+    without shared layers, hidden layers with ReLU.
+
+    :param observation_size: O
+    :param action_size: D
+    :param width: width of the hidden layers of both networks (P1: 1024)
+    :param depth: hidden layers of both networks (P1: 2)
+    :param learning_rate: of Adam, whose epsilon is 1e-5
+    :param normalize: whether observations and rewards are shifted and scaled by the mean and standard deviation of the
+        transitions that the model is trained on, at the input and in the errors. P1 does not say that it does; without
+        it, entries of large numbers are learned at the cost of all others
+    :param terminations: whether a second output of the reward network predicts that the episode terminates, by its
+        cross-entropy
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        width: int = 1024,
+        depth: int = 2,
+        learning_rate: float = 3e-4,
+        normalize: bool = True,
+        terminations: bool = False,
+    ):
+        super().__init__()
+        self.normalize, self.terminations = normalize, terminations
+        n_inputs = observation_size + action_size
+        trunks = [MLP(n_inputs, [width] * depth) for _ in range(2)]
+        n_outputs = (observation_size, 2 if terminations else 1)
+        heads = [linear(t.out_features, n, None, gain=1) for t, n in zip(trunks, n_outputs, strict=True)]
+        self.transition = nn.Sequential(trunks[0], heads[0])
+        self.reward = nn.Sequential(trunks[1], heads[1])
+        self.observation_scale = Standardizer(observation_size)
+        self.reward_scale = Standardizer(1)
+        self.optimizer = AdamW(self.parameters(), lr=learning_rate, eps=ADAM_EPS)
+
+    def forward(self, observations: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        :param observations: (B, O)
+        :param actions: (B, D)
+        :return: outputs of the transition network, (B, O), and of the reward network, (B, 1) or (B, 2), in the units
+            of the errors
+        """
+        x = self.observation_scale(observations) if self.normalize else observations
+        x = torch.cat([x, actions], dim=1)
+        return self.transition(x), self.reward(x)
+
+    def predict(self, observations: torch.Tensor, actions: torch.Tensor) -> Prediction:
+        """
+        :param observations: (B, O)
+        :param actions: (B, D)
+        :return: the next observations, rewards, and probabilities of going on
+        """
+        next_observations, outputs = self(observations, actions)
+        rewards = outputs[:, :1]
+        if self.normalize:
+            next_observations = self.observation_scale.inverse(next_observations)
+            rewards = self.reward_scale.inverse(rewards)
+        continues = torch.sigmoid(-outputs[:, 1]) if self.terminations else None
+        return Prediction(next_observations, rewards[:, 0], continues)
+
+    def losses(self, batch: Transitions) -> dict[str, torch.Tensor]:
+        """
+        :param batch: transitions, as tensors
+        :return: mean squared errors of observation and reward, and the cross-entropy of termination, scalars by name
+        """
+        next_observations, outputs = self(batch.observations, batch.actions)
+        target, reward_target = batch.next_observations, batch.rewards[:, None]
+        if self.normalize:
+            target, reward_target = self.observation_scale(target), self.reward_scale(reward_target)
+        losses = {
+            "transition_loss": F.mse_loss(next_observations, target),
+            "reward_loss": F.mse_loss(outputs[:, :1], reward_target),
+        }
+        if self.terminations:
+            losses["termination_loss"] = F.binary_cross_entropy_with_logits(outputs[:, 1], batch.terminations)
+        return losses
+
+    def fit(self, transitions: Transitions, batch_size: int) -> dict[str, torch.Tensor]:
+        """
+        One step of Adam for each batch, in the given order.
+
+        :param transitions: transitions, as tensors
+        :param batch_size: transitions a step
+        :return: losses before each step, their mean, by name
+        """
+        if self.normalize:
+            self.observation_scale.fit(transitions.observations)
+            self.reward_scale.fit(transitions.rewards[:, None])
+        batches = minibatches(transitions, batch_size)
+        return fit(self, self.optimizer, (self.losses(Transitions(*batch)) for batch in batches))
+
+
+def fit(
+    module: nn.Module, optimizer: torch.optim.Optimizer, steps: Iterator[dict[str, torch.Tensor]]
+) -> dict[str, torch.Tensor]:
+    """
+    Minimise the sum of the losses, one step of the optimizer for each element.
+
+    :param module: what is trained
+    :param optimizer: of its parameters
+    :param steps: computes the next batch's losses by name when it is asked for them
+    :return: the means of the losses, by name
+    """
+    parameters = list(module.parameters())
+    sums: dict[str, torch.Tensor] = {}
+    n_steps = 0
+    for losses in steps:
+        gradients = torch.autograd.grad(torch.stack(list(losses.values())).sum(), parameters)
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        optimizer.step()
+        n_steps += 1
+        for name, loss in losses.items():
+            sums[name] = sums[name] + loss.detach() if name in sums else loss.detach()
+    return {name: total / n_steps for name, total in sums.items()}
+
+
+def minibatches(tensors: Any, batch_size: int) -> Iterator[tuple[torch.Tensor, ...]]:
+    """
+    :param tensors: contiguous tensors of the same length
+    :param batch_size: rows a batch; the last one may have fewer
+    :return: slices of them, without a copy
+    """
+    for first in range(0, len(tensors[0]), batch_size):
+        yield tuple(tensor[first : first + batch_size] for tensor in tensors)
+
+
+def check_network_kwargs(name: str, kwargs: dict[str, Any], allowed: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param name: name of the argument
+    :param kwargs: its value: width, depth, learning rate, epochs, and switches
+    :param allowed: what it may hold, with the defaults
+    :return: the value with the defaults filled in
+    :raises ValueError: if there is something else in it, or a value is out of range
+    """
+    for key, value in kwargs.items():
+        if key not in allowed:
+            raise ValueError(f"{name} has {key!r}, but takes {list(allowed)}")
+        if isinstance(allowed[key], bool):
+            if not isinstance(value, bool):
+                raise ValueError(f"{name}[{key!r}] must be True or False, not {value!r}")
+        elif key == "learning_rate":
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < math.inf:
+                raise ValueError(f"{name}['learning_rate'] must be at least 0 and finite, not {value!r}")
+        elif not (key == "epochs" and value is None) and (
+            isinstance(value, bool) or not isinstance(value, int) or value < 1
+        ):
+            raise ValueError(f"{name}[{key!r}] must be an integer of at least 1, not {value!r}")
+    return {**allowed, **kwargs}

@@ -1,0 +1,52 @@
+"""MBMA: extra actions at the real states, their Q-values from rollouts of a learned model."""
+
+import torch
+
+from sb3_sample.ppo.model_based import ModelBasedPPO
+from sb3_sample.ppo.simulated_ppo import SimulatedSamples
+
+
+class MBMAPPO(ModelBasedPPO):
+    """
+    Model-based many-actions PPO (P1, Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011, section 4 and
+    appendix E): PPO with ``n_simulated`` extra actions at each real state. Their Q-values are TD(lambda) returns of
+    rollouts of a learned model under the policy, ``simulation_horizon`` steps long and bootstrapped with the critic.
+
+    Defaults are those of P1, appendix B.2. They differ from ``stable_baselines3.PPO`` in the networks (512 and 1024
+    instead of 64) and in that advantages are not normalised.
+
+    :param policy: "MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes
+    :param env: the environment, an id, or a vectorised environment
+    :param learning_rate: of actor and critic; a number or a function of the remaining progress (from 1 to 0)
+    :param n_simulated: X, extra actions at each real state; 0 for PPO. Actions of a Discrete space are not drawn but
+        all taken, weighted as X draws count in expectation
+    :param anneal_until: share of the training from which on nothing is simulated any more; None for no decline
+    :param warm_up_until: share of the training over which X rises from 0; None: 0.15, or 0 if ``anneal_until`` is
+        given. Both in full: :class:`SimulatedPPO`
+    :param simulation_horizon: H, steps of a rollout of the model
+    :param dynamics_buffer_size: transitions that the model learns from
+    :param dynamics_batch_size: transitions in a batch of the model
+    :param dynamics_kwargs: ``width``, ``depth``, ``learning_rate``, ``epochs``, ``normalize``: :class:`ModelBasedPPO`
+    :param predict_termination: whether the model predicts that episodes terminate; None: not for ``dmc/`` tasks
+    :param args: the other arguments of ``stable_baselines3.PPO`` in its order
+    :param kwargs: every other argument of :class:`ModelBasedPPO` and :class:`SimulatedPPO`, by name
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    def _simulate(
+        self, observations: torch.Tensor, values: torch.Tensor, n_simulated: int, noise: torch.Tensor | None
+    ) -> SimulatedSamples:
+        """Noise: (H, N, X, A), the first of the extra actions, the others of the actions in the rollouts."""
+        actions, log_probs, weights = self._many_actions(observations, n_simulated, None if noise is None else noise[0])
+        n_columns = actions.shape[1]
+        flat_actions = actions.flatten(0, 1)
+        later = None if noise is None else noise[1:].flatten(1, 2)
+        returns = []
+        rows = torch.arange(len(flat_actions), device=actions.device)
+        for piece in rows.split(self._rows_at_once()):
+            piece_noise = None if later is None else later[:, piece]
+            starts = observations[torch.div(piece, n_columns, rounding_mode="floor")]
+            returns.append(self.roll_out(starts, flat_actions[piece], piece_noise).q_values[0])
+        q_values = torch.cat(returns).view(-1, n_columns)
+        self._check_finite(q_values)
+        return SimulatedSamples(None, actions, log_probs, q_values, q_values - values[:, None], weights)

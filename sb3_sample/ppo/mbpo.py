@@ -1,0 +1,72 @@
+"""MBPO: rollouts of a learned model that branch from real states, and the policy gradient at the simulated states."""
+
+import torch
+
+from sb3_sample.ppo.model_based import ModelBasedPPO, draw
+from sb3_sample.ppo.simulated_ppo import SimulatedSamples
+
+
+class MBPOPPO(ModelBasedPPO):
+    """
+    PPO with simulated states, the rival of :class:`MBMAPPO` (P1, section 5.1; MBPO by Janner et al. 2019): from each
+    real state the learned model is rolled for ``simulation_horizon`` steps under the policy, and the policy gradient
+    is also taken at its first ``n_simulated`` states, which makes the trajectory ``n_simulated`` + 1 times as long.
+
+    P1 has 8 states and a horizon of 12. Read here: a rollout begins with a fresh action of the policy at the real
+    state; simulated states 1 to X are the samples, each with the TD(lambda) return from it to the end of the rollout,
+    where the critic's value stands. So ``simulation_horizon`` must be above ``n_simulated``. With
+    ``predict_termination`` a sample counts as much as the rollout is likely to have come so far.
+
+    :param policy: "MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes
+    :param env: the environment, an id, or a vectorised environment
+    :param learning_rate: of actor and critic; a number or a function of the remaining progress (from 1 to 0)
+    :param n_simulated: X, simulated states for each real one; 0 for PPO
+    :param anneal_until: share of the training from which on nothing is simulated any more; None for no decline
+    :param warm_up_until: share of the training over which X rises from 0; None: 0.15, or 0 if ``anneal_until`` is
+        given. Both in full: :class:`SimulatedPPO`
+    :param simulation_horizon: H, steps of a rollout of the model, above X
+    :param dynamics_buffer_size: transitions that the model learns from
+    :param dynamics_batch_size: transitions in a batch of the model
+    :param dynamics_kwargs: ``width``, ``depth``, ``learning_rate``, ``epochs``, ``normalize``: :class:`ModelBasedPPO`
+    :param predict_termination: whether the model predicts that episodes terminate; None: not for ``dmc/`` tasks
+    :param args: the other arguments of ``stable_baselines3.PPO`` in its order
+    :param kwargs: every other argument of :class:`ModelBasedPPO` and :class:`SimulatedPPO`, by name
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        self._check_horizon(self.n_simulated)
+
+    def _check_horizon(self, n_simulated: int) -> None:
+        if self.simulation_horizon <= n_simulated:
+            raise ValueError(
+                f"simulation_horizon must be above n_simulated={n_simulated}, so that the last simulated state has a "
+                f"return, not {self.simulation_horizon}"
+            )
+
+    def _simulate(
+        self, observations: torch.Tensor, values: torch.Tensor, n_simulated: int, noise: torch.Tensor | None
+    ) -> SimulatedSamples:
+        """Noise: (H, N, A), of the actions in the rollouts."""
+        self._check_horizon(n_simulated)
+        pieces, ends = [], False
+        for piece in torch.arange(len(observations), device=observations.device).split(self._rows_at_once()):
+            starts = observations[piece]
+            first = draw(self.distribution_at(starts), None if noise is None else noise[0, piece])
+            later = None if noise is None else noise[1:, piece]
+            rolled = self.roll_out(starts, first, later, n_kept=n_simulated)
+            q_values = rolled.q_values[1 : n_simulated + 1]
+            advantages = q_values - rolled.values[:n_simulated]
+            # Without terminations every state is reached.
+            reached = torch.ones_like(q_values)
+            if rolled.continues is not None:
+                reached = rolled.continues[:n_simulated].cumprod(dim=0)
+            ends = rolled.continues is not None
+            assert rolled.observations is not None and rolled.actions is not None and rolled.log_probs is not None
+            columns = (rolled.observations, rolled.actions, rolled.log_probs, q_values, advantages, reached)
+            pieces.append([column.transpose(0, 1) for column in columns])
+        joined = [torch.cat(column) for column in zip(*pieces, strict=True)]
+        self._check_finite(joined[3])
+        samples = SimulatedSamples(*joined)
+        return samples if ends else samples._replace(weights=None)

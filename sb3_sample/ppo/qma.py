@@ -1,0 +1,155 @@
+"""QMA: extra actions at the real states, their Q-values from two Q-networks."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from torch import nn
+
+from sb3_sample.networks.initialization import linear
+from sb3_sample.networks.mlp import MLP
+from sb3_sample.optim import AdamW
+from sb3_sample.ppo.dynamics import ADAM_EPS, Standardizer, check_network_kwargs, fit, minibatches
+from sb3_sample.ppo.simulated_ppo import SimulatedPPO, SimulatedSamples
+
+#: What ``q_kwargs`` may hold, with the defaults (P1, appendix B.2; ``normalize`` is decided here).
+Q_DEFAULTS: dict[str, Any] = {"width": 1024, "depth": 2, "learning_rate": 3e-4, "epochs": None, "normalize": True}
+
+
+class QNetworks(nn.Module):
+    """
+    Two Q-networks, as copies along a leading axis, hidden layers with ReLU.
+
+    :param observation_size: O
+    :param action_size: D
+    :param width: width of the hidden layers (P1: 1024)
+    :param depth: hidden layers (P1: 2)
+    :param learning_rate: of Adam, whose epsilon is 1e-5
+    :param normalize: whether observations are standardised by those that the networks are trained on
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        width: int = 1024,
+        depth: int = 2,
+        learning_rate: float = 3e-4,
+        normalize: bool = True,
+    ):
+        super().__init__()
+        self.normalize = normalize
+        trunk = MLP(observation_size + action_size, [width] * depth, n_copies=2)
+        self.networks = nn.Sequential(trunk, linear(trunk.out_features, 1, 2, gain=1))
+        self.observation_scale = Standardizer(observation_size)
+        self.optimizer = AdamW(self.parameters(), lr=learning_rate, eps=ADAM_EPS)
+
+    def forward(self, observations: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """
+        :param observations: (B, O)
+        :param actions: (B, D)
+        :return: Q-values of both networks, (2, B)
+        """
+        x = self.observation_scale(observations) if self.normalize else observations
+        return self.networks(torch.cat([x, actions], dim=1)).squeeze(2)
+
+    def loss(self, observations: torch.Tensor, actions: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
+        """
+        :param observations: (B, O)
+        :param actions: (B, D)
+        :param targets: TD(lambda) returns, (B,)
+        :return: mean squared error, summed over the networks, scalar
+        """
+        return (self(observations, actions) - targets).square().mean(dim=1).sum()
+
+
+class QMAPPO(SimulatedPPO):
+    """
+    PPO with many actions by Q-networks, the rival of :class:`MBMAPPO` (P1, section 5.1; Asadi et al. 2017, Petit et al.
+    2019): ``n_simulated`` extra actions at each real state, their Q-values the smaller of two Q-networks' that are
+    trained on the TD(lambda) returns of each rollout before the policy, by PPO's minibatches and epochs.
+
+    :param policy: "MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes
+    :param env: the environment, an id, or a vectorised environment
+    :param learning_rate: of actor and critic; a number or a function of the remaining progress (from 1 to 0)
+    :param n_simulated: X, extra actions at each real state; 0 for PPO. Actions of a Discrete space are not drawn but
+        all taken, weighted as X draws count in expectation
+    :param anneal_until: share of the training from which on nothing is simulated any more; None for no decline
+    :param warm_up_until: share of the training over which X rises from 0; None: 0.15, or 0 if ``anneal_until`` is
+        given. Both in full: :class:`SimulatedPPO`
+    :param q_kwargs: the Q-networks: ``width`` (1024) and ``depth`` (2) of the hidden layers, ``learning_rate`` (3e-4),
+        ``epochs`` over each rollout (None: ``n_epochs``), and ``normalize`` (True): whether observations are
+        standardised by the rollout
+    :param args: the other arguments of ``stable_baselines3.PPO`` in its order
+    :param kwargs: every other argument of :class:`SimulatedPPO`, by name
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    simulation_arguments: ClassVar[tuple[str, ...]] = (*SimulatedPPO.simulation_arguments, "q_kwargs")
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        *args: Any,
+        q_kwargs: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ):
+        self.q_kwargs = q_kwargs
+        super().__init__(policy, env, learning_rate, *args, **kwargs)
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_network_kwargs("q_kwargs", self.q_kwargs or {}, Q_DEFAULTS)
+
+    def _setup_models(self) -> None:
+        self._network_kwargs = check_network_kwargs("q_kwargs", self.q_kwargs or {}, Q_DEFAULTS)
+        network = {name: value for name, value in self._network_kwargs.items() if name != "epochs"}
+        #: The Q-networks.
+        self.q_networks = QNetworks(self.flat_observations.size, self.model_actions.size, **network).to(self.device)
+
+    def _model_names(self) -> list[str]:
+        return ["q_networks", "q_networks.optimizer"]
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_network_kwargs"]
+
+    def fit_models(self) -> None:
+        """
+        Train the Q-networks on the TD(lambda) returns of the present rollout, and log their loss: before the training,
+        on samples that they have not seen (``dynamics/heldout_q_loss``), and during it (``dynamics/train_q_loss``).
+        """
+        rollout = self.current_rollout()
+        columns = rollout.observations, self.model_actions(rollout.actions), rollout.returns
+        with torch.no_grad():
+            self.logger.record("dynamics/heldout_q_loss", self.q_networks.loss(*columns).item())
+        if self.q_networks.normalize:
+            self.q_networks.observation_scale.fit(rollout.observations)
+
+        def losses() -> Any:
+            for _ in range(self._network_kwargs["epochs"] or self.n_epochs):
+                order = torch.as_tensor(np.random.permutation(len(columns[0])), device=self.device)  # noqa: NPY002
+                for batch in minibatches([column[order] for column in columns], self.batch_size):
+                    yield {"q_loss": self.q_networks.loss(*batch)}
+
+        for name, loss in fit(self.q_networks, self.q_networks.optimizer, losses()).items():
+            self.logger.record(f"dynamics/train_{name}", loss.item())
+
+    def _simulate(
+        self, observations: torch.Tensor, values: torch.Tensor, n_simulated: int, noise: torch.Tensor | None
+    ) -> SimulatedSamples:
+        """Noise: (N, X, A), of the extra actions."""
+        actions, log_probs, weights = self._many_actions(observations, n_simulated, noise)
+        n_columns = actions.shape[1]
+        model_actions = self.model_actions(actions.flatten(0, 1))
+        rows = torch.arange(len(model_actions), device=actions.device)
+        smaller = [
+            self.q_networks(observations[torch.div(piece, n_columns, rounding_mode="floor")], model_actions[piece])
+            .amin(dim=0)
+            for piece in rows.split(4096)
+        ]  # fmt: skip
+        q_values = torch.cat(smaller).view(-1, n_columns)
+        return SimulatedSamples(None, actions, log_probs, q_values, q_values - values[:, None], weights)

@@ -1,0 +1,774 @@
+"""
+The on-policy family: PPO whose policy gradient also sees simulated samples, and the one class that carries the work.
+
+``SimulatedPPO.train`` is the whole iteration after the rollout, in the order of P1, algorithm 1. Where the extra
+samples come from is the business of its subclasses, in ``fit_models`` and ``_simulate``.
+"""
+
+import inspect
+import io
+import math
+import pathlib
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.distributions import CategoricalDistribution, DiagGaussianDistribution, Distribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.save_util import recursive_getattr
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import explained_variance
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_sample.envs.finite_check import FiniteCheck
+from sb3_sample.ppo.dynamics import minibatches
+from sb3_sample.ppo.spaces import FlatObservations, ModelActions
+
+Self = TypeVar("Self", bound="SimulatedPPO")
+
+#: Hidden widths of actor and critic (P1, appendix B.2), of the policies that are given by these names.
+NET_ARCH: dict[str, list[int]] = {"pi": [512, 512], "vf": [1024, 1024]}
+#: Share of the training over which the number of samples rises (P1, section 5.1).
+WARM_UP = 0.15
+NAMED_POLICIES = ("MlpPolicy", "MultiInputPolicy")
+
+
+class Rollout(NamedTuple):
+    """
+    The real samples of an iteration. N is their number, steps times environments.
+
+    :param observations: (N, O)
+    :param actions: the policy's, (N, A), or (N,) integers of a Discrete space
+    :param log_probs: of the actions under the policy that took them, (N,)
+    :param values: the critic's of the observations, before the update, (N,)
+    :param advantages: by GAE(lambda), (N,)
+    :param returns: TD(lambda), (N,)
+    """
+
+    observations: torch.Tensor
+    actions: torch.Tensor
+    log_probs: torch.Tensor
+    values: torch.Tensor
+    advantages: torch.Tensor
+    returns: torch.Tensor
+
+
+class SimulatedSamples(NamedTuple):
+    """
+    Samples of the policy that no environment has seen: X for each of N real observations.
+
+    :param observations: the simulated states, (N, X, O); None if the actions are for the N real observations
+    :param actions: the policy's, (N, X, A), or (N, X) integers of a Discrete space
+    :param log_probs: of the actions under the policy that drew them, (N, X)
+    :param q_values: estimates of Q(s, a), (N, X)
+    :param advantages: q_values minus the critic's values of the states, (N, X)
+    :param weights: how much each sample counts, a real one counting 1, (N, X); None if each counts 1
+    """
+
+    observations: torch.Tensor | None
+    actions: torch.Tensor
+    log_probs: torch.Tensor
+    q_values: torch.Tensor
+    advantages: torch.Tensor
+    weights: torch.Tensor | None = None
+
+
+class SimulatedPPO(PPO):
+    """
+    PPO whose policy loss also sees simulated samples (P1, Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011,
+    algorithm 1): what :class:`MBMAPPO`, :class:`QMAPPO` and :class:`MBPOPPO` share. The critic learns from the real
+    samples alone.
+
+    The number of updates is PPO's: each takes ``batch_size`` real samples with the simulated ones that belong to them
+    for the policy, and the real ones for the value. Without simulated samples it *is* Stable-Baselines3's PPO.
+
+    :param policy: "MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes
+    :param env: the environment, an id, or a vectorised environment
+    :param learning_rate: of actor and critic; a number or a function of the remaining progress (from 1 to 0)
+    :param n_steps: T, steps of each environment between two updates
+    :param batch_size: real samples a minibatch
+    :param n_epochs: passes over the rollout
+    :param gamma: discount factor, of real and simulated returns
+    :param gae_lambda: lambda of GAE and of the simulated TD(lambda) returns
+    :param clip_range: PPO's clipping of the probability ratio, of real and simulated samples; also a schedule
+    :param clip_range_vf: clipping of the value's change; None for none
+    :param normalize_advantage: whether advantages are normalised, in each minibatch, real and simulated samples
+        together. P1, section 5.1, does not, since "it has no grounding in SPG theory"
+    :param ent_coef: weight of the entropy at the real states
+    :param vf_coef: weight of the value loss
+    :param max_grad_norm: of the gradient of actor and critic together
+    :param use_sde: refused with simulated actions, since actions at one state share their noise
+    :param sde_sample_freq: as in Stable-Baselines3
+    :param rollout_buffer_class: as in Stable-Baselines3
+    :param rollout_buffer_kwargs: as in Stable-Baselines3
+    :param target_kl: the updates of an iteration end above 1.5 times this divergence, taken over all samples of the
+        policy loss; None for no limit
+    :param stats_window_size: episodes over which the logged return is averaged
+    :param tensorboard_log: folder of the TensorBoard log; none if None
+    :param policy_kwargs: arguments of the policy. Without ``net_arch``, "MlpPolicy" and "MultiInputPolicy" have P1's
+        two hidden layers of 512 (actor) and 1024 (critic)
+    :param verbose: 0 nothing, 1 info, 2 debug
+    :param seed: seed of everything random
+    :param device: "auto", "cpu", "cuda", ...
+    :param _init_setup_model: whether to build the networks at once
+    :param n_simulated: X, simulated samples for each real one, at the height of the schedule below; 0 for PPO. With
+        a Discrete space: see ``simulate``
+    :param anneal_until: share of the training, of ``total_timesteps``, from which on nothing is simulated any more: at
+        an iteration whose rollout began at the share p of the training, X = ceil(``n_simulated`` (1 - p /
+        ``anneal_until``)). None: X does not decline. A second ``learn`` counts anew, or goes on with
+        ``reset_num_timesteps=False``
+    :param warm_up_until: share of the training over which X rises linearly from 0 to ``n_simulated`` while the models
+        learn, rounded up too; 0 for no rise. None: 0.15, or 0 if ``anneal_until`` is given. With both, the two factors
+        are multiplied. P1, section 5.1: "We anneal the number of additional samples until 15% step of the training for
+        all methods". The default reads it as a rise that ends at 15%; ``anneal_until=0.15`` is the other reading, a
+        decline to none that ends there, with which nothing is left of the gain over PPO (docs/many_actions.md)
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    #: Arguments that mean nothing without simulated samples.
+    simulation_arguments: ClassVar[tuple[str, ...]] = ("anneal_until", "warm_up_until")
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        n_steps: int = 2048,
+        batch_size: int = 64,
+        n_epochs: int = 10,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        clip_range: float | Schedule = 0.2,
+        clip_range_vf: float | Schedule | None = None,
+        normalize_advantage: bool = False,
+        ent_coef: float = 0.0,
+        vf_coef: float = 0.5,
+        max_grad_norm: float = 0.5,
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        rollout_buffer_class: type[RolloutBuffer] | None = None,
+        rollout_buffer_kwargs: dict[str, Any] | None = None,
+        target_kl: float | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: torch.device | str = "auto",
+        _init_setup_model: bool = True,
+        *,
+        n_simulated: int = 8,
+        anneal_until: float | None = None,
+        warm_up_until: float | None = None,
+    ):
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            batch_size=batch_size,
+            n_epochs=n_epochs,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            clip_range=clip_range,
+            clip_range_vf=clip_range_vf,
+            normalize_advantage=normalize_advantage,
+            ent_coef=ent_coef,
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            rollout_buffer_class=rollout_buffer_class,
+            rollout_buffer_kwargs=rollout_buffer_kwargs,
+            target_kl=target_kl,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self.n_simulated = n_simulated
+        self.anneal_until = anneal_until
+        self.warm_up_until = warm_up_until
+        # A policy class has its own widths. A loaded model's class is known, the name it was given by is not.
+        self._has_named_policy = policy in NAMED_POLICIES
+        # Share of the training at which the present rollout began.
+        self._progress = 0.0
+        self._seconds: dict[str, float] = {}
+        if _init_setup_model:
+            self._setup_model()
+
+    # ---------------------------------------------------------------- construction
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        given = self.policy_kwargs
+        # The policy is built with more than the user's own arguments, and only the latter are saved.
+        self.policy_kwargs = self._full_policy_kwargs()
+        try:
+            super()._setup_model()
+        finally:
+            self.policy_kwargs = given
+        if self.n_simulated > 0:
+            if self.device.type == "cpu":
+                # glibc hands freed memory back to the system above a threshold, and the next block of a simulation
+                # pays for page faults. The threshold follows the largest block freed so far.
+                torch.empty(31 * 2**20, dtype=torch.uint8)
+            self.flat_observations = FlatObservations(self.observation_space)
+            self.model_actions = ModelActions(self.action_space, self.device)
+            # After the policy, whose initial weights are thereby Stable-Baselines3's of the same seed.
+            self._setup_models()
+
+    def _full_policy_kwargs(self) -> dict[str, Any]:
+        """
+        :return: the policy's arguments: the user's and the algorithm's
+        """
+        kwargs = dict(self.policy_kwargs)
+        if self._has_named_policy:
+            kwargs.setdefault("net_arch", {name: list(widths) for name, widths in NET_ARCH.items()})
+        optimizer_class = kwargs.get("optimizer_class", torch.optim.Adam)
+        # Without any, Stable-Baselines3's own, whose epsilon is P1's too.
+        given = kwargs.get("optimizer_kwargs") or {"eps": 1e-5}
+        fusible = optimizer_class is torch.optim.Adam and self.device.type in ("cpu", "cuda")
+        if self.n_simulated > 0 and fusible and not {"foreach", "differentiable"} & given.keys():
+            # The fused kernel takes the same steps in a third of the time.
+            kwargs["optimizer_kwargs"] = {"fused": True, **given}
+        return kwargs
+
+    def _check_arguments(self) -> None:
+        """
+        :raises ValueError: if an argument is out of range or contradicts another
+        """
+        check_integer("n_simulated", self.n_simulated, 0)
+        if self.anneal_until is not None and (not _is_number(self.anneal_until) or not 0 < self.anneal_until <= 1):
+            raise ValueError(
+                f"anneal_until must lie in (0, 1], a share of the training, or be None, not {self.anneal_until!r}"
+            )
+        if self.warm_up_until is not None and (not _is_number(self.warm_up_until) or not 0 <= self.warm_up_until < 1):
+            raise ValueError(
+                "warm_up_until must be at least 0 and below 1, a share of the training, or be None, not "
+                f"{self.warm_up_until!r}"
+            )
+        if self.anneal_until is not None and (self.warm_up_until or 0) >= self.anneal_until:
+            raise ValueError(f"warm_up_until must be below anneal_until={self.anneal_until}, not {self.warm_up_until}")
+        if self.n_simulated == 0:
+            self._check_unused(self.simulation_arguments, "n_simulated=0")
+            return
+        if self.use_sde:
+            raise ValueError(
+                "use_sde=True draws one noise for all actions at a state, so that simulated actions would be equal: "
+                "leave it out, or pass n_simulated=0"
+            )
+        space = self.action_space
+        if isinstance(space, spaces.Discrete):
+            if space.start != 0:
+                raise ValueError(f"the action space must start at 0, not be {space}")
+        elif not isinstance(space, spaces.Box):
+            raise ValueError(
+                f"the action space must be a Box or Discrete, whose actions can be drawn or enumerated, not {space}: "
+                "pass n_simulated=0 for plain PPO"
+            )
+        cls = self.rollout_buffer_class
+        if cls is not None and cls.get not in (RolloutBuffer.get, DictRolloutBuffer.get):
+            raise ValueError(
+                f"rollout_buffer_class={cls.__name__} draws its minibatches itself, but here they hold simulated "
+                "samples too: leave it out, or pass n_simulated=0"
+            )
+
+    def _check_unused(self, names: tuple[str, ...], choice: str) -> None:
+        """
+        :param names: arguments of the constructor that mean nothing under a choice
+        :param choice: that choice, for the error
+        :raises ValueError: if one of them is not at its default
+        """
+        for name in names:
+            signatures = (inspect.signature(cls).parameters for cls in type(self).__mro__)
+            default = next(parameters[name].default for parameters in signatures if name in parameters)
+            if getattr(self, name) != default:
+                raise ValueError(f"{name}={getattr(self, name)!r} means nothing with {choice}: leave it out")
+
+    def _setup_models(self) -> None:
+        """Build what the simulated samples come from."""
+        raise NotImplementedError
+
+    def _model_names(self) -> list[str]:
+        """
+        :return: attributes with a ``state_dict`` that are saved beside the policy
+        """
+        raise NotImplementedError
+
+    def _maybe_recommend_cpu(self, mlp_class_name: str = "ActorCriticPolicy") -> None:
+        # Simulation is what a GPU is for.
+        if self.n_simulated == 0:
+            super()._maybe_recommend_cpu(mlp_class_name)
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        venv = PPO._wrap_env(env, verbose, monitor_wrapper)
+        FiniteCheck.install(venv)
+        return venv
+
+    # ---------------------------------------------------------------- saving and loading
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        names, variables = super()._get_torch_save_params()
+        return [*names, *(self._model_names() if self.n_simulated > 0 else [])], variables
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "flat_observations", "model_actions", "_seconds"]
+
+    @classmethod
+    def load(
+        cls: type[Self],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: torch.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> Self:
+        """
+        Load a model, as in Stable-Baselines3. The file has the learned models, their optimizers and their transitions.
+
+        :param path: file, or where ``save`` wrote it
+        :param env: environment to go on with; none is needed for prediction
+        :param device: "auto", "cpu", "cuda", ...
+        :param custom_objects: objects that replace what the file holds under their names
+        :param print_system_info: whether to print the saved and the present versions
+        :param force_reset: whether the environment is reset before training goes on
+        :param kwargs: arguments of the constructor that shall differ from the saved ones
+        :return: the model
+        :raises ValueError: if ``kwargs`` holds something else, or values with which the file's parameters do not fit
+        """
+        known = {name for c in cls.__mro__ if issubclass(c, PPO) for name in inspect.signature(c).parameters}
+        known -= {"policy", "env", "kwargs", "_init_setup_model"}
+        unknown = sorted(kwargs.keys() - known)
+        if unknown:
+            raise ValueError(f"{', '.join(unknown)}: not an argument of {cls.__name__}, so load cannot change it")
+        try:
+            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        except (RuntimeError, ValueError) as error:
+            words = ("loading state_dict", "is an invalid object name", "do not match agents' parameters")
+            if kwargs and any(word in str(error) for word in words):
+                raise ValueError(
+                    f"{', '.join(sorted(kwargs))}: with these arguments the model has other networks than the file "
+                    f"({str(error).splitlines()[0]})"
+                ) from error
+            raise
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | dict[str, Any],
+        exact_match: bool = True,
+        device: torch.device | str = "auto",
+    ) -> None:
+        """
+        Load parameters, as in Stable-Baselines3. The optimizers' moments are loaded, their settings (learning rate,
+        epsilon, ...) stay this model's, so that ``load`` with other ones has them in force.
+
+        :param load_path_or_dict: a file, or parameters as ``get_parameters`` gives them
+        :param exact_match: whether parameters for every module must be there, and no others
+        :param device: "auto", "cpu", "cuda", ...
+        """
+        named = {name: recursive_getattr(self, name) for name in self._get_torch_save_params()[0]}
+        optimizers = [value for value in named.values() if isinstance(value, torch.optim.Optimizer)]
+        settings = [
+            [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
+            for optimizer in optimizers
+        ]
+        super().set_parameters(load_path_or_dict, exact_match, device)
+        for optimizer, own_groups in zip(optimizers, settings, strict=True):
+            for group, own in zip(optimizer.param_groups, own_groups, strict=True):
+                group.update(own)
+
+    # ---------------------------------------------------------------- the iteration
+
+    def learn(
+        self: Self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """
+        Train, as in Stable-Baselines3.
+
+        :param total_timesteps: environment steps to take
+        :param callback: called at every step
+        :param log_interval: iterations between two lines of the log
+        :param tb_log_name: name of the run in the TensorBoard log; the class's name if None
+        :param reset_num_timesteps: whether ``num_timesteps`` starts at zero again
+        :param progress_bar: whether to show a progress bar (needs tqdm and rich)
+        :return: the trained model
+        """
+        return super().learn(
+            total_timesteps,
+            callback,
+            log_interval,
+            tb_log_name or type(self).__name__,
+            reset_num_timesteps,
+            progress_bar,
+        )
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        """
+        Collect a rollout, as in Stable-Baselines3.
+
+        :param env: the environments
+        :param callback: called at every step
+        :param rollout_buffer: what is filled
+        :param n_rollout_steps: steps of each environment
+        :return: whether the callback lets the training go on
+        """
+        self._progress = self.num_timesteps / max(self._total_timesteps, 1)
+        with self._phase("collect"):
+            return self._collect(env, callback, rollout_buffer, n_rollout_steps)
+
+    def _collect(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+
+    def current_n_simulated(self) -> int:
+        """
+        :return: X of the present iteration, by ``n_simulated``, ``anneal_until`` and ``warm_up_until``
+        """
+        share = 1.0
+        if self.anneal_until is not None:
+            share *= max(0.0, 1 - self._progress / self.anneal_until)
+        warm_up = self.warm_up_until
+        if warm_up is None:
+            warm_up = WARM_UP if self.anneal_until is None else 0.0
+        if warm_up > 0:
+            share *= min(1.0, self._progress / warm_up)
+        # The tolerance keeps 8 times 0.5 from being rounded up to 5 by rounding errors.
+        return math.ceil(self.n_simulated * share - 1e-9)
+
+    def train(self) -> None:
+        """
+        Update models, policy and value with the present rollout (P1, algorithm 1, lines 5 to 13).
+        """
+        n_simulated = self.current_n_simulated()
+        # While X is still rising from 0 the models learn already.
+        if self.n_simulated > 0 and (self.anneal_until is None or self._progress < self.anneal_until):
+            with self._phase("dynamics"):
+                self.fit_models()
+        if n_simulated == 0:
+            with self._phase("policy"):
+                super().train()
+        else:
+            rollout = self.current_rollout()
+            with self._phase("simulate"):
+                samples = self.simulate(rollout.observations, rollout.values, n_simulated)
+            with self._phase("policy"):
+                self._update_policy(rollout, samples)
+        if self.n_simulated > 0:
+            self.logger.record("simulation/n_simulated", n_simulated)
+            self.logger.record("simulation/share", n_simulated / (n_simulated + 1))
+        for phase, seconds in self._seconds.items():
+            self.logger.record(f"time/{phase}_seconds", seconds)
+        self._seconds.clear()
+
+    def current_rollout(self) -> Rollout:
+        """
+        :return: the rollout buffer's samples as tensors, the steps of one environment after those of another
+        :raises ValueError: with ``n_simulated=0``, which allows for observations that are no vectors
+        """
+        self._check_simulates()
+        buffer = self.rollout_buffer
+
+        def tensor(values: np.ndarray) -> torch.Tensor:
+            # The buffer's own generator flattens in place what it is asked for first.
+            values = values if buffer.generator_ready else buffer.swap_and_flatten(values)
+            return torch.as_tensor(values, dtype=torch.float32, device=self.device)
+
+        stored: Any = buffer.observations
+        if not buffer.generator_ready:
+            is_dict = isinstance(stored, dict)
+            swap = buffer.swap_and_flatten
+            stored = {key: swap(values) for key, values in stored.items()} if is_dict else swap(stored)
+        observations = torch.as_tensor(self.flat_observations.flatten(stored), device=self.device)
+        actions = tensor(buffer.actions)
+        return Rollout(
+            observations,
+            actions.long().flatten() if self.model_actions.is_discrete else actions,
+            *(tensor(x).flatten() for x in (buffer.log_probs, buffer.values, buffer.advantages, buffer.returns)),
+        )
+
+    def _check_simulates(self) -> None:
+        if self.n_simulated == 0:
+            raise ValueError("n_simulated=0: this model has nothing to simulate with")
+
+    def fit_models(self) -> None:
+        """
+        Train what the simulated samples come from on the real ones so far, and log its errors.
+        """
+        raise NotImplementedError
+
+    def simulate(
+        self,
+        observations: torch.Tensor,
+        values: torch.Tensor | None = None,
+        n_simulated: int | None = None,
+        noise: torch.Tensor | None = None,
+    ) -> SimulatedSamples:
+        """
+        Draw extra samples of the present policy and estimate their Q-values. Nothing is changed by it, but for the
+        random generators; ``model.simulate(rollout.observations)`` with ``rollout = model.current_rollout()`` is what
+        ``train`` does.
+
+        Actions of a Discrete space are not drawn where they are for the real states: all of them are given, each with
+        the weight X pi(a|s), which is what X draws count in expectation.
+
+        :param observations: real ones, flat, as the policy sees them (normalised by ``VecNormalize``), (N, O)
+        :param values: the critic's of the observations, (N,); computed if None
+        :param n_simulated: X, at least 1; that of the present iteration if None
+        :param noise: standard Gaussian noise of the simulated actions, of the algorithm's own shape; drawn if None. A
+            given noise reproduces the samples exactly
+        :return: N times X samples
+        """
+        self._check_simulates()
+        n = self.current_n_simulated() if n_simulated is None else n_simulated
+        check_integer("n_simulated", n, 1)
+        self.policy.set_training_mode(False)
+        with torch.no_grad():
+            if values is None:
+                values = self.values_of(observations)
+            return self._simulate(observations, values, n, noise)
+
+    def _simulate(
+        self, observations: torch.Tensor, values: torch.Tensor, n_simulated: int, noise: torch.Tensor | None
+    ) -> SimulatedSamples:
+        raise NotImplementedError
+
+    # ---------------------------------------------------------------- the policy's part
+
+    def distribution_at(self, observations: torch.Tensor) -> Distribution:
+        """
+        :param observations: flat, (B, O)
+        :return: the policy's distribution of the actions
+        """
+        distribution = self.policy.get_distribution(self.flat_observations.restore(observations))
+        if not isinstance(distribution, (DiagGaussianDistribution, CategoricalDistribution)):
+            raise ValueError(
+                "policy must give a diagonal Gaussian or a categorical distribution for simulated samples, not "
+                f"{type(distribution).__name__}: pass n_simulated=0 for plain PPO"
+            )
+        return distribution
+
+    def values_of(self, observations: torch.Tensor) -> torch.Tensor:
+        """
+        :param observations: flat, (B, O)
+        :return: the critic's values, (B,)
+        """
+        return self.policy.predict_values(self.flat_observations.restore(observations)).flatten()
+
+    def _many_actions(
+        self, observations: torch.Tensor, n_simulated: int, noise: torch.Tensor | None
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+        """
+        Extra actions at real observations, their log-probabilities and their weights.
+
+        :param observations: (N, O)
+        :param n_simulated: X
+        :param noise: (N, X, A)
+        :return: (N, X, A), (N, X), None; or all n actions of a Discrete space: (N, n), (N, n), (N, n)
+        """
+        distribution = self.distribution_at(observations)
+        if isinstance(distribution, CategoricalDistribution):
+            log_probs = distribution.distribution.logits
+            actions = torch.arange(log_probs.shape[1], device=log_probs.device).expand(len(log_probs), -1)
+            return actions, log_probs, n_simulated * log_probs.exp()
+        normal: Any = distribution.distribution
+        mean, std = normal.mean[:, None], normal.stddev[:, None]
+        if noise is None:
+            noise = torch.randn(len(mean), n_simulated, mean.shape[2], device=mean.device)
+        actions = torch.addcmul(mean, std, noise)
+        return actions, log_prob_of_many(distribution, actions), None
+
+    def _update_policy(self, rollout: Rollout, samples: SimulatedSamples) -> None:
+        """
+        PPO's epochs over the rollout and the samples that belong to it (P1, algorithm 1, lines 10 to 13).
+
+        :param rollout: the real samples
+        :param samples: the simulated ones
+        """
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        clip_range = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
+        clip_range_vf = None
+        if self.clip_range_vf is not None:
+            clip_range_vf = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
+
+        # The real sample of a row first, then its simulated ones.
+        real_weights = torch.ones_like(rollout.log_probs)[:, None]
+        weights = torch.ones_like(samples.log_probs) if samples.weights is None else samples.weights
+        columns: dict[str, torch.Tensor] = {
+            "observations": rollout.observations,
+            "values": rollout.values,
+            "returns": rollout.returns,
+            "actions": torch.cat([rollout.actions[:, None], samples.actions], dim=1),
+            "log_probs": torch.cat([rollout.log_probs[:, None], samples.log_probs], dim=1),
+            "advantages": torch.cat([rollout.advantages[:, None], samples.advantages], dim=1),
+            "weights": torch.cat([real_weights, weights], dim=1),
+        }
+        if samples.observations is not None:
+            columns["simulated_observations"] = samples.observations
+
+        metrics: list[dict[str, torch.Tensor]] = []
+        divergences: list[torch.Tensor] = []
+        goes_on = True
+        for epoch in range(self.n_epochs):
+            divergences = []
+            # The same numbers as Stable-Baselines3 draws, and one copy an epoch instead of one a minibatch.
+            order = torch.as_tensor(np.random.permutation(len(rollout.values)), device=self.device)  # noqa: NPY002
+            shuffled = {name: values[order] for name, values in columns.items()}
+            for batch in minibatches(list(shuffled.values()), self.batch_size):
+                loss, step = self._losses(dict(zip(shuffled, batch, strict=True)), clip_range, clip_range_vf)
+                metrics.append({name: value.detach() for name, value in step.items()})
+                divergences.append(metrics[-1].pop("approx_kl"))
+                if self.target_kl is not None and divergences[-1] > 1.5 * self.target_kl:
+                    goes_on = False
+                    if self.verbose >= 1:
+                        print(f"Early stopping at step {epoch} due to reaching max kl: {divergences[-1]:.2f}")
+                    break
+                self.policy.optimizer.zero_grad()
+                loss.backward()
+                torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+                self.policy.optimizer.step()
+            self._n_updates += 1
+            if not goes_on:
+                break
+
+        for name in ("entropy_loss", "policy_gradient_loss", "value_loss", "clip_fraction"):
+            self.logger.record(f"train/{name}", torch.stack([step[name] for step in metrics]).mean().item())
+        self.logger.record("train/approx_kl", torch.stack(divergences).mean().item())
+        self.logger.record("train/loss", loss.item())
+        variance = explained_variance(self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten())
+        self.logger.record("train/explained_variance", variance)
+        if hasattr(self.policy, "log_std"):
+            self.logger.record("train/std", self.policy.log_std.exp().mean().item())
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/clip_range", clip_range)
+        if clip_range_vf is not None:
+            self.logger.record("train/clip_range_vf", clip_range_vf)
+
+    def _losses(
+        self, batch: dict[str, torch.Tensor], clip_range: float, clip_range_vf: float | None
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """
+        PPO's loss of a minibatch of B real samples with X simulated ones each.
+
+        :param batch: ``observations`` (B, O), ``values`` and ``returns`` (B,); with the real sample in the first column
+            ``actions`` (B, 1 + X, A), ``log_probs``, ``advantages`` and ``weights`` (B, 1 + X); and perhaps
+            ``simulated_observations`` (B, X, O)
+        :param clip_range: of the probability ratio
+        :param clip_range_vf: of the value's change, or None
+        :return: the loss, and scalars to log by name
+        """
+        observations, actions = batch["observations"], batch["actions"]
+        simulated = batch.get("simulated_observations")
+        if simulated is None:
+            # All actions of a row are at one state: the actor is evaluated once for them.
+            distribution = self.distribution_at(observations)
+            log_probs = log_prob_of_many(distribution, actions)
+            entropy = _entropy(distribution)
+        else:
+            states = torch.cat([observations[:, None], simulated], dim=1).flatten(0, 1)
+            distribution = self.distribution_at(states)
+            log_probs = distribution.log_prob(actions.flatten(0, 1)).view(actions.shape[:2])
+            entropy = _entropy(distribution).view(actions.shape[:2])[:, 0]
+        values = self.values_of(observations)
+
+        weights = batch["weights"]
+        weights = weights / weights.sum()
+        advantages = batch["advantages"]
+        if self.normalize_advantage:
+            centred = advantages - (weights * advantages).sum()
+            # With equal weights torch.std's estimate, which Stable-Baselines3 divides by.
+            variance = (weights * centred.square()).sum() * advantages.numel() / (advantages.numel() - 1)
+            advantages = centred / (variance.sqrt() + 1e-8)
+        log_ratio = log_probs - batch["log_probs"]
+        ratio = log_ratio.exp()
+        clipped = ratio.clamp(1 - clip_range, 1 + clip_range)
+        policy_loss = -(weights * torch.minimum(advantages * ratio, advantages * clipped)).sum()
+        if clip_range_vf is not None:
+            values = batch["values"] + (values - batch["values"]).clamp(-clip_range_vf, clip_range_vf)
+        value_loss = F.mse_loss(batch["returns"], values)
+        entropy_loss = -entropy.mean()
+        loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss
+        with torch.no_grad():
+            scalars = {
+                "policy_gradient_loss": policy_loss,
+                "value_loss": value_loss,
+                "entropy_loss": entropy_loss,
+                "clip_fraction": (weights * ((ratio - 1).abs() > clip_range)).sum(),
+                "approx_kl": (weights * (ratio - 1 - log_ratio)).sum(),
+            }
+        return loss, scalars
+
+    @contextmanager
+    def _phase(self, name: str) -> Iterator[None]:
+        """Measure what a phase of the iteration takes, to be logged."""
+        self._synchronize()
+        start = time.perf_counter()
+        yield
+        self._synchronize()
+        self._seconds[name] = time.perf_counter() - start
+
+    def _synchronize(self) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+
+
+def log_prob_of_many(distribution: Distribution, actions: torch.Tensor) -> torch.Tensor:
+    """
+    :param distribution: of the actions at B states
+    :param actions: M for each state, (B, M, A), or (B, M) integers
+    :return: their log-probabilities, (B, M)
+    """
+    if isinstance(distribution, CategoricalDistribution):
+        return distribution.distribution.logits.gather(1, actions.long())
+    assert isinstance(distribution, DiagGaussianDistribution)
+    normal: Any = distribution.distribution
+    mean, std = normal.mean[:, None], normal.stddev[:, None]
+    # torch's own formula, without its checks of every argument.
+    squares = ((actions - mean) / std).square().sum(dim=2)
+    constant = normal.stddev.log().sum(dim=1, keepdim=True) + mean.shape[2] * 0.5 * math.log(2 * math.pi)
+    return -0.5 * squares - constant
+
+
+def _entropy(distribution: Distribution) -> torch.Tensor:
+    entropy = distribution.entropy()
+    assert entropy is not None  # Gaussian and categorical distributions have one in closed form
+    return entropy
+
+
+def check_integer(name: str, value: Any, low: int) -> None:
+    """
+    :param name: name of an argument
+    :param value: its value
+    :param low: the smallest allowed
+    :raises ValueError: if it is no integer, or below that
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < low:
+        raise ValueError(f"{name} must be an integer of at least {low}, not {value!r}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)

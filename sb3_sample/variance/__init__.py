@@ -1,0 +1,26 @@
+"""
+The variance of policy gradients, as P1 (Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011) takes it apart:
+whether more actions at each state or a longer trajectory lower it more, and what simulated samples cost in bias.
+"""
+
+from sb3_sample.variance.bias import GradientSamples, compare_gradients, policy_gradient
+from sb3_sample.variance.decomposition import Choice, Components, at_equal_cost, relative_cost
+from sb3_sample.variance.estimate import Estimate, Interval, estimate_components
+from sb3_sample.variance.states import EnvState, check_restorable, restore_state, save_state
+
+__all__ = [
+    "Choice",
+    "Components",
+    "EnvState",
+    "Estimate",
+    "GradientSamples",
+    "Interval",
+    "at_equal_cost",
+    "check_restorable",
+    "compare_gradients",
+    "estimate_components",
+    "policy_gradient",
+    "relative_cost",
+    "restore_state",
+    "save_state",
+]

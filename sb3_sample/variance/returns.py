@@ -1,0 +1,129 @@
+"""Q-values of actions at visited states: the environment goes back to the state and the policy goes on from there."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from sb3_sample.variance.scores import check_policy
+from sb3_sample.variance.states import EnvState, restore_state
+
+
+class Agent:
+    """
+    What is needed of a model: samples of its policy, its critic, and the units in which it learns.
+
+    :param model: a ``PPO`` or ``A2C``, or a subclass. The statistics of a ``VecNormalize`` around its environment are
+        used as they are
+    :raises TypeError: ``model`` is of another family
+    :raises ValueError: its policy is of a kind that :func:`~sb3_sample.variance.scores.check_policy` refuses
+    """
+
+    def __init__(self, model: OnPolicyAlgorithm):
+        if not isinstance(model, OnPolicyAlgorithm):
+            raise TypeError(f"model must be a PPO or A2C, or a subclass, not {type(model).__name__}")
+        check_policy(model.policy)
+        self.model = model
+        self.policy: Any = model.policy
+        self.gamma = model.gamma
+        self._normalize = model.get_vec_normalize_env()
+
+    def normalize_observations(self, observations: np.ndarray) -> np.ndarray:
+        """
+        :param observations: the environment's, (B, ...)
+        :return: the policy's, (B, ...)
+        """
+        return observations if self._normalize is None else np.asarray(self._normalize.normalize_obs(observations))
+
+    def normalize_rewards(self, rewards: np.ndarray) -> np.ndarray:
+        """
+        :param rewards: the environment's, (B,)
+        :return: the critic's, (B,)
+        """
+        return rewards if self._normalize is None else self._normalize.normalize_reward(rewards)
+
+    def sample(self, observations: np.ndarray) -> np.ndarray:
+        """
+        :param observations: the environment's, (B, ...)
+        :return: actions as the policy samples them, by torch's global generator, (B, ...)
+        """
+        with torch.no_grad():
+            return self.policy.get_distribution(self._tensor(observations)).sample().cpu().numpy()
+
+    def values(self, observations: np.ndarray) -> np.ndarray:
+        """
+        :param observations: the environment's, (B, ...)
+        :return: the critic's values, (B,)
+        """
+        with torch.no_grad():
+            return self.policy.predict_values(self._tensor(observations)).double().flatten().cpu().numpy()
+
+    def to_env(self, actions: np.ndarray) -> np.ndarray:
+        """
+        :param actions: from :meth:`sample`, (B, ...)
+        :return: what the environment gets, as in ``OnPolicyAlgorithm.collect_rollouts``: clipped to the space
+        """
+        space = self.model.action_space
+        return np.clip(actions, space.low, space.high) if isinstance(space, spaces.Box) else actions
+
+    def _tensor(self, observations: np.ndarray) -> Any:
+        return self.policy.obs_to_tensor(self.normalize_observations(observations))[0]
+
+
+def sample_returns(
+    agent: Agent,
+    envs: Sequence[gym.Env],
+    states: Sequence[EnvState],
+    actions: np.ndarray,
+    horizon: int,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """
+    One sample of Q(s, a) for each state and action: the discounted rewards of the action and of the policy after it,
+    and after ``horizon`` steps, or at a time limit, the critic's value.
+
+    :param agent: policy and critic
+    :param envs: environments to restore the states in, as many as are to be stepped side by side
+    :param states: B states
+    :param actions: as the policy samples them, (B, ...)
+    :param horizon: steps, at least 1
+    :param rng: generator for what is random in the environments after the states
+    :return: (B,)
+    """
+    groups = [slice(start, start + len(envs)) for start in range(0, len(states), len(envs))]
+    returns = [_sample_group(agent, envs, states[group], actions[group], horizon, rng) for group in groups]
+    return np.concatenate(returns)
+
+
+def _sample_group(
+    agent: Agent,
+    envs: Sequence[gym.Env],
+    states: Sequence[EnvState],
+    actions: np.ndarray,
+    horizon: int,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    for env, state in zip(envs, states, strict=False):
+        restore_state(env, state, rng)
+    returns, discount = np.zeros(len(states)), 1.0
+    running = np.arange(len(states))
+    for step in range(horizon):
+        results = [envs[int(i)].step(action) for i, action in zip(running, agent.to_env(actions), strict=True)]
+        returns[running] += discount * agent.normalize_rewards(np.array([float(result[1]) for result in results]))
+        discount *= agent.gamma
+        observations = np.stack([result[0] for result in results])
+        terminated = np.array([result[2] for result in results], dtype=bool)
+        # Only a termination ends the sum; a time limit stops the simulation, not the task.
+        stopped = ~terminated & (np.array([result[3] for result in results], dtype=bool) | (step == horizon - 1))
+        if stopped.any():
+            returns[running[stopped]] += discount * agent.values(observations[stopped])
+        going_on = ~(terminated | stopped)
+        running, observations = running[going_on], observations[going_on]
+        if not len(running):
+            break
+        actions = agent.sample(observations)
+    return returns

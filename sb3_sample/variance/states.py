@@ -1,0 +1,234 @@
+"""
+Saving the state of an environment and going back to it, so that other actions can be tried at a visited state.
+
+A saved state is all that decides what comes next: the simulator's (``mjData``, with what was derived from positions and
+velocities, and the numbers of the model, which some tasks draw anew for each episode), the task's, the counters of time
+limits and wrappers, and the random generators. It can be restored in the environment that it is of, any number of
+times, or in another one that was made in the same way.
+"""
+
+import collections
+import copy
+import functools
+import types
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+#: Attributes of these types cannot change, so that they are kept as they are.
+_CONSTANTS = (type(None), bool, int, float, complex, str, bytes, np.generic)
+#: Attributes of these types are part of the state, with what they contain.
+_CONTAINERS = (list, tuple, dict, set, collections.deque)
+_GENERATORS = (np.random.Generator, np.random.RandomState)
+#: What describes an environment or its interface: never a part of the state.
+_NOT_STATE = (gym.Env, gym.Space, gym.envs.registration.EnvSpec, type, types.ModuleType, types.FunctionType)
+
+
+class EnvState(NamedTuple):
+    """
+    State of an environment, made by :func:`save_state`.
+
+    :param layers: attributes of the environment's wrappers, outermost first, of the environment itself, and of its task
+        and control loop if it is one of dm_control
+    :param data: copy of MuJoCo's data; None if it has no simulator
+    :param model: arrays of MuJoCo's model, by name
+    """
+
+    layers: list[dict[str, Any]]
+    data: Any
+    model: dict[str, np.ndarray]
+
+
+def save_state(env: gym.Env) -> EnvState:
+    """
+    :param env: environment of this package's ``dmc/``, of Gymnasium's MuJoCo, or one whose state is in its Python
+        attributes (Gymnasium's classic control), wrapped or not
+    :return: its state
+    :raises TypeError: ``env`` is not a ``gymnasium.Env``
+    """
+    layers, simulator = _layers(env), _simulator(env)
+    data, model = None, {}
+    if simulator is not None:
+        data = copy.copy(simulator[1])
+        model = {name: getattr(simulator[0], name).copy() for name in _model_arrays()}
+    return EnvState([_attributes(layer) for layer in layers], data, model)
+
+
+def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None = None) -> None:
+    """
+    Go back to a saved state: the same actions then give the same observations and rewards, bit by bit.
+
+    :param env: the environment that the state was saved of, or one made in the same way
+    :param state: from :func:`save_state`; it stays as it is
+    :param rng: if given, the environment's random generators are seeded anew from it, so that a task that is random
+        after its reset goes on at random from the state
+    :raises ValueError: ``state`` is of an environment with other wrappers, or of another model
+    """
+    layers, simulator = _layers(env), _simulator(env)
+    if len(layers) != len(state.layers):
+        raise ValueError(
+            f"state must be of an environment wrapped like env: it has {len(state.layers)} layers, env {len(layers)}"
+        )
+    if (simulator is None) != (state.data is None):
+        raise ValueError("state must be of an environment like env: only one of the two is simulated by MuJoCo")
+    if simulator is not None:
+        import mujoco
+
+        model, data = simulator
+        if model.nq != len(state.data.qpos) or model.nbody != len(state.data.xpos):
+            raise ValueError(
+                f"state must be of env's model: it has {len(state.data.qpos)} positions of {len(state.data.xpos)} "
+                f"bodies, env {model.nq} of {model.nbody}"
+            )
+        for name, array in state.model.items():
+            getattr(model, name)[...] = array
+        mujoco.mj_copyData(data, model, state.data)
+    for layer, attributes in zip(layers, state.layers, strict=True):
+        for name, value in attributes.items():
+            if rng is not None and isinstance(value, _GENERATORS):
+                setattr(layer, name, type(value)(_bit_generator(value, int(rng.integers(2**63)))))
+            else:
+                setattr(layer, name, _copy(value))
+
+
+def check_restorable(env: gym.Env, other: gym.Env | None = None, n_steps: int = 20, seed: int = 0) -> None:
+    """
+    Try it: random actions from a state that is reached by others, and once more from the same state restored.
+
+    :param env: environment; it is reset
+    :param other: environment to restore the state in; ``env`` itself if None
+    :param n_steps: steps before the state and, at most, from it
+    :param seed: of the reset and the actions
+    :raises ValueError: the two differ in an observation, reward or end of the episode
+    """
+    rng = np.random.default_rng(seed)
+    env.reset(seed=seed)
+    for _ in range(n_steps):
+        _, _, terminated, truncated, _ = env.step(random_action(env.action_space, rng))
+        if terminated or truncated:
+            env.reset()
+    state = save_state(env)
+    actions = [random_action(env.action_space, rng) for _ in range(n_steps)]
+    first = list(_follow(env, actions))
+    other = env if other is None else other
+    message = (
+        f"env must be an environment whose state can be saved and restored, as those of dmc/, Gymnasium's MuJoCo and "
+        f"classic control, not {env}: "
+    )
+    restore_state(other, state)
+    try:
+        second = list(_follow(other, actions))
+    except Exception as error:  # whatever an environment raises whose state is only in part what it should be
+        raise ValueError(f"{message}it fails after its state was restored ({error!r})") from error
+    if not _equal(first, second):
+        raise ValueError(f"{message}the same actions gave something else after its state was restored")
+
+
+def random_action(space: gym.Space, rng: np.random.Generator) -> Any:
+    """
+    :param space: space of actions; its own generator is not used
+    :param rng: generator
+    :return: a random element
+    """
+    space = copy.deepcopy(space)
+    space.seed(int(rng.integers(2**31)))
+    return space.sample()
+
+
+# ---------------------------------------------------------------- where the state is
+
+
+def _layers(env: gym.Env) -> list[Any]:
+    """The objects whose attributes are part of the state: wrappers, environment, dm_control's loop and task."""
+    if not isinstance(env, gym.Env):
+        raise TypeError(f"env must be a gymnasium.Env, not {env!r}")
+    layers: list[Any] = [env]
+    while isinstance(layers[-1], gym.Wrapper):
+        layers.append(layers[-1].env)
+    dm_env = getattr(layers[-1], "dm_env", None)
+    if dm_env is not None:
+        return [*layers, dm_env, dm_env.task]
+    # An environment around one of another library, such as metaworld/.
+    inside = [layer for value in vars(layers[-1]).values() if isinstance(value, gym.Env) for layer in _layers(value)]
+    return layers + inside
+
+
+def _simulator(env: gym.Env) -> tuple[Any, Any] | None:
+    """MuJoCo's model and data."""
+    base = env.unwrapped
+    if hasattr(base, "dm_env"):
+        physics = base.dm_env.physics
+        return physics.model.ptr, physics.data.ptr
+    for layer in reversed(_layers(env)):
+        model, data = vars(layer).get("model"), vars(layer).get("data")
+        if type(model).__module__.startswith("mujoco"):
+            return model, data
+    return None
+
+
+@functools.cache
+def _model_arrays() -> tuple[str, ...]:
+    """
+    Names of the arrays of a model that a task may draw anew: all of MuJoCo's own float type, and heights of the ground.
+    Not meshes and textures, the megabytes of a model, which no task of these suites changes.
+    """
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    names = [name for name in dir(model) if not name.startswith(("_", "mesh_", "tex_", "skin_"))]
+    arrays = {name: value for name in names if isinstance(value := getattr(model, name), np.ndarray)}
+    return tuple(name for name, value in arrays.items() if value.dtype == np.float64 or name == "hfield_data")
+
+
+def _attributes(layer: Any) -> dict[str, Any]:
+    return {name: _copy(value) for name, value in vars(layer).items() if _is_state(value)}
+
+
+def _is_state(value: Any) -> bool:
+    """Whether a value is data through and through: numbers, arrays, generators, containers and objects of them."""
+    if isinstance(value, (*_CONSTANTS, np.ndarray, *_GENERATORS)):
+        return True
+    if isinstance(value, dict):
+        return all(_is_state(item) for item in value.values())
+    if isinstance(value, _CONTAINERS):
+        return all(_is_state(item) for item in value)
+    if isinstance(value, _NOT_STATE) or not hasattr(value, "__dict__"):
+        return False
+    # Objects of a wrapper, such as the running mean and variance of a normalisation. A simulator's are the layers' and
+    # the data's; an environment inside of another attribute is none of the wrappers that this module knows.
+    return not type(value).__module__.startswith(("mujoco", "dm_control", "gymnasium.envs")) and all(
+        _is_state(item) for item in vars(value).values()
+    )
+
+
+def _copy(value: Any) -> Any:
+    return value if isinstance(value, _CONSTANTS) else copy.deepcopy(value)
+
+
+def _bit_generator(generator: Any, seed: int) -> Any:
+    """A bit generator of the kind that the generator has."""
+    if isinstance(generator, np.random.RandomState):
+        return np.random.MT19937(seed)
+    return type(generator.bit_generator)(seed)
+
+
+# ---------------------------------------------------------------- the check
+
+
+def _follow(env: gym.Env, actions: list[Any]) -> Iterator[tuple[Any, ...]]:
+    for action in actions:
+        observation, reward, terminated, truncated, _ = env.step(action)
+        yield copy.deepcopy(observation), float(reward), terminated, truncated
+        if terminated or truncated:
+            # The next episode is a part of the state as well: that of the generators.
+            yield copy.deepcopy(env.reset()[0]), 0.0, False, False
+
+
+def _equal(first: Any, second: Any) -> bool:
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(_equal(first[key], second[key]) for key in first)
+    if isinstance(first, (list, tuple)):
+        return len(first) == len(second) and all(_equal(a, b) for a, b in zip(first, second, strict=True))
+    return np.array_equal(first, second, equal_nan=np.asarray(first).dtype.kind == "f")
