@@ -707,7 +707,7 @@ class SAC(OffPolicyAlgorithm):
         moves_actor = self._n_updates % self.policy_delay == 0
         eager = self.keep_next_gradients
         metrics = execution(self, batch, noise, extra, moves_targets, moves_actor, eager=eager)
-        self.gradients_are_stale, self.keep_next_gradients = execution.compiled and not eager, False
+        self.gradients_are_stale, self.keep_next_gradients = not eager and not execution.leaves_gradients, False
         if self.redo is not None:
             metrics.update(self.redo.after_update(self, batch))
         return metrics

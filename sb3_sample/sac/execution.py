@@ -120,6 +120,11 @@ class Execution:
         captures = agent.device.type == "cuda" and agent.compile is not False and not _foreign_optimizers(agent)
         return cls(agent, bool(agent.compiled), agent.compile == "auto", cuda_graph if captures else None)
 
+    @property
+    def leaves_gradients(self) -> bool:
+        """Whether a gradient step that is not asked to be eager leaves its gradients in ``.grad``."""
+        return not self.compiled and self._captured is None
+
     def prepare(self, agent: "SAC") -> None:
         """
         Called before the gradient steps that follow an environment step, when everything else is done.
@@ -295,7 +300,8 @@ class Captured:
         own, repeat, metrics = self._recorded[kind]
         torch._foreach_copy_(_tensors(own), _tensors(inputs))
         repeat()
-        return metrics
+        # The caller adds to what it is given.
+        return dict(metrics)
 
 
 def _aside(run: Callable[[], Metrics]) -> Metrics:

@@ -205,6 +205,27 @@ def test_captured_survives_what_happens_in_training(tmp_path: Path) -> None:
     assert largest_difference(*models) < 1e-4
 
 
+def test_a_captured_step_gives_its_own_metrics_and_no_old_gradients() -> None:
+    model = sac(compile=False, redo_period=5, learning_starts=60)
+    model.learn(60)
+    captured(model)
+    recycled = []
+
+    def note(i: int) -> None:
+        if i > 0:
+            recycled.append("plasticity/n_recycled" in model._metrics)
+        model._metrics = {}
+
+    updates(model, 13, each=note)
+    assert [i + 1 for i, present in enumerate(recycled) if present] == [5, 10]
+    assert model.gradients_are_stale
+    model.keep_next_gradients = True
+    updates(model, 1)
+    assert not model.gradients_are_stale and model.critic.head.weight.grad is not None
+    updates(model, 1)
+    assert model.gradients_are_stale
+
+
 def test_learning_rates_of_a_schedule_compile_once() -> None:
     model, compiled = pair("SAC", compile=True)
     calls = torch._dynamo.utils.counters["stats"]["unique_graphs"]

@@ -55,6 +55,7 @@ def test_bro_learns_pendulum() -> None:
     assert score(small_bro(0).learn(2_500)) > GOOD
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [small_sac, small_bro])
 def test_compiled_step_learns_pendulum(make: Callable[..., SAC]) -> None:
     model = make(0, compile=True).learn(3_000)
