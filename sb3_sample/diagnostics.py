@@ -17,7 +17,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_sample.networks import neuron_scores
@@ -248,8 +248,8 @@ class DiagnosticsCallback(BaseCallback):
         self._next = (self.num_timesteps // self.every + 1) * self.every
 
     def _on_step(self) -> bool:
-        # The step after this call's is the last before a measurement, which then finds its gradients.
-        if self._next <= self.num_timesteps + self.model.n_envs:
+        # The gradient step after this call may be the last before a measurement, which then finds its gradients.
+        if self._next <= self.num_timesteps + self.model.n_envs * self._steps_between_updates():
             self.model.keep_next_gradients = True
         if self.num_timesteps < self._next:
             return True
@@ -269,6 +269,14 @@ class DiagnosticsCallback(BaseCallback):
             )
             print(f"Diagnostics at {self.num_timesteps} steps: {shown}")
         return True
+
+    def _steps_between_updates(self) -> int:
+        """Steps of all environments from one gradient step to the next, at most; 1 where only episodes tell."""
+        model = self.model
+        if model.replay_ratio is None:
+            assert isinstance(model.train_freq, TrainFreq)
+            return model.train_freq.frequency if model.train_freq.unit is TrainFrequencyUnit.STEP else 1
+        return math.ceil(1 / max(min(model.replay_ratio * model.n_envs, 1), 1e-3))
 
     # ---------------------------------------------------------------- what
 

@@ -75,9 +75,9 @@ class AdamW(Optimizer):
         Bring everything that :meth:`apply` reads up to date: the moments exist, and the learning rates of the groups
         stand in tensors. Compiled and captured steps, which know tensors only, then find both.
         """
-        rates = [group["lr"] for group in self.param_groups]
+        rates = [float(group["lr"]) for group in self.param_groups]
         device = self.param_groups[0]["params"][0].device
-        if self._rates is None or self._rates.device != device:
+        if self._rates is None or self._rates.device != device or len(self._rates_held) != len(rates):
             self._rates, self._rates_held = torch.tensor(rates, dtype=torch.float32, device=device), rates
         elif self._rates_held != rates:
             self._rates.copy_(torch.tensor(rates, dtype=torch.float32))
@@ -96,6 +96,11 @@ class AdamW(Optimizer):
                 for name in ("exp_avg", "exp_avg_sq"):
                     if name not in self.state[p]:
                         self.state[p][name] = torch.zeros_like(p)
+        # A compiled step finds a parameter's state by its place in the dict.
+        parameters = [p for group in self.param_groups for p in group["params"]]
+        if any(p is not q for p, q in zip(self.state, parameters, strict=False)):
+            ordered = {p: self.state.pop(p) for p in parameters if p in self.state}
+            self.state.update(ordered)
 
     def read_tensors(self) -> list[torch.Tensor]:
         """
@@ -103,14 +108,10 @@ class AdamW(Optimizer):
         """
         return [*([] if self._rates is None else [self._rates]), *self._steps]
 
-    def load_state_dict(self, state_dict: Any) -> None:
-        """
-        Load moments and settings, as in torch.
-
-        :param state_dict: what ``state_dict`` gave
-        """
-        super().load_state_dict(state_dict)
-        self._steps = []
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # Called by load_state_dict, copy and pickle: what follows from the state is made anew by prepare.
+        super().__setstate__(state)
+        self.capturable, self._rates, self._rates_held, self._steps = False, None, [], []
 
     @torch.no_grad()
     def apply(self, gradients: Sequence[torch.Tensor | None]) -> None:

@@ -219,7 +219,7 @@ class SAC(OffPolicyAlgorithm):
         #: Whether the gradient step is compiled; None while that is not decided. Saved: a loaded model goes on with it.
         self.compiled: bool | None = None
         self._execution: Execution | None = None
-        #: A callback that wants the gradients of the next gradient step in ``.grad`` sets this: it is run eagerly.
+        #: A callback that wants gradients in ``.grad`` sets this: the last of the next gradient steps is run eagerly.
         self.keep_next_gradients = False
         #: Whether ``.grad`` holds the gradients of another gradient step than the last, as a compiled one leaves none.
         self.gradients_are_stale = False
@@ -462,6 +462,8 @@ class SAC(OffPolicyAlgorithm):
             "_metrics",
             "_critic_loss",
             "_execution",
+            "_parts_mode",
+            "_batch_memory",
         ]
 
     def reinitialize(self, shrink: float = 0.0) -> None:
@@ -668,8 +670,9 @@ class SAC(OffPolicyAlgorithm):
         self._prepared_execution()
         for first in range(0, gradient_steps, MAX_BATCHES_AT_ONCE):
             n_batches = min(MAX_BATCHES_AT_ONCE, gradient_steps - first)
-            for batch in self._draw_batches(n_batches, batch_size):
-                self._metrics.update(self._update(batch))
+            for i, batch in enumerate(self._draw_batches(n_batches, batch_size), first + 1):
+                keeps_gradients = self.keep_next_gradients and i == gradient_steps
+                self._metrics.update(self._update(batch, keeps_gradients=keeps_gradients))
         self._set_training_mode(False)
 
     def _set_training_mode(self, mode: bool) -> None:
@@ -684,17 +687,20 @@ class SAC(OffPolicyAlgorithm):
         )
 
     def _prepared_execution(self) -> Execution:
-        if self._execution is None:
+        if self._execution is None or not self._execution.serves(self):
             self._execution = Execution.of(self)
         self._execution.prepare(self)
         return self._execution
 
-    def _update(self, batch: Batch, noise: Noise | None = None) -> dict[str, torch.Tensor]:
+    def _update(
+        self, batch: Batch, noise: Noise | None = None, keeps_gradients: bool = False
+    ) -> dict[str, torch.Tensor]:
         """
         One gradient step: what is drawn and counted around it, and the step.
 
         :param batch: transitions
         :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly.
+        :param keeps_gradients: whether they are left in ``.grad``, for which the step is run eagerly
         :return: what to log, by name, scalars on the model's device, computed with the parameters from before
             the update of the module in question
         """
@@ -705,9 +711,10 @@ class SAC(OffPolicyAlgorithm):
         self._n_updates += 1
         moves_targets = self._n_updates % (self.target_update_interval or self.policy_delay) == 0
         moves_actor = self._n_updates % self.policy_delay == 0
-        eager = self.keep_next_gradients
-        metrics = execution(self, batch, noise, extra, moves_targets, moves_actor, eager=eager)
-        self.gradients_are_stale, self.keep_next_gradients = not eager and not execution.leaves_gradients, False
+        metrics = execution(self, batch, noise, extra, moves_targets, moves_actor, eager=keeps_gradients)
+        self.gradients_are_stale = not (keeps_gradients or execution.leaves_gradients)
+        if keeps_gradients:
+            self.keep_next_gradients = False
         if self.redo is not None:
             metrics.update(self.redo.after_update(self, batch))
         return metrics

@@ -296,10 +296,10 @@ class BatchMemory:
 
         def take(name: Any, array: np.ndarray, but: np.ndarray | None = None) -> torch.Tensor:
             rows = array.reshape(-1, *(array.shape[2:] or (1,)))
-            if name not in self._columns or len(self._columns[name]) != n:
+            if name not in self._columns or len(self._columns[name]) < n:
                 like = torch.from_numpy(rows[:0])
                 self._columns[name] = torch.empty((n, *like.shape[1:]), dtype=like.dtype, pin_memory=to_cuda)
-            column = self._columns[name]
+            column = self._columns[name][:n]
             out = column.numpy()
             rows.take(places, axis=0, out=out, mode="clip")
             if but is not None:

@@ -5,15 +5,15 @@ All three run the same function, ``SAC._gradient_step``, which knows nothing of 
 noise as tensors, chooses nothing by the value of a tensor, and counts nothing outside of tensors.
 """
 
+import functools
+import inspect
 import time
 import types
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
-import torch._dynamo
-import torch._inductor.exc
 
 from sb3_sample.optim import AdamW
 
@@ -25,17 +25,21 @@ if TYPE_CHECKING:
 #: thousand steps (docs/performance.md). A number of steps, not a measurement, so that a seed fixes the whole run.
 PAYS_FROM = 20_000
 
-#: What torch raises where it cannot compile, or has compiled the same for too many settings.
-COMPILATION_ERRORS = (
-    torch._dynamo.exc.TorchDynamoException,
-    torch._dynamo.exc.FailOnRecompileLimitHit,
-    torch._inductor.exc.InductorError,
-)
-
 Metrics = dict[str, torch.Tensor]
 #: Runs a function without its effects taking place, and gives back what repeats them, and its result, whose tensors
 #: each repetition fills anew.
 Recorder = Callable[[Callable[[], Metrics]], tuple[Callable[[], None], Metrics]]
+
+
+def _compilation_errors() -> tuple[type[Exception], ...]:
+    """
+    What torch raises where it cannot compile, at first where it has not been told to trace gradients, at last where it
+    has compiled the same for too many settings. Imported when needed, since it takes a second.
+    """
+    from torch._dynamo.exc import FailOnRecompileLimitHit, TorchDynamoException, Unsupported
+    from torch._inductor.exc import InductorError
+
+    return Unsupported, TorchDynamoException, InductorError, FailOnRecompileLimitHit
 
 
 def why_not_compiled(agent: "SAC") -> str | None:
@@ -49,6 +53,8 @@ def why_not_compiled(agent: "SAC") -> str | None:
     if agent.device.type not in ("cpu", "cuda"):
         return f"it is not supported on the device {str(agent.device)!r}"
     # Present from the first version on that compiles a whole step, gradients included.
+    import torch._dynamo
+
     if not hasattr(torch._dynamo.config, "trace_autograd_ops") or not hasattr(torch.compiler, "skip_all_guards_unsafe"):
         return f"torch {torch.__version__} is too old for it"
     if agent.device.type == "cpu":
@@ -70,11 +76,11 @@ def why_not_compiled(agent: "SAC") -> str | None:
 def has_foreign_parts(agent: "SAC") -> bool:
     """
     :param agent: the algorithm
-    :return: whether it has parts from outside of this package, which may not be written to be compiled: a number that
-        they change at every step, say, would have the step compiled anew at every step
+    :return: whether it has parts, or a gradient step, from outside of this package, which may not be written to be
+        compiled: a number that they change at every step, say, would have the step compiled anew at every step
     """
-    parts = (agent.explorer, agent.pessimism_rule)
-    return any(type(part).__module__.split(".")[0] != __name__.split(".")[0] for part in parts)
+    parts = (type(agent.explorer), type(agent.pessimism_rule), type(agent)._gradient_step)
+    return any(part.__module__.split(".")[0] != __name__.split(".")[0] for part in parts)
 
 
 def _foreign_optimizers(agent: "SAC") -> str:
@@ -99,12 +105,22 @@ class Execution:
         if compiled:
             # The compiler keeps what it made by the code object. With one for each model, models neither use each
             # other's nor reach the limit of compilations together.
-            code = self._step.__code__.replace()  # type: ignore[attr-defined]  # a function
-            own = types.FunctionType(code, self._step.__globals__, code.co_name)  # type: ignore[attr-defined]
+            step: Any = self._step
+            own = types.FunctionType(
+                step.__code__.replace(), step.__globals__, step.__name__, step.__defaults__, step.__closure__
+            )
             self._step = torch.compile(
                 own, fullgraph=True, dynamic=False, options={"guard_filter_fn": _settings_and_inputs}
             )
         self._captured = None if recorder is None else Captured(recorder)
+        self._modules = _modules(agent)
+
+    def serves(self, agent: "SAC") -> bool:
+        """
+        :param agent: the algorithm
+        :return: whether it still has the networks, parts, optimizers and loss that this was made for
+        """
+        return self._modules == _modules(agent)
 
     @classmethod
     def of(cls, agent: "SAC") -> "Execution":
@@ -159,12 +175,14 @@ class Execution:
         try:
             try:
                 return self._step(agent, *inputs)
-            except torch._dynamo.exc.Unsupported:
+            except _compilation_errors()[0]:
                 # Not compiled yet for these inputs or settings: to trace gradients needs a switch.
                 return self._compile(agent, *inputs)
-        except COMPILATION_ERRORS as error:
+        except _compilation_errors() as error:
             # Raised before anything of the step has been run.
             reason = str(error).strip().splitlines()[0]
+            if "RecompileLimit" in type(error).__name__:
+                reason = "a setting that it reads changes again and again, and each change has it compiled anew"
             if not self.fall_back:
                 raise RuntimeError(
                     f"compile=True, but the gradient step cannot be compiled: {reason}. Pass compile=False, or 'auto'"
@@ -192,7 +210,7 @@ def _settings_and_inputs(guards: Sequence[Any]) -> list[bool]:
     Which of the conditions under which a compiled step holds are looked at before each step.
 
     Those on parameters, modules and functions are most of them, and looking at them takes as long as a small network's
-    forward pass. They hold by construction: modules are changed in place only. A learning rate may change: it is read
+    forward pass. They hold as long as :meth:`Execution.serves` says so. A learning rate may change: it is read
     from a tensor.
     """
     settings = ("CONSTANT_MATCH", "EQUALS_MATCH", "GRAD_MODE", "GLOBAL_STATE", "DETERMINISTIC_ALGORITHMS")
@@ -314,6 +332,15 @@ def _aside(run: Callable[[], Metrics]) -> Metrics:
     return metrics
 
 
+def _modules(agent: "SAC") -> tuple[Any, ...]:
+    """What a compiled or captured step takes for granted, by identity."""
+    critics = (agent.critic, agent.critic.trunk, agent.critic_target, agent.critic_target.trunk)
+    networks = (agent.actor, agent.actor.trunk, *critics, agent.temperature)
+    parts = (agent.explorer, agent.pessimism_rule, *agent._optimizers().values())
+    groups = [len(group["params"]) for optimizer in agent._optimizers().values() for group in optimizer.param_groups]
+    return (*map(id, (*networks, *parts)), agent._critic_loss, *groups)
+
+
 def _places(agent: "SAC") -> tuple[int, ...]:
     """Addresses of every tensor that a gradient step reads or writes, but its inputs."""
     modules = (agent.policy, agent.temperature, agent.explorer, agent.pessimism_rule)
@@ -325,15 +352,28 @@ def _places(agent: "SAC") -> tuple[int, ...]:
     return tuple(t.data_ptr() for t in tensors)
 
 
+#: Public numbers of a part that are no settings: they move with the run, and the gradient step does not read them.
+NO_SETTINGS = {"arm", "training"}
+
+
 def _settings(agent: "SAC") -> list[Any]:
-    """Numbers and words that a gradient step may read: the model's, its parts' and its optimizers'."""
-    settings: list[Any] = [agent.batch_size, agent.target_subset, agent.policy_delay]
-    for holder in (agent, agent.explorer, agent.pessimism_rule):
-        # Integers count something, but for those above; what is private moves with the run, or follows from the rest.
-        settings.append(
-            {k: v for k, v in vars(holder).items() if isinstance(v, (float, str, bool)) and not k.startswith("_")}
-        )
-    for name, optimizer in agent._optimizers().items():
+    """Numbers and words that a gradient step may read: the model's arguments, its modules' and its optimizers'."""
+
+    def plain(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+        return {name: value for name, value in values if isinstance(value, (int, float, str, type(None)))}
+
+    settings: list[Any] = [plain((name, getattr(agent, name, None)) for name in _arguments(type(agent)))]
+    for root in (agent.policy, agent.explorer, agent.pessimism_rule):
+        for module in root.modules():
+            public = ((k, v) for k, v in vars(module).items() if not k.startswith("_") and k not in NO_SETTINGS)
+            settings.append(plain(public))
+    for optimizer in agent._optimizers().values():
         for group in optimizer.param_groups:
-            settings.append((name, {k: v for k, v in group.items() if k not in ("params", "lr")}))
+            settings.append({k: v for k, v in group.items() if k not in ("params", "lr")})
     return settings
+
+
+@functools.cache
+def _arguments(cls: type["SAC"]) -> tuple[str, ...]:
+    """Names of a class's arguments, its bases' included."""
+    return tuple({name for c in cls.__mro__ if "__init__" in vars(c) for name in inspect.signature(c).parameters})

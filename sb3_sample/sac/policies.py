@@ -38,8 +38,12 @@ class ModeSwitch:
     """
 
     def __init__(self, *roots: nn.Module):
-        # A module with a train of its own (one that keeps its batch norm in evaluation mode, say) is asked.
-        self._own = [root for root in roots if any(type(m).train is not nn.Module.train for m in root.modules())]
+        # A module with a train of its own is asked (one that keeps its batch norm in evaluation mode, say), and so is one
+        # whose attributes are not Python's.
+        def is_special(m: nn.Module) -> bool:
+            return type(m).train is not nn.Module.train or isinstance(m, torch.jit.ScriptModule)
+
+        self._own = [root for root in roots if any(map(is_special, root.modules()))]
         self._plain = [m for root in roots if root not in self._own for m in root.modules()]
 
     def __call__(self, mode: bool) -> None:

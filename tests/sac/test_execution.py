@@ -1,6 +1,8 @@
 """The three ways to run the gradient step give the same numbers: eager, compiled, captured."""
 
+import copy
 import warnings
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -220,10 +222,71 @@ def test_a_captured_step_gives_its_own_metrics_and_no_old_gradients() -> None:
     assert [i + 1 for i, present in enumerate(recycled) if present] == [5, 10]
     assert model.gradients_are_stale
     model.keep_next_gradients = True
-    updates(model, 1)
+    model.train(3, 8)
     assert not model.gradients_are_stale and model.critic.head.weight.grad is not None
     updates(model, 1)
     assert model.gradients_are_stale
+
+
+@pytest.mark.parametrize("how", ["compiled", "captured"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda m: setattr(m, "actor_pessimism", 1),
+        lambda m: setattr(m, "_critic_loss", lambda q, target: 3 * (q - target).abs().mean()),
+        lambda m: setattr(m, "pessimism_rule", Pessimism(0.3)),
+        lambda m: m.critic.optimizer.param_groups[0].update(eps=0.1),
+    ],
+    ids=["integer", "loss", "part", "optimizer"],
+)
+def test_changes_on_the_way_are_noticed(how: str, change: Callable[[SAC], None]) -> None:
+    model, other = pair("SAC", compile=how == "compiled", learning_rate=1e-3)
+    if how == "captured":
+        captured(other)
+    for m in (model, other):
+        updates(m, 5)
+        change(m)
+        if how == "captured" and m is other and not m._execution.serves(m):
+            captured(m)
+        updates(m, 6, seed=1)
+    assert largest_difference(model, other) < TOLERANCE
+
+
+def test_moments_are_found_in_any_order_of_the_file() -> None:
+    model, compiled = pair("SAC", compile=True, learning_rate=1e-3)
+    for m in (model, compiled):
+        updates(m, 5)
+        saved = m.critic.optimizer.state_dict()
+        order = list(saved["state"])
+        order[1], order[3] = order[3], order[1]
+        saved["state"] = {i: saved["state"][i] for i in order}
+        m.critic.optimizer.load_state_dict(saved)
+        updates(m, 10, seed=1)
+    assert largest_difference(model, compiled) < TOLERANCE
+
+
+def test_diagnostics_do_not_have_steps_captured_anew() -> None:
+    model = sac(compile=False, learning_starts=10)
+    recorder = captured(model)
+    model.learn(100, callback=DiagnosticsCallback(Toy(), every=10))
+    assert recorder.n_recordings == 1
+
+
+def test_a_gradient_step_of_ones_own() -> None:
+    class Own(SAC):
+        def _gradient_step(self, *args: Any) -> dict[str, torch.Tensor]:
+            return super()._gradient_step(*args)
+
+    assert sac(cls=Own, compile=True).learn(20)._execution.compiled
+
+
+def test_a_copied_model_trains_on_and_a_file_holds_no_transitions(tmp_path: Path) -> None:
+    model = sac(compile=False, batch_size=1_000).learn(30)
+    before = copy.deepcopy(model).learn(10).num_timesteps
+    assert before == 10
+    model.save(tmp_path / "model.zip")
+    with zipfile.ZipFile(tmp_path / "model.zip") as file:
+        assert len(file.read("data")) < 30_000
 
 
 def test_learning_rates_of_a_schedule_compile_once() -> None:
@@ -370,8 +433,9 @@ def test_says_how_long_it_takes(capsys: pytest.CaptureFixture[str]) -> None:
     assert out.count("Compiled in") == 1
 
 
-def test_diagnostics_find_gradients_of_a_compiled_model() -> None:
-    model = sac(compile=True, learning_starts=10)
+@pytest.mark.parametrize("replay_ratio", [0.5, 1, 3])
+def test_diagnostics_find_gradients_of_a_compiled_model(replay_ratio: float) -> None:
+    model = sac(compile=True, learning_starts=10, replay_ratio=replay_ratio)
     callback = DiagnosticsCallback(Toy(), every=20)
     model.learn(35, callback=callback)
     assert model._execution.compiled
