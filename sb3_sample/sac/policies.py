@@ -38,8 +38,8 @@ class ModeSwitch:
     """
 
     def __init__(self, *roots: nn.Module):
-        # A module with a train of its own is asked (one that keeps its batch norm in evaluation mode, say), and so is one
-        # whose attributes are not Python's.
+        # A module with a train of its own is asked (one that keeps its batch norm in evaluation mode, say), and so is
+        # one whose attributes are not Python's.
         def is_special(m: nn.Module) -> bool:
             return type(m).train is not nn.Module.train or isinstance(m, torch.jit.ScriptModule)
 
