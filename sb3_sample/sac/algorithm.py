@@ -221,6 +221,7 @@ class SAC(OffPolicyAlgorithm):
         self._execution: Execution | None = None
         #: A callback that wants gradients in ``.grad`` sets this: the last of the next gradient steps is run eagerly.
         self.keep_next_gradients = False
+        self._keeps_gradients = False
         #: Whether ``.grad`` holds the gradients of another gradient step than the last, as a compiled one leaves none.
         self.gradients_are_stale = False
         #: Transitions stored over the model's life; unlike ``num_timesteps`` never zeroed by ``learn``.
@@ -620,10 +621,10 @@ class SAC(OffPolicyAlgorithm):
             n_updates = self.replay_ratio * n_steps
         else:
             assert isinstance(self.train_freq, TrainFreq)
-            # An episode's length is not known: at least a step.
-            n_updates = (
-                n_steps if self.gradient_steps < 0 else self.gradient_steps * n_steps / self.train_freq.frequency
-            )
+            n_calls = n_steps / (self.n_envs * self.train_freq.frequency)
+            if self.train_freq.unit is TrainFrequencyUnit.EPISODE:
+                n_calls = 0  # How long episodes are is not known.
+            n_updates = n_steps if self.gradient_steps < 0 else self.gradient_steps * n_calls
         # What keeps the step from being compiled is worth a warning only where it was asked for.
         pays = n_updates >= PAYS_FROM and not has_foreign_parts(self)
         self.compiled = pays and why_not_compiled(self) is None
@@ -671,8 +672,8 @@ class SAC(OffPolicyAlgorithm):
         for first in range(0, gradient_steps, MAX_BATCHES_AT_ONCE):
             n_batches = min(MAX_BATCHES_AT_ONCE, gradient_steps - first)
             for i, batch in enumerate(self._draw_batches(n_batches, batch_size), first + 1):
-                keeps_gradients = self.keep_next_gradients and i == gradient_steps
-                self._metrics.update(self._update(batch, keeps_gradients=keeps_gradients))
+                self._keeps_gradients = self.keep_next_gradients and i == gradient_steps
+                self._metrics.update(self._update(batch))
         self._set_training_mode(False)
 
     def _set_training_mode(self, mode: bool) -> None:
@@ -692,15 +693,12 @@ class SAC(OffPolicyAlgorithm):
         self._execution.prepare(self)
         return self._execution
 
-    def _update(
-        self, batch: Batch, noise: Noise | None = None, keeps_gradients: bool = False
-    ) -> dict[str, torch.Tensor]:
+    def _update(self, batch: Batch, noise: Noise | None = None) -> dict[str, torch.Tensor]:
         """
         One gradient step: what is drawn and counted around it, and the step.
 
         :param batch: transitions
         :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly.
-        :param keeps_gradients: whether they are left in ``.grad``, for which the step is run eagerly
         :return: what to log, by name, scalars on the model's device, computed with the parameters from before
             the update of the module in question
         """
@@ -711,10 +709,10 @@ class SAC(OffPolicyAlgorithm):
         self._n_updates += 1
         moves_targets = self._n_updates % (self.target_update_interval or self.policy_delay) == 0
         moves_actor = self._n_updates % self.policy_delay == 0
-        metrics = execution(self, batch, noise, extra, moves_targets, moves_actor, eager=keeps_gradients)
-        self.gradients_are_stale = not (keeps_gradients or execution.leaves_gradients)
-        if keeps_gradients:
-            self.keep_next_gradients = False
+        metrics = execution(self, batch, noise, extra, moves_targets, moves_actor, eager=self._keeps_gradients)
+        self.gradients_are_stale = not (self._keeps_gradients or execution.leaves_gradients)
+        if self._keeps_gradients:
+            self._keeps_gradients = self.keep_next_gradients = False
         if self.redo is not None:
             metrics.update(self.redo.after_update(self, batch))
         return metrics

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import TrainFreq
 
-from sb3_sample.sac.buffers import ValidationSplit
+from sb3_sample.sac.buffers import DeviceReplayBuffer, ValidationSplit
 from sb3_sample.sac.exploration import EXPLORATIONS
 from sb3_sample.sac.pessimism import PESSIMISMS, check_beta
 
@@ -71,6 +71,7 @@ def check(agent: "SAC") -> None:
     _check_pessimism(agent)
     _check_replay(agent)
     _check_n_steps(agent)
+    _check_device_buffer(agent)
     _check_train_freq(agent)
 
 
@@ -129,6 +130,19 @@ def _check_replay(agent: "SAC") -> None:
             )
         if agent.optimize_memory_usage:
             raise ValueError("optimize_memory_usage=True cannot be combined with validation_proportion above 0")
+
+
+def _check_device_buffer(agent: "SAC") -> None:
+    cls = agent.replay_buffer_class
+    if cls is None or not issubclass(cls, DeviceReplayBuffer):
+        return
+    if agent.get_vec_normalize_env() is not None:
+        raise ValueError(
+            "replay_buffer_class=DeviceReplayBuffer cannot be combined with VecNormalize, which normalises on the host: "
+            "leave replay_buffer_class out"
+        )
+    if agent.optimize_memory_usage:
+        raise ValueError("replay_buffer_class=DeviceReplayBuffer cannot be combined with optimize_memory_usage=True")
 
 
 def _check_n_steps(agent: "SAC") -> None:

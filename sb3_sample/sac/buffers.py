@@ -184,14 +184,11 @@ class DeviceReplayBuffer(ReplayBuffer):
     transitions as ``ReplayBuffer`` with the same seed.
 
     :param args: as in Stable-Baselines3
-    :param kwargs: as in Stable-Baselines3, but for ``optimize_memory_usage``
-    :raises ValueError: with ``optimize_memory_usage``
+    :param kwargs: as in Stable-Baselines3; ``optimize_memory_usage`` and ``VecNormalize`` are refused by the algorithm
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        if self.optimize_memory_usage:
-            raise ValueError("optimize_memory_usage=True cannot be combined with DeviceReplayBuffer")
         for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
             # The host's array was never written to, so that it took no memory.
             setattr(

@@ -133,7 +133,9 @@ class Execution:
             if reason is not None:
                 warnings.warn(f"The gradient step is not compiled: {reason}", stacklevel=2)
                 agent.compiled = False
-        captures = agent.device.type == "cuda" and agent.compile is not False and not _foreign_optimizers(agent)
+        # Parts of one's own may look at values on the host: captured only when asked for.
+        asked = agent.compile is True or (agent.compile == "auto" and not has_foreign_parts(agent))
+        captures = agent.device.type == "cuda" and asked and not _foreign_optimizers(agent)
         return cls(agent, bool(agent.compiled), agent.compile == "auto", cuda_graph if captures else None)
 
     @property

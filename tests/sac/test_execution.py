@@ -342,7 +342,10 @@ def test_auto_compiles_where_it_pays_and_the_file_remembers(tmp_path: Path, monk
         ({"replay_ratio": 0.5}, 40),
         ({"train_freq": 4, "gradient_steps": 2}, 40),
         ({"train_freq": 4, "gradient_steps": -1}, 80),
-        ({"train_freq": (1, "episode"), "gradient_steps": 2}, 160),
+        ({"train_freq": (1, "episode"), "gradient_steps": -1}, 80),
+        ({"env": vec(4), "replay_ratio": 0.5}, 40),
+        ({"env": vec(4), "train_freq": 1, "gradient_steps": 2}, 40),
+        ({"env": vec(4), "train_freq": 1, "gradient_steps": -1}, 80),
     ],
 )
 def test_counts_the_gradient_steps_to_come(
@@ -353,6 +356,13 @@ def test_counts_the_gradient_steps_to_come(
         model = sac(learning_starts=20, **kwargs)
         model._decide_compilation(100)
         assert model.compiled is expected
+
+
+def test_episodes_of_unknown_length_stay_uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(algorithm, "PAYS_FROM", 1)
+    model = sac(learning_starts=20, train_freq=(1, "episode"), gradient_steps=2)
+    model._decide_compilation(100)
+    assert model.compiled is False
 
 
 @pytest.mark.parametrize("compile", [True, "auto"])
@@ -510,7 +520,7 @@ def test_device_buffer_gives_what_the_plain_one_gives() -> None:
         assert np.array_equal(getattr(plain, name), getattr(on_device, name).numpy())
     assert plain.full and on_device.full and plain.pos == on_device.pos
     assert not differing(state(models[0]), state(models[1]))
-    with pytest.raises(ValueError, match="VecNormalize"):
-        sac(VecNormalize(vec()), replay_buffer_class=DeviceReplayBuffer).learn(30)
-    with pytest.raises(ValueError, match="optimize_memory_usage"):
+    with pytest.raises(ValueError, match="DeviceReplayBuffer.*VecNormalize"):
+        sac(VecNormalize(vec()), replay_buffer_class=DeviceReplayBuffer)
+    with pytest.raises(ValueError, match="DeviceReplayBuffer.*optimize_memory_usage=True"):
         sac(replay_buffer_class=DeviceReplayBuffer, optimize_memory_usage=True)
