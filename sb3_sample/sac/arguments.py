@@ -138,8 +138,8 @@ def _check_device_buffer(agent: "SAC") -> None:
         return
     if agent.get_vec_normalize_env() is not None:
         raise ValueError(
-            "replay_buffer_class=DeviceReplayBuffer cannot be combined with VecNormalize, which normalises on the host: "
-            "leave replay_buffer_class out"
+            "replay_buffer_class=DeviceReplayBuffer cannot be combined with VecNormalize, which normalises on the "
+            "host: leave replay_buffer_class out"
         )
     if agent.optimize_memory_usage:
         raise ValueError("replay_buffer_class=DeviceReplayBuffer cannot be combined with optimize_memory_usage=True")
