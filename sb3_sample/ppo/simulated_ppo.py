@@ -5,7 +5,6 @@ The on-policy family: PPO whose policy gradient also sees simulated samples, and
 samples come from is the business of its subclasses, in ``fit_models`` and ``_simulate``.
 """
 
-import inspect
 import io
 import math
 import pathlib
@@ -28,6 +27,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_sample.arguments import check_known, check_unused
 from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.ppo.dynamics import minibatches
 from sb3_sample.ppo.spaces import FlatObservations, ModelActions
@@ -262,7 +262,7 @@ class SimulatedPPO(PPO):
         if self.anneal_until is not None and (self.warm_up_until or 0) >= self.anneal_until:
             raise ValueError(f"warm_up_until must be below anneal_until={self.anneal_until}, not {self.warm_up_until}")
         if self.n_simulated == 0:
-            self._check_unused(self.simulation_arguments, "n_simulated=0")
+            check_unused(self, self.simulation_arguments, "n_simulated=0")
             return
         if self.use_sde:
             raise ValueError(
@@ -284,18 +284,6 @@ class SimulatedPPO(PPO):
                 f"rollout_buffer_class={cls.__name__} draws its minibatches itself, but here they hold simulated "
                 "samples too: leave it out, or pass n_simulated=0"
             )
-
-    def _check_unused(self, names: tuple[str, ...], choice: str) -> None:
-        """
-        :param names: arguments of the constructor that mean nothing under a choice
-        :param choice: that choice, for the error
-        :raises ValueError: if one of them is not at its default
-        """
-        for name in names:
-            signatures = (inspect.signature(cls).parameters for cls in type(self).__mro__)
-            default = next(parameters[name].default for parameters in signatures if name in parameters)
-            if getattr(self, name) != default:
-                raise ValueError(f"{name}={getattr(self, name)!r} means nothing with {choice}: leave it out")
 
     def _setup_models(self) -> None:
         """Build what the simulated samples come from."""
@@ -351,11 +339,7 @@ class SimulatedPPO(PPO):
         :return: the model
         :raises ValueError: if ``kwargs`` holds something else, or values with which the file's parameters do not fit
         """
-        known = {name for c in cls.__mro__ if issubclass(c, PPO) for name in inspect.signature(c).parameters}
-        known -= {"policy", "env", "kwargs", "_init_setup_model"}
-        unknown = sorted(kwargs.keys() - known)
-        if unknown:
-            raise ValueError(f"{', '.join(unknown)}: not an argument of {cls.__name__}, so load cannot change it")
+        check_known(cls, PPO, kwargs)
         try:
             return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except (RuntimeError, ValueError) as error:

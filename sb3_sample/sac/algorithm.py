@@ -4,7 +4,6 @@ The off-policy family: soft actor-critic with exchangeable parts, and its one up
 ``SAC._gradient_step`` is the whole gradient step, in the order of BRO's pseudo-code (P5, algorithm 2).
 """
 
-import inspect
 import io
 import pathlib
 from collections.abc import Sequence
@@ -21,6 +20,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
+from sb3_sample.arguments import check_known
 from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.networks.spectral_norm import SpectralNorm
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
@@ -370,11 +370,7 @@ class SAC(OffPolicyAlgorithm):
         :return: the model
         :raises ValueError: if ``kwargs`` holds something else, or values that are not allowed
         """
-        known = {name for c in cls.__mro__ if issubclass(c, SAC) for name in inspect.signature(c).parameters}
-        known -= {"policy", "env", "kwargs", "_init_setup_model"}
-        unknown = sorted(kwargs.keys() - known)
-        if unknown:
-            raise ValueError(f"{', '.join(unknown)}: not an argument of {cls.__name__}, so load cannot change it")
+        check_known(cls, SAC, kwargs)
         if "compile" in kwargs:
             kwargs["compiled"] = None
         if "train_freq" in kwargs or "gradient_steps" in kwargs:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import TrainFreq
 
+from sb3_sample.arguments import check_unused
 from sb3_sample.sac.buffers import DeviceReplayBuffer, ValidationSplit
 from sb3_sample.sac.exploration import EXPLORATIONS
 from sb3_sample.sac.pessimism import PESSIMISMS, check_beta
@@ -178,20 +179,6 @@ def check_names(argument: str, choice: str, make: Callable[..., Any], kwargs: di
     for name in kwargs:
         if name not in allowed:
             raise ValueError(f"{argument}_kwargs has {name!r}, but {argument}={choice!r} takes {allowed or 'none'}")
-
-
-def check_unused(agent: "SAC", names: Sequence[str], choice: str) -> None:
-    """
-    :param agent: the algorithm
-    :param names: arguments of its constructor that mean nothing under a choice
-    :param choice: that choice, for the error
-    :raises ValueError: if one of them is not at its default
-    """
-    for name in names:
-        signatures = (inspect.signature(cls).parameters for cls in type(agent).__mro__)
-        default = next(parameters[name].default for parameters in signatures if name in parameters)
-        if getattr(agent, name) != default:
-            raise ValueError(f"{name}={getattr(agent, name)!r} means nothing with {choice}: leave it out")
 
 
 def check_once(kwargs_name: str, kwargs: dict[str, Any] | None, arguments: dict[str, str]) -> None:

@@ -9,6 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
+from sb3_sample.arguments import check_unused
 from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
@@ -192,7 +193,7 @@ class BRO(SAC):
             same = {name: name for name in OPTIMISTIC_SHIFT_SETTINGS}
             arguments.check_once("exploration_kwargs", self.exploration_kwargs, same)
         else:
-            arguments.check_unused(self, OPTIMISTIC_SHIFT_SETTINGS, f"exploration={self.exploration!r}")
+            check_unused(self, OPTIMISTIC_SHIFT_SETTINGS, f"exploration={self.exploration!r}")
         if not 0 <= self.weight_decay < math.inf:
             raise ValueError(f"weight_decay must be at least 0 and finite, not {self.weight_decay}")
         described = sorted({"critic_network", "critic_network_kwargs"} & self.policy_kwargs.keys())

@@ -4,6 +4,7 @@ from typing import Any
 
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
+from sb3_sample.arguments import check_unused
 from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
@@ -88,7 +89,7 @@ class DAC(SAC):
         if start is not None and not isinstance(beta, str) and not start > -beta:
             raise ValueError(f"initial_optimism must be above minus the pessimism, {-beta}, not {start}")
         if self.exploration != "optimistic_actor":
-            arguments.check_unused(self, OPTIMISTIC_ACTOR_SETTINGS, f"exploration={self.exploration!r}")
+            check_unused(self, OPTIMISTIC_ACTOR_SETTINGS, f"exploration={self.exploration!r}")
 
     def _full_exploration_kwargs(self) -> dict[str, Any]:
         kwargs = super()._full_exploration_kwargs()

@@ -287,7 +287,6 @@ class Captured:
         self._runs: dict[Any, int] = {}
         self._recorded: dict[Any, tuple[Any, Callable[[], None], Metrics]] = {}
         self._held: Any = None
-        self.n_captures = 0
 
     def forget_if_stale(self, agent: "SAC") -> None:
         """
@@ -316,7 +315,6 @@ class Captured:
         if kind not in self._recorded:
             own = _like(inputs, torch.clone)
             self._recorded[kind] = (own, *self._recorder(lambda: step(agent, *own)))
-            self.n_captures += 1
         own, repeat, metrics = self._recorded[kind]
         torch._foreach_copy_(_tensors(own), _tensors(inputs))
         repeat()

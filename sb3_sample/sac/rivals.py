@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
+from sb3_sample.arguments import check_unused
 from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
@@ -189,7 +190,7 @@ class OAC(SAC):
             same = {"optimism": "optimism", "kl_radius": "kl_radius"}
             arguments.check_once("exploration_kwargs", self.exploration_kwargs, same)
         else:
-            arguments.check_unused(self, ("optimism", "kl_radius"), f"exploration={self.exploration!r}")
+            check_unused(self, ("optimism", "kl_radius"), f"exploration={self.exploration!r}")
 
     def _full_exploration_kwargs(self) -> dict[str, Any]:
         kwargs = super()._full_exploration_kwargs()

@@ -4,6 +4,7 @@ from typing import Any
 
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
+from sb3_sample.arguments import check_unused
 from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
@@ -83,7 +84,7 @@ class VPLSAC(SAC):
         super()._check_arguments()
         if self.pessimism != "vpl":
             own = ("initial_pessimism", "pessimism_learning_rate", "pessimism_source", "pessimism_loss")
-            arguments.check_unused(self, own, f"pessimism={self.pessimism}, which is fixed")
+            check_unused(self, own, f"pessimism={self.pessimism}, which is fixed")
 
     def _full_pessimism_kwargs(self) -> dict[str, Any]:
         return {
