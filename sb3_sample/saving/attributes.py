@@ -94,6 +94,17 @@ def _generators_of(space: gym.Space) -> Iterator[gym.Space]:
         yield from _generators_of(part)
 
 
+def without_generators(space: gym.Space) -> gym.Space:
+    """
+    :param space: a space
+    :return: the same, not yet seeded
+    """
+    bare = copy.deepcopy(space)
+    for part in _generators_of(bare):
+        part._np_random = None
+    return bare
+
+
 class Describer:
     """
     Makes trees of the attributes of several objects that may share values.
@@ -179,10 +190,10 @@ class Describer:
             return {"dict": items, "of": class_name(value)}
         if isinstance(value, gym.Space):
             return {"space": [self.describe(part._np_random) for part in _generators_of(value)]}
-        if _has_state_dict(value):
-            return {"state_dict": self.describe(value.state_dict())}
         if is_inert(value) or id(value) in self._inert:
             return {"inert": class_name(value)}
+        if _has_state_dict(value):
+            return {"state_dict": self.describe(value.state_dict())}
         foreign = isinstance(value, (gym.Env, *_CONTAINERS)) or _in(value, _FOREIGN_MODULES)
         if foreign or not hasattr(value, "__dict__"):
             raise Opaque(class_name(value))
@@ -267,10 +278,11 @@ class Restorer:
             case {"deque": items, "maxlen": maxlen}:
                 return collections.deque((self.restore(item, None, name) for item in items), maxlen)
             case {"dict": items, "of": what}:
-                need(what == "builtins.dict" or class_name(present) == what, what)
                 old = present if isinstance(present, dict) else {}
-                mapping: Any = {}
-                if what != "builtins.dict":
+                mapping: Any = collections.OrderedDict() if what == "collections.OrderedDict" else {}
+                if class_name(mapping) != what:
+                    # One with a default of its own.
+                    need(class_name(present) == what, what)
                     mapping = copy.copy(present)
                     mapping.clear()
                 early(mapping)

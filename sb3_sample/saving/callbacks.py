@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, ProgressBarCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.envs.portable_states import pack, unpack
@@ -38,6 +38,8 @@ def walk(callback: BaseCallback, path: str = "callback") -> Iterator[tuple[str, 
     :param path: its name
     :return: it and the callbacks that it calls, by their path
     """
+    if isinstance(callback, ConvertCallback) and callback.callback is None:
+        return  # what Stable-Baselines3 makes of no callback
     yield path, callback
     for name, value in vars(callback).items():
         if name in _NOT_OWN:
@@ -134,7 +136,9 @@ class CallbackStates:
                 warnings.warn(f"{type(callback).__name__} ({path}) starts anew: {error}", stacklevel=4)
         for path, callback in self._callbacks.items():
             if path not in states:
-                warnings.warn(f"{type(callback).__name__} ({path}) starts anew: it is not in the checkpoint", stacklevel=4)
+                warnings.warn(
+                    f"{type(callback).__name__} ({path}) starts anew: it is not in the checkpoint", stacklevel=4
+                )
 
     def _restore(self, path: str, callback: BaseCallback, state: dict[str, Any]) -> None:
         Restorer().attributes(callback, state["attributes"])

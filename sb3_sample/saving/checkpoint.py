@@ -10,6 +10,7 @@ of its loop, after the gradient steps, which is the one moment when everything a
 import json
 import os
 import signal
+import sys
 import threading
 import time
 import types
@@ -84,11 +85,11 @@ class Checkpointer:
         model = self._model
         assert model.env is not None
         self._env: VecEnv = model.env
-        self._identity = _identity(model)
         self._rings = {"model": _ring_of(model)} if getattr(model, "replay_buffer", None) is not None else {}
         for path, each in self._callbacks():
             for name, ring in getattr(each, "checkpoint_rings", dict)().items():
                 self._rings[f"{path}.{name}"] = ring
+        self._identity = _identity(model)
         found = self._folder.newest_good()
         if found is not None:
             path, self._manifest = found
@@ -136,7 +137,9 @@ class Checkpointer:
             return
         state, model = self._resumed, self._model
         theirs, ours = self._manifest["circumstances"], training_state.circumstances(model.device)
-        changed = [f"{name} {theirs.get(name)} (now {value})" for name, value in ours.items() if theirs.get(name) != value]
+        changed = [
+            f"{name} {theirs.get(name)} (now {value})" for name, value in ours.items() if theirs.get(name) != value
+        ]
         if changed:
             warnings.warn(
                 f"The run goes on under other circumstances, so that it need not be the same to the last bit: the "
@@ -321,6 +324,14 @@ def _write(path: Path, kind: str, value: Any) -> None:
     container.write(path, kind, encode(value, kind, tensors), tensors)
 
 
+def _own_modules() -> tuple[str, ...]:
+    """
+    Whose classes may be named in what is written: those of this program. Who reads the model's file decides anew whom
+    to trust, and what is restored here never makes an object by its name.
+    """
+    return tuple(sorted({name.split(".")[0] for name in sys.modules} - {"__main__", "__mp_main__"}))
+
+
 def _identity(model: BaseAlgorithm) -> dict[str, list[str]]:
     """
     What tells a run from another, by the argument's name: a digest to compare, and the value to show.
@@ -332,7 +343,7 @@ def _identity(model: BaseAlgorithm) -> dict[str, list[str]]:
     identity = {}
     for name, value in values.items():
         tensors: dict[str, Any] = {}
-        digest = sha256(json.dumps(encode(value, name, tensors), sort_keys=True).encode())
+        digest = sha256(json.dumps(encode(value, name, tensors, _own_modules()), sort_keys=True).encode())
         for key in sorted(tensors):
             digest.update(key.encode())
             digest.update(np.ascontiguousarray(torch.as_tensor(tensors[key]).cpu().numpy()).tobytes())
@@ -373,7 +384,9 @@ class _Interrupts:
             self.leave(orderly=False)
         self.received = number
         name = signal.Signals(number).name
-        os.write(2, f"\n{name}: the turn is finished and saved in {self._folder}; once more to leave at once\n".encode())
+        os.write(
+            2, f"\n{name}: the turn is finished and saved in {self._folder}; once more to leave at once\n".encode()
+        )
 
     def leave(self, orderly: bool = True) -> None:
         """

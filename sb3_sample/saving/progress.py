@@ -45,7 +45,8 @@ class ProgressFile(KVWriter):
         """
         if self._size < state["size"]:
             warnings.warn(
-                f"{self.path} has {self._size} bytes, {state['size']} at the checkpoint: lines are missing", stacklevel=5
+                f"{self.path} has {self._size} bytes, {state['size']} at the checkpoint: lines are missing",
+                stacklevel=5,
             )
         self._size = min(self._size, state["size"])
         os.ftruncate(self._file, self._size)

@@ -79,7 +79,9 @@ class RunFolder:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             os.close(lock)
-            raise ValueError(f"checkpoint={str(self.path)!r} is in use: another process trains in this folder") from error
+            raise ValueError(
+                f"checkpoint={str(self.path)!r} is in use: another process trains in this folder"
+            ) from error
         except OSError:  # a file system without locks
             os.close(lock)
             return None
@@ -141,6 +143,8 @@ class RunFolder:
         manifest = _read_manifest(path / MANIFEST)
         for root, part in ((path, "files"), (self.path, "segments")):
             for name, facts in manifest[part].items():
+                if name != (Path(name).name if part == "files" else Segment(*_place(facts)).path):
+                    raise Damaged(f"{path / MANIFEST} names a file elsewhere: {name}")
                 _verify_file(root / name, facts)
         return manifest
 
@@ -150,7 +154,7 @@ class RunFolder:
         :param manifest: of a checkpoint
         :return: the rows that it needs, oldest first
         """
-        return [Segment(facts["ring"], facts["first"], facts["last"]) for facts in manifest["segments"].values()]
+        return [Segment(*_place(facts)) for facts in manifest["segments"].values()]
 
     # ---------------------------------------------------------------- writing
 
@@ -239,6 +243,12 @@ class RunFolder:
                 file.unlink(missing_ok=True)
 
 
+def _place(facts: dict[str, Any]) -> tuple[str, int, int]:
+    ring = str(facts.get("ring"))
+    # What follows is a name of a file, and nothing else.
+    return ring if ring.isidentifier() else "?", int(facts.get("first", -1)), int(facts.get("last", -1))
+
+
 def _facts(path: Path) -> dict[str, Any]:
     """Size and checksum of a file, which is on the disk when this returns."""
     with path.open("rb") as file:
@@ -273,7 +283,7 @@ def _write_manifest(path: Path, manifest: dict[str, Any]) -> None:
     body = json.dumps(manifest, indent=1)
     digest = hashlib.sha256(body.encode()).hexdigest()
     with path.open("w", encoding="utf-8") as file:
-        file.write(f"{body[:-2]},\n \"sha256\": \"{digest}\"\n}}\n")
+        file.write(f'{body[:-2]},\n "sha256": "{digest}"\n}}')
         file.flush()
         os.fsync(file.fileno())
 
@@ -285,9 +295,9 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         whole = hashlib.sha256(json.dumps(manifest, indent=1).encode()).hexdigest() == digest
     except FileNotFoundError as error:
         raise Damaged(f"{path} is missing") from error
-    except (ValueError, KeyError, AttributeError) as error:
+    except (ValueError, KeyError, AttributeError, TypeError) as error:
         raise Damaged(f"{path} is damaged: {error}") from error
-    if not whole:
+    if not whole or not {"files", "segments", "steps"} <= manifest.keys():
         raise Damaged(f"{path} is damaged: its checksum is not that of what was written")
     return manifest
 

@@ -15,7 +15,7 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 
-from sb3_sample.saving.attributes import Describer, Node, Opaque, Restorer
+from sb3_sample.saving.attributes import Describer, Node, Opaque, Restorer, without_generators
 from sb3_sample.version import __version__
 
 #: Attributes of an algorithm that its file leaves out and that the future of the run depends on nevertheless.
@@ -23,7 +23,8 @@ KEPT = ("_metrics", "action_noise")
 #: Attributes that follow from the arguments, from what is restored besides, or from the present ``learn``; clocks.
 #: ``_execution``, ``_batch_memory`` and ``rollout_buffer`` are filled anew before they are used.
 DERIVED = (
-    "start_time", "_total_timesteps", "lr_schedule", "_execution", "_batch_memory", "_seconds", "rollout_buffer", "redo",
+    "start_time", "_total_timesteps", "lr_schedule", "_execution", "_batch_memory", "_parts_mode", "_seconds",
+    "rollout_buffer", "redo",
     "env", "_vec_normalize_env", "_logger", "_custom_logger", "replay_buffer", "device",
 )  # fmt: skip
 #: Arguments that may differ between the parts of a run: where it computes, and what it prints.
@@ -137,7 +138,8 @@ def arguments_of(model: BaseAlgorithm) -> dict[str, Any]:
     own = vars(model)
     values: dict[str, Any] = {"class": f"{type(model).__module__}.{type(model).__qualname__}"}
     values["policy"] = model.policy_class
-    values["observation_space"], values["action_space"] = model.observation_space, model.action_space
+    for name in ("observation_space", "action_space"):
+        values[name] = without_generators(getattr(model, name))
     for name in sorted(argument_names(model) - {"env", "policy", *HARMLESS}):
         if name in own:
             values[name] = own[name]

@@ -85,7 +85,9 @@ def describe_spec(env: gym.Env) -> list[str]:
         inner = inner.env
     layers.append(class_name(inner))
     if env.spec is not None:
-        layers.append(f"{env.spec.id}, max_episode_steps={env.spec.max_episode_steps}, {sorted(env.spec.kwargs.items())}")
+        layers.append(
+            f"{env.spec.id}, max_episode_steps={env.spec.max_episode_steps}, {sorted(env.spec.kwargs.items())}"
+        )
     return layers
 
 
@@ -196,5 +198,3 @@ def set_sigint_ignored(venv: VecEnv, ignored: bool) -> None:
     """
     if isinstance(venv.unwrapped, SubprocVecEnv):
         call(venv, "ignore_sigint", [ignored] * venv.num_envs)
-
-

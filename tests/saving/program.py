@@ -27,6 +27,7 @@ from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
 from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO
+from sb3_sample.diagnostics import DiagnosticsCallback
 from sb3_sample.envs import make_env
 from sb3_sample.saving import training_state, vec_envs
 from sb3_sample.saving.callbacks import walk
@@ -93,13 +94,13 @@ def model(algorithm: str, folder: str, env: dict[str, Any], **kwargs: Any) -> An
             arguments.pop("warm_up_until")
         return cls("MlpPolicy", venv, **arguments)
     if kwargs.pop("her", False):
-        kwargs |= {"replay_buffer_class": HerReplayBuffer, "policy": "MultiInputPolicy", "learning_starts": 30}
+        kwargs |= {"replay_buffer_class": HerReplayBuffer, "policy": "MultiInputPolicy", "learning_starts": 60}
     if kwargs.pop("noise", False):
         kwargs["action_noise"] = OrnsteinUhlenbeckActionNoise(np.zeros(1), np.full(1, 0.3))
     return MAKERS[algorithm](venv, **kwargs)
 
 
-def callbacks(folder: str, env: dict[str, Any], evaluate: bool = False) -> Any:
+def callbacks(folder: str, env: dict[str, Any], evaluate: bool = False, diagnose: bool = False) -> Any:
     """Callbacks that remember things."""
     if not evaluate:
         return None
@@ -112,7 +113,11 @@ def callbacks(folder: str, env: dict[str, Any], evaluate: bool = False) -> Any:
         evaluated, callback_after_eval=stop, n_eval_episodes=1, eval_freq=max(1, 24 // n),
         log_path=f"{folder}-eval", best_model_save_path=f"{folder}-eval", verbose=0,
     )  # fmt: skip
-    return [evaluation, StopTrainingOnMaxEpisodes(1000)]
+    others: list[Any] = [StopTrainingOnMaxEpisodes(1000)]
+    if diagnose:
+        # At steps where the last gradients are those from before a checkpoint, too.
+        others.append(DiagnosticsCallback(environment(**{**env, "n": 1}), every=97, rollout_length=20, seed=3))
+    return [evaluation, *others]
 
 
 class _Kill(threading.Thread):
@@ -120,10 +125,10 @@ class _Kill(threading.Thread):
 
     def __init__(self, folder: str, after_steps: int, seconds: float):
         super().__init__(daemon=True)
-        self.path, self.seconds = Path(folder) / f"checkpoint-{after_steps:012d}", seconds
+        self.folder, self.after, self.seconds = Path(folder), f"checkpoint-{after_steps:012d}", seconds
 
     def run(self) -> None:
-        while not self.path.exists():
+        while not any(path.name >= self.after for path in self.folder.glob("checkpoint-*")):
             time.sleep(0.0005)
         time.sleep(self.seconds)
         os.kill(os.getpid(), signal.SIGKILL)
@@ -143,7 +148,7 @@ def train(case: dict[str, Any], steps: int, every: int, folder: str, kill: tuple
     warnings.simplefilter("ignore")
     env = case.get("env", {})
     agent = model(case["algorithm"], folder, env, **case.get("kwargs", {}))
-    callback = callbacks(folder, env, case.get("evaluate", False))
+    callback = callbacks(folder, env, case.get("evaluate", False), case.get("diagnose", False))
     if kill is not None:
         _Kill(folder, *kill).start()
     agent.learn(steps, callback=callback, log_interval=1, checkpoint=folder, checkpoint_freq=every)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from tests.saving.program import result, run
+from tests.saving.program import PPOS, result, run
 
 N = 96
 DUMMY4: dict[str, Any] = {"n": 4}
@@ -15,7 +15,7 @@ NORMALIZED: dict[str, Any] = {"n": 2, "wrap": "normalize"}
 
 #: By name: the algorithm, its arguments and its environment.
 FAST: dict[str, dict[str, Any]] = {
-    "BRO": {"algorithm": "BRO", "kwargs": {"resets": (40, 120)}, "evaluate": True},
+    "BRO": {"algorithm": "BRO", "kwargs": {"resets": (40, 120)}, "evaluate": True, "diagnose": True},
     "VPLSAC, workers": {"algorithm": "VPLSAC", "env": WORKERS4},
     "MBMA": {"algorithm": "MBMA"},
 }
@@ -53,11 +53,13 @@ def differing(first: dict[str, str], second: dict[str, str]) -> list[str]:
 def check(case: dict[str, Any], folder: Path, seed: int = 0) -> None:
     """2N steps at once, and N steps, a SIGKILL at a random later moment, and the rest."""
     whole, killed = str(folder / "whole"), str(folder / "killed")
-    run(case, 2 * N, N, whole)
+    # Iterations of PPO are long, so that the process is not done before it is killed.
+    total = 2 * N if case["algorithm"] not in PPOS else 8 * N
+    run(case, total, N, whole)
     seconds = random.Random(seed).uniform(0, 0.02)
-    run(case, 2 * N, N, killed, (N, seconds), code=-9)
+    run(case, total, N, killed, (N, seconds), code=-9)
     assert not Path(f"{killed}.json").exists()
-    run(case, 2 * N, N, killed)
+    run(case, total, N, killed)
     assert len(result(whole)) > 100
     assert not differing(result(whole), result(killed))
 
