@@ -1,10 +1,10 @@
 """
 Checkpoints of a training, from which it goes on as if it had never been interrupted.
 
-``learn`` calls three methods of a :class:`Checkpointer`: :meth:`~Checkpointer.resume` before its callbacks hear that
-the training starts, :meth:`~Checkpointer.start` after that, and :meth:`~Checkpointer.after_turn` at the end of each turn
-of its loop, after the gradient steps, which is the one moment when everything agrees: between the environment's step and
-``train`` a transition is in no buffer, or has no update yet.
+``learn`` calls three methods of a :class:`Checkpointer`: ``resume`` before its callbacks hear that the training starts,
+``start`` after that, and ``after_turn`` at the end of each turn of its loop, after the gradient steps, which is the one
+moment when everything agrees: between the environment's step and ``train`` a transition is in no buffer, or has no
+update yet.
 """
 
 import json
@@ -92,10 +92,10 @@ class Checkpointer:
         self._identity = _identity(model)
         found = self._folder.newest_good()
         if found is not None:
-            path, self._manifest = found
-            self._resumed = decode(*container.read(path / STATE, KIND), "checkpoint")
-            self._check_identity(path, self._resumed["identity"])
-            self._resumed["path"] = path
+            folder, self._manifest = found
+            self._resumed = decode(*container.read(folder / STATE, KIND), "checkpoint")
+            self._check_identity(self._resumed["identity"])
+            self._resumed["path"] = folder
 
     def _callbacks(self) -> Iterator[tuple[str, BaseCallback]]:
         return walk(without_progress_bar(self._callback))
@@ -121,7 +121,7 @@ class Checkpointer:
 
     # ---------------------------------------------------------------- going on
 
-    def _check_identity(self, path: Path, theirs: dict[str, list[str]]) -> None:
+    def _check_identity(self, theirs: dict[str, list[str]]) -> None:
         ours = self._identity
         for name in sorted(ours.keys() | theirs.keys()):
             present, saved = ours.get(name, ["", "not given"]), theirs.get(name, ["", "not given"])

@@ -36,8 +36,8 @@ def argument_names(model: BaseAlgorithm) -> set[str]:
     :param model: the algorithm
     :return: the arguments of its constructor and of those of its bases
     """
-    signatures = (inspect.signature(cls.__init__).parameters for cls in type(model).__mro__[:-1])
-    return {name for parameters in signatures for name in parameters} - {"self", "args", "kwargs", "_init_setup_model"}
+    signatures = (inspect.signature(cls).parameters for cls in type(model).__mro__ if issubclass(cls, BaseAlgorithm))
+    return {name for parameters in signatures for name in parameters} - {"args", "kwargs", "_init_setup_model"}
 
 
 def _saved_elsewhere(model: BaseAlgorithm) -> set[str]:

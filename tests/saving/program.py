@@ -204,8 +204,10 @@ def outcome(agent: Any, folder: str, callback: Any = None) -> dict[str, str]:
             note("buffer/_ring", buffer._ring[used])
     for each in callback or []:
         for path, part in walk(each, type(each).__name__):
-            names = ("best_mean_reward", "evaluations_timesteps", "evaluations_results", "n_calls", "n_episodes",
-                     "no_improvement_evals", "last_best_mean_reward", "num_timesteps", "evaluations_length")  # fmt: skip
+            names = (
+                "best_mean_reward", "evaluations_timesteps", "evaluations_results", "n_calls", "n_episodes",
+                "no_improvement_evals", "last_best_mean_reward", "num_timesteps", "evaluations_length", "last_results",
+            )  # fmt: skip
             note(path, {name: vars(part)[name] for name in names if name in vars(part)})
     for i, line in enumerate((Path(folder) / "progress.jsonl").read_text().splitlines()):
         note(f"log/{i}", json.loads(line))

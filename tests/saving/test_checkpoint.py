@@ -243,7 +243,7 @@ def test_a_full_quota_is_survived(tmp_path: Path) -> None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (500 if limited else hard, hard))
             return True
 
-    with pytest.warns(UserWarning) as caught:
+    with pytest.warns(UserWarning, match="No checkpoint") as caught:
         model = sac().learn(40, Limit(), checkpoint=tmp_path, log_interval=1, **STEPS)
     messages = [str(w.message) for w in caught if "No checkpoint" in str(w.message)]
     assert len(messages) == 2
