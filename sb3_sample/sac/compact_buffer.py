@@ -129,7 +129,7 @@ class NextObservations:
         first, rest = (index[:2], index[2:]) if isinstance(index, tuple) else (index, ())
         n_rows, n_envs = self.shape[:2]
         if isinstance(first, tuple) and len(first) == 2 and all(_are_numbers(i) for i in first):
-            places = np.ravel_multi_index(first, (n_rows, n_envs))
+            places: Any = np.ravel_multi_index(first, (n_rows, n_envs))
         else:
             places = np.arange(n_rows * n_envs).reshape(n_rows, n_envs)[first]
         rows = self.take(places.reshape(-1)).reshape(*places.shape, *self.shape[2:])
