@@ -22,7 +22,8 @@ HELPER = "_sb3_sample_state"
 _SKIPPED = ("env", HELPER)
 #: Stable-Baselines3's Monitor counts seconds from when it was made, and its file says so.
 _CLOCKS = {"stable_baselines3.common.monitor.Monitor": ("t_start",)}
-#: Arrays in a memory whose size depends on the contacts; they are computed anew at each step, before they are read.
+#: Arrays whose size depends on the contacts, and on which bodies touch each other; they are computed anew at each step,
+#: before they are read.
 _IN_ARENA = ("efc_", "iefc_", "island_", "map_", "iL", "iM", "iacc", "ifrc")
 
 

@@ -156,11 +156,10 @@ class Checkpointer:
                 ring.restore(state["rings"][name], self._pieces([s for s in segments if s.ring == _file_name(name)]))
         self._saved_at = self._whole_at = model.num_timesteps
 
-    def _pieces(self, segments: list[Segment]) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
+    def _pieces(self, segments: list[Segment]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
         assert self._folder is not None
         for segment in segments:
-            rows = decode(*container.read(self._folder.path / segment.path, SEGMENT_KIND), "rows")
-            yield segment.first, segment.last, rows
+            yield segment.first, decode(*container.read(self._folder.path / segment.path, SEGMENT_KIND), "rows")
 
     def start(self) -> None:
         """
@@ -300,7 +299,7 @@ class Checkpointer:
         if first < last:
             segment = Segment(name, first, last)
             needed[segment.path] = self._folder.write_segment(
-                segment, lambda path: _write(path, SEGMENT_KIND, ring.rows(first, last))
+                segment, lambda path: _write(path, SEGMENT_KIND, ring.rows(first))
             )
         return needed
 

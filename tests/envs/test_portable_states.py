@@ -29,8 +29,8 @@ FAST = [
 SLOW = [
     *(f"dmc/{task}-v0" for task in (
         "quadruped-escape", "reacher-hard", "point_mass-hard", "fish-swim", "swimmer-swimmer6", "walker-walk",
-        "manipulator-bring_ball", "humanoid-run", "dog-run", "dog-fetch", "stacker-stack_4", "humanoid_CMU-run", "ball_in_cup-catch",
-        "hopper-hop", "quadruped-fetch", "cheetah-run", "acrobot-swingup", "pendulum-swingup",
+        "manipulator-bring_ball", "humanoid-run", "dog-run", "dog-fetch", "stacker-stack_4", "humanoid_CMU-run",
+        "ball_in_cup-catch", "hopper-hop", "quadruped-fetch", "cheetah-run", "acrobot-swingup", "pendulum-swingup",
     )),
     *(f"metaworld/{task}-v3" for task in (
         "push", "drawer-open", "hammer", "door-open", "coffee-pull", "peg-insert-side", "soccer", "assembly",
@@ -94,9 +94,9 @@ def test_the_saved_arrays_are_those_whose_size_the_model_determines() -> None:
         assert data.ncon > 0
         for name, array in saved.items():
             assert array.shape == getattr(fresh, name).shape
-        # And no other array of floats has such a size.
+        # And no other array of floats has such a size, but for matrices of the islands of bodies that touch.
         floats = {n for n in dir(fresh) if getattr(getattr(fresh, n), "dtype", None) == np.float64}
-        assert {name for name in floats - saved.keys() if getattr(fresh, name).size} == set()
+        assert {name for name in floats - saved.keys() if getattr(fresh, name).size} <= {"iLD", "iM", "iLDiagInv"}
 
 
 def test_a_view_of_the_simulators_memory_follows_it() -> None:

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback, StopTrainingOnMaxEpisodes, StopTrainingOnNoModelImprovement
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
@@ -29,6 +30,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.diagnostics import DiagnosticsCallback
 from sb3_sample.envs import make_env
+from sb3_sample.sac.compact_buffer import CompactReplay
 from sb3_sample.saving import training_state, vec_envs
 from sb3_sample.saving.callbacks import walk
 from tests.ppo.common import TINY, TINY_MODELS
@@ -95,6 +97,8 @@ def model(algorithm: str, folder: str, env: dict[str, Any], **kwargs: Any) -> An
         return cls("MlpPolicy", venv, **arguments)
     if kwargs.pop("her", False):
         kwargs |= {"replay_buffer_class": HerReplayBuffer, "policy": "MultiInputPolicy", "learning_starts": 60}
+    if kwargs.pop("plain", False):
+        kwargs["replay_buffer_class"] = ReplayBuffer
     if kwargs.pop("noise", False):
         kwargs["action_noise"] = OrnsteinUhlenbeckActionNoise(np.zeros(1), np.full(1, 0.3))
     return MAKERS[algorithm](venv, **kwargs)
@@ -197,11 +201,13 @@ def outcome(agent: Any, folder: str, callback: Any = None) -> dict[str, str]:
     note("env", vec_envs.save(agent.env)[0])
     buffer = getattr(agent, "replay_buffer", None)
     if buffer is not None:
-        note("buffer", {k: v for k, v in vars(buffer).items() if isinstance(v, (np.ndarray, dict, int, float))})
-        found.pop("buffer/infos", None)
+        # Where the compact buffers keep their next observations is not the same, what they are is.
+        own = {k: v for k, v in vars(buffer).items() if k not in ("infos", "slot", "_ring", "_first", "_last", "aside")}
+        note("buffer", {k: v for k, v in own.items() if isinstance(v, (np.ndarray, dict, int, float))})
+        if isinstance(buffer, CompactReplay):
+            note("buffer/rows", buffer.new_rows(buffer.size()))
         if hasattr(buffer, "_ring"):
-            used = np.arange(buffer._first, buffer._last) % len(buffer._ring)
-            note("buffer/_ring", buffer._ring[used])
+            note("buffer/_ring", buffer._ring[np.arange(buffer._first, buffer._last) % len(buffer._ring)])
     for each in callback or []:
         for path, part in walk(each, type(each).__name__):
             names = (

@@ -36,8 +36,9 @@ SLOW: dict[str, dict[str, Any]] = {
     "hindsight": {"algorithm": "SAC", "kwargs": {"her": True}, "env": {"env": "goal"}},
     "hindsight, 4": {"algorithm": "SAC", "kwargs": {"her": True}, "env": {"env": "goal", "n": 4}},
     "n-step returns": {"algorithm": "SAC", "kwargs": {"n_steps": 3}, "env": DUMMY4},
-    "memory": {"algorithm": "SAC", "kwargs": {
+    "memory": {"algorithm": "SAC", "kwargs": {"plain": True,
         "optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}},
+    "plain ring": {"algorithm": "SAC", "kwargs": {"plain": True, "buffer_size": 70}, "env": {"n": 2}},
     "ring": {"algorithm": "VPLSAC", "kwargs": {"buffer_size": 70}, "env": {"n": 2}},
     "ring, hindsight": {"algorithm": "SAC", "kwargs": {"her": True, "buffer_size": 70}, "env": {"env": "goal"}},
     "noise": {"algorithm": "BROTD3", "kwargs": {"noise": True}, "env": {"n": 2}},
