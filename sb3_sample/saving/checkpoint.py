@@ -328,7 +328,7 @@ def _own_modules() -> tuple[str, ...]:
     Whose classes may be named in what is written: those of this program. Who reads the model's file decides anew whom
     to trust, and what is restored here never makes an object by its name.
     """
-    return tuple(sorted({name.split(".")[0] for name in sys.modules} - {"__main__", "__mp_main__"}))
+    return tuple(sorted({name.split(".")[0] for name in sys.modules}))
 
 
 def _identity(model: BaseAlgorithm) -> dict[str, list[str]]:
