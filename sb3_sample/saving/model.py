@@ -2,6 +2,7 @@
 
 import io
 import pathlib
+import warnings
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, TypeVar
@@ -23,6 +24,8 @@ from sb3_sample.saving.replay import MAX_TRANSITIONS
 KIND = "model"
 #: Environments and, of a HerReplayBuffer, which makes an object for each, transitions that a file can ask for.
 MAX_ENVS, MAX_HER_TRANSITIONS = 100_000, 20_000_000
+#: The largest width, depth or number of networks that a file can ask for. Python makes lists of such lengths.
+MAX_WIDTH = 1_000_000
 #: What the common optimizers keep of each parameter, in its shape. torch's fused kernels do not check it.
 _MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq", "momentum_buffer", "square_avg", "grad_avg")
 Self = TypeVar("Self", bound="SafeFiles")
@@ -130,6 +133,8 @@ class SafeFiles(BaseAlgorithm):
             print("== SAVED MODEL SYSTEM INFO ==")
             print("\n".join(f"- {name}: {version}" for name, version in content.versions.items()))
         attributes = content.attributes(custom_objects or {})
+        if "replay_buffer_kwargs" not in kwargs:
+            _forget_folder(attributes, warn=env is not None)
         given = kwargs.get("policy_kwargs")
         if "policy_kwargs" in kwargs and given != attributes["policy_kwargs"]:
             raise ValueError(
@@ -326,6 +331,18 @@ def _check_moments(optimizer: torch.optim.Optimizer, state: Any, name: str) -> N
                 raise BadFile(f"{name}: {key} of parameter {index} must be a tensor of shape {tuple(wanted)}")
 
 
+def _forget_folder(attributes: dict[str, Any], warn: bool) -> None:
+    """A file does not choose where this computer writes, nor does a loaded model write over the buffer of its run."""
+    buffer_kwargs = attributes.get("replay_buffer_kwargs")
+    folder = buffer_kwargs.pop("memory_map", None) if isinstance(buffer_kwargs, dict) else None
+    if folder is not None and warn:
+        warnings.warn(
+            f"the replay buffer was in the folder {folder!r:.200}, the loaded model's is in memory: pass "
+            "replay_buffer_kwargs={'memory_map': <folder>} to load for another folder",
+            stacklevel=4,
+        )
+
+
 def _check_names(model: SafeFiles, attributes: dict[str, Any], name: str) -> None:
     """A file sets attributes, but never in the place of a method or of what belongs to the class."""
     own = vars(model)
@@ -338,9 +355,23 @@ def _check_sizes(model: Any, name: str) -> None:
     """What is allocated without torch, or object by object, and so out of the budget's sight."""
     if type(model.n_envs) is not int or not 1 <= model.n_envs <= MAX_ENVS:
         raise BadFile(f"{name}: n_envs must lie in [1, {MAX_ENVS}], not be {model.n_envs!r:.100}")
+    for key, value in vars(model).items():
+        if key.endswith("_kwargs") and key not in ("replay_buffer_kwargs", "rollout_buffer_kwargs"):
+            _check_widths(value, f"{name}: {key}")
     buffer_class, size = getattr(model, "replay_buffer_class", None), getattr(model, "buffer_size", 1)
     most = MAX_TRANSITIONS
     if isinstance(buffer_class, type) and issubclass(buffer_class, HerReplayBuffer):
         most = MAX_HER_TRANSITIONS
     if type(size) is not int or not 1 <= size <= most:
         raise BadFile(f"{name}: buffer_size must lie in [1, {most}], not be {size!r:.100}: pass another one to load")
+
+
+def _check_widths(value: Any, name: str) -> None:
+    if isinstance(value, int) and abs(value) > MAX_WIDTH:
+        raise BadFile(f"{name} holds {value!r:.100}, but sizes of networks are at most {MAX_WIDTH}")
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _check_widths(item, f"{name}.{key}")
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            _check_widths(item, name)

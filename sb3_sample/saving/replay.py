@@ -12,7 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.saving import container, paths
-from sb3_sample.saving.classes import NotPortable, check_trusted, checked_path, resolve
+from sb3_sample.saving.classes import NotPortable, check_trusted, checked_path
 from sb3_sample.saving.container import BadFile, PickledFile
 from sb3_sample.saving.encoding import decode, encode
 
@@ -176,8 +176,8 @@ def decode_buffer(
     :raises ValueError: if it is the buffer of other spaces
     """
     try:
-        cls = resolve(str(tree["class"]), trusted)
-        if not issubclass(cls, ReplayBuffer):
+        cls = decode({"import": tree["class"]}, {}, "replay_buffer", trusted)
+        if not (isinstance(cls, type) and issubclass(cls, ReplayBuffer)):
             raise BadFile(f"it holds a {cls.__name__}, which is no replay buffer")
         if _has_state(cls):
             return _with_state(cls, tree, tensors, model, trusted)
@@ -233,7 +233,8 @@ def _with_attributes(
     if type(buffer.full) is not bool or type(buffer.pos) is not int or not 0 <= buffer.pos < size:
         raise BadFile(f"it is filled up to {buffer.pos!r:.50} of {size} rows")
     for name in _COLUMNS:
-        columns = getattr(buffer, name, {})
+        # With optimize_memory_usage the next observations are those of the next row.
+        columns = {} if name == "next_observations" and buffer.optimize_memory_usage else getattr(buffer, name)
         for column in columns.values() if isinstance(columns, dict) else [columns]:
             if column.shape[:2] != (size, n_envs):
                 raise BadFile(f"{name} is of shape {tuple(column.shape)}, not of {size} rows of {n_envs} environments")
