@@ -29,6 +29,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_known, check_unused
 from sb3_sample.envs.finite_check import FiniteCheck
+from sb3_sample.export import Exportable
 from sb3_sample.ppo.dynamics import minibatches
 from sb3_sample.ppo.spaces import FlatObservations, ModelActions
 
@@ -81,7 +82,7 @@ class SimulatedSamples(NamedTuple):
     weights: torch.Tensor | None = None
 
 
-class SimulatedPPO(PPO):
+class SimulatedPPO(Exportable, PPO):
     """
     PPO whose policy loss also sees simulated samples (P1, Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011,
     algorithm 1): what :class:`MBMAPPO`, :class:`QMAPPO` and :class:`MBPOPPO` share. The critic learns from the real

@@ -22,6 +22,7 @@ from torch import nn
 
 from sb3_sample.arguments import check_known
 from sb3_sample.envs.finite_check import FiniteCheck
+from sb3_sample.export import Exportable
 from sb3_sample.networks.spectral_norm import SpectralNorm
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 from sb3_sample.sac import arguments, losses
@@ -42,7 +43,7 @@ Self = TypeVar("Self", bound="SAC")
 MAX_BATCHES_AT_ONCE = 64
 
 
-class SAC(OffPolicyAlgorithm):
+class SAC(Exportable, OffPolicyAlgorithm):
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
     SAC that the papers compare with (P2-P5): tanh-Gaussian actor, two critics, clipped double Q-learning.
