@@ -28,7 +28,7 @@ from sb3_sample.optim import AdamW, sharpness_aware_gradients
 from sb3_sample.sac import arguments, losses
 from sb3_sample.sac.batch import Batch, CriticStep, Extra, Noise, draw_batches
 from sb3_sample.sac.buffers import BatchMemory, ValidationDictReplayBuffer, ValidationReplayBuffer, ValidationSplit
-from sb3_sample.sac.compact_buffer import CompactDictReplayBuffer, CompactReplayBuffer
+from sb3_sample.sac.compact_buffer import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
 from sb3_sample.sac.execution import PAYS_FROM, Execution, has_foreign_parts, why_not_compiled
 from sb3_sample.sac.exploration import EXPLORATIONS, Exploration
 from sb3_sample.sac.parts import ParametersDoNotFit, Part
@@ -287,12 +287,15 @@ class SAC(Exportable, OffPolicyAlgorithm):
                 **self.replay_buffer_kwargs,
                 "validation_proportion": self.validation_proportion,
             }
-            return
-        if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, ValidationSplit):
+        elif self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, ValidationSplit):
             # Loaded, with validation_proportion=0 instead of the saved one.
             self.replay_buffer_class = None
         if self.replay_buffer_class is None and self.n_steps == 1:
             self.replay_buffer_class = CompactDictReplayBuffer if is_dict else CompactReplayBuffer
+        if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, CompactReplay):
+            # It saves the memory in any case. Where Stable-Baselines3 reads the argument, it would end an episode that
+            # only its own variant needs to have ended.
+            self.optimize_memory_usage = False
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         """
