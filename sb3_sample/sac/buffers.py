@@ -15,8 +15,8 @@ from sb3_sample.sac.compact_buffer import (
     CompactDictReplayBuffer,
     CompactReplay,
     CompactReplayBuffer,
-    NextObservations,
 )
+from sb3_sample.sac.next_observations import NextObservations
 
 
 def samples_at(

@@ -3,147 +3,28 @@ Replay buffers that store one observation a step: the next observation of a step
 the step after it.
 """
 
+import functools
 import os
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-import psutil
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 
-from sb3_sample.sac.memory_map import MemoryMap, n_bytes
+from sb3_sample.sac import memory_map as files
+from sb3_sample.sac.next_observations import NEXT_ROW, ONLY, NextObservations, SideStore
 
-#: In ``slot``: the next row's observation is the next observation.
-NEXT_ROW = -1
-#: The name of the only observation where it is not a dict.
-_ONLY = ""
+try:  # As in Stable-Baselines3: without it nobody looks at the memory.
+    import psutil
+except ImportError:
+    psutil = None
 
 
 def _file_name(column: str, key: str) -> str:
     return f"{column}/{key}" if key else column
-
-
-class SideStore:
-    """
-    The next observations that no row holds, by a number, their slot. Slots 0 to ``n_envs - 1`` are those of the newest
-    row, whose following row is not there yet. It grows as it is needed.
-
-    :param like: shape and type of the observations, by key
-    :param n_envs: number of environments
-    :param memory_map: where its arrays are; None for the memory
-    """
-
-    def __init__(self, like: dict[str, tuple[tuple[int, ...], Any]], n_envs: int, memory_map: MemoryMap | None):
-        self._n_envs, self._memory_map = n_envs, memory_map
-        zeros: Callable[..., np.ndarray] = np.zeros if memory_map is None else memory_map.zeros
-        #: (capacity, O) each.
-        self.arrays = {key: zeros((n_envs, *shape), dtype) for key, (shape, dtype) in like.items()}
-        self._free: list[int] = []
-
-    def __len__(self) -> int:
-        """How many are in it, without those of the newest row."""
-        return self._capacity() - self._n_envs - len(self._free)
-
-    def _capacity(self) -> int:
-        return len(next(iter(self.arrays.values())))
-
-    def newest(self) -> dict[str, np.ndarray]:
-        """
-        :return: the next observations of the newest row, to be read and written, (n_envs, O) each
-        """
-        return {key: array[: self._n_envs] for key, array in self.arrays.items()}
-
-    def put(self, values: dict[str, np.ndarray]) -> list[int]:
-        """
-        :param values: next observations, (n, O) each
-        :return: their slots
-        """
-        n = len(next(iter(values.values())))
-        if n > len(self._free):
-            self._grow(n - len(self._free))
-        slots = [self._free.pop() for _ in range(n)]
-        for key, array in self.arrays.items():
-            array[slots] = values[key]
-        return slots
-
-    def _grow(self, n: int) -> None:
-        old = self._capacity()
-        new = old + max(n, old // 4)
-        for key, array in self.arrays.items():
-            if self._memory_map is not None:
-                self.arrays[key] = self._memory_map.longer(array, new)
-            else:
-                self.arrays[key] = np.empty((new, *array.shape[1:]), array.dtype)
-                self.arrays[key][:old] = array
-        self._free.extend(range(new - 1, old - 1, -1))
-
-    def free(self, slots: np.ndarray) -> None:
-        """
-        :param slots: numbers that are needed no more; those below ``n_envs`` do not count
-        """
-        self._free.extend(slots[slots >= self._n_envs].tolist())
-
-    def clear(self) -> None:
-        """Free all."""
-        self._free = list(range(self._capacity() - 1, self._n_envs - 1, -1))
-
-
-class NextObservations:
-    """
-    The next observations of a buffer, read like an array: indices of rows and environments come first. Rows that were
-    never stored mean nothing.
-
-    :param buffer: the buffer
-    :param key: which observation, of a dict of them
-    """
-
-    def __init__(self, buffer: "CompactReplay", key: str = _ONLY):
-        self._buffer, self._key = buffer, key
-        observations = buffer.stored()[key]
-        self.shape, self.dtype, self.ndim = observations.shape, observations.dtype, observations.ndim
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def take(self, places: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """
-        :param places: position * n_envs + environment of each, (N,)
-        :param out: memory for the result, (N, O); None for new one
-        :return: the next observations there
-        """
-        n_envs, n = self.shape[1], self.shape[0] * self.shape[1]
-        following = places + n_envs
-        following[following >= n] -= n  # the row after the last one is the first
-        stored = self._buffer.stored()[self._key].reshape(n, *(self.shape[2:] or (1,)))
-        rows = stored.take(following, axis=0, out=out, mode="clip")
-        slots = self._buffer.slot.reshape(n).take(places)
-        apart = np.flatnonzero(slots != NEXT_ROW)
-        if len(apart):
-            rows[apart] = self._buffer.aside.arrays[self._key][slots[apart]].reshape(-1, *rows.shape[1:])
-        return rows
-
-    def __getitem__(self, index: Any) -> Any:
-        first, rest = (index[:2], index[2:]) if isinstance(index, tuple) else (index, ())
-        n_rows, n_envs = self.shape[:2]
-        if isinstance(first, tuple) and len(first) == 2 and all(_are_numbers(i) for i in first):
-            places: Any = np.ravel_multi_index(first, (n_rows, n_envs))
-        else:
-            places = np.arange(n_rows * n_envs).reshape(n_rows, n_envs)[first]
-        rows = self.take(places.reshape(-1)).reshape(*places.shape, *self.shape[2:])
-        return rows[(*(slice(None),) * places.ndim, *rest)] if rest else rows
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        if copy is False:
-            raise ValueError("next observations are not stored as an array: reading them all makes one")
-        rows = self.take(np.arange(self.shape[0] * self.shape[1])).reshape(self.shape)
-        return rows if dtype is None else rows.astype(dtype)
-
-
-def _are_numbers(index: Any) -> bool:
-    return isinstance(index, np.ndarray) and index.dtype != bool and index.size > 0 and int(index.min()) >= 0
 
 
 class CompactReplay:
@@ -162,9 +43,9 @@ class CompactReplay:
     :param n_envs: number of environments
     :param optimize_memory_usage: either value: the buffer always stores one observation a step
     :param handle_timeout_termination: whether a time limit is no termination
-    :param memory_map: a folder, made if it is not there, whose files hold the buffer instead of the memory; one run a
-        folder. The files stay until they are deleted or the next run replaces them. None for the memory
-    :raises ValueError: if ``memory_map`` cannot be written to, has not the space or holds the buffer of another run
+    :param memory_map: a folder, made if it is not there, whose files hold the buffer instead of the memory. They have
+        no names and go with the buffer: runs cannot meet in them, and nothing is left to delete. None for the memory
+    :raises ValueError: if ``memory_map`` cannot be written to or has not the space
     """
 
     buffer_size: int
@@ -172,6 +53,7 @@ class CompactReplay:
     pos: int
     full: bool
     observations: Any
+    memory_map: str | None
     slot: np.ndarray
     aside: SideStore
 
@@ -195,23 +77,24 @@ class CompactReplay:
         self.handle_timeout_termination = handle_timeout_termination
         rows = (self.buffer_size, self.n_envs)
         is_dict = isinstance(observation_space, spaces.Dict)
-        one: dict[str, tuple[tuple[int, ...], Any]] = {_ONLY: (self.obs_shape, observation_space.dtype)}
+        one: dict[str, tuple[tuple[int, ...], Any]] = {ONLY: (self.obs_shape, observation_space.dtype)}
         if isinstance(observation_space, spaces.Dict):
             shapes: Any = self.obs_shape
             one = {key: (shapes[key], space.dtype) for key, space in observation_space.spaces.items()}
         layout = {key: ((*rows, *shape), dtype) for key, (shape, dtype) in one.items()}
         actions = ((*rows, self.action_dim), self._maybe_cast_dtype(action_space.dtype))
-        needed = n_bytes([*layout.values(), actions, *[(rows, np.float32)] * 4])
-        self.memory_map = None if memory_map is None else MemoryMap(memory_map, needed)
-        if self.memory_map is None and needed > (available := psutil.virtual_memory().available):
+        needed = sum(files.n_bytes(*array) for array in [*layout.values(), actions, *[(rows, np.float32)] * 4])
+        #: The folder that holds the arrays; None if the memory does.
+        self.memory_map = None if memory_map is None else files.check_folder(memory_map, needed)
+        if memory_map is None and psutil is not None and needed > (available := psutil.virtual_memory().available):
             warnings.warn(
                 f"the full replay buffer takes {needed / 1e9:.2f} GB, and {available / 1e9:.2f} GB of memory are free: "
                 "pass a smaller buffer_size, or replay_buffer_kwargs={'memory_map': <folder>}",
                 stacklevel=2,
             )
-        zeros: Callable[..., np.ndarray] = np.zeros if self.memory_map is None else self.memory_map.zeros
+        zeros = functools.partial(files.zeros, self.memory_map)
         stored = {key: zeros(*array) for key, array in layout.items()}
-        self.observations = stored if is_dict else stored[_ONLY]
+        self.observations = stored if is_dict else stored[ONLY]
         self.actions = zeros(*actions)
         self.rewards, self.dones, self.timeouts = (zeros(rows, np.float32) for _ in range(3))
         #: Where the next observation is: in the next row, or aside, in this slot; (buffer_size, n_envs).
@@ -219,11 +102,23 @@ class CompactReplay:
         self.slot[...] = NEXT_ROW
         self.aside = SideStore(one, self.n_envs, self.memory_map)
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        if self.memory_map is None:
+            return
+        # What is copied or unpickled is in the memory.
+        self.memory_map = files.check_folder(self.memory_map, sum(array.nbytes for array in self.stored().values()))
+        stored = {key: files.moved(self.memory_map, array) for key, array in self.stored().items()}
+        self.observations = stored if isinstance(self.observations, dict) else stored[ONLY]
+        for name in ("actions", "rewards", "dones", "timeouts", "slot"):
+            setattr(self, name, files.moved(self.memory_map, getattr(self, name)))
+        self.aside.arrays = {key: files.moved(self.memory_map, array) for key, array in self.aside.arrays.items()}
+
     def stored(self) -> dict[str, np.ndarray]:
         """
         :return: the observations by key, (buffer_size, n_envs, O) each
         """
-        return self.observations if isinstance(self.observations, dict) else {_ONLY: self.observations}
+        return self.observations if isinstance(self.observations, dict) else {ONLY: self.observations}
 
     @property
     def next_observations(self) -> Any:
@@ -269,7 +164,7 @@ class CompactReplay:
 
     def _as_stored(self, given: Any) -> dict[str, np.ndarray]:
         """Observations of all environments in the form in which they are stored, (n_envs, O) each."""
-        by_key = given if isinstance(self.observations, dict) else {_ONLY: given}
+        by_key = given if isinstance(self.observations, dict) else {ONLY: given}
         return {
             key: np.ascontiguousarray(by_key[key], dtype=array.dtype).reshape(array.shape[1:])
             for key, array in self.stored().items()
@@ -355,6 +250,8 @@ class CompactReplay:
                 self._replace(rows, piece, keeps_before=begin < first and n < self.buffer_size)
             end = first + n
             self.pos, self.full = end % self.buffer_size, end - begin >= self.buffer_size
+        if begin % self.buffer_size != 0 and not self.full:
+            raise ValueError(f"the steps before step {begin} are missing")
         self._restored()
 
     def _replace(self, rows: np.ndarray, piece: dict[str, np.ndarray], keeps_before: bool) -> None:

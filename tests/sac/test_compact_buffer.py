@@ -1,12 +1,7 @@
-"""The buffer that stores one observation a step, beside Stable-Baselines3's, which stores two."""
+"""The buffers that store each observation once, beside Stable-Baselines3's, which stores two."""
 
 import copy
-import pickle
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,364 +11,215 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_sample.sac import memory_map
-from sb3_sample.sac.batch import draw_batches
-from sb3_sample.sac.buffers import BatchMemory, ValidationDictReplayBuffer, ValidationReplayBuffer
-from sb3_sample.sac.compact_buffer import CompactDictReplayBuffer, CompactReplayBuffer
+from sb3_sample import SAC, CompactDictReplayBuffer, CompactReplayBuffer
+from sb3_sample.sac.buffers import ValidationReplayBuffer, latest, samples_at
 from tests.sac.common import sac, vec
+from tests.sac.streams import ACTIONS, BOX, DICT, SPACES, Stream, assert_same, draw, pair, same_bits
 
-BOX = spaces.Box(-np.inf, np.inf, (2,), np.float32)
-DICT = spaces.Dict({"x": BOX, "image": spaces.Box(0, 255, (2, 3), np.uint8), "n": spaces.Discrete(5)})
-ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
-#: Values whose comparison is not that of their bits, and a few more, so that observations repeat.
-VALUES = np.array([0.0, -0.0, np.nan, 1.0, 2.0], np.float32)
+# ---------------------------------------------------------------- the same transitions
 
 
-def transitions(space: spaces.Space, n_envs: int, seed: int, p_end: float = 0.15) -> Iterator[tuple[Any, ...]]:
-    """
-    Steps as ``add`` takes them: episodes end in each environment by themselves; now and then all of them are reset
-    without an end, or next observation and observation differ in the sign of a zero only.
-    """
-    rng = np.random.default_rng(seed)
-
-    def draw(sub: Any) -> np.ndarray:
-        if sub is BOX:
-            return rng.choice(VALUES, (n_envs, 2))
-        if isinstance(sub, spaces.Discrete):
-            return rng.integers(0, 5, n_envs)
-        return rng.integers(0, 3, (n_envs, *sub.shape)).astype(np.uint8)
-
-    def observe() -> dict[str, np.ndarray]:
-        return {key: draw(sub) for key, sub in (space.items() if isinstance(space, spaces.Dict) else [("", space)])}
-
-    now = observe()
-    while True:
-        after, done = observe(), rng.random(n_envs) < p_end
-        given = [copy.deepcopy(o if isinstance(space, spaces.Dict) else o[""]) for o in (now, after)]
-        infos = [{"TimeLimit.truncated": bool(d and rng.random() < 0.5)} for d in done]
-        yield *given, rng.uniform(-1, 1, (n_envs, 2)), rng.normal(size=n_envs), done, infos
-        fresh = observe()
-        now = {key: value.copy() for key, value in after.items()}
-        broken = np.full(n_envs, rng.random() < 0.05) | done
-        for key, value in now.items():
-            value[broken] = fresh[key][broken]
-
-
-def make(cls: Any, rows: int, n_envs: int, **kwargs: Any) -> Any:
-    space = DICT if issubclass(cls, DictReplayBuffer) else BOX
-    if "Validation" in cls.__name__:
-        kwargs["validation_proportion"] = 0.3
-    return cls(rows * n_envs, space, ACTIONS, device="cpu", n_envs=n_envs, **kwargs)
-
-
-def flat(samples: Any) -> list[torch.Tensor]:
-    # The sixth field, discounts, is of n-step returns.
-    return [x for field in samples[:5] for x in (field.values() if isinstance(field, dict) else [field])]
-
-
-def same(a: Any, b: Any) -> bool:
-    """Equal bit by bit, NaN and the sign of zeros included."""
-    return all(
-        x.dtype == y.dtype and x.shape == y.shape and x.numpy().tobytes() == y.numpy().tobytes()
-        for x, y in zip(flat(a), flat(b), strict=True)
-    )
-
-
-def compare(ours: Any, theirs: Any, seed: int, n: int = 64) -> None:
-    np.random.seed(seed)
-    expected = theirs.sample(n)
-    after = np.random.random()
-    np.random.seed(seed)
-    assert same(ours.sample(n), expected)
-    assert np.random.random() == after, "as many numbers were drawn"
-
-
-PAIRS = [(CompactReplayBuffer, ReplayBuffer), (CompactDictReplayBuffer, DictReplayBuffer)]
-
-
-@pytest.mark.parametrize(("cls", "sb3"), PAIRS)
-@pytest.mark.parametrize(("rows", "n_envs"), [(1, 1), (1, 3), (2, 1), (7, 2), (40, 3)])
-@pytest.mark.parametrize("p_end", [0.02, 0.5, 1.0])
-def test_long_random_run(cls: Any, sb3: Any, rows: int, n_envs: int, p_end: float) -> None:
-    ours, theirs = make(cls, rows, n_envs), make(sb3, rows, n_envs)
-    steps = transitions(ours.observation_space, n_envs, seed=rows, p_end=p_end)
-    for step in range(5 * rows + 3):
-        one = next(steps)
-        ours.add(*copy.deepcopy(one))
-        theirs.add(*copy.deepcopy(one))
+@pytest.mark.parametrize(("rows", "n_envs"), [(50, 1), (11, 3), (1, 1), (1, 2), (2, 1), (400, 2)])
+@pytest.mark.parametrize("space", SPACES)
+def test_what_stable_baselines3s_buffer_holds(space: str, rows: int, n_envs: int) -> None:
+    """Over long random runs, ring and all: the same samples from the same draws, and the same array when it is read."""
+    ours, theirs = pair(SPACES[space], rows, n_envs)
+    stream = Stream(SPACES[space], n_envs, seed=rows)
+    for step in range(4 * rows + 7):
+        transition = stream.transition()
+        ours.add(*copy.deepcopy(transition))
+        theirs.add(*copy.deepcopy(transition))
+        # Nothing of the caller's is kept.
+        if isinstance(transition[0], np.ndarray):
+            transition[0][...] = transition[1][...] = 0
         assert (ours.pos, ours.full, ours.size()) == (theirs.pos, theirs.full, theirs.size())
-        compare(ours, theirs, seed=step)
-        for env, key in [(e, k) for e in range(n_envs) for k in ours.stored()]:
-            mine, other = ((b.next_observations[key] if key else b.next_observations) for b in (ours, theirs))
-            n = theirs.size()
-            assert mine[:n, env].tobytes() == other[:n, env].tobytes()
-        n_apart = int((ours.slot >= n_envs).sum())
-        assert len(ours.aside) == n_apart, "no slot is lost"
+        assert len(ours.aside) == (ours.slot >= n_envs).sum(), "no place aside is lost"
+        if step % 13 == 0 or step < 5:
+            assert same_bits(draw(ours, 64, step), draw(theirs, 64, step))
+        if step % 29 == 0:
+            n = ours.size()
+            for key in SPACES[space] if space == "dict" else [None]:  # type: ignore[attr-defined]
+                mine, array = (b.next_observations if key is None else b.next_observations[key] for b in (ours, theirs))
+                assert same_bits(mine[:n], array[:n])
 
 
-def test_normalised_samples() -> None:
-    venv = VecNormalize(vec(2))
-    venv.reset()
-    venv.step(np.zeros((2, 2)))
-    ours, theirs = (
-        cls(30, venv.observation_space, ACTIONS, device="cpu", n_envs=2) for cls in (CompactReplayBuffer, ReplayBuffer)
+def test_the_comparison_can_fail() -> None:
+    """A buffer that always takes the next row's observation is found out: by an episode's end, and by -0 for 0."""
+    for following in (np.full((1, 3), 5), np.array([[0, -0.0, 0]])):
+        ours, theirs = pair(BOX, 10, 1)
+        for buffer in (ours, theirs):
+            for t, after in ((-1, following), (0, np.ones((1, 3)))):
+                buffer.add(np.zeros((1, 3)), after, np.zeros((1, 2)), np.array([t]), np.zeros(1), [{}])
+        assert same_bits(draw(ours, 9, 0), draw(theirs, 9, 0))
+        assert ours.slot[0, 0] > 0
+        ours.slot[0, 0] = -1
+        assert not same_bits(draw(ours, 9, 0), draw(theirs, 9, 0))
+
+
+def test_only_what_differs_is_kept_twice() -> None:
+    """Episodes of 50 steps: the memory kept aside stays that of the episodes that are in the buffer."""
+    ours, _ = pair(BOX, 500, 2)
+    space_aside = []
+    for t in range(5000):
+        start, end = t % 50 == 0, t % 50 == 49
+        now, after = np.full((2, 3), t + 0.5 * start), np.full((2, 3), t + 1.0)
+        ours.add(now, after, np.zeros((2, 2)), np.zeros(2), np.full(2, end), [{"TimeLimit.truncated": end}] * 2)
+        space_aside.append(len(ours.aside.arrays[""]))
+    assert (ours.slot >= 2).sum() == 2 * 9 and (ours.slot == -1).sum() == 2 * 490
+    assert space_aside[-1] == space_aside[600] <= 64
+    assert ours.observations.shape == (500, 2, 3)
+    large = [k for k, v in vars(ours).items() if isinstance(v, np.ndarray) and v.size >= ours.observations.size]
+    assert large == ["observations"]
+
+
+@pytest.mark.parametrize("handle", [True, False])
+@pytest.mark.parametrize("optimize", [True, False])
+def test_arguments_of_stable_baselines3s_buffer(handle: bool, optimize: bool) -> None:
+    ours = CompactReplayBuffer(
+        40, BOX, ACTIONS, "cpu", 2, optimize_memory_usage=optimize, handle_timeout_termination=handle
     )
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        one = (*rng.normal(size=(2, 2, 3)), rng.normal(size=(2, 2)), rng.normal(size=2), np.zeros(2), [{}, {}])
-        ours.add(*one)
-        theirs.add(*one)
-    np.random.seed(1)
-    expected = theirs.sample(50, env=venv)
-    np.random.seed(1)
-    assert same(ours.sample(50, env=venv), expected)
+    theirs = ReplayBuffer(40, BOX, ACTIONS, "cpu", 2, handle_timeout_termination=handle)
+    stream = Stream(BOX, 2, 0)
+    for _ in range(50):
+        transition = stream.transition()
+        ours.add(*transition)
+        theirs.add(*transition)
+    assert same_bits(draw(ours, 200, 0), draw(theirs, 200, 0))
+    assert handle == bool(ours.timeouts.any())
 
 
-def test_the_view_is_read_like_an_array() -> None:
-    ours, theirs = make(CompactReplayBuffer, 10, 3), make(ReplayBuffer, 10, 3)
-    steps = transitions(BOX, 3, seed=0)
-    for _ in range(14):
-        one = next(steps)
-        ours.add(*one)
-        theirs.add(*one)
+def test_reset_empties_it() -> None:
+    for n_envs in (1, 3):
+        ours, theirs = pair(DICT, 20, n_envs)
+        stream = Stream(DICT, n_envs, 0)
+        for step in range(75):
+            if step in (1, 15, 50):
+                ours.reset()
+                theirs.reset()
+                assert ours.size() == 0 and (ours.slot == -1).all()
+            transition = stream.transition()
+            ours.add(*transition)
+            theirs.add(*transition)
+            assert same_bits(draw(ours, 30, step), draw(theirs, 30, step))
+
+
+# ---------------------------------------------------------------- reading the next observations
+
+
+def test_indices() -> None:
+    """Every way of indexing, against the array."""
+    ours, theirs = pair(SPACES["float64"], 13, 3)
+    stream = Stream(SPACES["float64"], 3, 0, ends=0.3)
+    for _ in range(31):
+        transition = stream.transition()
+        ours.add(*transition)
+        theirs.add(*transition)
     view, array = ours.next_observations, theirs.next_observations
-    assert (view.shape, view.dtype, view.ndim, len(view)) == (array.shape, array.dtype, 3, 10)
-    rows, envs = np.array([3, 9, 0, 4]), np.array([0, 2, 1, 2])
-    indices: list[Any] = [
-        3, -1, slice(2, 7), (4, 1), (slice(None), 2), rows, (rows, envs), (rows, envs, slice(None)), (rows, envs, 1),
-        (rows[:, None], envs), (slice(1, 3), slice(None), 0), array[..., 0, 0] > 0, (-rows, envs), np.array([], int),
-    ]  # fmt: skip
-    for index in indices:
-        assert np.array_equal(view[index], array[index], equal_nan=True), index
-    assert np.array_equal(np.asarray(view), array, equal_nan=True)
-    for index in (10, (rows, envs + 1), (rows + 9, envs)):
-        with pytest.raises((IndexError, ValueError)):
-            view[index]
-    with pytest.raises(TypeError):
+    rng = np.random.default_rng(0)
+    positions, envs = rng.integers(-13, 13, 40), rng.integers(-3, 3, 40)
+    mask = rng.random((13, 3)) < 0.5
+    for key in (
+        (positions, envs), (positions, envs, slice(None)), (positions, envs, 1), (positions, envs, slice(1), 0),
+        positions, list(positions), 3, -1, (4, 2), (-1, -2, 1, 0), slice(None), slice(2, 9, 3), (slice(3, None), 1),
+        (slice(None, None, -1), envs), (slice(2), slice(1, 3)), (positions, slice(1, None)), (positions, 2), mask,
+        mask[:, 0], (mask, 1), Ellipsis, (Ellipsis, 0), (slice(4), Ellipsis, 1),
+        (positions.reshape(8, 5), envs.reshape(8, 5)),
+        (np.int64(5), np.array([0, 2])), (np.array(5), np.array(1)), (positions[:0], envs[:0]),
+    ):  # fmt: skip
+        assert same_bits(view[key], array[key]), key
+    assert same_bits(np.asarray(view), array) and same_bits(np.asarray(view, np.float32), array.astype(np.float32))
+    assert (len(view), view.shape, view.dtype, view.ndim) == (len(array), array.shape, array.dtype, array.ndim)
+    before = np.asarray(view)
+    for key in (3, (4, 2), slice(None), positions):
+        view[key][...] = 7  # a copy
+    assert same_bits(np.asarray(view), before)
+    for key in (13, (0, 3), (positions + 13, envs)):
+        with pytest.raises(IndexError):
+            view[key]
+    with pytest.raises(TypeError, match="item assignment"):
         view[0] = 1
+    # One that was taken earlier sees what comes later.
+    for _ in range(40):
+        transition = stream.transition()
+        ours.add(*transition)
+        theirs.add(*transition)
+    assert same_bits(view[:], theirs.next_observations)
 
 
-@pytest.mark.parametrize("n_envs", [1, 3])
-@pytest.mark.parametrize("cls", [CompactReplayBuffer, CompactDictReplayBuffer, ValidationDictReplayBuffer])
-def test_gathered(cls: Any, n_envs: int) -> None:
-    buffer, memory = make(cls, 20, n_envs), BatchMemory()
-    steps = transitions(buffer.observation_space, n_envs, seed=1)
-    for i in range(50):
-        buffer.add(*next(steps))
-        np.random.seed(i)
-        expected = draw_batches(buffer, 3, 16, 0.9, None)
-        np.random.seed(i)
-        assert memory.serves(buffer, None)
-        for a, b in zip(draw_batches(buffer, 3, 16, 0.9, None, memory), expected, strict=True):
-            assert same(a[:5], b[:5])
+@pytest.mark.parametrize("as_dict", [False, True])
+def test_named_transitions(as_dict: bool) -> None:
+    ours, theirs = pair(DICT if as_dict else BOX, 9, 2)
+    stream = Stream(DICT if as_dict else BOX, 2, 0)
+    for step in range(30):
+        transition = stream.transition()
+        ours.add(*copy.deepcopy(transition))
+        theirs.add(*copy.deepcopy(transition))
+        n = ours.size()
+        places = np.divmod(np.arange(2 * n), 2)
+        assert same_bits(samples_at(ours, *places), samples_at(theirs, *places))
+        assert same_bits(latest(ours, min(n, 5)), latest(theirs, min(n, 5))), step
 
 
-# ------------------------------------------------------------------ models
+# ---------------------------------------------------------------- in training
 
 
 @pytest.mark.parametrize("as_dict", [False, True])
 @pytest.mark.parametrize("n_envs", [1, 3])
-@pytest.mark.parametrize("truncate", [False, True])
-def test_trains_the_same_model(as_dict: bool, n_envs: int, truncate: bool) -> None:
-    space = spaces.Dict({"a": spaces.Box(-10, 10, (3,)), "b": spaces.Box(-10, 10, (2,))}) if as_dict else None
-    models = []
-    for cls in (None, DictReplayBuffer if as_dict else ReplayBuffer):
-        model = sac(
-            vec(n_envs, obs_space=space, truncate=truncate), policy="MultiInputPolicy" if as_dict else "MlpPolicy",
-            replay_buffer_class=cls, buffer_size=60,
-        )  # fmt: skip
-        model.learn(50)
-        model.learn(50)  # resets the environments in the midst of an episode
-        models.append(model)
-    assert type(models[0].replay_buffer) is (CompactDictReplayBuffer if as_dict else CompactReplayBuffer)
-    ours, theirs = (model.policy.state_dict() for model in models)
-    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
-    compare(models[0].replay_buffer, models[1].replay_buffer, seed=0)
+@pytest.mark.parametrize("normalize", [False, True])
+def test_trains_as_with_stable_baselines3s_buffer(as_dict: bool, n_envs: int, normalize: bool) -> None:
+    """Bit by bit, over the ring's seam and a second ``learn``, which breaks an episode off."""
+    kwargs: dict[str, Any] = {"obs_space": spaces.Dict({"a": BOX, "b": BOX})} if as_dict else {}
+    theirs = DictReplayBuffer if as_dict else ReplayBuffer
+    models: list[SAC] = []
+    for cls in (None, theirs):
+        venv: Any = vec(n_envs, **kwargs)
+        venv = VecNormalize(venv) if normalize else venv
+        policy = "MultiInputPolicy" if as_dict else "MlpPolicy"
+        model = sac(venv, policy=policy, replay_buffer_class=cls, buffer_size=60, learning_starts=10)
+        models.append(model.learn(50).learn(43))
+    ours, other = models
+    assert type(ours.replay_buffer) is (CompactDictReplayBuffer if as_dict else CompactReplayBuffer)
+    assert type(other.replay_buffer) is theirs
+    assert ours._n_updates == other._n_updates > 20
+    for (name, a), b in zip(ours.policy.state_dict().items(), other.policy.state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
 
 
-def test_who_gets_which_buffer(tmp_path: Path) -> None:
+def test_optimize_memory_usage_is_the_default() -> None:
+    """Nothing that Stable-Baselines3 does for its variant (a warning, an episode that ends) happens to ours."""
+    models = [sac(optimize_memory_usage=optimize).learn(40).learn(40) for optimize in (True, False)]
+    assert type(models[0].replay_buffer) is CompactReplayBuffer
+    for a, b in zip(models[0].policy.parameters(), models[1].policy.parameters(), strict=True):
+        assert torch.equal(a, b)
+    assert same_bits(models[0].replay_buffer.dones, models[1].replay_buffer.dones)  # type: ignore[union-attr]
+
+
+def test_saved_and_loaded(tmp_path: Path) -> None:
+    model = sac(replay_buffer_kwargs={"memory_map": str(tmp_path / "map")}, buffer_size=30).learn(45)
+    model.save(tmp_path / "m")
+    model.save_replay_buffer(tmp_path / "b")
+    loaded = SAC.load(tmp_path / "m", env=vec(), replay_buffer_kwargs={"memory_map": str(tmp_path / "other")})
+    assert type(loaded.replay_buffer) is CompactReplayBuffer and loaded.replay_buffer.size() == 0
+    loaded.load_replay_buffer(tmp_path / "b")
+    assert_same(model.replay_buffer, loaded.replay_buffer)
+    loaded.learn(20, reset_num_timesteps=False)
+    # A buffer of Stable-Baselines3's own, saved elsewhere, is used as it is.
+    plain = sac(replay_buffer_class=ReplayBuffer).learn(20)
+    plain.save_replay_buffer(tmp_path / "p")
+    loaded.load_replay_buffer(tmp_path / "p")
+    assert type(loaded.replay_buffer) is ReplayBuffer
+    loaded.learn(10, reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("kwargs", [{"n_steps": 3}, {"replay_buffer_class": ReplayBuffer}])
+def test_memory_map_needs_our_buffers(kwargs: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="memory_map is known to CompactReplayBuffer"):
+        sac(replay_buffer_kwargs={"memory_map": str(tmp_path)}, **kwargs)
+    model = sac(replay_buffer_kwargs={"memory_map": str(tmp_path)}, validation_proportion=0.3).learn(30)
+    assert isinstance(model.replay_buffer, ValidationReplayBuffer) and model.replay_buffer.memory_map == str(tmp_path)
+
+
+def test_who_gets_which_buffer() -> None:
     assert type(sac(n_steps=3).replay_buffer) is NStepReplayBuffer
     assert type(sac(replay_buffer_class=ReplayBuffer).replay_buffer) is ReplayBuffer
     assert isinstance(sac(optimize_memory_usage=True, validation_proportion=0.5).replay_buffer, ValidationReplayBuffer)
-    for kwargs, what in (({"n_steps": 3}, "n_steps=3"), ({"replay_buffer_class": ReplayBuffer}, "ReplayBuffer")):
-        with pytest.raises(ValueError, match=f"memory_map .*{what}"):
-            sac(replay_buffer_kwargs={"memory_map": str(tmp_path)}, **kwargs)
-
-
-# ------------------------------------------------------------------ to and from files
-
-ALL = [CompactReplayBuffer, CompactDictReplayBuffer, ValidationReplayBuffer, ValidationDictReplayBuffer]
-
-
-def check_equal(restored: Any, original: Any, steps: Iterator[tuple[Any, ...]]) -> None:
-    """Now and as they go on."""
-    for i in range(30):
-        assert (restored.pos, restored.full) == (original.pos, original.full)
-        if original.size() > 0 and getattr(original, "n_training", 1) > 0:
-            compare(restored, original, seed=i)
-        if getattr(original, "n_validation", 0) > 0:
-            np.random.seed(i)
-            expected = original.sample_validation(20)
-            np.random.seed(i)
-            assert same(restored.sample_validation(20), expected)
-            assert (restored.n_validation, restored.n_training) == (original.n_validation, original.n_training)
-        one = next(steps)
-        for buffer in (restored, original):
-            np.random.seed(i)
-            buffer.add(*copy.deepcopy(one))
-
-
-@pytest.mark.parametrize("cls", ALL)
-@pytest.mark.parametrize("n", [0, 1, 9, 10, 11, 37])
-def test_state_dict(cls: Any, n: int) -> None:
-    original, restored = make(cls, 10, 2), make(cls, 10, 2)
-    steps = transitions(original.observation_space, 2, seed=n)
-    for _ in range(n):
-        original.add(*next(steps))
-        restored.add(*next(steps))  # whatever it held
-    state = copy.deepcopy(original.state_dict())
-    assert all(isinstance(value, (int, bool, np.ndarray)) for value in state.values())
-    restored.load_state_dict(state)
-    check_equal(restored, original, steps)
-
-
-@pytest.mark.parametrize("cls", ALL)
-@pytest.mark.parametrize("sizes", [[3, 4], [10], [4, 6, 1], [7, 2, 9, 9, 5], [1] * 23, [10, 10, 3]])
-@pytest.mark.parametrize("rewritten", [False, True])
-def test_rows_appended_piece_by_piece(cls: Any, sizes: list[int], rewritten: bool) -> None:
-    original, restored = make(cls, 10, 2), make(cls, 10, 2)
-    steps = transitions(original.observation_space, 2, seed=len(sizes))
-    pieces, total = [], 0
-    for n in sizes:
-        for _ in range(n):
-            original.add(*next(steps))
-        again = int(rewritten and total > 0 and n < 10)  # the last step of the piece before, once more
-        pieces.append((total - again, original.new_rows(n + again)))
-        total += n
-    restored.add(*next(steps))
-    # Only pieces with a step that is still there are needed.
-    needed = [(first, piece) for first, piece in pieces if first + len(piece["actions"]) > total - 10]
-    restored.restore_rows(needed)
-    check_equal(restored, original, steps)
-
-
-def test_a_changed_last_row_replaces_it() -> None:
-    original, restored = make(CompactReplayBuffer, 10, 2), make(CompactReplayBuffer, 10, 2)
-    steps = transitions(BOX, 2, seed=3, p_end=0)
-    for _ in range(6):
-        original.add(*next(steps))
-    pieces = [(0, original.new_rows(6))]
-    original.dones[5] = original.timeouts[5] = 1
-    original.add(*next(steps))
-    pieces.append((5, original.new_rows(2)))
-    restored.restore_rows(pieces)
-    assert restored.dones[5].all()
-    check_equal(restored, original, steps)
-
-
-def test_bad_rows_are_refused() -> None:
-    buffer = make(CompactReplayBuffer, 10, 2)
-    steps = transitions(BOX, 2, seed=3)
-    for _ in range(6):
-        buffer.add(*next(steps))
-    good, target = buffer.state_dict(), make(CompactReplayBuffer, 10, 2)
-    index = good["next_index"]
-    for change, what in (
-        ({"actions": good["actions"][:5]}, "actions must be"),
-        ({"rewards": good["rewards"].astype(np.float64)}, "rewards must be float32"),
-        ({"pos": 10}, "pos=10"), ({"pos": True}, "pos=True"), ({"full": 1}, "full=1"), ({"n_envs": 3}, "n_envs is 2"),
-        ({"pos": 7}, "must be"),
-        ({"more": np.zeros(3)}, "columns"),
-        ({"next_index": index[::-1].copy()}, "rising"), ({"next_index": index + 2}, "rising"),
-        ({"next_index": index.astype(float)}, "rising"),
-        ({"next_index": index[:-1], "next_observations": good["next_observations"][:-1]}, "all of the newest step"),
-    ):  # fmt: skip
-        with pytest.raises(ValueError, match=what):
-            target.load_state_dict({**good, **change})
-    with pytest.raises(ValueError, match="columns"):
-        target.load_state_dict({name: value for name, value in good.items() if name != "dones"})
-    piece = buffer.new_rows(3)
-    for pieces in ([(0, piece), (4, piece)], [(3, piece), (2, piece)]):
-        with pytest.raises(ValueError, match="are followed by those from"):
-            target.restore_rows(pieces)
-    with pytest.raises(ValueError, match="n must lie between 0 and 6"):
-        buffer.new_rows(7)
-
-
-def test_copies_and_pickles() -> None:
-    buffer = make(ValidationReplayBuffer, 10, 2)
-    steps = transitions(BOX, 2, seed=3)
-    for _ in range(16):
-        buffer.add(*next(steps))
-    check_equal(pickle.loads(pickle.dumps(buffer)), buffer, steps)
-
-
-# ------------------------------------------------------------------ in files
-
-
-@pytest.mark.parametrize("cls", ALL)
-def test_memory_map(cls: Any, tmp_path: Path) -> None:
-    in_files, plain = make(cls, 10, 2, memory_map=tmp_path / "new" / "folder"), make(cls, 10, 2)
-    assert all(isinstance(array, np.memmap) for array in (*in_files.stored().values(), in_files.actions, in_files.slot))
-    assert list((tmp_path / "new" / "folder").glob("*.bin"))
-    steps = transitions(plain.observation_space, 2, seed=5, p_end=0.5)
-    for i in range(25):
-        one = next(steps)
-        for buffer in (in_files, plain):
-            np.random.seed(i)
-            buffer.add(*copy.deepcopy(one))
-    check_equal(in_files, plain, steps)
-    with pytest.raises(TypeError, match="cannot be pickled"):
-        pickle.dumps(in_files)
-
-
-def test_two_buffers_of_a_process_in_one_folder(tmp_path: Path) -> None:
-    """A model that is loaded while the one it was saved from lives."""
-    first, plain = make(CompactReplayBuffer, 10, 1, memory_map=tmp_path), make(CompactReplayBuffer, 10, 1)
-    steps = transitions(BOX, 1, seed=5, p_end=0.5)
-    second = make(CompactReplayBuffer, 10, 1, memory_map=tmp_path)
-    for _ in range(30):
-        one = next(steps)
-        first.add(*one)
-        plain.add(*one)
-        second.add(*next(steps))
-    check_equal(first, plain, steps)
-
-
-def test_a_folder_belongs_to_one_run(tmp_path: Path) -> None:
-    code = (
-        "import sys; from tests.sac.test_compact_buffer import *\n"
-        f"b = make(CompactReplayBuffer, 10, 1, memory_map={str(tmp_path)!r})\n"
-        "print('ready', flush=True); sys.stdin.read()"
-    )
-    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
-        assert other.stdout is not None and other.stdout.readline() == b"ready\n"
-        with pytest.raises(ValueError, match=f"another run, process {other.pid}"):
-            make(CompactReplayBuffer, 10, 1, memory_map=tmp_path)
-        other.kill()
-    # What it left is nobody's, and replaced.
-    left = set(tmp_path.glob("*.bin"))
-    buffer = make(CompactReplayBuffer, 12, 1, memory_map=tmp_path)
-    files = {Path(array.filename) for array in (*buffer.columns().values(), buffer.slot, *buffer.aside.arrays.values())}
-    assert len(left) == len(files) == 7 and set(tmp_path.glob("*.bin")) == files
-    assert not buffer.observations.any()
-
-
-def test_folders_that_cannot_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def build(folder: Any) -> None:
-        sac(replay_buffer_kwargs={"memory_map": folder})
-
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match="memory_map=.*must be a folder that can be written to"):
-        build(str(tmp_path / "file"))
-    for bad in (3, ""):
-        with pytest.raises(ValueError, match="memory_map must be a folder"):
-            build(bad)
-    (tmp_path / "foreign").mkdir()
-    (tmp_path / "foreign" / "replay_buffer.0.bin").write_text("mine")
-    with pytest.raises(ValueError, match="no replay buffer's"):
-        build(str(tmp_path / "foreign"))
-    assert (tmp_path / "foreign" / "replay_buffer.0.bin").read_text() == "mine"
-    monkeypatch.setattr(memory_map.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
-    with pytest.raises(ValueError, match=r"the replay buffer takes .* are free there"):
-        build(str(tmp_path / "small"))

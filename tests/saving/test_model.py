@@ -144,13 +144,13 @@ def test_images_and_dicts(tmp_path: Path) -> None:
 
 def test_a_file_does_not_choose_a_folder_to_write_to(tmp_path: Path) -> None:
     sac(replay_buffer_kwargs={"memory_map": str(tmp_path / "rows")}).save(tmp_path / "m")
-    written = {path: path.stat().st_mtime_ns for path in (tmp_path / "rows").iterdir()}
+    (tmp_path / "rows").rmdir()
     SAC.load(tmp_path / "m")
     with pytest.warns(UserWarning, match="the replay buffer was in the folder .*rows'.*to load for another folder"):
-        assert SAC.load(tmp_path / "m", env=vec()).replay_buffer.memory_map is None
-    assert written == {path: path.stat().st_mtime_ns for path in (tmp_path / "rows").iterdir()}
+        assert SAC.load(tmp_path / "m", env=vec()).replay_buffer.memory_map is None  # type: ignore[union-attr]
+    assert not (tmp_path / "rows").exists()
     other = SAC.load(tmp_path / "m", env=vec(), replay_buffer_kwargs={"memory_map": str(tmp_path / "other")})
-    assert other.replay_buffer.memory_map is not None and list((tmp_path / "other").iterdir())
+    assert other.replay_buffer.memory_map == str(tmp_path / "other")  # type: ignore[union-attr]
 
 
 # ---------------------------------------------------------------- what has no place in a file
