@@ -3,11 +3,11 @@ Memory and time of replay buffers, with the sizes of dog-run: observation 223, a
 
     python benchmarks/replay_memory.py [--transitions 1000000] [--folder .]
 
-Each buffer is filled beyond its capacity, in a process of its own. "memory" is what the process then has resident of its
-own (RssAnon), less what it had before; "of files" the same of files (RssFile), which the system takes back when it needs
-the space. "add" is one step of one environment, in the fastest of all runs of 1,000; "batch" a gradient step's batch of 256
-when 20 are drawn at once, as the algorithms do, the fastest of 200: other programs on the machine count as little as
-possible.
+Each buffer is filled beyond its capacity, in a process of its own. "memory" is what the process then has resident of
+its own (RssAnon), less what it had before; "of files" the same of files (RssFile), which the system takes back when it
+needs the space. "add" is one step of one environment, in the fastest of all runs of 1,000; "batch" a gradient step's
+batch of 256 when 20 are drawn at once, as the algorithms do, the fastest of 200: so other programs on the machine count
+as little as possible.
 """
 
 import argparse

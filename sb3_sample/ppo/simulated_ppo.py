@@ -29,8 +29,10 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_known, check_unused
 from sb3_sample.envs.finite_check import FiniteCheck
+from sb3_sample.export import Exportable
 from sb3_sample.ppo.dynamics import minibatches
 from sb3_sample.ppo.spaces import FlatObservations, ModelActions
+from sb3_sample.saving.checkpoint import Checkpointer
 
 Self = TypeVar("Self", bound="SimulatedPPO")
 
@@ -81,7 +83,7 @@ class SimulatedSamples(NamedTuple):
     weights: torch.Tensor | None = None
 
 
-class SimulatedPPO(PPO):
+class SimulatedPPO(Exportable, PPO):
     """
     PPO whose policy loss also sees simulated samples (P1, Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011,
     algorithm 1): what :class:`MBMAPPO`, :class:`QMAPPO` and :class:`MBPOPPO` share. The critic learns from the real
@@ -204,6 +206,8 @@ class SimulatedPPO(PPO):
         self._has_named_policy = policy in NAMED_POLICIES
         # Share of the training at which the present rollout began.
         self._progress = 0.0
+        # Of the present or last learn.
+        self._iteration = 0
         self._seconds: dict[str, float] = {}
         if _init_setup_model:
             self._setup_model()
@@ -386,9 +390,13 @@ class SimulatedPPO(PPO):
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
+        checkpoint: str | pathlib.Path | None = None,
+        checkpoint_freq: int = 10_000,
     ) -> Self:
         """
-        Train, as in Stable-Baselines3.
+        Train, as in Stable-Baselines3; with ``checkpoint``, so that nothing is lost when the program ends before it is
+        done: the same program, started again, goes on where the folder's last checkpoint is, and the result is the same
+        bit by bit (docs/saving.md).
 
         :param total_timesteps: environment steps to take
         :param callback: called at every step
@@ -396,16 +404,35 @@ class SimulatedPPO(PPO):
         :param tb_log_name: name of the run in the TensorBoard log; the class's name if None
         :param reset_num_timesteps: whether ``num_timesteps`` starts at zero again
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
+        :param checkpoint: folder of the run, for one call of ``learn``; None for no checkpoints
+        :param checkpoint_freq: environment steps between two checkpoints, each at the end of an iteration
         :return: the trained model
+        :raises ValueError: if the folder is of another run (the message names what differs), cannot be used, or has
+            checkpoints that are all damaged
         """
-        return super().learn(
-            total_timesteps,
-            callback,
-            log_interval,
-            tb_log_name or type(self).__name__,
-            reset_num_timesteps,
-            progress_bar,
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
+        self._iteration = 0
+        with Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
+            checkpointer.resume()
+            callback.on_training_start(locals(), globals())
+            checkpointer.start()
+            assert self.env is not None
+            while self.num_timesteps < total_timesteps:
+                if not self.collect_rollouts(self.env, callback, self.rollout_buffer, n_rollout_steps=self.n_steps):
+                    break
+                self._iteration += 1
+                self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+                if log_interval is not None and self._iteration % log_interval == 0:
+                    self.dump_logs(self._iteration)
+                self.train()
+                checkpointer.after_turn()
+            callback.on_training_end()
+        return self
+
+    def _on_environment_reset(self) -> None:
+        """The environments were reset in the midst of their episodes, of which nothing is remembered here."""
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int

@@ -22,6 +22,7 @@ from torch import nn
 
 from sb3_sample.arguments import check_known
 from sb3_sample.envs.finite_check import FiniteCheck
+from sb3_sample.export import Exportable
 from sb3_sample.networks.spectral_norm import SpectralNorm
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 from sb3_sample.sac import arguments, losses
@@ -35,6 +36,7 @@ from sb3_sample.sac.pessimism import PESSIMISMS, Pessimism, pessimistic_value
 from sb3_sample.sac.plasticity import ReDo, Resets
 from sb3_sample.sac.policies import Actor, CnnPolicy, CriticEnsemble, MlpPolicy, ModeSwitch, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.scalars import FixedScalar, LogScalar
+from sb3_sample.saving.checkpoint import Checkpointer
 
 Self = TypeVar("Self", bound="SAC")
 
@@ -42,7 +44,7 @@ Self = TypeVar("Self", bound="SAC")
 MAX_BATCHES_AT_ONCE = 64
 
 
-class SAC(OffPolicyAlgorithm):
+class SAC(Exportable, OffPolicyAlgorithm):
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
     SAC that the papers compare with (P2-P5): tanh-Gaussian actor, two critics, clipped double Q-learning.
@@ -577,9 +579,13 @@ class SAC(OffPolicyAlgorithm):
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
+        checkpoint: str | pathlib.Path | None = None,
+        checkpoint_freq: int = 10_000,
     ) -> Self:
         """
-        Train, as in Stable-Baselines3.
+        Train, as in Stable-Baselines3; with ``checkpoint``, so that nothing is lost when the program ends before it is
+        done: the same program, started again, goes on where the folder's last checkpoint is, and the result is the same
+        bit by bit (docs/saving.md).
 
         :param total_timesteps: environment steps to take
         :param callback: called at every step
@@ -587,35 +593,47 @@ class SAC(OffPolicyAlgorithm):
         :param tb_log_name: name of the run in the TensorBoard log; the class's name if None
         :param reset_num_timesteps: whether ``num_timesteps`` starts at zero again
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
+        :param checkpoint: folder of the run, for one call of ``learn``; None for no checkpoints
+        :param checkpoint_freq: environment steps between two checkpoints
         :return: the trained model
+        :raises ValueError: if the folder is of another run (the message names what differs), cannot be used, or has
+            checkpoints that are all damaged
         """
         resets_environment = reset_num_timesteps or self._last_obs is None
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         if resets_environment:
-            for part in self._parts().values():
-                part.on_environment_reset(self)
-        self._decide_compilation(total_timesteps - self.num_timesteps)
-        callback.on_training_start(locals(), globals())
-        assert self.env is not None and self.replay_buffer is not None
-        while self.num_timesteps < total_timesteps:
-            rollout = self.collect_rollouts(
-                self.env,
-                train_freq=self.train_freq,  # type: ignore[arg-type]  # converted in _setup_model
-                action_noise=self.action_noise,
-                callback=callback,
-                learning_starts=self.learning_starts,
-                replay_buffer=self.replay_buffer,
-                log_interval=log_interval,
-            )
-            if not rollout.continue_training:
-                break
-            n_updates = self._updates_due(rollout.episode_timesteps)
-            if n_updates > 0:
-                self.train(n_updates, self.batch_size)
-        callback.on_training_end()
+            self._on_environment_reset()
+        with Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
+            checkpointer.resume()
+            self._decide_compilation(total_timesteps - self.num_timesteps)
+            callback.on_training_start(locals(), globals())
+            checkpointer.start()
+            assert self.env is not None and self.replay_buffer is not None
+            while self.num_timesteps < total_timesteps:
+                rollout = self.collect_rollouts(
+                    self.env,
+                    train_freq=self.train_freq,  # type: ignore[arg-type]  # converted in _setup_model
+                    action_noise=self.action_noise,
+                    callback=callback,
+                    learning_starts=self.learning_starts,
+                    replay_buffer=self.replay_buffer,
+                    log_interval=log_interval,
+                )
+                if not rollout.continue_training:
+                    break
+                n_updates = self._updates_due(rollout.episode_timesteps)
+                if n_updates > 0:
+                    self.train(n_updates, self.batch_size)
+                checkpointer.after_turn()
+            callback.on_training_end()
         return self
+
+    def _on_environment_reset(self) -> None:
+        """The environments were reset in the midst of their episodes."""
+        for part in self._parts().values():
+            part.on_environment_reset(self)
 
     def _decide_compilation(self, n_steps: int) -> None:
         """With ``compile="auto"``, once and for all: whether the coming environment steps pay it back."""

@@ -16,12 +16,12 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_sample.envs import make_env
+from sb3_sample.envs.states import check_restorable
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.variance.bias import GradientSamples, check_comparison, compare_gradients
 from sb3_sample.variance.decomposition import Components, at_equal_cost, relative_cost
 from sb3_sample.variance.estimate import Estimate, Interval, check_arguments, check_counts, estimate_components
 from sb3_sample.variance.returns import Agent
-from sb3_sample.variance.states import check_restorable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -12,10 +12,10 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_sample.envs import make_env
+from sb3_sample.envs.states import save_state
 from sb3_sample.variance.decomposition import Components
 from sb3_sample.variance.estimate import Estimate, Interval, combine, estimate_components, jackknife
 from sb3_sample.variance.returns import Agent, sample_returns
-from sb3_sample.variance.states import save_state
 from tests.variance.common import GAMMA, Exact, Tabular, softmax_policy, tabular_model
 
 T = 6
