@@ -87,14 +87,19 @@ def test_a_disk_that_gets_full(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
     transition = stream.transition()
-    with pytest.raises(OSError, match="GB of a replay buffer"):
-        try:
-            while True:
-                ours.add(*transition)
-                theirs.add(*transition)
-                transition = stream.transition()
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    def fill() -> None:
+        nonlocal transition
+        while True:
+            ours.add(*transition)
+            theirs.add(*transition)
+            transition = stream.transition()
+
+    try:
+        with pytest.raises(OSError, match="GB of a replay buffer"):
+            fill()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert 300 < theirs.size() == ours.size() < 1000
     assert same_bits(draw(ours, 500, 0), draw(theirs, 500, 0))
     for _ in range(2500):
