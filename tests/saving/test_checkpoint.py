@@ -6,6 +6,7 @@ import resource
 import signal
 import subprocess
 import warnings
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 from sb3_sample import MBMAPPO
 from sb3_sample.sac.buffers import DeviceReplayBuffer
-from sb3_sample.saving import training_state
+from sb3_sample.sac.policies import MlpPolicy
+from sb3_sample.saving import container, training_state
 from sb3_sample.saving.attributes import Describer, same
 from sb3_sample.saving.callbacks import CallbackStates
 from tests.ppo.common import ALGORITHMS, tiny
@@ -227,6 +229,42 @@ def test_buffers_that_no_checkpoint_can_hold(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="copy_info_dict=True"):
         model.learn(10, checkpoint=tmp_path)
     assert model.num_timesteps == 0 and not steps_of(tmp_path)
+
+
+def test_a_schedule_that_no_file_can_hold_is_refused_before_training(tmp_path: Path) -> None:
+    model = sac(learning_rate=lambda progress: 1e-3 * progress)
+    with pytest.raises(ValueError, match="learning_rate: .*<lambda>"):
+        model.learn(20, checkpoint=tmp_path)
+    assert model._n_updates == 0 and not steps_of(tmp_path)
+
+
+class OwnPolicy(MlpPolicy):
+    """A policy class of the user's own."""
+
+
+def test_classes_of_ones_own(tmp_path: Path) -> None:
+    for steps in (20, 40):
+        again = sac(policy=OwnPolicy).learn(steps, checkpoint=tmp_path)
+    assert not differing(state(sac(policy=OwnPolicy).learn(40)), state(again))
+    file = tmp_path / "checkpoint-000000000040" / "model.zip"
+    with pytest.raises(ValueError, match="not trusted"):
+        type(again).load(file)
+    loaded = type(again).load(file, trusted_modules=["tests.saving.test_checkpoint"])
+    assert isinstance(loaded.policy, OwnPolicy)
+
+
+def test_no_file_is_pickled(tmp_path: Path) -> None:
+    sac(vec(2)).learn(40, [Counter()], checkpoint=tmp_path, **STEPS)
+    files = sorted(path for path in tmp_path.rglob("*.zip"))
+    assert len(files) > 6
+    for path in files:
+        with zipfile.ZipFile(path) as archive:
+            assert sorted(archive.namelist()) == ["checksums.json", "data.json", "tensors.safetensors"]
+            json.loads(archive.read("data.json"))
+        kind = {"model.zip": "model", "state.zip": "checkpoint"}.get(path.name, "replay rows")
+        container.read(path, kind)
+    others = {path.name for path in tmp_path.rglob("*") if path.is_file()} - {path.name for path in files}
+    assert others == {"manifest.json", "progress.jsonl", ".lock"}
 
 
 def test_a_file_in_place_of_the_folder(tmp_path: Path) -> None:
