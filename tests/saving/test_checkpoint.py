@@ -26,6 +26,7 @@ from sb3_sample.sac.policies import MlpPolicy
 from sb3_sample.saving import container, training_state
 from sb3_sample.saving.attributes import Describer, same
 from sb3_sample.saving.callbacks import CallbackStates
+from sb3_sample.saving.run_folder import RunFolder
 from tests.ppo.common import ALGORITHMS, tiny
 from tests.sac.common import MAKERS, bro, differing, sac, state, vec
 from tests.saving.program import Goal, outcome
@@ -300,6 +301,23 @@ def test_a_full_quota_is_survived(tmp_path: Path) -> None:
     assert len((tmp_path / "progress.jsonl").read_text().splitlines()) == 5
     again = sac().learn(50, checkpoint=tmp_path, **STEPS)
     assert not differing(state(sac().learn(50)), state(again)) and model.num_timesteps == 40
+
+
+def test_rows_of_a_checkpoint_that_failed_are_removed_and_written_again(tmp_path: Path, monkeypatch: Any) -> None:
+    write, rows = RunFolder.write, []
+
+    def fail_at_20(self: RunFolder, steps: int, *args: Any) -> Any:
+        if steps == 20:
+            raise OSError(28, "No space left on device")
+        rows.append(sorted(path.name[6:] for path in (tmp_path / "replay").iterdir()))
+        return write(self, steps, *args)
+
+    monkeypatch.setattr(RunFolder, "write", fail_at_20)
+    with pytest.warns(UserWarning, match="No checkpoint at 20 steps"):
+        sac().learn(30, checkpoint=tmp_path, **STEPS)
+    assert rows == [[], ["000000000000-000000000010.zip"],
+                    ["000000000000-000000000010.zip", "000000000010-000000000030.zip"]]  # fmt: skip
+    assert not differing(state(sac().learn(40)), state(sac().learn(40, checkpoint=tmp_path)))
 
 
 def test_no_space_and_a_read_only_file_system(tmp_path: Path) -> None:
