@@ -1,6 +1,11 @@
 """A run that is killed and started again is the run that was never killed, bit by bit."""
 
+import os
 import random
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +62,7 @@ def check(case: dict[str, Any], folder: Path, seed: int = 0) -> None:
     """2N steps at once, and N steps, a SIGKILL at a random later moment, and the rest."""
     whole, killed = str(folder / "whole"), str(folder / "killed")
     # Iterations of PPO are long, so that the process is not done before it is killed.
-    total = 2 * N if case["algorithm"] not in PPOS else 8 * N
+    total = 2 * N if case["algorithm"] not in PPOS else 2 * N + 64 * case.get("env", {}).get("n", 1)
     run(case, total, N, whole)
     seconds = random.Random(seed).uniform(0, 0.02)
     run(case, total, N, killed, (N, seconds), code=-9)
@@ -88,3 +93,34 @@ def test_killed_while_a_checkpoint_is_written(seed: int, tmp_path: Path) -> None
     run(case, 2 * N, 24, killed, (-1, at), code=-9)
     run(case, 2 * N, 24, killed)
     assert not differing(result(whole), result(killed))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_of_a_terminal_and_of_a_scheduler(number: int, code: int, tmp_path: Path) -> None:
+    """A program with workers, started as from a shell: Ctrl-C goes to all of its processes, kill to one."""
+    case = {"algorithm": "SAC", "env": {"n": 2, "workers": "forkserver"}}
+    text = f"from tests.saving.program import train\ntrain({case}, 10**6, 10**5, {str(tmp_path / 'run')!r})"
+    script = f"if __name__ == '__main__':\n    {text.replace(chr(10), chr(10) + '    ')}\n"
+    (tmp_path / "script.py").write_text(script)
+    environment = {**os.environ, "PYTHONPATH": os.getcwd()}
+    process = subprocess.Popen(
+        [sys.executable, tmp_path / "script.py"], start_new_session=True, env=environment, stderr=subprocess.PIPE
+    )
+    try:
+        deadline = time.monotonic() + 100
+        log = tmp_path / "run" / "progress.jsonl"
+        while not (log.exists() and log.stat().st_size) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        if number == signal.SIGINT:
+            os.killpg(process.pid, number)
+        else:
+            process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    assert process.returncode in (code, -number), errors.decode()
+    assert b"the turn is finished and saved" in errors and b"BrokenPipe" not in errors and b"EOFError" not in errors
+    first, last = sorted(int(path.name.split("-")[1]) for path in (tmp_path / "run").glob("checkpoint-*"))
+    assert first == 0 < last
