@@ -3,6 +3,8 @@ What a training run consists of besides parameters, replay buffer, environments 
 random generators and logger; and what tells one run from another.
 """
 
+import contextlib
+import importlib.metadata
 import inspect
 import platform
 import random
@@ -161,8 +163,6 @@ def circumstances(device: torch.device) -> dict[str, str]:
         "device": device.type if device.type != "cuda" else torch.cuda.get_device_name(device),
         "torch threads": str(torch.get_num_threads()),
     }
-    try:
-        import mujoco
-    except ImportError:
-        return found
-    return {**found, "mujoco": mujoco.__version__}
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        found["mujoco"] = importlib.metadata.version("mujoco")
+    return found
