@@ -83,6 +83,25 @@ def _zoo_function(module: str, function: str) -> Callable[[list[str]], None]:
     return run
 
 
+def _train(arguments: list[str]) -> None:
+    _zoo_module("rl_zoo3.train")
+    from sb3_sample import zoo_runs
+
+    parser = zoo_runs.train_parser()
+    options, rest = parser.parse_known_args(arguments)
+    if {"-h", "--help"} & set(rest):
+        print(parser.format_help())
+    try:
+        start = zoo_runs.plan(options, rest)
+        if start is None:
+            _zoo_function("rl_zoo3.train", "train")(rest)
+        else:
+            _set_command_line("train", start.arguments)
+            zoo_runs.train(start)
+    except zoo_runs.RunError as error:
+        sys.exit(f"sb3-sample train: {error}")
+
+
 def _zoo_plot(function: str) -> Callable[[list[str]], None]:
     def run(arguments: list[str]) -> None:
         # These commands look for the id in the names of the log folders, in which a dash stands for the slash.
@@ -122,7 +141,7 @@ def _variance(arguments: list[str]) -> None:
 
 
 COMMANDS: dict[str, Command] = {
-    "train": Command(_zoo_function("rl_zoo3.train", "train"), "train an agent, or search for hyperparameters"),
+    "train": Command(_train, "train an agent, or search for hyperparameters"),
     "enjoy": Command(_zoo_function("rl_zoo3.enjoy", "enjoy"), "run a trained agent"),
     "record_video": Command(_record_video, "write a video of a trained agent"),
     "plot": Command(_plot, "draw the runs of a task, mean and range over seeds, beside the published curves"),
