@@ -11,7 +11,7 @@ import json
 import os
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +19,6 @@ import gymnasium as gym
 import rl_zoo3.exp_manager
 import rl_zoo3.train
 from rl_zoo3.exp_manager import ExperimentManager
-from rl_zoo3.utils import get_model_path
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat, configure
@@ -27,8 +26,8 @@ from stable_baselines3.common.monitor import Monitor, get_monitor_files
 from stable_baselines3.common.utils import get_latest_run_id
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.saving.checkpoint import MODEL
 from sb3_sample.zoo import ALGORITHMS
+from sb3_sample.zoo_files import add_trust, replaced
 
 RECORD = "run.json"
 #: Environment steps between two checkpoints.
@@ -143,6 +142,7 @@ def train_parser() -> argparse.ArgumentParser:
         help="Go on with the run in --run-dir, or else with the run of --algo and --env below the log folder that has "
         "the latest checkpoint; an error if there is none",
     )
+    add_trust(parser.add_argument_group("files that run no code (our algorithms)"))
     return parser
 
 
@@ -212,23 +212,6 @@ def train(start: Start) -> None:
     """
     with replaced(rl_zoo3.train, "ExperimentManager", functools.partial(RunManager, start)):
         rl_zoo3.train.train()
-
-
-@contextlib.contextmanager
-def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """
-    Something else in the place of an attribute, for a while.
-
-    :param owner: whose attribute
-    :param name: its name
-    :param value: what takes its place
-    """
-    before = getattr(owner, name)
-    setattr(owner, name, value)
-    try:
-        yield
-    finally:
-        setattr(owner, name, before)
 
 
 class RunManager(ExperimentManager):
@@ -395,25 +378,3 @@ class RunFiles(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
-
-
-# ---------------------------------------------------------------- watching
-
-
-def model_path(
-    run_dir: Path, exp_id: int, folder: str, algo: str, env_name: Any, load_best: bool = False,
-    load_checkpoint: str | None = None, load_last_checkpoint: bool = False,
-) -> tuple[str, str, str]:  # fmt: skip
-    """
-    In the place of the zoo's ``get_model_path``.
-
-    :param run_dir: folder of the run
-    :return: name for a video, the model's file, the run's folder
-    """
-    made = checkpoints(run_dir)
-    if load_last_checkpoint and made:
-        steps = int(made[-1].name.removeprefix("checkpoint-"))
-        return f"checkpoint-{steps}-{algo}-{env_name}", str(made[-1] / MODEL), str(run_dir)
-    # A path that ends in an empty name is the folder itself.
-    prefix, path, _ = get_model_path(-1, str(run_dir), "", env_name, load_best, load_checkpoint, load_last_checkpoint)
-    return prefix.replace(f"-{env_name}", f"{algo}-{env_name}"), path, str(run_dir)

@@ -66,7 +66,8 @@ def outcome(folder: str | Path, algo: str = "sac_sample", env: str = "Pendulum-v
         with file.open() as lines:
             lines.readline()
             found[file.name] = [(row["r"], row["l"]) for row in csv.DictReader(lines)]
-    found |= dict(np.load(folder / "evaluations.npz"))
+    if (folder / "evaluations.npz").exists():
+        found |= dict(np.load(folder / "evaluations.npz"))
     return found
 
 
@@ -161,6 +162,24 @@ def test_resume_goes_on_with_the_run_of_the_latest_checkpoint(run) -> None:
     assert steps(first) == [90, 120]
     with pytest.raises(SystemExit, match="no run of sr_sac on Pendulum-v1"):
         run("--resume", "--algo", "sr_sac")
+
+
+def test_a_run_that_begins_with_another_ones_model(run) -> None:
+    run("-n", "60", "--save-replay-buffer", "--seed", "1")
+    first = Path("logs/sac_sample/Pendulum-v1_1")
+    begin = ("--seed", "2", "--checkpoint-freq", "40", "-i", str(first / "Pendulum-v1.zip"))
+    run("--run-dir", "whole", "-n", "80", *begin)
+    run("--run-dir", "parts", "-n", "40", *begin)
+    run("--run-dir", "parts", "-n", "80", *begin)
+    check_equal(outcome("whole"), outcome("parts"))
+    assert outcome("parts")["n_updates"] > 40
+
+
+def test_copies_of_the_model_go_on_and_a_progress_bar_may_come(run) -> None:
+    arguments = ("--checkpoint-freq", "30", "--save-freq", "40", "--seed", "1")
+    run("--run-dir", "parts", "-n", "60", *arguments)
+    run("--run-dir", "parts", "-n", "90", *arguments, "--progress")
+    assert {path.name for path in Path("parts").glob("rl_model_*")} == {f"rl_model_{n}_steps.zip" for n in (40, 80)}
 
 
 # ---------------------------------------------------------------- what is refused
