@@ -27,6 +27,7 @@ from sb3_sample.optim import AdamW, sharpness_aware_gradients
 from sb3_sample.sac import arguments, losses
 from sb3_sample.sac.batch import Batch, CriticStep, Extra, Noise, draw_batches
 from sb3_sample.sac.buffers import BatchMemory, ValidationDictReplayBuffer, ValidationReplayBuffer, ValidationSplit
+from sb3_sample.sac.compact_buffer import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
 from sb3_sample.sac.execution import PAYS_FROM, Execution, has_foreign_parts, why_not_compiled
 from sb3_sample.sac.exploration import EXPLORATIONS, Exploration
 from sb3_sample.sac.parts import ParametersDoNotFit, Part
@@ -67,9 +68,11 @@ class SAC(OffPolicyAlgorithm):
     :param gradient_steps: as in Stable-Baselines3, gradient steps each time (-1: as many as transitions were
         collected); if given, it replaces ``replay_ratio``
     :param action_noise: noise added to the actions while training
-    :param replay_buffer_class: class of the replay buffer; chosen by the observation space if None
-    :param replay_buffer_kwargs: its arguments
-    :param optimize_memory_usage: as in Stable-Baselines3's replay buffer
+    :param replay_buffer_class: class of the replay buffer; chosen by the observation space if None, one that stores
+        one observation a step
+    :param replay_buffer_kwargs: its arguments; ``memory_map="folder"`` keeps the default buffer in files
+    :param optimize_memory_usage: for a ``replay_buffer_class`` that knows it. The default buffer saves the memory
+        anyway, with time limits handled, and takes either value
     :param n_steps: n-step returns, as in Stable-Baselines3
     :param ent_coef: temperature: "auto" learns it, "auto_0.1" from that start, a number fixes it
     :param target_update_interval: gradient steps between two updates of the targets; None: ``policy_delay``
@@ -277,8 +280,8 @@ class SAC(OffPolicyAlgorithm):
         arguments.check(self)
 
     def _choose_replay_buffer(self) -> None:
+        is_dict = isinstance(self.observation_space, spaces.Dict)
         if self.validation_proportion > 0:
-            is_dict = isinstance(self.observation_space, spaces.Dict)
             self.replay_buffer_class = ValidationDictReplayBuffer if is_dict else ValidationReplayBuffer
             self.replay_buffer_kwargs = {
                 **self.replay_buffer_kwargs,
@@ -287,6 +290,12 @@ class SAC(OffPolicyAlgorithm):
         elif self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, ValidationSplit):
             # Loaded, with validation_proportion=0 instead of the saved one.
             self.replay_buffer_class = None
+        if self.replay_buffer_class is None and self.n_steps == 1:
+            self.replay_buffer_class = CompactDictReplayBuffer if is_dict else CompactReplayBuffer
+        if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, CompactReplay):
+            # It saves the memory in any case. Where Stable-Baselines3 reads the argument, it would end an episode that
+            # only its own variant needs to have ended.
+            self.optimize_memory_usage = False
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         """
