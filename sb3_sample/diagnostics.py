@@ -309,7 +309,7 @@ class DiagnosticsCallback(BaseCallback):
         return [*self.model.critic.parameters(), *self.model.actor.parameters()]
 
     def _gradients(self) -> list[torch.Tensor | None] | None:
-        """Those of the last gradient step, if the next environment step measures their norms before there are others."""
+        """Those of the last gradient step, if the next environment step measures their norms before new ones."""
         if self.model.gradients_are_stale or self.model.num_timesteps + self.model.n_envs < self._next:
             return None
         return [parameter.grad for parameter in self._measured_parameters()]

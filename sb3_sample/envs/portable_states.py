@@ -1,6 +1,6 @@
 """
-The state of an environment as plain values: arrays, numbers, strings, random generators and containers of them, which can
-be written to a file and restored in another process, in an environment that was made in the same way.
+The state of an environment as plain values: arrays, numbers, strings, random generators and containers of them, which
+can be written to a file and restored in another process, in an environment that was made in the same way.
 
 MuJoCo's data is not written as it lies in memory. What decides the future is its integration state
 (``mjSTATE_INTEGRATION``); all other numbers follow from it or are left over from the last step, and the latter are read
@@ -22,7 +22,8 @@ HELPER = "_sb3_sample_state"
 _SKIPPED = ("env", HELPER)
 #: Stable-Baselines3's Monitor counts seconds from when it was made, and its file says so.
 _CLOCKS = {"stable_baselines3.common.monitor.Monitor": ("t_start",)}
-#: Arrays in a memory whose size depends on the contacts; they are computed anew at each step, before they are read.
+#: Arrays whose size depends on the contacts, and on which bodies touch each other; they are computed anew at each step,
+#: before they are read.
 _IN_ARENA = ("efc_", "iefc_", "island_", "map_", "iL", "iM", "iacc", "ifrc")
 
 

@@ -22,6 +22,7 @@ from torch import nn
 
 from sb3_sample.arguments import check_known
 from sb3_sample.envs.finite_check import FiniteCheck
+from sb3_sample.export import Exportable
 from sb3_sample.networks.spectral_norm import SpectralNorm
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 from sb3_sample.sac import arguments, losses
@@ -36,6 +37,9 @@ from sb3_sample.sac.plasticity import ReDo, Resets
 from sb3_sample.sac.policies import Actor, CnnPolicy, CriticEnsemble, MlpPolicy, ModeSwitch, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.scalars import FixedScalar, LogScalar
 from sb3_sample.saving.checkpoint import Checkpointer
+from sb3_sample.saving.container import BadFile
+from sb3_sample.saving.model import SafeFiles
+from sb3_sample.saving.replay import SafeReplayBuffers
 
 Self = TypeVar("Self", bound="SAC")
 
@@ -43,7 +47,7 @@ Self = TypeVar("Self", bound="SAC")
 MAX_BATCHES_AT_ONCE = 64
 
 
-class SAC(OffPolicyAlgorithm):
+class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
     SAC that the papers compare with (P2-P5): tanh-Gaussian actor, two critics, clipped double Q-learning.
@@ -364,10 +368,13 @@ class SAC(OffPolicyAlgorithm):
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
         force_reset: bool = True,
+        *,
+        allow_pickle: bool = False,
+        trusted_modules: Sequence[str] = (),
         **kwargs: Any,
     ) -> Self:
         """
-        Load a model, as in Stable-Baselines3.
+        Load a model, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it.
 
         :param path: file, or where ``save`` wrote it
         :param env: environment to go on with; none is needed for prediction
@@ -375,9 +382,13 @@ class SAC(OffPolicyAlgorithm):
         :param custom_objects: objects that replace what the file holds under their names
         :param print_system_info: whether to print the saved and the present versions
         :param force_reset: whether the environment is reset before training goes on
+        :param allow_pickle: whether a file in Stable-Baselines3's own, pickled format is loaded too, which can run any
+            code that its author wanted
+        :param trusted_modules: modules, or packages of modules, whose classes and functions the file may name
         :param kwargs: arguments of the constructor that shall differ from the saved ones. What a learned number starts
             from (``initial_...``, ``ent_coef="auto_..."``) counts from the next reset on: the file has its value
         :return: the model
+        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
         :raises ValueError: if ``kwargs`` holds something else, or values that are not allowed
         """
         check_known(cls, SAC, kwargs)
@@ -386,7 +397,17 @@ class SAC(OffPolicyAlgorithm):
         if "train_freq" in kwargs or "gradient_steps" in kwargs:
             kwargs.setdefault("replay_ratio", None)
         try:
-            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+            return super().load(
+                path,
+                env,
+                device,
+                custom_objects,
+                print_system_info,
+                force_reset,
+                allow_pickle=allow_pickle,
+                trusted_modules=trusted_modules,
+                **kwargs,
+            )
         except RuntimeError as error:
             if kwargs and ("loading state_dict" in str(error) or isinstance(error, ParametersDoNotFit)):
                 raise ValueError(
@@ -397,9 +418,12 @@ class SAC(OffPolicyAlgorithm):
 
     def set_parameters(
         self,
-        load_path_or_dict: str | dict[str, Any],
+        load_path_or_dict: str | pathlib.Path | io.BufferedIOBase | dict[str, Any],
         exact_match: bool = True,
         device: torch.device | str = "auto",
+        *,
+        allow_pickle: bool = False,
+        trusted_modules: Sequence[str] = (),
     ) -> None:
         """
         Load parameters, as in Stable-Baselines3. The optimizers' moments are loaded, their settings (learning rate,
@@ -408,18 +432,19 @@ class SAC(OffPolicyAlgorithm):
         :param load_path_or_dict: a file, or parameters as ``get_parameters`` gives them
         :param exact_match: whether parameters for every module must be there, and no others
         :param device: "auto", "cpu", "cuda", ...
+        :param allow_pickle: see ``load``
+        :param trusted_modules: see ``load``
+        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
+        :raises ValueError: if the parameters are of other networks or parts
         """
-        settings = {
-            name: [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
-            for name, optimizer in self._optimizers().items()
-        }
         try:
-            super().set_parameters(load_path_or_dict, exact_match, device)
+            super().set_parameters(
+                load_path_or_dict, exact_match, device, allow_pickle=allow_pickle, trusted_modules=trusted_modules
+            )
+        except BadFile:
+            raise
         except ValueError as error:
             raise ParametersDoNotFit(str(error)) from error
-        for name, optimizer in self._optimizers().items():
-            for group, own in zip(optimizer.param_groups, settings[name], strict=True):
-                group.update(own)
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -468,6 +493,7 @@ class SAC(OffPolicyAlgorithm):
             "critic_target",
             "_metrics",
             "_critic_loss",
+            "redo",
             "_execution",
             "_parts_mode",
             "_batch_memory",
@@ -550,16 +576,27 @@ class SAC(OffPolicyAlgorithm):
                 if "episode" in infos[index]:  # Monitor's entry; absent if the environment is not monitored
                     part.on_episode_end(self, int(index), infos[index]["episode"]["r"])
 
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+    def load_replay_buffer(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        truncate_last_traj: bool = True,
+        *,
+        allow_pickle: bool = False,
+        trusted_modules: Sequence[str] = (),
+    ) -> None:
         """
-        Load a replay buffer, as in Stable-Baselines3.
+        Load a replay buffer, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it.
 
-        :param path: where ``save_replay_buffer`` wrote it
+        :param path: file, or where ``save_replay_buffer`` wrote it
         :param truncate_last_traj: with ``HerReplayBuffer``, whether the last episode counts as ended
-        :raises ValueError: if it holds out another share of its transitions than ``validation_proportion``
+        :param allow_pickle: see ``load``
+        :param trusted_modules: see ``load``
+        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile or pickled
+        :raises ValueError: if it is the buffer of other spaces, or holds out another share of its transitions than
+            ``validation_proportion``
         """
         before = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
+        super().load_replay_buffer(path, truncate_last_traj, allow_pickle=allow_pickle, trusted_modules=trusted_modules)
         share = self.replay_buffer.validation_proportion if isinstance(self.replay_buffer, ValidationSplit) else 0.0
         if share != self.validation_proportion:
             self.replay_buffer = before

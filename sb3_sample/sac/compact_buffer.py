@@ -173,19 +173,22 @@ class CompactReplay:
     def _set_newest(self, row: int, following: dict[str, np.ndarray]) -> None:
         for key, array in self.aside.newest().items():
             array[...] = following[key]
-        self.slot[row] = np.arange(self.n_envs)
+        self.slot[row] = self.aside.slots_of_newest
 
     def _settle(self, row: int, now: dict[str, np.ndarray]) -> None:
         """The newest row is followed by another: decide where its next observation is, given that one's observation."""
         pending = self.aside.newest()
+        if all(array.tobytes() == now[key].tobytes() for key, array in pending.items()):
+            self.slot[row] = NEXT_ROW
+            return  # nearly always
         differs = np.zeros(self.n_envs, dtype=bool)
         for key, array in pending.items():
-            if array.tobytes() != now[key].tobytes():
-                a, b = (np.ascontiguousarray(x).reshape(self.n_envs, -1).view(np.uint8) for x in (array, now[key]))
-                differs |= (a != b).any(axis=1)
+            a, b = (np.ascontiguousarray(x).reshape(self.n_envs, -1).view(np.uint8) for x in (array, now[key]))
+            differs |= (a != b).any(axis=1)
+        # A disk may be found to be full here: nothing has changed yet.
+        slots = self.aside.put({key: array[differs] for key, array in pending.items()})
         self.slot[row] = NEXT_ROW
-        if differs.any():
-            self.slot[row, differs] = self.aside.put({key: array[differs] for key, array in pending.items()})
+        self.slot[row, differs] = slots
 
     def reset(self) -> None:
         """Empty the buffer."""

@@ -27,6 +27,7 @@ class SideStore:
 
     def __init__(self, like: dict[str, tuple[tuple[int, ...], Any]], n_envs: int, folder: str | None):
         self._n_envs, self._folder = n_envs, folder
+        self.slots_of_newest = np.arange(n_envs, dtype=np.int32)
         #: (capacity, O) each.
         self.arrays = {key: zeros(folder, (n_envs, *shape), dtype) for key, (shape, dtype) in like.items()}
         self._free: list[int] = []

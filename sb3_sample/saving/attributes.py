@@ -271,14 +271,14 @@ class Restorer:
                 return made
             case {"tuple": items, "of": what}:
                 need(what == "builtins.tuple" or class_name(present) == what, what)
-                old = present if isinstance(present, tuple) and len(present) == len(items) else (None,) * len(items)
-                values = [self.restore(item, old[i], f"{name}[{i}]") for i, item in enumerate(items)]
+                parts = present if isinstance(present, tuple) and len(present) == len(items) else (None,) * len(items)
+                values = [self.restore(item, parts[i], f"{name}[{i}]") for i, item in enumerate(items)]
                 # Named tuples take their items one by one.
                 return tuple(values) if what == "builtins.tuple" else type(present)(*values)
             case {"deque": items, "maxlen": maxlen}:
                 return collections.deque((self.restore(item, None, name) for item in items), maxlen)
             case {"dict": items, "of": what}:
-                old = present if isinstance(present, dict) else {}
+                before = present if isinstance(present, dict) else {}
                 mapping: Any = collections.OrderedDict() if what == "collections.OrderedDict" else {}
                 if class_name(mapping) != what:
                     # One with a default of its own.
@@ -288,13 +288,13 @@ class Restorer:
                 early(mapping)
                 for key_node, item in items:
                     key = self.restore(key_node, None, name)
-                    mapping[key] = self.restore(item, old.get(key), f"{name}[{key!r}]")
+                    mapping[key] = self.restore(item, before.get(key), f"{name}[{key!r}]")
                 return mapping
             case {"space": generators}:
                 need(isinstance(present, gym.Space), "a space")
-                parts = list(_generators_of(present))
-                need(len(parts) == len(generators), "another space")
-                for part, generator in zip(parts, generators, strict=True):
+                subspaces = list(_generators_of(present))
+                need(len(subspaces) == len(generators), "another space")
+                for part, generator in zip(subspaces, generators, strict=True):
                     part._np_random = self.restore(generator, part._np_random, name)
                 return present
             case {"state_dict": state}:

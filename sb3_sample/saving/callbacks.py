@@ -112,7 +112,7 @@ class CallbackStates:
         return {
             "class": class_name(callback),
             "attributes": {name: now[name] for name in self._changed[path] if name in now},
-            "state": Describer().describe(callback.state_dict()) if _gives_state(callback) else None,
+            "state": Describer().describe(callback.state_dict()) if _gives_state(callback) else None,  # type: ignore[attr-defined]
             "environments": {name: _save_env(env)[0] for name, env in environments(callback)},
         }
 

@@ -1,10 +1,10 @@
 """
 Checkpoints of a training, from which it goes on as if it had never been interrupted.
 
-``learn`` calls three methods of a :class:`Checkpointer`: :meth:`~Checkpointer.resume` before its callbacks hear that
-the training starts, :meth:`~Checkpointer.start` after that, and :meth:`~Checkpointer.after_turn` at the end of each turn
-of its loop, after the gradient steps, which is the one moment when everything agrees: between the environment's step and
-``train`` a transition is in no buffer, or has no update yet.
+``learn`` calls three methods of a :class:`Checkpointer`: ``resume`` before its callbacks hear that the training starts,
+``start`` after that, and ``after_turn`` at the end of each turn of its loop, after the gradient steps, which is the one
+moment when everything agrees: between the environment's step and ``train`` a transition is in no buffer, or has no
+update yet.
 """
 
 import json
@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
@@ -31,6 +30,7 @@ from sb3_sample.saving import container, training_state, vec_envs
 from sb3_sample.saving.attributes import DoesNotFit
 from sb3_sample.saving.callbacks import CallbackStates, environments, walk, without_progress_bar
 from sb3_sample.saving.encoding import NotPortable, decode, encode
+from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.progress import ProgressFile
 from sb3_sample.saving.rings import Ring
 from sb3_sample.saving.run_folder import RunFolder, Segment
@@ -51,7 +51,7 @@ class Checkpointer:
     :raises ValueError: ``every`` is out of range, the folder cannot be used, or the model cannot be saved
     """
 
-    def __init__(self, model: BaseAlgorithm, callback: BaseCallback, folder: str | Path | None, every: int):
+    def __init__(self, model: SafeFiles, callback: BaseCallback, folder: str | Path | None, every: int):
         if isinstance(every, bool) or not isinstance(every, (int, np.integer)) or every < 1:
             raise ValueError(f"checkpoint_freq must be an integer of at least 1, in environment steps, not {every!r}")
         self._model, self._callback, self._every = model, callback, int(every)
@@ -92,10 +92,10 @@ class Checkpointer:
         self._identity = _identity(model)
         found = self._folder.newest_good()
         if found is not None:
-            path, self._manifest = found
-            self._resumed = decode(*container.read(path / STATE, KIND), "checkpoint")
-            self._check_identity(path, self._resumed["identity"])
-            self._resumed["path"] = path
+            folder, self._manifest = found
+            self._resumed = decode(*container.read(folder / STATE, KIND), "checkpoint")
+            self._check_identity(self._resumed["identity"])
+            self._resumed["path"] = folder
 
     def _callbacks(self) -> Iterator[tuple[str, BaseCallback]]:
         return walk(without_progress_bar(self._callback))
@@ -121,7 +121,7 @@ class Checkpointer:
 
     # ---------------------------------------------------------------- going on
 
-    def _check_identity(self, path: Path, theirs: dict[str, list[str]]) -> None:
+    def _check_identity(self, theirs: dict[str, list[str]]) -> None:
         ours = self._identity
         for name in sorted(ours.keys() | theirs.keys()):
             present, saved = ours.get(name, ["", "not given"]), theirs.get(name, ["", "not given"])
@@ -146,7 +146,7 @@ class Checkpointer:
                 f"checkpoint was made with {', '.join(changed)}",
                 stacklevel=3,
             )
-        model.set_parameters(str(state["path"] / MODEL))
+        model.set_parameters(state["path"] / MODEL, trusted_modules=_own_modules())
         training_state.restore_attributes(model, state["attributes"])
         model.start_time = time.time_ns() - state["elapsed_ns"]
         assert self._folder is not None
@@ -156,11 +156,10 @@ class Checkpointer:
                 ring.restore(state["rings"][name], self._pieces([s for s in segments if s.ring == _file_name(name)]))
         self._saved_at = self._whole_at = model.num_timesteps
 
-    def _pieces(self, segments: list[Segment]) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
+    def _pieces(self, segments: list[Segment]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
         assert self._folder is not None
         for segment in segments:
-            rows = decode(*container.read(self._folder.path / segment.path, SEGMENT_KIND), "rows")
-            yield segment.first, segment.last, rows
+            yield segment.first, decode(*container.read(self._folder.path / segment.path, SEGMENT_KIND), "rows")
 
     def start(self) -> None:
         """
@@ -281,7 +280,7 @@ class Checkpointer:
             "generators": training_state.save_generators(model.device),
         }
         files: dict[str, Callable[[Path], None]] = {
-            MODEL: lambda path: model.save(path),
+            MODEL: lambda path: model.save(path, trusted_modules=_own_modules()),
             STATE: lambda path: _write(path, KIND, state),
         }
         about = {"circumstances": training_state.circumstances(model.device)}
@@ -300,7 +299,7 @@ class Checkpointer:
         if first < last:
             segment = Segment(name, first, last)
             needed[segment.path] = self._folder.write_segment(
-                segment, lambda path: _write(path, SEGMENT_KIND, ring.rows(first, last))
+                segment, lambda path: _write(path, SEGMENT_KIND, ring.rows(first))
             )
         return needed
 
@@ -329,10 +328,10 @@ def _own_modules() -> tuple[str, ...]:
     Whose classes may be named in what is written: those of this program. Who reads the model's file decides anew whom
     to trust, and what is restored here never makes an object by its name.
     """
-    return tuple(sorted({name.split(".")[0] for name in sys.modules} - {"__main__", "__mp_main__"}))
+    return tuple(sorted({name.split(".")[0] for name in sys.modules}))
 
 
-def _identity(model: BaseAlgorithm) -> dict[str, list[str]]:
+def _identity(model: SafeFiles) -> dict[str, list[str]]:
     """
     What tells a run from another, by the argument's name: a digest to compare, and the value to show.
 

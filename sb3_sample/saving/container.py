@@ -13,15 +13,20 @@ import json
 import math
 import os
 import pathlib
+import platform
 import re
 import secrets
 import struct
-import sys
 import zipfile
 from collections.abc import Iterator
 from typing import IO, Any
 
+import gymnasium as gym
+import numpy as np
+import stable_baselines3 as sb3
 import torch
+
+from sb3_sample.version import __version__ as sb3_sample_version
 
 DATA, TENSORS, CHECKSUMS = "data.json", "tensors.safetensors", "checksums.json"
 ENTRIES = (TENSORS, DATA, CHECKSUMS)
@@ -53,6 +58,10 @@ class BadFile(ValueError):
     """A file that is damaged, of another kind, or not made by this package."""
 
 
+class PickledFile(BadFile):
+    """A file that could run code when it is read."""
+
+
 # ---------------------------------------------------------------- writing
 
 
@@ -68,8 +77,7 @@ def write(path_or_file: PathOrFile, kind: str, tree: Any, tensors: dict[str, tor
     :raises OSError: if it cannot be written; it names the path
     :raises ValueError: if the tree takes more than 32 MiB of JSON, or 8 MiB for a model
     """
-    versions = {"python": sys.version.split()[0], "torch": str(torch.__version__)}
-    content = {"kind": kind, "format": FORMAT, "versions": versions, "tree": tree}
+    content = {"kind": kind, "format": FORMAT, "versions": versions(), "tree": tree}
     try:
         data = json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
     except RecursionError as error:
@@ -82,6 +90,15 @@ def write(path_or_file: PathOrFile, kind: str, tree: Any, tensors: dict[str, tor
         return
     with replacing(pathlib.Path(path_or_file)) as file:
         _write(file, data, tensors)
+
+
+def versions() -> dict[str, str]:
+    """
+    :return: the versions of what has a part in a file
+    """
+    modules = {"sb3_sample": sb3_sample_version, "stable_baselines3": sb3.__version__, "gymnasium": gym.__version__}
+    libraries = {"torch": str(torch.__version__), "numpy": np.__version__, "python": platform.python_version()}
+    return {**modules, **libraries}
 
 
 @contextlib.contextmanager
@@ -227,7 +244,7 @@ def _opened(file: IO[bytes], kind: str, name: str) -> zipfile.ZipFile:
     entries = archive.infolist()
     names = [entry.filename for entry in entries]
     if any(entry.endswith((".pth", "/data.pkl")) for entry in names):
-        raise BadFile(f"{name} is a model of Stable-Baselines3 or torch and {_PICKLED}")
+        raise PickledFile(f"{name} is a model of Stable-Baselines3 or torch and {_PICKLED}")
     if sorted(names) != sorted(ENTRIES):
         raise BadFile(f"{name} is no file of sb3_sample: it holds {sorted(names)!r:.300}, not {sorted(ENTRIES)}")
     end = 0
@@ -256,7 +273,7 @@ def _check_table(file: IO[bytes], size: int, name: str) -> None:
     if size < 22 or tail[-22:-18] != b"PK\x05\x06" or tail[-2:] != b"\0\0":
         # A comment may follow the table of a zip, but not of ours.
         if start[:1] == b"\x80":
-            raise BadFile(f"{name} {_PICKLED}")
+            raise PickledFile(f"{name} {_PICKLED}")
         raise BadFile(f"{name} is truncated, or no file of sb3_sample")
     n_entries, length, offset = struct.unpack("<HII", tail[-12:-2])
     table_end = size - 22

@@ -13,16 +13,14 @@ import numpy as np
 import torch
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_sample.sac.buffers import ValidationSplit
+from sb3_sample.sac.compact_buffer import CompactReplay
 
-#: What a buffer keeps of each row.
-COLUMNS = (
-    "observations", "next_observations", "actions", "rewards", "dones", "timeouts", "held_out", "ep_start",
-)  # fmt: skip
+#: What a buffer of Stable-Baselines3 keeps of each row.
+COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "ep_start")
 #: What changes in rows that are there already, or is no row; written anew each time.
 _SMALL = ("ep_length", "_current_ep_start")
-#: Follows from the columns; or is never used (infos, without copy_info_dict); or never changes.
-_DERIVED = ("_ring", "infos", "obs_shape", "device", "observation_space", "action_space", "env")
+#: Never used (infos, without copy_info_dict), or never changes; and what follows from the rows of a compact buffer.
+_DERIVED = ("infos", "obs_shape", "device", "observation_space", "action_space", "env", "slot", "held_out", "_ring")
 
 
 class Ring:
@@ -74,10 +72,23 @@ class Ring:
             self.n_rows += self.capacity + (int(self.buffer.pos) - self.n_rows) % self.capacity
         return max(self.n_written, self.n_rows - self.size()), self.n_rows
 
-    def columns(self) -> dict[str, Any]:
+    def rows(self, first: int) -> dict[str, np.ndarray]:
         """
-        :return: the arrays (or tensors) whose first axis is that of the rows, by name
+        :param first: first row
+        :return: copies of the rows from there on, by the column's name
         """
+        if isinstance(self.buffer, CompactReplay):
+            return self.buffer.new_rows(self.n_rows - first)
+        places = np.arange(first, self.n_rows) % self.capacity
+        return {
+            name: array[torch.from_numpy(places).to(array.device)].cpu().numpy()
+            if isinstance(array, torch.Tensor)
+            else array[places]
+            for name, array in self._columns().items()
+        }
+
+    def _columns(self) -> dict[str, Any]:
+        """The arrays (or tensors) whose first axis is that of the rows, by name."""
         found: dict[str, Any] = {}
         for name in COLUMNS:
             value = getattr(self.buffer, name, None)
@@ -87,48 +98,44 @@ class Ring:
                 found[name] = value
         return found
 
-    def rows(self, first: int, last: int) -> dict[str, np.ndarray]:
-        """
-        :param first: first row
-        :param last: last row, exclusive
-        :return: copies of these rows, (last - first, ...) each, by the column's name
-        """
-        places = np.arange(first, last) % self.capacity
-        return {
-            name: array[torch.from_numpy(places).to(array.device)].cpu().numpy()
-            if isinstance(array, torch.Tensor)
-            else array[places]
-            for name, array in self.columns().items()
-        }
-
     def small(self) -> dict[str, Any]:
         """
         :return: everything else of the buffer, as plain values
         """
-        numbers = {k: v for k, v in vars(self.buffer).items() if isinstance(v, (bool, int, float))}
-        arrays = {name: vars(self.buffer)[name] for name in _SMALL if name in vars(self.buffer)}
-        small: dict[str, Any] = {"numbers": numbers, "arrays": arrays, "n_rows": self.n_rows, "head": None}
-        if self.buffer.optimize_memory_usage:
-            # The last next observation, which lies where the next row comes.
-            small["head"] = self.buffer.observations[self.buffer.pos]
+        small: dict[str, Any] = {"n_rows": self.n_rows}
+        if isinstance(self.buffer, CompactReplay):
+            return small
+        own = vars(self.buffer)
+        small["numbers"] = {name: value for name, value in own.items() if isinstance(value, (bool, int, float))}
+        small["arrays"] = {name: own[name] for name in _SMALL if name in own}
+        # The last next observation, which lies where the next row comes.
+        small["head"] = self.buffer.observations[self.buffer.pos] if self.buffer.optimize_memory_usage else None
         return small
 
-    def restore(self, small: dict[str, Any], pieces: Iterable[tuple[int, int, dict[str, np.ndarray]]]) -> None:
+    def restore(self, small: dict[str, Any], pieces: Iterable[tuple[int, dict[str, np.ndarray]]]) -> None:
         """
         Put rows back into a buffer made as the saved one.
 
         :param small: from :meth:`small`
-        :param pieces: first row, last row and rows, oldest first
+        :param pieces: first row and rows, oldest first
         :raises ValueError: they are of another buffer
         """
-        columns = self.columns()
-        for first, last, rows in pieces:
-            places = np.arange(first, last) % self.capacity
+        if isinstance(self.buffer, CompactReplay):
+            self.buffer.restore_rows(pieces)
+        else:
+            self._restore(small, pieces)
+        self.n_rows = self.n_written = int(small["n_rows"])
+        self._count = self._counter()
+
+    def _restore(self, small: dict[str, Any], pieces: Iterable[tuple[int, dict[str, np.ndarray]]]) -> None:
+        columns = self._columns()
+        for first, rows in pieces:
             if rows.keys() != columns.keys():
                 raise ValueError(f"the buffer has the columns {sorted(columns)}, the saved one {sorted(rows)}")
+            places = np.arange(first, first + len(rows["actions"])) % self.capacity
             for name, values in rows.items():
                 array = columns[name]
-                if tuple(array.shape[1:]) != values.shape[1:]:
+                if values.shape != (len(places), *array.shape[1:]):
                     raise ValueError(f"the buffer's {name} are {tuple(array.shape[1:])}, the saved {values.shape[1:]}")
                 if isinstance(array, torch.Tensor):
                     array[torch.from_numpy(places).to(array.device)] = torch.from_numpy(values).to(array)
@@ -140,22 +147,6 @@ class Ring:
             getattr(self.buffer, name)[...] = value
         if small["head"] is not None:
             self.buffer.observations[self.buffer.pos] = small["head"]
-        if isinstance(self.buffer, ValidationSplit):
-            self._restore_places(self.buffer)
-        self.n_rows = self.n_written = int(small["n_rows"])
-        self._count = self._counter()
-
-    def _restore_places(self, buffer: Any) -> None:
-        """The places held out, oldest first, from the mask."""
-        oldest_first = np.arange(self._oldest(buffer), self._oldest(buffer) + self.size()) % self.capacity
-        steps, envs = np.nonzero(buffer.held_out[oldest_first])
-        places = oldest_first[steps] * buffer.n_envs + envs
-        buffer._ring[np.arange(buffer._first, buffer._last) % len(buffer._ring)] = places
-
-    @staticmethod
-    def _oldest(buffer: Any) -> int:
-        """The place of the oldest row."""
-        return int(buffer.pos) if buffer.full else 0
 
     def interrupt(self) -> None:
         """

@@ -120,8 +120,8 @@ class RunFolder:
             return path, manifest
         if reasons:
             raise Damaged(
-                f"checkpoint={str(self.path)!r} has no checkpoint that is whole: {'; '.join(reasons)}. Remove the folder "
-                "to start anew."
+                f"checkpoint={str(self.path)!r} has no checkpoint that is whole: {'; '.join(reasons)}. Remove the "
+                "folder to start anew."
             )
         return None
 

@@ -3,6 +3,8 @@ What a training run consists of besides parameters, replay buffer, environments 
 random generators and logger; and what tells one run from another.
 """
 
+import contextlib
+import importlib.metadata
 import inspect
 import platform
 import random
@@ -36,8 +38,8 @@ def argument_names(model: BaseAlgorithm) -> set[str]:
     :param model: the algorithm
     :return: the arguments of its constructor and of those of its bases
     """
-    signatures = (inspect.signature(cls.__init__).parameters for cls in type(model).__mro__[:-1])
-    return {name for parameters in signatures for name in parameters} - {"self", "args", "kwargs", "_init_setup_model"}
+    signatures = (inspect.signature(cls).parameters for cls in type(model).__mro__ if issubclass(cls, BaseAlgorithm))
+    return {name for parameters in signatures for name in parameters} - {"args", "kwargs", "_init_setup_model"}
 
 
 def _saved_elsewhere(model: BaseAlgorithm) -> set[str]:
@@ -161,8 +163,6 @@ def circumstances(device: torch.device) -> dict[str, str]:
         "device": device.type if device.type != "cuda" else torch.cuda.get_device_name(device),
         "torch threads": str(torch.get_num_threads()),
     }
-    try:
-        import mujoco
-    except ImportError:
-        return found
-    return {**found, "mujoco": mujoco.__version__}
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        found["mujoco"] = importlib.metadata.version("mujoco")
+    return found

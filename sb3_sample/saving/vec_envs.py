@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_sample.envs.portable_states import HELPER, pack, unpack
@@ -85,10 +86,20 @@ def describe_spec(env: gym.Env) -> list[str]:
         inner = inner.env
     layers.append(class_name(inner))
     if env.spec is not None:
-        layers.append(
-            f"{env.spec.id}, max_episode_steps={env.spec.max_episode_steps}, {sorted(env.spec.kwargs.items())}"
-        )
+        kwargs = {name: _shown(value) for name, value in sorted(env.spec.kwargs.items())}
+        layers.append(f"{env.spec.id}, max_episode_steps={env.spec.max_episode_steps}, {kwargs}")
     return layers
+
+
+def _shown(value: Any) -> str:
+    """A value in words that are the same in every process: without addresses in the memory."""
+    if isinstance(value, dict):
+        return str({str(key): _shown(item) for key, item in value.items()})
+    if isinstance(value, (list, tuple)):
+        return str([_shown(item) for item in value])
+    if isinstance(value, np.ndarray):
+        return str(value.tolist())
+    return repr(value) if isinstance(value, (str, int, float, bool, np.generic, type(None))) else class_name(value)
 
 
 def _wrappers(venv: VecEnv) -> Iterator[VecEnvWrapper]:

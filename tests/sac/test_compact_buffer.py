@@ -198,7 +198,7 @@ def test_saved_and_loaded(tmp_path: Path) -> None:
     model = sac(replay_buffer_kwargs={"memory_map": str(tmp_path / "map")}, buffer_size=30).learn(45)
     model.save(tmp_path / "m")
     model.save_replay_buffer(tmp_path / "b")
-    loaded = SAC.load(tmp_path / "m", env=vec())
+    loaded = SAC.load(tmp_path / "m", env=vec(), replay_buffer_kwargs={"memory_map": str(tmp_path / "other")})
     assert type(loaded.replay_buffer) is CompactReplayBuffer and loaded.replay_buffer.size() == 0
     loaded.load_replay_buffer(tmp_path / "b")
     assert_same(model.replay_buffer, loaded.replay_buffer)

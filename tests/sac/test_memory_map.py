@@ -80,6 +80,35 @@ def test_a_disk_that_refuses(tmp_path: Path) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
+def test_a_disk_that_gets_full(tmp_path: Path) -> None:
+    """Where every step breaks the sequence: the step that does not fit is refused, and the buffer is as before."""
+    ours, theirs = pair(BOX, 2000, 1, memory_map=tmp_path)
+    stream = Stream(BOX, 1, 0, ends=1.0)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
+    transition = stream.transition()
+
+    def fill() -> None:
+        nonlocal transition
+        while True:
+            ours.add(*transition)
+            theirs.add(*transition)
+            transition = stream.transition()
+
+    try:
+        with pytest.raises(OSError, match="GB of a replay buffer"):
+            fill()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert 300 < theirs.size() == ours.size() < 1000
+    assert same_bits(draw(ours, 500, 0), draw(theirs, 500, 0))
+    for _ in range(2500):
+        ours.add(*transition)
+        theirs.add(*transition)
+        transition = stream.transition()
+    assert same_bits(draw(ours, 500, 0), draw(theirs, 500, 0))
+
+
 def test_two_buffers_in_a_folder(tmp_path: Path) -> None:
     """Each has files of its own."""
     (first, plain), (second, _) = (pair(BOX, 10, 1, memory_map=str(tmp_path)) for _ in range(2))

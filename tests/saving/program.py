@@ -9,6 +9,7 @@ import json
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 import warnings
@@ -21,6 +22,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback, StopTrainingOnMaxEpisodes, StopTrainingOnNoModelImprovement
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
@@ -29,6 +31,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.diagnostics import DiagnosticsCallback
 from sb3_sample.envs import make_env
+from sb3_sample.sac.buffers import DeviceReplayBuffer
+from sb3_sample.sac.compact_buffer import CompactReplay
 from sb3_sample.saving import training_state, vec_envs
 from sb3_sample.saving.callbacks import walk
 from tests.ppo.common import TINY, TINY_MODELS
@@ -95,6 +99,9 @@ def model(algorithm: str, folder: str, env: dict[str, Any], **kwargs: Any) -> An
         return cls("MlpPolicy", venv, **arguments)
     if kwargs.pop("her", False):
         kwargs |= {"replay_buffer_class": HerReplayBuffer, "policy": "MultiInputPolicy", "learning_starts": 60}
+    buffers = {"plain": ReplayBuffer, "device": DeviceReplayBuffer}
+    if "buffer" in kwargs:
+        kwargs["replay_buffer_class"] = buffers[kwargs.pop("buffer")]
     if kwargs.pop("noise", False):
         kwargs["action_noise"] = OrnsteinUhlenbeckActionNoise(np.zeros(1), np.full(1, 0.3))
     return MAKERS[algorithm](venv, **kwargs)
@@ -120,6 +127,20 @@ def callbacks(folder: str, env: dict[str, Any], evaluate: bool = False, diagnose
     return [evaluation, *others]
 
 
+def kill_in_writing(folder: str, k: int) -> None:
+    """End this process by SIGKILL at the k-th thing that it does to the files in a folder from now on."""
+    count = 0
+
+    def hook(event: str, args: Any) -> None:
+        nonlocal count
+        if (event == "open" or event.startswith("os.")) and args and folder in str(args[0]):
+            count += 1
+            if count == k:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    sys.addaudithook(hook)
+
+
 class _Kill(threading.Thread):
     """Ends this process by SIGKILL a while after a checkpoint is there, wherever it is then."""
 
@@ -142,14 +163,17 @@ def train(case: dict[str, Any], steps: int, every: int, folder: str, kill: tuple
     :param steps: environment steps
     :param every: steps between two checkpoints
     :param folder: the run's
-    :param kill: after the checkpoint of how many steps, and how much later, the process is killed
+    :param kill: after the checkpoint of how many steps, and how many seconds later, the process is killed; or -1, and
+        at which of the things that it does to the folder's files
     """
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     env = case.get("env", {})
     agent = model(case["algorithm"], folder, env, **case.get("kwargs", {}))
     callback = callbacks(folder, env, case.get("evaluate", False), case.get("diagnose", False))
-    if kill is not None:
+    if kill is not None and kill[0] < 0:
+        kill_in_writing(folder, int(kill[1]))
+    elif kill is not None:
         _Kill(folder, *kill).start()
     agent.learn(steps, callback=callback, log_interval=1, checkpoint=folder, checkpoint_freq=every)
     Path(f"{folder}.json").write_text(json.dumps(outcome(agent, folder, callback)))
@@ -197,15 +221,19 @@ def outcome(agent: Any, folder: str, callback: Any = None) -> dict[str, str]:
     note("env", vec_envs.save(agent.env)[0])
     buffer = getattr(agent, "replay_buffer", None)
     if buffer is not None:
-        note("buffer", {k: v for k, v in vars(buffer).items() if isinstance(v, (np.ndarray, dict, int, float))})
-        found.pop("buffer/infos", None)
+        # Where the compact buffers keep their next observations is not the same, what they are is.
+        own = {k: v for k, v in vars(buffer).items() if k not in ("infos", "slot", "_ring", "_first", "_last", "aside")}
+        note("buffer", {k: v for k, v in own.items() if isinstance(v, (np.ndarray, dict, int, float))})
+        if isinstance(buffer, CompactReplay):
+            note("buffer/rows", buffer.new_rows(buffer.size()))
         if hasattr(buffer, "_ring"):
-            used = np.arange(buffer._first, buffer._last) % len(buffer._ring)
-            note("buffer/_ring", buffer._ring[used])
+            note("buffer/_ring", buffer._ring[np.arange(buffer._first, buffer._last) % len(buffer._ring)])
     for each in callback or []:
         for path, part in walk(each, type(each).__name__):
-            names = ("best_mean_reward", "evaluations_timesteps", "evaluations_results", "n_calls", "n_episodes",
-                     "no_improvement_evals", "last_best_mean_reward", "num_timesteps", "evaluations_length")  # fmt: skip
+            names = (
+                "best_mean_reward", "evaluations_timesteps", "evaluations_results", "n_calls", "n_episodes",
+                "no_improvement_evals", "last_best_mean_reward", "num_timesteps", "evaluations_length", "last_results",
+            )  # fmt: skip
             note(path, {name: vars(part)[name] for name in names if name in vars(part)})
     for i, line in enumerate((Path(folder) / "progress.jsonl").read_text().splitlines()):
         note(f"log/{i}", json.loads(line))

@@ -19,6 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps, St
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
+from sb3_sample import MBMAPPO
 from sb3_sample.sac.buffers import DeviceReplayBuffer
 from sb3_sample.saving import training_state
 from sb3_sample.saving.attributes import Describer, same
@@ -37,7 +38,13 @@ def steps_of(folder: Path) -> list[int]:
 # ---------------------------------------------------------------- what is held
 
 
-@pytest.mark.parametrize("maker", [*MAKERS, *ALGORITHMS])
+@pytest.mark.parametrize(
+    "maker",
+    [
+        pytest.param(maker, marks=[] if maker in ("BRO", "VPLSAC", MBMAPPO) else pytest.mark.slow)
+        for maker in (*MAKERS, *ALGORITHMS)
+    ],
+)
 def test_every_attribute_that_changes_is_held(maker: Any, tmp_path: Path) -> None:
     """Fails when somebody adds state to an algorithm that no checkpoint holds."""
 
@@ -243,7 +250,7 @@ def test_a_full_quota_is_survived(tmp_path: Path) -> None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (500 if limited else hard, hard))
             return True
 
-    with pytest.warns(UserWarning) as caught:
+    with pytest.warns(UserWarning, match="No checkpoint") as caught:
         model = sac().learn(40, Limit(), checkpoint=tmp_path, log_interval=1, **STEPS)
     messages = [str(w.message) for w in caught if "No checkpoint" in str(w.message)]
     assert len(messages) == 2

@@ -21,7 +21,8 @@ FAST: dict[str, dict[str, Any]] = {
 }
 SLOW: dict[str, dict[str, Any]] = {
     **{name: {"algorithm": name} for name in (
-        "SAC", "BROFast", "BROTD3", "DAC", "SRSAC", "OAC", "TOPSAC", "GPLSAC", "OPLSAC", "RegularizedSAC", "QMA", "MBPO",
+        "SAC", "BROFast", "BROTD3", "DAC", "SRSAC", "OAC", "TOPSAC", "GPLSAC", "OPLSAC", "RegularizedSAC", "QMA",
+        "MBPO",
     )},
     **{f"{name}, workers": {"algorithm": name, "env": WORKERS4} for name in ("BRO", "OPLSAC", "MBMA", "QMA", "MBPO")},
     **{f"{name}, {env}": {"algorithm": name, "env": {"env": env}} for name in ("BRO", "MBMA")
@@ -35,8 +36,10 @@ SLOW: dict[str, dict[str, Any]] = {
     "hindsight": {"algorithm": "SAC", "kwargs": {"her": True}, "env": {"env": "goal"}},
     "hindsight, 4": {"algorithm": "SAC", "kwargs": {"her": True}, "env": {"env": "goal", "n": 4}},
     "n-step returns": {"algorithm": "SAC", "kwargs": {"n_steps": 3}, "env": DUMMY4},
-    "memory": {"algorithm": "SAC", "kwargs": {
+    "memory": {"algorithm": "SAC", "kwargs": {"buffer": "plain",
         "optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}},
+    "device ring": {"algorithm": "SAC", "kwargs": {"buffer": "device", "buffer_size": 70}, "env": {"n": 2}},
+    "plain ring": {"algorithm": "SAC", "kwargs": {"buffer": "plain", "buffer_size": 70}, "env": {"n": 2}},
     "ring": {"algorithm": "VPLSAC", "kwargs": {"buffer_size": 70}, "env": {"n": 2}},
     "ring, hindsight": {"algorithm": "SAC", "kwargs": {"her": True, "buffer_size": 70}, "env": {"env": "goal"}},
     "noise": {"algorithm": "BROTD3", "kwargs": {"noise": True}, "env": {"n": 2}},
@@ -73,3 +76,15 @@ def test_killed_and_started_again(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", SLOW)
 def test_killed_and_started_again_everywhere(name: str, tmp_path: Path) -> None:
     check(SLOW[name], tmp_path, seed=len(name))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(6))
+def test_killed_while_a_checkpoint_is_written(seed: int, tmp_path: Path) -> None:
+    case = {"algorithm": "VPLSAC", "kwargs": {"buffer_size": 70}}
+    whole, killed = str(tmp_path / "whole"), str(tmp_path / "killed")
+    run(case, 2 * N, 24, whole)
+    at = random.Random(seed).randrange(60, 300)
+    run(case, 2 * N, 24, killed, (-1, at), code=-9)
+    run(case, 2 * N, 24, killed)
+    assert not differing(result(whole), result(killed))

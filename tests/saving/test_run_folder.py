@@ -190,14 +190,17 @@ def test_what_cannot_be_written_leaves_nothing(code: int, where: str, tmp_path: 
         Path(path).write_bytes(b"half") if where != "rename" else None
         raise OSError(code, os.strerror(code), str(path))
 
-    with monkeypatch.context() as patch, pytest.raises(OSError, match=os.strerror(code)):
+    def attempt() -> None:
         if where == "segment":
             folder.write_segment(Segment("model", 10, 20), fail)
-        else:
-            if where == "rename":
-                patch.setattr(os, "rename", fail)
-            files = {"model.zip": writer(b"m"), "state.zip": fail if where == "file" else writer(b"s")}
-            folder.write(20, files, segments, {})
+        files = {"model.zip": writer(b"m"), "state.zip": fail if where == "file" else writer(b"s")}
+        folder.write(20, files, segments, {})
+
+    with monkeypatch.context() as patch:
+        if where == "rename":
+            patch.setattr(os, "rename", fail)
+        with pytest.raises(OSError, match=os.strerror(code)):
+            attempt()
     assert sorted(str(p) for p in tmp_path.rglob("*")) == before
     write(folder, 20, segments)
     assert folder.newest_good()[1]["steps"] == 20  # type: ignore[index]
