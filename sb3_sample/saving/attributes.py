@@ -174,6 +174,10 @@ class Describer:
         if isinstance(value, torch.Generator):
             return {"torch_generator": value.get_state()}
         if type(value) is list:
+            # Long ones, as of all episodes' returns, are small as arrays.
+            for number, dtype in ((float, np.float64), (int, np.int64)):
+                if len(value) > 16 and all(type(item) is number and abs(item) < 2**63 for item in value):
+                    return {"numbers": np.array(value, dtype)}
             if all(isinstance(item, _CONSTANTS) and not isinstance(item, enum.Enum) for item in value):
                 return {"value": list(value)}
             return {"list": [self.describe(item) for item in value]}
@@ -252,6 +256,8 @@ class Restorer:
         match node:
             case {"value": value}:
                 return copy.deepcopy(value)
+            case {"numbers": array}:
+                return array.tolist()
             case {"view": place}:
                 there = isinstance(present, np.ndarray) and is_view_of_foreign_memory(present)
                 fits = there and self._origin is not None and _place(present, self._origin) == list(place)

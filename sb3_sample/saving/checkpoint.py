@@ -123,8 +123,9 @@ class Checkpointer:
 
     def _check_identity(self, theirs: dict[str, list[str]]) -> None:
         ours = self._identity
-        for name in sorted(ours.keys() | theirs.keys()):
-            present, saved = ours.get(name, ["", "not given"]), theirs.get(name, ["", "not given"])
+        # An argument that only one of the two has is one of another version, of which the circumstances tell.
+        for name in sorted(ours.keys() & theirs.keys()):
+            present, saved = ours[name], theirs[name]
             if present[0] != saved[0]:
                 raise ValueError(
                     f"{name}={present[1]}: the run of checkpoint={str(self._name)!r} was made with {name}={saved[1]}. "
@@ -263,11 +264,24 @@ class Checkpointer:
         """
         :raises OSError: it cannot be written
         """
+        known = self._manifest["segments"]
+        segments = dict(known)
+        try:
+            for name, ring in self._rings.items():
+                segments = self._save_rows(_file_name(name), ring, segments)
+            self._save_rest(segments)
+        except BaseException:
+            assert self._folder is not None
+            self._folder.remove_segments(segments.keys() - known.keys())
+            raise
+        self._manifest = {"segments": segments}
+        self._saved_at = self._model.num_timesteps
+        for ring in self._rings.values():
+            ring.n_written = ring.n_rows
+
+    def _save_rest(self, segments: dict[str, Any]) -> None:
         assert self._folder is not None
         model = self._model
-        segments = dict(self._manifest["segments"])
-        for name, ring in self._rings.items():
-            segments = self._save_rows(_file_name(name), ring, segments)
         state = {
             "identity": self._identity,
             "attributes": training_state.save_attributes(model),
@@ -285,10 +299,6 @@ class Checkpointer:
         }
         about = {"circumstances": training_state.circumstances(model.device)}
         self._folder.write(model.num_timesteps, files, segments, about)
-        self._manifest = {"segments": segments}
-        self._saved_at = model.num_timesteps
-        for ring in self._rings.values():
-            ring.n_written = ring.n_rows
 
     def _save_rows(self, name: str, ring: Ring, known: dict[str, Any]) -> dict[str, Any]:
         """Write the rows that the files lack. What the manifest says of all that are needed then."""

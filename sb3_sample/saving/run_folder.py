@@ -14,7 +14,7 @@ import os
 import re
 import shutil
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -180,6 +180,14 @@ class RunFolder:
         _sync(path.parent)
         _verify_file(path, facts)
         return {"ring": segment.ring, "first": segment.first, "last": segment.last, **facts}
+
+    def remove_segments(self, names: Iterable[str]) -> None:
+        """
+        :param names: paths, in the run's folder, of rows whose checkpoint was not written
+        """
+        for name in names:
+            with contextlib.suppress(OSError):
+                (self.path / name).unlink(missing_ok=True)
 
     def write(
         self, steps: int, files: dict[str, Callable[[Path], None]], segments: dict[str, Any], about: dict[str, Any]

@@ -13,7 +13,7 @@ from sb3_sample.envs import make_env
 from sb3_sample.envs.portable_states import pack, unpack
 from sb3_sample.envs.states import layers_of, restore_state, save_state, simulator_of
 from sb3_sample.saving import container
-from sb3_sample.saving.attributes import DoesNotFit, same
+from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, same
 from sb3_sample.saving.encoding import decode, encode
 from tests.envs.test_states import assert_equal, random_actions, steps
 
@@ -195,3 +195,21 @@ def test_states_of_other_environments() -> None:
     with pytest.raises(DoesNotFit, match="Sharing.inner is builtins.NoneType, but was .*Inner"):
         unpack(other, pack(sharing)[0])
     assert len(layers_of(Monitor(sharing))) == 2
+
+
+def test_long_lists_of_numbers_come_back_as_they_were(tmp_path: Path) -> None:
+    values: list[Any] = [
+        [0.1 * i for i in range(40)],
+        list(range(-20, 20)),
+        [float("nan"), float("inf"), *[-0.0] * 30],
+        [2**80] * 20,
+        [True] * 20,
+        [np.float64(0.1)] * 20,
+        [1, 2.0] * 10,
+    ]
+    node = through_a_file(Describer().describe(values), tmp_path / "state")
+    assert sum("numbers" in item for item in node["list"]) == 2
+    again = Restorer().restore(node, None, "values")
+    assert [[(type(x), repr(x)) for x in items] for items in again] == [
+        [(type(x), repr(x)) for x in items] for items in values
+    ]

@@ -6,6 +6,7 @@ import resource
 import signal
 import subprocess
 import warnings
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 from sb3_sample import MBMAPPO
 from sb3_sample.sac.buffers import DeviceReplayBuffer
-from sb3_sample.saving import training_state
+from sb3_sample.sac.policies import MlpPolicy
+from sb3_sample.saving import container, training_state
 from sb3_sample.saving.attributes import Describer, same
 from sb3_sample.saving.callbacks import CallbackStates
+from sb3_sample.saving.run_folder import RunFolder
 from tests.ppo.common import ALGORITHMS, tiny
 from tests.sac.common import MAKERS, bro, differing, sac, state, vec
 from tests.saving.program import Goal, outcome
@@ -229,6 +232,42 @@ def test_buffers_that_no_checkpoint_can_hold(tmp_path: Path) -> None:
     assert model.num_timesteps == 0 and not steps_of(tmp_path)
 
 
+def test_a_schedule_that_no_file_can_hold_is_refused_before_training(tmp_path: Path) -> None:
+    model = sac(learning_rate=lambda progress: 1e-3 * progress)
+    with pytest.raises(ValueError, match="learning_rate: .*<lambda>"):
+        model.learn(20, checkpoint=tmp_path)
+    assert model._n_updates == 0 and not steps_of(tmp_path)
+
+
+class OwnPolicy(MlpPolicy):
+    """A policy class of the user's own."""
+
+
+def test_classes_of_ones_own(tmp_path: Path) -> None:
+    for steps in (20, 40):
+        again = sac(policy=OwnPolicy).learn(steps, checkpoint=tmp_path)
+    assert not differing(state(sac(policy=OwnPolicy).learn(40)), state(again))
+    file = tmp_path / "checkpoint-000000000040" / "model.zip"
+    with pytest.raises(ValueError, match="not trusted"):
+        type(again).load(file)
+    loaded = type(again).load(file, trusted_modules=["tests.saving.test_checkpoint"])
+    assert isinstance(loaded.policy, OwnPolicy)
+
+
+def test_no_file_is_pickled(tmp_path: Path) -> None:
+    sac(vec(2)).learn(40, [Counter()], checkpoint=tmp_path, **STEPS)
+    files = sorted(path for path in tmp_path.rglob("*.zip"))
+    assert len(files) > 6
+    for path in files:
+        with zipfile.ZipFile(path) as archive:
+            assert sorted(archive.namelist()) == ["checksums.json", "data.json", "tensors.safetensors"]
+            json.loads(archive.read("data.json"))
+        kind = {"model.zip": "model", "state.zip": "checkpoint"}.get(path.name, "replay rows")
+        container.read(path, kind)
+    others = {path.name for path in tmp_path.rglob("*") if path.is_file()} - {path.name for path in files}
+    assert others == {"manifest.json", "progress.jsonl", ".lock"}
+
+
 def test_a_file_in_place_of_the_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match=r"checkpoint must name a folder, but .*file is a file"):
@@ -262,6 +301,23 @@ def test_a_full_quota_is_survived(tmp_path: Path) -> None:
     assert len((tmp_path / "progress.jsonl").read_text().splitlines()) == 5
     again = sac().learn(50, checkpoint=tmp_path, **STEPS)
     assert not differing(state(sac().learn(50)), state(again)) and model.num_timesteps == 40
+
+
+def test_rows_of_a_checkpoint_that_failed_are_removed_and_written_again(tmp_path: Path, monkeypatch: Any) -> None:
+    write, rows = RunFolder.write, []
+
+    def fail_at_20(self: RunFolder, steps: int, *args: Any) -> Any:
+        if steps == 20:
+            raise OSError(28, "No space left on device")
+        rows.append(sorted(path.name[6:] for path in (tmp_path / "replay").iterdir()))
+        return write(self, steps, *args)
+
+    monkeypatch.setattr(RunFolder, "write", fail_at_20)
+    with pytest.warns(UserWarning, match="No checkpoint at 20 steps"):
+        sac().learn(30, checkpoint=tmp_path, **STEPS)
+    assert rows == [[], ["000000000000-000000000010.zip"],
+                    ["000000000000-000000000010.zip", "000000000010-000000000030.zip"]]  # fmt: skip
+    assert not differing(state(sac().learn(40)), state(sac().learn(40, checkpoint=tmp_path)))
 
 
 def test_no_space_and_a_read_only_file_system(tmp_path: Path) -> None:
