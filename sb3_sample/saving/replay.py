@@ -210,7 +210,7 @@ def _with_state(
             **{**same_class, **arguments, "buffer_size": size * n_envs},
         )
     buffer.load_state_dict(state)
-    return buffer  # type: ignore[no-any-return]
+    return buffer
 
 
 def _with_attributes(
@@ -239,7 +239,7 @@ def _with_attributes(
             if column.shape[:2] != (size, n_envs):
                 raise BadFile(f"{name} is of shape {tuple(column.shape)}, not of {size} rows of {n_envs} environments")
     _check_spaces(buffer, model)
-    return buffer  # type: ignore[no-any-return]
+    return buffer
 
 
 def _check_size(size: Any, n_envs: Any) -> None:

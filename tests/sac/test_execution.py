@@ -12,6 +12,7 @@ import pytest
 import torch
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -175,7 +176,7 @@ def test_the_recorder_repeats_and_does_not_ask() -> None:
 
 def test_captured_survives_what_happens_in_training(tmp_path: Path) -> None:
     """Resets, a schedule of the learning rate, settings changed on the way, saving and loading."""
-    kwargs: dict[str, Any] = {"learning_rate": lambda progress: 1e-3 * progress, "resets": (75,), "learning_starts": 20}
+    kwargs: dict[str, Any] = {"learning_rate": LinearSchedule(1e-3, 0, 1), "resets": (75,), "learning_starts": 20}
     models = []
     for i in range(2):
         # Made one after the other, since the seed is that of all random numbers.

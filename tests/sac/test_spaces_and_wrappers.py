@@ -21,6 +21,7 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
 from sb3_sample.sac import SAC
@@ -458,7 +459,7 @@ def test_constant_learning_rate() -> None:
 
 def test_scheduled_learning_rate(tmp_path: Path) -> None:
     """A schedule moves every rate but that of optimism and its weight."""
-    model = bro(learning_rate=lambda remaining: 1e-3 * remaining, adjustment_learning_rate=2e-5).learn(40)
+    model = bro(learning_rate=LinearSchedule(1e-3, 0, 1), adjustment_learning_rate=2e-5).learn(40)
     for name, rate in rates(model).items():
         expected = 2e-5 if name == "explorer.scalar_optimizer" else 1e-3 * model._current_progress_remaining
         assert rate == pytest.approx(expected), name
