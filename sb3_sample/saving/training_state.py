@@ -65,6 +65,9 @@ def restore_attributes(model: BaseAlgorithm, described: dict[str, Node]) -> None
     :param model: an algorithm made as the saved one
     :param described: from :func:`save_attributes`
     """
+    if getattr(model, "compile", "auto") != "auto":
+        # How it is run is said by the present program; what "auto" once decided stays.
+        described = {name: node for name, node in described.items() if name != "compiled"}
     Restorer().attributes(model, described)
 
 

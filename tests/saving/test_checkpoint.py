@@ -594,6 +594,16 @@ def test_the_elapsed_time_goes_on(tmp_path: Path) -> None:
     assert 0 < time.time_ns() - states[0][0] < 600e9 and states[0][1] == 0
 
 
+def test_compile_is_the_present_programs_and_what_auto_decided_stays() -> None:
+    decided = sac(compile="auto")
+    decided.compiled = True
+    attributes = training_state.save_attributes(decided)
+    for present, compiled in (("auto", True), (False, False)):
+        model = sac(compile=present)
+        training_state.restore_attributes(model, attributes)
+        assert model.compiled is compiled
+
+
 def test_callback_states_notice_changes_in_place() -> None:
     model = sac()
     callback = Counter()
