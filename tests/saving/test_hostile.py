@@ -1,0 +1,310 @@
+"""
+Thousands of damaged, truncated and hostile files: each is a clean error, or harmless; none runs code, takes the
+interpreter down, or takes more than a moment and some memory.
+
+``python -m tests.saving.test_hostile TARGET SEED FIRST N FOLDER`` throws N files at one loader and prints a line of JSON
+for each, before and after: who watches it knows by which it was taken down.
+"""
+
+import contextlib
+import io
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sb3_sample.ppo import MBMAPPO
+from sb3_sample.sac import SAC
+from sb3_sample.sac.bro import BRO
+from sb3_sample.sac.parts import ParametersDoNotFit
+from sb3_sample.saving import BadFile, load_vec_normalize, save_vec_normalize
+from tests.ppo.common import tiny
+from tests.sac.common import bro, differing, sac, state, vec
+from tests.saving.hostile import FAMILIES, Case, Original, case_of
+from tests.saving.test_replay import goals
+
+OBSERVATIONS = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
+#: Seconds of the processor and bytes that one file may take; measured: see the slow test's output.
+SECONDS, BYTES = 2.0, 400 * 2**20
+#: Of address space, in which more is taken than is ever filled: a crash before the machine's memory is gone.
+HEADROOM = 16 * 2**30
+
+
+@cache
+def model_of(target: str) -> Any:
+    make: dict[str, Callable[[], Any]] = {
+        "SAC": sac, "BRO": bro, "MBMAPPO": lambda: tiny(MBMAPPO), "set_parameters": sac, "buffer": sac,
+        "her": lambda: _her(),
+    }  # fmt: skip
+    return make[target]().learn(16)
+
+
+def _her() -> Any:
+    from stable_baselines3.her import HerReplayBuffer
+
+    return sac(
+        goals(1), policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer,
+        replay_buffer_kwargs={"copy_info_dict": True}, learning_starts=20,
+    )  # fmt: skip
+
+
+@cache
+def original_of(target: str) -> Original:
+    file = io.BytesIO()
+    if target == "VecNormalize":
+        from stable_baselines3.common.vec_env import VecNormalize
+
+        env = VecNormalize(vec())
+        env.reset()
+        env.step(np.zeros((1, 2)))
+        save_vec_normalize(env, file)  # type: ignore[arg-type]
+    elif target in ("buffer", "her"):
+        model_of(target).save_replay_buffer(file)
+    else:
+        model_of(target).save(file)
+    return Original(target, file.getvalue())
+
+
+def load(target: str, path: Path) -> Any:
+    """What the loader makes of a file, used once, as far as using it is in the loader's hands."""
+    if target == "VecNormalize":
+        env = load_vec_normalize(path, vec())
+        env.reset()
+        return env
+    if target in ("buffer", "her"):
+        model = model_of(target)
+        model.load_replay_buffer(path)
+        return model.replay_buffer
+    if target == "set_parameters":
+        model = sac()
+        model.set_parameters(path)
+        return model
+    return {"SAC": SAC, "BRO": BRO, "MBMAPPO": MBMAPPO}[target].load(path, device="cpu")  # type: ignore[attr-defined]
+
+
+def content(target: str, loaded: Any) -> Any:
+    """All of what was loaded, to compare."""
+    if target == "VecNormalize":
+        rms = loaded.obs_rms
+        return {"mean": torch.tensor(rms.mean), "var": torch.tensor(rms.var), "clip": torch.tensor(loaded.clip_obs)}
+    if target in ("buffer", "her"):
+        arrays = {k: v for k, v in _flat(vars(loaded)) if isinstance(v, (np.ndarray, torch.Tensor)) and v.dtype != object}
+        return {key: torch.as_tensor(value).clone() for key, value in arrays.items()}
+    return state(loaded)
+
+
+def _flat(values: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from ((f"{key}.{inner}", item) for inner, item in _flat(value))
+        else:
+            yield str(key), value
+
+
+@cache
+def wanted(target: str, folder: Path) -> Any:
+    path = folder / "good.zip"
+    path.write_bytes(original_of(target).data)
+    good = content(target, load(target, path))
+    path.unlink()
+    return good
+
+
+# ---------------------------------------------------------------- watching
+
+
+class Watch:
+    """
+    Notes what the interpreter is asked to do while it is on: to run another program, to read a pickle, to write, remove
+    or rename a file, to open a connection. Python offers no way to remove a hook, so that it can be switched off.
+    """
+
+    EVENTS = (
+        "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "subprocess.Popen", "pickle.find_class",
+        "os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod", "os.putenv",
+        "shutil.rmtree", "shutil.copyfile", "shutil.unpack_archive", "socket.connect", "socket.bind", "ctypes.dlopen",
+        "webbrowser.open", "urllib.Request",
+    )  # fmt: skip
+
+    def __init__(self) -> None:
+        self.on = False
+        self.seen: list[str] = []
+        self.modules: set[str] = set()
+        sys.addaudithook(self._hear)
+
+    def _hear(self, event: str, args: tuple[Any, ...]) -> None:
+        if not self.on:
+            return
+        if event == "open" and isinstance(args[2], int) and args[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
+            self.seen.append(f"open {args[0]!r} for writing")
+        elif event == "import" and args[0] not in sys.modules:
+            self.modules.add(args[0])
+        elif event in self.EVENTS:
+            self.seen.append(f"{event} {args!r:.100}")
+
+    @contextlib.contextmanager
+    def watching(self) -> Iterator[None]:
+        self.seen, self.modules, self.on = [], set(), True
+        try:
+            yield
+        finally:
+            self.on = False
+
+
+@cache
+def watch() -> Watch:
+    return Watch()
+
+
+def peak() -> int:
+    """Bytes that were in memory at most, since ``forget_peak`` where Linux has it, else since the start."""
+    try:
+        status = Path("/proc/self/status").read_text()
+        return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) * 1024
+    except (OSError, StopIteration):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def forget_peak() -> None:
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def throw(target: str, case: Case, folder: Path) -> dict[str, Any]:
+    """
+    :param target: which loader
+    :param case: what is thrown at it
+    :param folder: the present one, in which nothing else is
+    :return: what went wrong, None if nothing, and what it took
+    """
+    path = folder / "case.zip"
+    path.write_bytes(case.data)
+    good = wanted(target, folder)
+    wrong, loaded, outcome = None, None, "loaded"
+    forget_peak()
+    before = peak()
+    start, wall = time.process_time(), time.perf_counter()
+    with warnings.catch_warnings(), watch().watching():
+        warnings.simplefilter("ignore")
+        try:
+            loaded = load(target, path)
+        except (BadFile, ParametersDoNotFit) as error:
+            outcome = type(error).__name__
+            if len(str(error)) > 3000:
+                wrong = f"a message of {len(str(error))} characters"
+        except BaseException as error:  # of any kind: that is what is tested
+            outcome = type(error).__name__
+            wrong = f"{outcome}: {error!s:.300}"
+    taken = {"seconds": time.process_time() - start, "wall": time.perf_counter() - wall, "bytes": peak() - before}
+    path.unlink()
+    if loaded is not None:
+        wrong = wrong or _wrong_with(target, case, content(target, loaded), good)
+    if watch().seen:
+        wrong = f"{wrong or ''} it did {watch().seen}"
+    if left := os.listdir(folder):
+        wrong = f"{wrong or ''} it left {left}"
+    if taken["seconds"] > SECONDS or taken["bytes"] > BYTES:
+        wrong = f"{wrong or ''} it took {taken}, with imports of {sorted(watch().modules)!r:.200}"
+    return {"case": case.words, "outcome": outcome, "wrong": wrong, **taken}
+
+
+def _wrong_with(target: str, case: Case, found: Any, good: Any) -> str | None:
+    if case.damaged and differing(found, good):
+        return f"it was loaded, with other {differing(found, good)}"
+    if target in ("buffer", "her", "VecNormalize"):
+        return None
+    if found.keys() != good.keys() or any(found[key].shape != good[key].shape for key in good):
+        return "it was loaded, as another network"
+    bad = [key for key in found if not found[key].isfinite().all()]
+    return f"it was loaded, with {bad} not finite" if bad else None
+
+
+TARGETS = ("SAC", "BRO", "MBMAPPO", "set_parameters", "buffer", "her", "VecNormalize")
+
+
+@pytest.fixture
+def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "a" / "b"
+    folder.mkdir(parents=True)
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_some_files(target: str, empty: Path) -> None:
+    """One of each family, three of the tree."""
+    for number in range(len(FAMILIES)):
+        result = throw(target, case_of(0, number, original_of(target)), empty)
+        assert result["wrong"] is None, result
+
+
+def test_the_watch_notices(empty: Path) -> None:
+    """A test that could not fail would be none."""
+    import pickle
+
+    from tests.saving.hostile import MARKER, Payload
+
+    with watch().watching():
+        pickle.loads(pickle.dumps(Payload()))
+        Path("written").write_text("x")
+        os.system("true")
+    seen = " ".join(watch().seen)
+    assert all(word in seen for word in ("pickle.find_class", "os.mkdir", "for writing", "os.system")), seen
+    assert {MARKER, "written"} == set(os.listdir(empty))
+
+
+def test_a_good_file_is_loaded(empty: Path) -> None:
+    """What is thrown is refused for what was done to it."""
+    for target in TARGETS:
+        result = throw(target, Case("nothing changed", original_of(target).data, True), empty)
+        assert result["outcome"] == "loaded" and result["wrong"] is None, result
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", TARGETS)
+def test_thousands_of_files(target: str, tmp_path: Path) -> None:
+    n, seed = 360, 1
+    folder = tmp_path / "a" / "b"
+    folder.mkdir(parents=True)
+    command = [sys.executable, "-m", "tests.saving.test_hostile", target, str(seed), "0", str(n), str(folder)]
+    root = Path(__file__).parents[2]
+    env = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(root), *sys.path])}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=root, env=env, timeout=1200)
+    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    results = [line for line in lines if "outcome" in line]
+    assert done.returncode == 0, (done.returncode, lines[-1:], done.stderr[-2000:])
+    assert len(results) == n
+    wrong = [(line["number"], line["case"], line["wrong"]) for line in results if line["wrong"]]
+    assert not wrong, f"{len(wrong)} of {n}: {wrong[:20]}"
+    worst = {key: max(line[key] for line in results) for key in ("seconds", "wall", "bytes")}
+    counts = {kind: sum(line["outcome"] == kind for line in results) for kind in {line["outcome"] for line in results}}
+    print(f"{target}: {counts}, at most {worst}")
+    assert counts.get("BadFile", 0) > n / 2
+
+
+def main(target: str, seed: str, first: str, n: str, folder: str) -> None:
+    torch.set_num_threads(1)
+    os.chdir(folder)
+    original = original_of(target)
+    wanted(target, Path(folder))
+    size = int(next(line for line in Path("/proc/self/status").read_text().splitlines() if "VmSize" in line).split()[1])
+    resource.setrlimit(resource.RLIMIT_AS, (size * 1024 + HEADROOM,) * 2)
+    for number in range(int(first), int(first) + int(n)):
+        case = case_of(int(seed), number, original)
+        print(json.dumps({"number": number, "case": case.words}), flush=True)
+        print(json.dumps({"number": number, **throw(target, case, Path(folder))}), flush=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
