@@ -22,6 +22,8 @@ from torch import nn
 
 from sb3_sample.arguments import check_known
 from sb3_sample.envs.finite_check import FiniteCheck
+from sb3_sample.envs.workers import watch_workers
+from sb3_sample.faults import MetricWatch, TrainingDiverged, check_finite_parameters, not_finite
 from sb3_sample.networks.spectral_norm import SpectralNorm
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 from sb3_sample.sac import arguments, losses
@@ -267,6 +269,7 @@ class SAC(OffPolicyAlgorithm):
         self._execution = None
         self._parts_mode = ModeSwitch(*self._parts().values())
         self._batch_memory = BatchMemory()
+        self._watch = MetricWatch(self.device)
         self._set_training_mode(False)
 
     def _check_arguments(self) -> None:
@@ -422,6 +425,7 @@ class SAC(OffPolicyAlgorithm):
             raise ValueError(f"env must have an action space with low < high in every dimension, not {space}")
         venv = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         FiniteCheck.install(venv)
+        watch_workers(venv)
         return venv
 
     def make_optimizer(self, parameters: Any) -> torch.optim.Optimizer:
@@ -461,6 +465,7 @@ class SAC(OffPolicyAlgorithm):
             "_execution",
             "_parts_mode",
             "_batch_memory",
+            "_watch",
         ]
 
     def reinitialize(self, shrink: float = 0.0) -> None:
@@ -518,9 +523,17 @@ class SAC(OffPolicyAlgorithm):
                 observations, _ = self.policy.obs_to_tensor(self._last_obs)
                 actions = self.explorer.act(self, observations)
             scaled = actions.cpu().numpy().reshape((n_envs, *self.action_space.shape))
+            if not np.isfinite(scaled).all():
+                self._stop_diverged(scaled)
         if action_noise is not None:
             scaled = np.clip(scaled + action_noise(), -1, 1)
         return self.policy.unscale_action(scaled), scaled
+
+    def _stop_diverged(self, actions: np.ndarray) -> None:
+        """An action is not finite, and no environment shall see it: say why."""
+        check_finite_parameters(self)
+        worst = not_finite({"the policy's action": actions.sum()})
+        raise TrainingDiverged(worst, f"gradient step {self._n_updates}", self.num_timesteps)
 
     def _store_transition(
         self,
@@ -579,6 +592,7 @@ class SAC(OffPolicyAlgorithm):
         :param reset_num_timesteps: whether ``num_timesteps`` starts at zero again
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
         :return: the trained model
+        :raises TrainingDiverged: if a loss, another metric or a parameter is NaN or infinite
         """
         resets_environment = reset_num_timesteps or self._last_obs is None
         total_timesteps, callback = self._setup_learn(
@@ -605,6 +619,7 @@ class SAC(OffPolicyAlgorithm):
             n_updates = self._updates_due(rollout.episode_timesteps)
             if n_updates > 0:
                 self.train(n_updates, self.batch_size)
+        check_finite_parameters(self)
         callback.on_training_end()
         return self
 
@@ -654,6 +669,8 @@ class SAC(OffPolicyAlgorithm):
 
         :param gradient_steps: how many
         :param batch_size: transitions a step
+        :raises TrainingDiverged: if a metric is NaN or infinite; on a GPU that may be noticed later, at the latest when
+            the log is written
         """
         assert self.replay_buffer is not None
         self._set_training_mode(True)
@@ -669,8 +686,12 @@ class SAC(OffPolicyAlgorithm):
             n_batches = min(MAX_BATCHES_AT_ONCE, gradient_steps - first)
             for i, batch in enumerate(self._draw_batches(n_batches, batch_size), first + 1):
                 self._keeps_gradients = self.keep_next_gradients and i == gradient_steps
-                self._metrics.update(self._update(batch))
+                metrics = self._update(batch)
+                self._watch.note(metrics, self._n_updates, self.num_timesteps)
+                self._metrics.update(metrics)
         self._set_training_mode(False)
+        if self.device.type == "cpu":
+            self._watch.check()
 
     def _set_training_mode(self, mode: bool) -> None:
         """Dropout and power iterations: on during gradient steps, off whoever acts."""
@@ -833,7 +854,10 @@ class SAC(OffPolicyAlgorithm):
     def dump_logs(self) -> None:
         """
         Write the log. Only here are the metrics fetched from the device.
+
+        :raises TrainingDiverged: if one of them was NaN or infinite since the last time
         """
+        self._watch.check()
         for name, value in self._metrics.items():
             self.logger.record(name, value.item())
         self.logger.record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
