@@ -6,6 +6,7 @@ from sb3_sample.faults import TrainingDiverged
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
 from sb3_sample.sac.buffers import DeviceReplayBuffer
+from sb3_sample.sac.compact_buffer import CompactDictReplayBuffer, CompactReplayBuffer
 from sb3_sample.version import __version__
 
 __all__ = [
@@ -23,6 +24,8 @@ __all__ = [
     "TOPSAC",
     "VPLSAC",
     "BROFast",
+    "CompactDictReplayBuffer",
+    "CompactReplayBuffer",
     "DeviceReplayBuffer",
     "DiagnosticsCallback",
     "EnvironmentDied",

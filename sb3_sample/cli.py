@@ -3,10 +3,11 @@ The command ``sb3-sample``: the zoo's commands with the algorithms of this packa
 """
 
 import argparse
+import contextlib
 import importlib
 import runpy
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType
 from typing import NamedTuple
 
@@ -83,6 +84,53 @@ def _zoo_function(module: str, function: str) -> Callable[[list[str]], None]:
     return run
 
 
+def _train(arguments: list[str]) -> None:
+    _zoo_module("rl_zoo3.train")
+    from sb3_sample import zoo_runs
+    from sb3_sample.zoo_files import reading
+
+    options, rest = _own_options(zoo_runs.train_parser(), arguments)
+    with _errors("train"), reading(options.allow_pickle, options.trusted_modules):
+        start = zoo_runs.plan(options, rest)
+        if start is None:
+            _zoo_function("rl_zoo3.train", "train")(rest)
+        else:
+            _set_command_line("train", start.arguments)
+            zoo_runs.train(start)
+
+
+def _enjoy(arguments: list[str]) -> None:
+    module = _zoo_module("rl_zoo3.enjoy")
+    from sb3_sample import zoo_watch
+
+    options, rest = _own_options(zoo_watch.watch_parser("enjoy"), arguments)
+    with _errors("enjoy"), zoo_watch.watching(options, rest, module) as command:
+        _set_command_line("enjoy", command)
+        module.enjoy()
+
+
+def _own_options(parser: argparse.ArgumentParser, arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
+    """Our options and the zoo's, whose help comes after ours."""
+    if {"-h", "--help"} & set(arguments):
+        print(parser.format_help())
+    return parser.parse_known_args(arguments)
+
+
+@contextlib.contextmanager
+def _errors(command: str) -> Iterator[None]:
+    """A run or a file that is refused is told of without a traceback."""
+    from sb3_sample.saving.classes import NotPortable
+    from sb3_sample.saving.container import BadFile, PickledFile
+    from sb3_sample.zoo_runs import RunError
+
+    try:
+        yield
+    except PickledFile as error:
+        sys.exit(f"sb3-sample {command}: {error}. Here it is the option --allow-pickle")
+    except (BadFile, NotPortable, RunError) as error:
+        sys.exit(f"sb3-sample {command}: {error}")
+
+
 def _zoo_plot(function: str) -> Callable[[list[str]], None]:
     def run(arguments: list[str]) -> None:
         # These commands look for the id in the names of the log folders, in which a dash stands for the slash.
@@ -91,22 +139,37 @@ def _zoo_plot(function: str) -> Callable[[list[str]], None]:
         import sb3_sample.envs  # noqa: F401  # registers the ids
 
         names = [argument.replace("/", "-") if argument in gym.registry else argument for argument in arguments]
-        _zoo_function("rl_zoo3.plots", function)(names)
+        module = _zoo_module(f"rl_zoo3.plots.{function}")
+        if function == "plot_train":
+            _zoo_function("rl_zoo3.plots", function)(names)
+            return
+        from sb3_sample.zoo_files import PlottedRuns, replaced
+
+        parser = argparse.ArgumentParser(f"sb3-sample {function}", usage=argparse.SUPPRESS, add_help=False)
+        parser.add_argument(
+            "--allow-pickle", action="store_true", help="Read a pickled file too, which can run any code"
+        )
+        options, names = _own_options(parser, names)
+        with _errors(function), replaced(module, "pickle", PlottedRuns(options.allow_pickle)):
+            _zoo_function("rl_zoo3.plots", function)(names)
 
     return run
 
 
 def _record_video(arguments: list[str]) -> None:
     # The zoo's other commands have this option, this one has not.
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--gym-packages", nargs="+", default=[])
-    known, rest = parser.parse_known_args(arguments)
     select_gl_backend()
-    _register()
-    for package in known.gym_packages:
+    utils = _zoo_module("rl_zoo3.utils")
+    from sb3_sample import zoo_watch
+
+    parser = zoo_watch.watch_parser("record_video")
+    parser.add_argument("--gym-packages", nargs="+", default=[], help="Packages to import, as for enjoy")
+    options, rest = _own_options(parser, arguments)
+    for package in options.gym_packages:
         importlib.import_module(package)
-    _set_command_line("record_video", rest)
-    runpy.run_module("rl_zoo3.record_video", run_name="__main__")  # it has no function to call
+    with _errors("record_video"), zoo_watch.watching(options, rest, utils) as command:
+        _set_command_line("record_video", command)
+        runpy.run_module("rl_zoo3.record_video", run_name="__main__")  # it has no function to call
 
 
 def _plot(arguments: list[str]) -> None:
@@ -122,8 +185,8 @@ def _variance(arguments: list[str]) -> None:
 
 
 COMMANDS: dict[str, Command] = {
-    "train": Command(_zoo_function("rl_zoo3.train", "train"), "train an agent, or search for hyperparameters"),
-    "enjoy": Command(_zoo_function("rl_zoo3.enjoy", "enjoy"), "run a trained agent"),
+    "train": Command(_train, "train an agent, or search for hyperparameters"),
+    "enjoy": Command(_enjoy, "run a trained agent"),
     "record_video": Command(_record_video, "write a video of a trained agent"),
     "plot": Command(_plot, "draw the runs of a task, mean and range over seeds, beside the published curves"),
     "variance": Command(_variance, "measure a policy gradient's variance: more actions or a longer trajectory?"),

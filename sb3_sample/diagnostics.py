@@ -25,6 +25,7 @@ from sb3_sample.sac import SAC, losses
 from sb3_sample.sac.batch import Batch
 from sb3_sample.sac.buffers import samples_at
 from sb3_sample.sac.pessimism import epistemic_std
+from sb3_sample.saving.rings import Ring
 
 
 class Rollout(NamedTuple):
@@ -203,6 +204,8 @@ class DiagnosticsCallback(BaseCallback):
         #: What was measured last, by name, without the prefix ``diagnostics/``.
         self.last_results: dict[str, float] = {}
         self._next = every
+        # Transitions ever added to the store.
+        self._n_stored = 0
         self._store: ReplayBuffer | None = None
         self._measured_model: SAC | None = None
 
@@ -278,6 +281,45 @@ class DiagnosticsCallback(BaseCallback):
             return model.train_freq.frequency if model.train_freq.unit is TrainFrequencyUnit.STEP else 1
         return math.ceil(1 / max(min(model.replay_ratio * model.n_envs, 1), 1e-3))
 
+    # ---------------------------------------------------------------- checkpoints
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: what the coming measurements depend on, beside ``eval_env`` and the validation transitions, which a
+            checkpoint has as well
+        """
+        return {
+            "next": self._next,
+            "n_stored": self._n_stored,
+            "rng": self._rng,
+            "last_results": self.last_results,
+            "gradients": self._gradients(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: from :meth:`state_dict`
+        """
+        self._next, self._n_stored, self._rng = state["next"], state["n_stored"], state["rng"]
+        self.last_results = state["last_results"]
+        for parameter, gradient in zip(self._measured_parameters(), state["gradients"] or (), strict=False):
+            parameter.grad = None if gradient is None else gradient.to(parameter.device)
+
+    def _measured_parameters(self) -> list[torch.nn.Parameter]:
+        return [*self.model.critic.parameters(), *self.model.actor.parameters()]
+
+    def _gradients(self) -> list[torch.Tensor | None] | None:
+        """Those of the last gradient step, if the next environment step measures their norms before new ones."""
+        if self.model.gradients_are_stale or self.model.num_timesteps + self.model.n_envs < self._next:
+            return None
+        return [parameter.grad for parameter in self._measured_parameters()]
+
+    def checkpoint_rings(self) -> dict[str, Ring]:
+        """
+        :return: the validation transitions, for checkpoints, which write what is new of them only
+        """
+        return {} if self._store is None else {"store": Ring(self._store, lambda: self._n_stored)}
+
     # ---------------------------------------------------------------- what
 
     def measure(self) -> dict[str, float]:
@@ -328,6 +370,7 @@ class DiagnosticsCallback(BaseCallback):
                 last = infos[0]["terminal_observation"]
                 last = {k: np.asarray(v)[None] for k, v in last.items()} if isinstance(last, dict) else np.array([last])
             self._store.add(observation, last, scaled, reward, done, infos)
+            self._n_stored += 1
             steps.append((tensors, action))
             rewards.append(reward[0])
             log_probs.append(log_prob.item())

@@ -26,6 +26,7 @@ except ModuleNotFoundError as error:
     ) from error
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_sample import zoo_files
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
 from sb3_sample.sac.regularized_sac import (
@@ -282,8 +283,9 @@ def register() -> None:
 def _adapt_experiment_manager() -> None:
     """
     Have the zoo's ``ExperimentManager`` take our hyperparameter files for our algorithms, evaluate them in environments
-    with the ``env_kwargs`` of those files (the zoo does so with the command line's only), and record successes in the
-    Monitor files of our environments that report them. The zoo has no option for these.
+    with the ``env_kwargs`` of those files (the zoo does so with the command line's only), record successes in the
+    Monitor files of our environments that report them, and write files that run no code. The zoo has no option for
+    these.
     """
     # Not at the top: it imports custom_envs, and the custom_envs of this repository imports this module.
     module = importlib.import_module("rl_zoo3.exp_manager")
@@ -323,6 +325,7 @@ def _adapt_experiment_manager() -> None:
         # The zoo asks this question only to decide whether Monitor records is_success.
         return env_id.startswith(SUCCESS_PREFIXES) or original_is_robotics_env(env_id)
 
+    zoo_files.adapt(module, list(ALGORITHMS))
     manager.__init__ = init
     manager.read_hyperparameters = read_hyperparameters
     manager.is_robotics_env = staticmethod(is_robotics_env)

@@ -10,6 +10,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3 import SAC as SB3SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
@@ -321,7 +322,7 @@ def test_held_out_transitions_are_not_training_data() -> None:
 def test_memory_optimised_buffer() -> None:
     """When it is full, one transition has lost its next observation, and is left out."""
     model = sac(
-        gamma=0.5, ent_coef=0.0, buffer_size=4, optimize_memory_usage=True,
+        gamma=0.5, ent_coef=0.0, buffer_size=4, optimize_memory_usage=True, replay_buffer_class=ReplayBuffer,
         replay_buffer_kwargs={"handle_timeout_termination": False}, **LINEAR,
     )  # fmt: skip
     answer(model.critic, 0, 0)

@@ -225,8 +225,8 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
         self._context = multiprocessing.get_context(start_method)
         self.processes: list[Any] = []
         self.remotes: Any = []
-        # Of each environment, what it observed last.
-        self._last: list[Any] = [None] * len(self._env_fns)
+        #: Of each environment, what it observed last.
+        self.last_observations: list[Any] = [None] * len(self._env_fns)
         try:
             for index in range(len(self._env_fns)):
                 process, remote = self._start(index)
@@ -273,10 +273,10 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
             except EnvironmentDied as error:
                 results.append(self._replace(index, error))
         self.waiting = False
-        self._last, self.reset_infos = map(list, zip(*results, strict=True))
+        self.last_observations, self.reset_infos = map(list, zip(*results, strict=True))
         self._reset_seeds()
         self._reset_options()
-        return _stack_obs(self._last, self.observation_space)
+        return _stack_obs(self.last_observations, self.observation_space)
 
     def step_wait(self) -> VecEnvStepReturn:
         """
@@ -291,14 +291,14 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
                 observation, reset_info = self._replace(index, error)
                 info = {
                     "TimeLimit.truncated": True,
-                    "terminal_observation": self._last[index],
+                    "terminal_observation": self.last_observations[index],
                     "worker_died": str(error),
                 }
                 results.append((observation, 0.0, True, info, reset_info))
         self.waiting = False
         observations, rewards, dones, infos, reset_infos = zip(*results, strict=True)
-        self._last, self.reset_infos = list(observations), list(reset_infos)
-        return _stack_obs(self._last, self.observation_space), np.stack(rewards), np.stack(dones), infos  # type: ignore[return-value]
+        self.last_observations, self.reset_infos = list(observations), list(reset_infos)
+        return _stack_obs(self.last_observations, self.observation_space), np.stack(rewards), np.stack(dones), infos  # type: ignore[return-value]
 
     def _replace(self, index: int, error: EnvironmentDied) -> tuple[Any, dict[str, Any]]:
         """

@@ -94,17 +94,20 @@ class TransitionBuffer:
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """
-        :return: the transitions by name, oldest first
+        :return: the transitions by name, oldest first; and the row that comes next, since ``sample`` draws rows
         """
         kept = self.take(self._by_age(self.size))
-        return {name: torch.from_numpy(values) for name, values in kept._asdict().items()}
+        named = {name: torch.from_numpy(values) for name, values in kept._asdict().items()}
+        return {**named, "next": torch.tensor(self._next)}
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor], strict: bool = True) -> None:
         """
         :param state: transitions as ``state_dict`` gives them; of more than the capacity the most recent are taken
         :param strict: there for Stable-Baselines3, which passes it
         """
-        self.size = self._next = 0
+        self.size = 0
+        # Files of earlier versions are without it.
+        self._next = (int(state.get("next", 0)) - len(state["rewards"])) % self.capacity
         self.add(Transitions(*(state[name].cpu().numpy() for name in Transitions._fields)))
 
 

@@ -136,6 +136,13 @@ class ModelBasedPPO(SimulatedPPO):
         check_network_kwargs("dynamics_kwargs", self.dynamics_kwargs or {}, DYNAMICS_DEFAULTS)
         if self.predict_termination not in (None, True, False):
             raise ValueError(f"predict_termination must be True, False or None, not {self.predict_termination!r}")
+        normalizer = self._vec_normalize_env
+        if self.n_simulated > 0 and normalizer is not None and normalizer.observation_space != self.observation_space:
+            raise ValueError(
+                "VecNormalize must be around the wrappers that change observations, so that the model can normalise "
+                f"what it learns from: its observations are {normalizer.observation_space}, the policy's "
+                f"{self.observation_space}. Allowed: VecNormalize(VecFrameStack(env, n))"
+            )
 
     def _setup_models(self) -> None:
         if self.predict_termination is None:

@@ -9,7 +9,7 @@ import io
 import math
 import pathlib
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -22,7 +22,6 @@ from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import CategoricalDistribution, DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
@@ -30,9 +29,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_sample.arguments import check_known, check_unused
 from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.envs.workers import watch_workers
+from sb3_sample.export import Exportable
 from sb3_sample.faults import TrainingDiverged, check_finite_parameters, not_finite
 from sb3_sample.ppo.dynamics import minibatches
 from sb3_sample.ppo.spaces import FlatObservations, ModelActions
+from sb3_sample.saving.checkpoint import Checkpointer
+from sb3_sample.saving.model import SafeFiles
 
 Self = TypeVar("Self", bound="SimulatedPPO")
 
@@ -83,7 +85,7 @@ class SimulatedSamples(NamedTuple):
     weights: torch.Tensor | None = None
 
 
-class SimulatedPPO(PPO):
+class SimulatedPPO(Exportable, SafeFiles, PPO):
     """
     PPO whose policy loss also sees simulated samples (P1, Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011,
     algorithm 1): what :class:`MBMAPPO`, :class:`QMAPPO` and :class:`MBPOPPO` share. The critic learns from the real
@@ -206,6 +208,8 @@ class SimulatedPPO(PPO):
         self._has_named_policy = policy in NAMED_POLICIES
         # Share of the training at which the present rollout began.
         self._progress = 0.0
+        # Of the present or last learn.
+        self._iteration = 0
         self._seconds: dict[str, float] = {}
         if _init_setup_model:
             self._setup_model()
@@ -327,10 +331,14 @@ class SimulatedPPO(PPO):
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
         force_reset: bool = True,
+        *,
+        allow_pickle: bool = False,
+        trusted_modules: Sequence[str] = (),
         **kwargs: Any,
     ) -> Self:
         """
-        Load a model, as in Stable-Baselines3. The file has the learned models, their optimizers and their transitions.
+        Load a model, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it. The file has the learned
+        models, their optimizers and their transitions.
 
         :param path: file, or where ``save`` wrote it
         :param env: environment to go on with; none is needed for prediction
@@ -338,13 +346,27 @@ class SimulatedPPO(PPO):
         :param custom_objects: objects that replace what the file holds under their names
         :param print_system_info: whether to print the saved and the present versions
         :param force_reset: whether the environment is reset before training goes on
+        :param allow_pickle: whether a file in Stable-Baselines3's own, pickled format is loaded too, which can run any
+            code that its author wanted
+        :param trusted_modules: modules, or packages of modules, whose classes and functions the file may name
         :param kwargs: arguments of the constructor that shall differ from the saved ones
         :return: the model
+        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
         :raises ValueError: if ``kwargs`` holds something else, or values with which the file's parameters do not fit
         """
         check_known(cls, PPO, kwargs)
         try:
-            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+            return super().load(
+                path,
+                env,
+                device,
+                custom_objects,
+                print_system_info,
+                force_reset,
+                allow_pickle=allow_pickle,
+                trusted_modules=trusted_modules,
+                **kwargs,
+            )
         except (RuntimeError, ValueError) as error:
             words = ("loading state_dict", "is an invalid object name", "do not match agents' parameters")
             if kwargs and any(word in str(error) for word in words):
@@ -353,31 +375,6 @@ class SimulatedPPO(PPO):
                     f"({str(error).splitlines()[0]})"
                 ) from error
             raise
-
-    def set_parameters(
-        self,
-        load_path_or_dict: str | dict[str, Any],
-        exact_match: bool = True,
-        device: torch.device | str = "auto",
-    ) -> None:
-        """
-        Load parameters, as in Stable-Baselines3. The optimizers' moments are loaded, their settings (learning rate,
-        epsilon, ...) stay this model's, so that ``load`` with other ones has them in force.
-
-        :param load_path_or_dict: a file, or parameters as ``get_parameters`` gives them
-        :param exact_match: whether parameters for every module must be there, and no others
-        :param device: "auto", "cpu", "cuda", ...
-        """
-        named = {name: recursive_getattr(self, name) for name in self._get_torch_save_params()[0]}
-        optimizers = [value for value in named.values() if isinstance(value, torch.optim.Optimizer)]
-        settings = [
-            [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
-            for optimizer in optimizers
-        ]
-        super().set_parameters(load_path_or_dict, exact_match, device)
-        for optimizer, own_groups in zip(optimizers, settings, strict=True):
-            for group, own in zip(optimizer.param_groups, own_groups, strict=True):
-                group.update(own)
 
     # ---------------------------------------------------------------- the iteration
 
@@ -389,9 +386,13 @@ class SimulatedPPO(PPO):
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
+        checkpoint: str | pathlib.Path | None = None,
+        checkpoint_freq: int = 10_000,
     ) -> Self:
         """
-        Train, as in Stable-Baselines3.
+        Train, as in Stable-Baselines3; with ``checkpoint``, so that nothing is lost when the program ends before it is
+        done: the same program, started again, goes on where the folder's last checkpoint is, and the result is the same
+        bit by bit (docs/saving.md).
 
         :param total_timesteps: environment steps to take
         :param callback: called at every step
@@ -399,17 +400,38 @@ class SimulatedPPO(PPO):
         :param tb_log_name: name of the run in the TensorBoard log; the class's name if None
         :param reset_num_timesteps: whether ``num_timesteps`` starts at zero again
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
+        :param checkpoint: folder of the run, for one call of ``learn``; None for no checkpoints
+        :param checkpoint_freq: environment steps between two checkpoints, each at the end of an iteration
         :return: the trained model
+        :raises ValueError: if the folder is of another run (the message names what differs), cannot be used, or has
+            checkpoints that are all damaged
         :raises TrainingDiverged: if a loss or a parameter is NaN or infinite
         """
-        return super().learn(
-            total_timesteps,
-            callback,
-            log_interval,
-            tb_log_name or type(self).__name__,
-            reset_num_timesteps,
-            progress_bar,
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
+        self._iteration = 0
+        with Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
+            checkpointer.resume()
+            callback.on_training_start(locals(), globals())
+            checkpointer.start()
+            assert self.env is not None
+            while self.num_timesteps < total_timesteps:
+                heard = checkpointer.callback
+                if not self.collect_rollouts(self.env, heard, self.rollout_buffer, n_rollout_steps=self.n_steps):
+                    break
+                self._iteration += 1
+                self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+                if log_interval is not None and self._iteration % log_interval == 0:
+                    self.dump_logs(self._iteration)
+                self.train()
+                checkpointer.after_turn()
+            check_finite_parameters(self)
+            checkpointer.finish()
+        return self
+
+    def _on_environment_reset(self) -> None:
+        """The environments were reset in the midst of their episodes, of which nothing is remembered here."""
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int

@@ -23,12 +23,14 @@ from torch import nn
 from sb3_sample.arguments import check_known
 from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.envs.workers import watch_workers
+from sb3_sample.export import Exportable
 from sb3_sample.faults import MetricWatch, TrainingDiverged, check_finite_parameters, not_finite
 from sb3_sample.networks.spectral_norm import SpectralNorm
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 from sb3_sample.sac import arguments, losses
 from sb3_sample.sac.batch import Batch, CriticStep, Extra, Noise, draw_batches
 from sb3_sample.sac.buffers import BatchMemory, ValidationDictReplayBuffer, ValidationReplayBuffer, ValidationSplit
+from sb3_sample.sac.compact_buffer import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
 from sb3_sample.sac.execution import PAYS_FROM, Execution, has_foreign_parts, why_not_compiled
 from sb3_sample.sac.exploration import EXPLORATIONS, Exploration
 from sb3_sample.sac.parts import ParametersDoNotFit, Part
@@ -36,6 +38,10 @@ from sb3_sample.sac.pessimism import PESSIMISMS, Pessimism, pessimistic_value
 from sb3_sample.sac.plasticity import ReDo, Resets
 from sb3_sample.sac.policies import Actor, CnnPolicy, CriticEnsemble, MlpPolicy, ModeSwitch, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.scalars import FixedScalar, LogScalar
+from sb3_sample.saving.checkpoint import Checkpointer
+from sb3_sample.saving.container import BadFile
+from sb3_sample.saving.model import SafeFiles
+from sb3_sample.saving.replay import SafeReplayBuffers
 
 Self = TypeVar("Self", bound="SAC")
 
@@ -43,7 +49,7 @@ Self = TypeVar("Self", bound="SAC")
 MAX_BATCHES_AT_ONCE = 64
 
 
-class SAC(OffPolicyAlgorithm):
+class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
     SAC that the papers compare with (P2-P5): tanh-Gaussian actor, two critics, clipped double Q-learning.
@@ -68,9 +74,11 @@ class SAC(OffPolicyAlgorithm):
     :param gradient_steps: as in Stable-Baselines3, gradient steps each time (-1: as many as transitions were
         collected); if given, it replaces ``replay_ratio``
     :param action_noise: noise added to the actions while training
-    :param replay_buffer_class: class of the replay buffer; chosen by the observation space if None
-    :param replay_buffer_kwargs: its arguments
-    :param optimize_memory_usage: as in Stable-Baselines3's replay buffer
+    :param replay_buffer_class: class of the replay buffer; chosen by the observation space if None, one that stores
+        one observation a step
+    :param replay_buffer_kwargs: its arguments; ``memory_map="folder"`` keeps the default buffer in files
+    :param optimize_memory_usage: for a ``replay_buffer_class`` that knows it. The default buffer saves the memory
+        anyway, with time limits handled, and takes either value
     :param n_steps: n-step returns, as in Stable-Baselines3
     :param ent_coef: temperature: "auto" learns it, "auto_0.1" from that start, a number fixes it
     :param target_update_interval: gradient steps between two updates of the targets; None: ``policy_delay``
@@ -279,8 +287,8 @@ class SAC(OffPolicyAlgorithm):
         arguments.check(self)
 
     def _choose_replay_buffer(self) -> None:
+        is_dict = isinstance(self.observation_space, spaces.Dict)
         if self.validation_proportion > 0:
-            is_dict = isinstance(self.observation_space, spaces.Dict)
             self.replay_buffer_class = ValidationDictReplayBuffer if is_dict else ValidationReplayBuffer
             self.replay_buffer_kwargs = {
                 **self.replay_buffer_kwargs,
@@ -289,6 +297,12 @@ class SAC(OffPolicyAlgorithm):
         elif self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, ValidationSplit):
             # Loaded, with validation_proportion=0 instead of the saved one.
             self.replay_buffer_class = None
+        if self.replay_buffer_class is None and self.n_steps == 1:
+            self.replay_buffer_class = CompactDictReplayBuffer if is_dict else CompactReplayBuffer
+        if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, CompactReplay):
+            # It saves the memory in any case. Where Stable-Baselines3 reads the argument, it would end an episode that
+            # only its own variant needs to have ended.
+            self.optimize_memory_usage = False
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         """
@@ -357,10 +371,13 @@ class SAC(OffPolicyAlgorithm):
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
         force_reset: bool = True,
+        *,
+        allow_pickle: bool = False,
+        trusted_modules: Sequence[str] = (),
         **kwargs: Any,
     ) -> Self:
         """
-        Load a model, as in Stable-Baselines3.
+        Load a model, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it.
 
         :param path: file, or where ``save`` wrote it
         :param env: environment to go on with; none is needed for prediction
@@ -368,9 +385,13 @@ class SAC(OffPolicyAlgorithm):
         :param custom_objects: objects that replace what the file holds under their names
         :param print_system_info: whether to print the saved and the present versions
         :param force_reset: whether the environment is reset before training goes on
+        :param allow_pickle: whether a file in Stable-Baselines3's own, pickled format is loaded too, which can run any
+            code that its author wanted
+        :param trusted_modules: modules, or packages of modules, whose classes and functions the file may name
         :param kwargs: arguments of the constructor that shall differ from the saved ones. What a learned number starts
             from (``initial_...``, ``ent_coef="auto_..."``) counts from the next reset on: the file has its value
         :return: the model
+        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
         :raises ValueError: if ``kwargs`` holds something else, or values that are not allowed
         """
         check_known(cls, SAC, kwargs)
@@ -379,7 +400,17 @@ class SAC(OffPolicyAlgorithm):
         if "train_freq" in kwargs or "gradient_steps" in kwargs:
             kwargs.setdefault("replay_ratio", None)
         try:
-            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+            return super().load(
+                path,
+                env,
+                device,
+                custom_objects,
+                print_system_info,
+                force_reset,
+                allow_pickle=allow_pickle,
+                trusted_modules=trusted_modules,
+                **kwargs,
+            )
         except RuntimeError as error:
             if kwargs and ("loading state_dict" in str(error) or isinstance(error, ParametersDoNotFit)):
                 raise ValueError(
@@ -390,9 +421,12 @@ class SAC(OffPolicyAlgorithm):
 
     def set_parameters(
         self,
-        load_path_or_dict: str | dict[str, Any],
+        load_path_or_dict: str | pathlib.Path | io.BufferedIOBase | dict[str, Any],
         exact_match: bool = True,
         device: torch.device | str = "auto",
+        *,
+        allow_pickle: bool = False,
+        trusted_modules: Sequence[str] = (),
     ) -> None:
         """
         Load parameters, as in Stable-Baselines3. The optimizers' moments are loaded, their settings (learning rate,
@@ -401,18 +435,19 @@ class SAC(OffPolicyAlgorithm):
         :param load_path_or_dict: a file, or parameters as ``get_parameters`` gives them
         :param exact_match: whether parameters for every module must be there, and no others
         :param device: "auto", "cpu", "cuda", ...
+        :param allow_pickle: see ``load``
+        :param trusted_modules: see ``load``
+        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
+        :raises ValueError: if the parameters are of other networks or parts
         """
-        settings = {
-            name: [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
-            for name, optimizer in self._optimizers().items()
-        }
         try:
-            super().set_parameters(load_path_or_dict, exact_match, device)
+            super().set_parameters(
+                load_path_or_dict, exact_match, device, allow_pickle=allow_pickle, trusted_modules=trusted_modules
+            )
+        except BadFile:
+            raise
         except ValueError as error:
             raise ParametersDoNotFit(str(error)) from error
-        for name, optimizer in self._optimizers().items():
-            for group, own in zip(optimizer.param_groups, settings[name], strict=True):
-                group.update(own)
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -462,6 +497,7 @@ class SAC(OffPolicyAlgorithm):
             "critic_target",
             "_metrics",
             "_critic_loss",
+            "redo",
             "_execution",
             "_parts_mode",
             "_batch_memory",
@@ -553,16 +589,27 @@ class SAC(OffPolicyAlgorithm):
                 if "episode" in infos[index]:  # Monitor's entry; absent if the environment is not monitored
                     part.on_episode_end(self, int(index), infos[index]["episode"]["r"])
 
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+    def load_replay_buffer(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        truncate_last_traj: bool = True,
+        *,
+        allow_pickle: bool = False,
+        trusted_modules: Sequence[str] = (),
+    ) -> None:
         """
-        Load a replay buffer, as in Stable-Baselines3.
+        Load a replay buffer, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it.
 
-        :param path: where ``save_replay_buffer`` wrote it
+        :param path: file, or where ``save_replay_buffer`` wrote it
         :param truncate_last_traj: with ``HerReplayBuffer``, whether the last episode counts as ended
-        :raises ValueError: if it holds out another share of its transitions than ``validation_proportion``
+        :param allow_pickle: see ``load``
+        :param trusted_modules: see ``load``
+        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile or pickled
+        :raises ValueError: if it is the buffer of other spaces, or holds out another share of its transitions than
+            ``validation_proportion``
         """
         before = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
+        super().load_replay_buffer(path, truncate_last_traj, allow_pickle=allow_pickle, trusted_modules=trusted_modules)
         share = self.replay_buffer.validation_proportion if isinstance(self.replay_buffer, ValidationSplit) else 0.0
         if share != self.validation_proportion:
             self.replay_buffer = before
@@ -581,9 +628,13 @@ class SAC(OffPolicyAlgorithm):
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
+        checkpoint: str | pathlib.Path | None = None,
+        checkpoint_freq: int = 10_000,
     ) -> Self:
         """
-        Train, as in Stable-Baselines3.
+        Train, as in Stable-Baselines3; with ``checkpoint``, so that nothing is lost when the program ends before it is
+        done: the same program, started again, goes on where the folder's last checkpoint is, and the result is the same
+        bit by bit (docs/saving.md).
 
         :param total_timesteps: environment steps to take
         :param callback: called at every step
@@ -591,7 +642,11 @@ class SAC(OffPolicyAlgorithm):
         :param tb_log_name: name of the run in the TensorBoard log; the class's name if None
         :param reset_num_timesteps: whether ``num_timesteps`` starts at zero again
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
+        :param checkpoint: folder of the run, for one call of ``learn``; None for no checkpoints
+        :param checkpoint_freq: environment steps between two checkpoints
         :return: the trained model
+        :raises ValueError: if the folder is of another run (the message names what differs), cannot be used, or has
+            checkpoints that are all damaged
         :raises TrainingDiverged: if a loss, another metric or a parameter is NaN or infinite
         """
         resets_environment = reset_num_timesteps or self._last_obs is None
@@ -599,29 +654,37 @@ class SAC(OffPolicyAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         if resets_environment:
-            for part in self._parts().values():
-                part.on_environment_reset(self)
-        self._decide_compilation(total_timesteps - self.num_timesteps)
-        callback.on_training_start(locals(), globals())
-        assert self.env is not None and self.replay_buffer is not None
-        while self.num_timesteps < total_timesteps:
-            rollout = self.collect_rollouts(
-                self.env,
-                train_freq=self.train_freq,  # type: ignore[arg-type]  # converted in _setup_model
-                action_noise=self.action_noise,
-                callback=callback,
-                learning_starts=self.learning_starts,
-                replay_buffer=self.replay_buffer,
-                log_interval=log_interval,
-            )
-            if not rollout.continue_training:
-                break
-            n_updates = self._updates_due(rollout.episode_timesteps)
-            if n_updates > 0:
-                self.train(n_updates, self.batch_size)
-        check_finite_parameters(self)
-        callback.on_training_end()
+            self._on_environment_reset()
+        with Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
+            checkpointer.resume()
+            self._decide_compilation(total_timesteps - self.num_timesteps)
+            callback.on_training_start(locals(), globals())
+            checkpointer.start()
+            assert self.env is not None and self.replay_buffer is not None
+            while self.num_timesteps < total_timesteps:
+                rollout = self.collect_rollouts(
+                    self.env,
+                    train_freq=self.train_freq,  # type: ignore[arg-type]  # converted in _setup_model
+                    action_noise=self.action_noise,
+                    callback=checkpointer.callback,
+                    learning_starts=self.learning_starts,
+                    replay_buffer=self.replay_buffer,
+                    log_interval=log_interval,
+                )
+                if not rollout.continue_training:
+                    break
+                n_updates = self._updates_due(rollout.episode_timesteps)
+                if n_updates > 0:
+                    self.train(n_updates, self.batch_size)
+                checkpointer.after_turn()
+            check_finite_parameters(self)
+            checkpointer.finish()
         return self
+
+    def _on_environment_reset(self) -> None:
+        """The environments were reset in the midst of their episodes."""
+        for part in self._parts().values():
+            part.on_environment_reset(self)
 
     def _decide_compilation(self, n_steps: int) -> None:
         """With ``compile="auto"``, once and for all: whether the coming environment steps pay it back."""

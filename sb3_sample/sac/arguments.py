@@ -10,7 +10,8 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.type_aliases import TrainFreq
 
 from sb3_sample.arguments import check_unused
-from sb3_sample.sac.buffers import DeviceReplayBuffer, ValidationSplit
+from sb3_sample.sac.buffers import DeviceReplayBuffer
+from sb3_sample.sac.compact_buffer import CompactReplay
 from sb3_sample.sac.exploration import EXPLORATIONS
 from sb3_sample.sac.pessimism import PESSIMISMS, check_beta
 
@@ -72,6 +73,7 @@ def check(agent: "SAC") -> None:
     _check_pessimism(agent)
     _check_replay(agent)
     _check_n_steps(agent)
+    _check_memory_map(agent)
     _check_device_buffer(agent)
     _check_train_freq(agent)
 
@@ -117,7 +119,7 @@ def _check_replay(agent: "SAC") -> None:
         raise ValueError(f"validation_proportion must lie in [0, 1), not {agent.validation_proportion}")
     if agent.validation_proportion > 0:
         cls = agent.replay_buffer_class
-        if cls is not None and cls not in (ReplayBuffer, DictReplayBuffer) and not issubclass(cls, ValidationSplit):
+        if cls is not None and cls not in (ReplayBuffer, DictReplayBuffer) and not issubclass(cls, CompactReplay):
             raise ValueError(
                 f"validation_proportion={agent.validation_proportion} holds single transitions out, which is known of "
                 f"ReplayBuffer and DictReplayBuffer only, not of {cls.__name__} (samples of several transitions, as "
@@ -129,8 +131,18 @@ def _check_replay(agent: "SAC") -> None:
                 f"validation_proportion={agent.validation_proportion} holds single transitions out, which "
                 f"n_steps={agent.n_steps} would carry into training: pass n_steps=1, or validation_proportion=0"
             )
-        if agent.optimize_memory_usage:
-            raise ValueError("optimize_memory_usage=True cannot be combined with validation_proportion above 0")
+
+
+def _check_memory_map(agent: "SAC") -> None:
+    """A buffer in files: only those of this package know it."""
+    cls, is_split = agent.replay_buffer_class, agent.validation_proportion > 0
+    made_by_us = is_split or (agent.n_steps == 1 if cls is None else issubclass(cls, CompactReplay))
+    if (agent.replay_buffer_kwargs or {}).get("memory_map") is not None and not made_by_us:
+        what = f"n_steps={agent.n_steps}" if cls is None else f"replay_buffer_class={cls.__name__}"
+        raise ValueError(
+            f"replay_buffer_kwargs: memory_map is known to CompactReplayBuffer, the default, and not to the buffer of "
+            f"{what}: leave one of them out"
+        )
 
 
 def _check_device_buffer(agent: "SAC") -> None:

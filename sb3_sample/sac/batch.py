@@ -3,21 +3,14 @@
 from typing import Any, NamedTuple
 
 import torch
-from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_sample.sac.buffers import BatchMemory, DeviceReplayBuffer, ValidationDictReplayBuffer, ValidationReplayBuffer
+from sb3_sample.sac.buffers import PLAIN_BUFFERS, BatchMemory, DeviceReplayBuffer
 
 # Buffers whose every transition is drawn independently, so that one large draw can be cut into batches. Others compose
 # each batch (HerReplayBuffer: so many real, so many relabelled transitions) and are asked once a gradient step.
-INDEPENDENT_BUFFERS = (
-    ReplayBuffer,
-    DictReplayBuffer,
-    NStepReplayBuffer,
-    ValidationReplayBuffer,
-    ValidationDictReplayBuffer,
-    DeviceReplayBuffer,
-)
+INDEPENDENT_BUFFERS = (*PLAIN_BUFFERS, NStepReplayBuffer, DeviceReplayBuffer)
 
 
 class Batch(NamedTuple):

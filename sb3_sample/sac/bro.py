@@ -62,9 +62,11 @@ class BRO(SAC):
     :param train_freq: as in Stable-Baselines3; if given, it replaces ``replay_ratio``
     :param gradient_steps: as in Stable-Baselines3; if given, it replaces ``replay_ratio``
     :param action_noise: noise added to the actions while training
-    :param replay_buffer_class: class of the replay buffer; chosen by the observation space if None
-    :param replay_buffer_kwargs: its arguments
-    :param optimize_memory_usage: as in Stable-Baselines3's replay buffer
+    :param replay_buffer_class: class of the replay buffer; chosen by the observation space if None, one that stores
+        one observation a step
+    :param replay_buffer_kwargs: its arguments; ``memory_map="folder"`` keeps the default buffer in files
+    :param optimize_memory_usage: for a ``replay_buffer_class`` that knows it. The default buffer saves the memory
+        anyway, with time limits handled, and takes either value
     :param n_steps: n-step returns, as in Stable-Baselines3
     :param ent_coef: temperature: "auto" learns it from 1, "auto_0.1" from that start, a number fixes it
     :param target_update_interval: gradient steps between two updates of the targets; None: ``policy_delay``

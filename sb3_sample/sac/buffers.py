@@ -11,6 +11,13 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_sample.sac.compact_buffer import (
+    CompactDictReplayBuffer,
+    CompactReplay,
+    CompactReplayBuffer,
+)
+from sb3_sample.sac.next_observations import NextObservations
+
 
 def samples_at(
     buffer: ReplayBuffer, positions: np.ndarray, env_indices: np.ndarray, vec_normalize: VecNormalize | None = None
@@ -55,7 +62,7 @@ def samples_at(
     return ReplayBufferSamples(*columns)
 
 
-class ValidationSplit:
+class ValidationSplit(CompactReplay):
     """
     What a replay buffer gains that holds transitions out (P4, section 4.1 and algorithm 1, lines 4-10): each
     transition of each environment goes to the validation side with a given probability, for as long as it is in the
@@ -63,13 +70,10 @@ class ValidationSplit:
 
     Nothing is stored twice: the split is a mask, and a list of the places that it marks.
 
+    :param args: as of ``CompactReplayBuffer``
+    :param kwargs: as of ``CompactReplayBuffer``
     :param validation_proportion: probability of the validation side, in (0, 1)
     """
-
-    buffer_size: int
-    n_envs: int
-    pos: int
-    full: bool
 
     def __init__(self, *args: Any, validation_proportion: float, **kwargs: Any):
         super().__init__(*args, **kwargs)
@@ -99,7 +103,27 @@ class ValidationSplit:
         new = self.pos * self.n_envs + np.flatnonzero(held_out)
         self._ring[(self._last + np.arange(len(new))) % len(self._ring)] = new
         self._last += len(new)
-        super().add(*args, **kwargs)  # type: ignore[misc]  # the buffer's
+        super().add(*args, **kwargs)
+
+    def reset(self) -> None:
+        """Empty the buffer."""
+        super().reset()
+        self.held_out[...] = False
+        self._first = self._last = 0
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """
+        :return: what a row holds, as of ``CompactReplayBuffer``, and ``held_out``
+        """
+        return super().columns() | {"held_out": self.held_out}
+
+    def _restored(self) -> None:
+        super()._restored()
+        size = self.buffer_size if self.full else self.pos
+        oldest_first = (np.arange(size) + (self.pos if self.full else 0)) % self.buffer_size
+        steps, envs = np.nonzero(self.held_out[oldest_first])
+        self._first, self._last = 0, len(steps)
+        self._ring[: self._last] = oldest_first[steps] * self.n_envs + envs
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
         """
@@ -148,11 +172,11 @@ class ValidationSplit:
         return samples_at(self, *np.divmod(places, self.n_envs), env)
 
 
-class ValidationReplayBuffer(ValidationSplit, ReplayBuffer):
+class ValidationReplayBuffer(ValidationSplit, CompactReplayBuffer):  # type: ignore[misc, override]
     """A replay buffer that holds transitions out."""
 
 
-class ValidationDictReplayBuffer(ValidationSplit, DictReplayBuffer):
+class ValidationDictReplayBuffer(ValidationSplit, CompactDictReplayBuffer):  # type: ignore[misc, override]
     """The same for dict observations."""
 
 
@@ -252,7 +276,14 @@ class DeviceReplayBuffer(ReplayBuffer):
 
 
 #: Buffers that hold one transition a place, each of which can be drawn by itself.
-PLAIN_BUFFERS = (ReplayBuffer, DictReplayBuffer, ValidationReplayBuffer, ValidationDictReplayBuffer)
+PLAIN_BUFFERS = (
+    CompactReplayBuffer,
+    CompactDictReplayBuffer,
+    ValidationReplayBuffer,
+    ValidationDictReplayBuffer,
+    ReplayBuffer,
+    DictReplayBuffer,
+)
 
 
 class BatchMemory:
@@ -291,14 +322,17 @@ class BatchMemory:
             self._moved.synchronize()
         to_cuda = buffer.device.type == "cuda"
 
-        def take(name: Any, array: np.ndarray, but: np.ndarray | None = None) -> torch.Tensor:
-            rows = array.reshape(-1, *(array.shape[2:] or (1,)))
+        def take(name: Any, array: Any, but: np.ndarray | None = None) -> torch.Tensor:
+            shape = array.shape[2:] or (1,)
             if name not in self._columns or len(self._columns[name]) < n:
-                like = torch.from_numpy(rows[:0])
-                self._columns[name] = torch.empty((n, *like.shape[1:]), dtype=like.dtype, pin_memory=to_cuda)
+                dtype = torch.from_numpy(np.empty(0, array.dtype)).dtype
+                self._columns[name] = torch.empty((n, *shape), dtype=dtype, pin_memory=to_cuda)
             column = self._columns[name][:n]
             out = column.numpy()
-            rows.take(places, axis=0, out=out, mode="clip")
+            if isinstance(array, NextObservations):
+                array.take(places, out)
+            else:
+                array.reshape(-1, *shape).take(places, axis=0, out=out, mode="clip")
             if but is not None:
                 out *= 1 - but.reshape(-1, 1).take(places, axis=0)
             return column.to(buffer.device, non_blocking=True) if to_cuda else column

@@ -219,7 +219,7 @@ class DeterministicActor(Actor):
         :return: action in [-1, 1], (B, A), and zeros, (B, 1)
         """
         action = torch.tanh(self.mean(self.trunk(self.features(obs))))
-        return action, action.new_zeros(len(action), 1)
+        return action, action.new_zeros(action.shape[0], 1)
 
     def smoothed(self, obs: PyTorchObs, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """

@@ -3,10 +3,10 @@ The variance of policy gradients, as P1 (Nauman and Cygan 2023, https://arxiv.or
 whether more actions at each state or a longer trajectory lower it more, and what simulated samples cost in bias.
 """
 
+from sb3_sample.envs.states import EnvState, check_restorable, restore_state, save_state
 from sb3_sample.variance.bias import GradientSamples, compare_gradients, policy_gradient
 from sb3_sample.variance.decomposition import Choice, Components, at_equal_cost, relative_cost
 from sb3_sample.variance.estimate import Estimate, Interval, estimate_components
-from sb3_sample.variance.states import EnvState, check_restorable, restore_state, save_state
 
 __all__ = [
     "Choice",

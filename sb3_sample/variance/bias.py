@@ -3,7 +3,7 @@ Bias and variance of policy gradients that see simulated samples, relative to th
 table 3). M estimates of each method, P parameters of the policy that its actions depend on.
 """
 
-import pickle
+import copy
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.ppo.simulated_ppo import Rollout, SimulatedPPO, SimulatedSamples, log_prob_of_many
@@ -300,10 +300,11 @@ def _environment(model: OnPolicyAlgorithm, make_env: Callable[[], gym.Env]) -> V
     env: VecEnv = DummyVecEnv([make_env])
     normalize = model.get_vec_normalize_env()
     if normalize is not None:
-        copy: VecNormalize = pickle.loads(pickle.dumps(normalize))
-        copy.set_venv(env)
-        copy.training = False
-        env = copy
+        # As VecNormalize's own file would have it: without its environment.
+        own = copy.deepcopy(normalize)
+        own.set_venv(env)
+        own.training = False
+        env = own
     return env
 
 

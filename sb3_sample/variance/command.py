@@ -13,15 +13,17 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_sample.envs import make_env
+from sb3_sample.envs.states import check_restorable
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
+from sb3_sample.saving import load_vec_normalize
+from sb3_sample.saving.model import SafeFiles
 from sb3_sample.variance.bias import GradientSamples, check_comparison, compare_gradients
 from sb3_sample.variance.decomposition import Components, at_equal_cost, relative_cost
 from sb3_sample.variance.estimate import Estimate, Interval, check_arguments, check_counts, estimate_components
 from sb3_sample.variance.returns import Agent
-from sb3_sample.variance.states import check_restorable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -270,7 +272,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--env-kwargs", nargs="+", default=[], metavar="NAME=VALUE", help="such as action_repeat=4")
     parser.add_argument("--model", type=Path, help="saved model; without one a PPO is trained")
     parser.add_argument("--algo", choices=list(ALGORITHMS), default="ppo", help="what the model was saved by")
-    parser.add_argument("--vecnormalize", type=Path, help="saved VecNormalize of the model, vecnormalize.pkl")
+    parser.add_argument("--vecnormalize", type=Path, help="saved VecNormalize of the model")
+    parser.add_argument("--allow-pickle", action="store_true", help="load pickled files too, which may run any code")
     parser.add_argument("--train-steps", type=int, default=10_240, help="steps of the PPO that is trained; 0 for none")
     parser.add_argument("--n-steps", type=int, default=128, help="T of the measured rollouts")
     parser.add_argument("--n-rollouts", type=int, default=16, help="independent rollouts")
@@ -368,9 +371,18 @@ def _model(args: argparse.Namespace, make: Callable[[], gym.Env]) -> OnPolicyAlg
     for name, path in (("model", args.model), ("vecnormalize", args.vecnormalize)):
         if path is not None and not path.is_file():
             raise ValueError(f"{name} must be a file, not {path}")
-    model = ALGORITHMS[args.algo].load(args.model, device="cpu")
+    cls: Any = ALGORITHMS[args.algo]
+    if issubclass(cls, SafeFiles):
+        model = cls.load(args.model, device="cpu", allow_pickle=args.allow_pickle)
+    elif args.allow_pickle:
+        model = cls.load(args.model, device="cpu")
+    else:
+        raise ValueError(
+            f"model {args.model} is pickled, as those of {cls.__name__} are, and may run any code: pass --allow-pickle "
+            "if you trust its author"
+        )
     if args.vecnormalize is not None:
-        venv = VecNormalize.load(str(args.vecnormalize), DummyVecEnv([make]))
+        venv = load_vec_normalize(args.vecnormalize, DummyVecEnv([make]), allow_pickle=args.allow_pickle)
         venv.training = False
         model.set_env(venv)
     return model

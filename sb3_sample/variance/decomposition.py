@@ -74,7 +74,9 @@ class Components:
         :param n_steps: T; with a fraction, which a comparison at equal costs gives, the sums go on linearly
         :param n_actions: N
         :return: variance, (...)
+        :raises ValueError: an argument is out of range
         """
+        _check_counts(n_steps, n_actions)
         fading = self._fading(n_steps)
         marginal = self.marginal_variance + 2 * _dot(fading, self.marginal_covariance)
         policy = self.policy_variance + 2 * _dot(fading, self.policy_covariance)
@@ -88,7 +90,9 @@ class Components:
         :param n_actions: N
         :return: change of the variance by an action more at each state, from N to N + 1: a number below 0 is a
             reduction, (...)
+        :raises ValueError: an argument is out of range
         """
+        _check_counts(n_steps, n_actions)
         return -self.policy_dependent_variance(n_steps) / (n_steps * n_actions * (n_actions + 1))
 
     def gain_of_steps(self, n_steps: int, delta: float, n_actions: int = 1, tail: bool = True) -> np.ndarray:
@@ -104,7 +108,10 @@ class Components:
         :param n_actions: N
         :param tail: whether to count the covariances that the lemma leaves out
         :return: change of the variance, (...)
+        :raises ValueError: an argument is out of range
         """
+        _check_counts(n_steps, n_actions)
+        _check_delta(delta)
         longer = n_steps * (1 + delta)
         if tail:
             return self.variance(longer, n_actions) - self.variance(n_steps, n_actions)
@@ -124,7 +131,10 @@ class Components:
         :param delta: cost of an action more at all T states, in units of the cost of those T states
         :param n_actions: N
         :return: left and right side, (...) each
+        :raises ValueError: an argument is out of range
         """
+        _check_counts(n_steps, n_actions)
+        _check_delta(delta)
         lags, n, longer = self._lags(), n_actions, n_steps * (1 + delta)
         known = lags < n_steps
         scale = delta * (n**2 + n)
@@ -170,7 +180,9 @@ def at_equal_cost(components: Components, n_steps: int, action_cost: float, max_
         (0 if it costs nothing): with N actions there are ``T / (1 + action_cost (N - 1))`` states
     :param max_actions: largest number of actions
     :return: one choice for each number of actions
+    :raises ValueError: an argument is out of range
     """
+    _check_cost(action_cost)
     lengths = [n_steps / (1 + action_cost * (n - 1)) for n in range(1, max_actions + 1)]
     return [Choice(n, length, components.variance(length, n)) for n, length in enumerate(lengths, start=1)]
 
@@ -182,8 +194,28 @@ def relative_cost(action_cost: float, n_actions: int = 1) -> float:
     :param action_cost: cost of an additional action at one state, in units of that of a state with a single action
     :param n_actions: N, actions at each state so far
     :return: delta
+    :raises ValueError: an argument is out of range
     """
+    _check_cost(action_cost)
+    _check_counts(1, n_actions)
     return action_cost / (1 + action_cost * (n_actions - 1))
+
+
+def _check_counts(n_steps: float, n_actions: float) -> None:
+    if not n_steps > 0:  # a comparison at equal costs may come to less than one
+        raise ValueError(f"n_steps must be above 0, not {n_steps!r}")
+    if not n_actions >= 1:
+        raise ValueError(f"n_actions must be at least 1, not {n_actions!r}")
+
+
+def _check_delta(delta: float) -> None:
+    if not delta > 0:
+        raise ValueError(f"delta must be above 0, not {delta!r}")
+
+
+def _check_cost(action_cost: float) -> None:
+    if not action_cost >= 0:
+        raise ValueError(f"action_cost must be at least 0, not {action_cost!r}")
 
 
 def _dot(weights: np.ndarray, covariances: np.ndarray) -> np.ndarray:

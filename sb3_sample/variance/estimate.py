@@ -17,10 +17,10 @@ import torch
 from scipy import stats
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_sample.envs.states import check_restorable, save_state
 from sb3_sample.variance.decomposition import Components
 from sb3_sample.variance.returns import Agent, sample_returns
 from sb3_sample.variance.scores import Scores
-from sb3_sample.variance.states import check_restorable, save_state
 
 
 class Interval(NamedTuple):
@@ -107,7 +107,10 @@ def jackknife(value: float, left_out: np.ndarray, confidence: float = 0.95) -> I
     :param left_out: estimates without each of them, (M,)
     :param confidence: probability with which the interval is to cover what is estimated
     :return: estimate, and its interval by the jackknife with Student's t
+    :raises ValueError: ``confidence`` is out of range
     """
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence must be between 0 and 1, not {confidence!r}")
     m = len(left_out)
     deviation = math.sqrt((m - 1) / m * np.sum((left_out - left_out.mean()) ** 2))
     half = float(stats.t.ppf(0.5 + confidence / 2, m - 1)) * deviation

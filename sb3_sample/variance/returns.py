@@ -9,8 +9,8 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_sample.envs.states import EnvState, restore_state
 from sb3_sample.variance.scores import check_policy
-from sb3_sample.variance.states import EnvState, restore_state
 
 
 class Agent:

@@ -7,6 +7,7 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from torch import nn
 
 from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO
@@ -103,6 +104,14 @@ def test_actions_that_are_neither_drawn_nor_enumerated(space: spaces.Space) -> N
     for cls in ALGORITHMS:
         with pytest.raises(ValueError, match="the action space must be a Box or Discrete, .* pass n_simulated=0"):
             tiny(cls, vec(action_space=space))
+
+
+@pytest.mark.parametrize("cls", [MBMAPPO, MBPOPPO])
+def test_observations_that_change_after_they_are_normalised(cls: Any) -> None:
+    with pytest.raises(ValueError, match="VecNormalize must be around the wrappers that change observations"):
+        tiny(cls, VecFrameStack(VecNormalize(vec(2)), 3))
+    cls("MlpPolicy", VecFrameStack(VecNormalize(vec(2)), 3), n_simulated=0, device="cpu")
+    assert tiny(cls, VecNormalize(VecFrameStack(vec(2), 3))).learn(16).transitions.size == 32
 
 
 def test_simulating_with_nothing_to_simulate_with() -> None:

@@ -1,8 +1,5 @@
 """Saving, loading, and seeds: everything bit for bit."""
 
-import io
-import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_sample import MBMAPPO, QMAPPO
+from sb3_sample.saving import container, load_vec_normalize, save_vec_normalize
 from tests.ppo.common import ALGORITHMS, tiny
 from tests.sac.common import differing, state, vec
 
@@ -81,16 +79,14 @@ def test_the_models_choice_of_termination_is_saved(tmp_path: Path) -> None:
     assert MBMAPPO.load(tmp_path / "m").predict_termination is False
 
 
-def test_the_file_holds_no_pickled_model(tmp_path: Path) -> None:
+def test_the_file_holds_arguments_and_tensors(tmp_path: Path) -> None:
     tiny().learn(16).save(tmp_path / "m.zip")
-    with zipfile.ZipFile(tmp_path / "m.zip") as archive:
-        data = json.loads(archive.read("data"))
-        names = [name for name in archive.namelist() if name.endswith(".pth")]
-        for name in names:
-            torch.load(io.BytesIO(archive.read(name)), weights_only=True)
-    assert {"dynamics.pth", "dynamics.optimizer.pth", "transitions.pth"} <= set(names)
-    assert not {"dynamics", "transitions", "flat_observations", "model_actions"} & data.keys()
-    assert data["policy_kwargs"]["net_arch"] == [8] and "optimizer_kwargs" not in data["policy_kwargs"]
+    tree, tensors = container.read(tmp_path / "m.zip", "model")
+    attributes = tree["attributes"]
+    assert {"dynamics", "dynamics.optimizer", "transitions"} <= tree["parameters"].keys()
+    assert not {"dynamics", "transitions", "flat_observations", "model_actions"} & attributes.keys()
+    assert attributes["policy_kwargs"] == {"dict": {"net_arch": [8]}}
+    assert len(tensors["transitions.rewards"]) == 16
 
 
 def test_load_with_other_arguments(tmp_path: Path) -> None:
@@ -141,7 +137,7 @@ def test_vec_normalize_round_trip(tmp_path: Path) -> None:
     env = VecNormalize(vec(2))
     model = tiny(env=env).learn(32)
     model.save(tmp_path / "m")
-    env.save(tmp_path / "v")
-    loaded = MBMAPPO.load(tmp_path / "m", env=VecNormalize.load(tmp_path / "v", vec(2)))
+    save_vec_normalize(env, tmp_path / "v")
+    loaded = MBMAPPO.load(tmp_path / "m", env=load_vec_normalize(tmp_path / "v", vec(2)))
     loaded.learn(32)
     assert loaded.transitions.size == 64

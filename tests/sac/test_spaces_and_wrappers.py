@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -20,9 +21,11 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
 from sb3_sample.sac import SAC
+from sb3_sample.sac.compact_buffer import CompactReplayBuffer
 from tests.sac.common import MAKERS, Toy, bro, random_batch, sac, vec
 
 BOX = spaces.Box(-10, 10, (3,), np.float32)
@@ -246,9 +249,19 @@ def test_n_step_returns() -> None:
 
 
 def test_optimize_memory_usage() -> None:
-    model = bro(optimize_memory_usage=True, replay_buffer_kwargs={"handle_timeout_termination": False})
+    """The default buffer does it anyway; Stable-Baselines3's own is used where it is named."""
+    for value in (True, False):
+        model = bro(optimize_memory_usage=value)
+        check_trains(model)
+        assert type(model.replay_buffer) is CompactReplayBuffer
+        assert model.replay_buffer.handle_timeout_termination
+    model = bro(
+        optimize_memory_usage=True,
+        replay_buffer_class=ReplayBuffer,
+        replay_buffer_kwargs={"handle_timeout_termination": False},
+    )
     check_trains(model)
-    assert not hasattr(model.replay_buffer, "next_observations")
+    assert type(model.replay_buffer) is ReplayBuffer and not hasattr(model.replay_buffer, "next_observations")
 
 
 @pytest.mark.parametrize("truncate", [True, False])
@@ -446,7 +459,7 @@ def test_constant_learning_rate() -> None:
 
 def test_scheduled_learning_rate(tmp_path: Path) -> None:
     """A schedule moves every rate but that of optimism and its weight."""
-    model = bro(learning_rate=lambda remaining: 1e-3 * remaining, adjustment_learning_rate=2e-5).learn(40)
+    model = bro(learning_rate=LinearSchedule(1e-3, 0, 1), adjustment_learning_rate=2e-5).learn(40)
     for name, rate in rates(model).items():
         expected = 2e-5 if name == "explorer.scalar_optimizer" else 1e-3 * model._current_progress_remaining
         assert rate == pytest.approx(expected), name

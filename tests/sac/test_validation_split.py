@@ -22,6 +22,7 @@ from sb3_sample.sac.buffers import (
     latest,
     samples_at,
 )
+from sb3_sample.sac.compact_buffer import CompactReplayBuffer
 from sb3_sample.sac.pessimism import LearnedPessimism
 from tests.sac.common import TINY_BRO, TINY_SAC, differing, sac, state, vec
 
@@ -268,7 +269,7 @@ def test_nothing_held_out_and_fixed_pessimism_is_sac(n_envs: int) -> None:
     ours = vpl(tagged((7, 5)[:n_envs]), validation_proportion=0, pessimism=1.0).learn(80)
     plain = sac(tagged((7, 5)[:n_envs])).learn(80)
     assert ours._n_updates == plain._n_updates > 60
-    assert type(ours.replay_buffer) is ReplayBuffer
+    assert type(ours.replay_buffer) is CompactReplayBuffer
     assert not differing(state(ours), state(plain))
     # The comparison can fail.
     other = vpl(tagged((7, 5)[:n_envs]), pessimism=1.0).learn(80)
@@ -308,7 +309,7 @@ def test_loaded_with_another_proportion(tmp_path: Path) -> None:
     vpl(pessimism=1.0).learn(20).save(tmp_path / "m")
     assert isinstance(VPLSAC.load(tmp_path / "m", env=vec()).replay_buffer, ValidationReplayBuffer)
     without = VPLSAC.load(tmp_path / "m", env=vec(), validation_proportion=0)
-    assert type(without.replay_buffer) is ReplayBuffer
+    assert type(without.replay_buffer) is CompactReplayBuffer
     with pytest.raises(ValueError, match=r"validation_proportion=1/32"):
         VPLSAC.load(tmp_path / "m", env=vec(), validation_proportion=0, pessimism="vpl")
 
@@ -347,7 +348,6 @@ class Goal(gym.Env):
     [
         ({"n_steps": 3}, "n_steps=3"),
         ({"replay_buffer_class": NStepReplayBuffer, "replay_buffer_kwargs": {"n_steps": 3}}, "NStepReplayBuffer"),
-        ({"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}, "optimize_"),
         ({"replay_buffer_class": HerReplayBuffer}, "HerReplayBuffer"),
     ],
 )

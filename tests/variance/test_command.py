@@ -9,7 +9,9 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_sample import MBMAPPO
 from sb3_sample.cli import main
+from sb3_sample.saving import save_vec_normalize
 from sb3_sample.variance.command import Question, draw, format_choices, format_components, verdict
 from sb3_sample.variance.decomposition import Components
 from sb3_sample.variance.estimate import Estimate
@@ -82,17 +84,27 @@ def test_a_dmc_task_with_arguments_and_a_longer_trajectory(
     assert "delta = 0.333" in out
 
 
+@pytest.mark.parametrize("safe", [False, True])
 @pytest.mark.parametrize("normalized", [False, True])
-def test_a_saved_model(normalized: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_saved_model(normalized: bool, safe: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     venv: Any = DummyVecEnv([lambda: gym.make("Pendulum-v1")])
     arguments = ["--model", str(tmp_path / "model.zip"), "-o", str(tmp_path / "picture.png")]
     if normalized:
         venv = VecNormalize(venv)
         arguments += ["--vecnormalize", str(tmp_path / "vecnormalize.pkl")]
-    model = PPO("MlpPolicy", venv, n_steps=64, device="cpu", policy_kwargs={"net_arch": [8]}).learn(64)
+    cls: Any = MBMAPPO if safe else PPO
+    model = cls("MlpPolicy", venv, n_steps=64, device="cpu", policy_kwargs={"net_arch": [8]}).learn(64)
     model.save(tmp_path / "model.zip")
-    if normalized:
+    if normalized and safe:
+        save_vec_normalize(venv, tmp_path / "vecnormalize.pkl")
+    elif normalized:
         venv.save(tmp_path / "vecnormalize.pkl")
+    if safe:
+        arguments += ["--algo", "mbma_ppo"]
+    else:
+        with pytest.raises(SystemExit, match="model .*model.zip is pickled, .* pass --allow-pickle"):
+            run(*arguments)
+        arguments.append("--allow-pickle")
     run(*arguments)
     assert "gradient of 42 parameters" in capsys.readouterr().out
 

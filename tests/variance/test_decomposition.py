@@ -1,5 +1,8 @@
 """The paper's lemmas against the enumeration of all paths of a tabular task, and each other."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -155,3 +158,23 @@ def test_relative_cost_is_that_of_states_with_their_actions() -> None:
     assert relative_cost(0.5) == 0.5
     # A state with 3 actions costs 2; another action at 10 states costs 5, a quarter of what the 10 states cost.
     assert relative_cost(0.5, 3) == 0.25
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda c: c.variance(0), "n_steps must be above 0, not 0"),
+        (lambda c: c.variance(float("nan")), "n_steps must be above 0, not nan"),
+        (lambda c: c.gain_of_action(10, 0), "n_actions must be at least 1, not 0"),
+        (lambda c: c.gain_of_steps(10, -1.0), "delta must be above 0, not -1.0"),
+        (lambda c: c.gain_of_steps(10, 0.0, tail=False), "delta must be above 0, not 0.0"),
+        (lambda c: c.theorem_3_3(10, 0.0), "delta must be above 0, not 0.0"),
+        (lambda c: at_equal_cost(c, 10, -2.0), "action_cost must be at least 0, not -2.0"),
+        (lambda c: at_equal_cost(c, 0, 1.0), "n_steps must be above 0, not 0"),
+        (lambda c: relative_cost(1.0, 0), "n_actions must be at least 1, not 0"),
+        (lambda c: relative_cost(-0.5), "action_cost must be at least 0, not -0.5"),
+    ],
+)
+def test_what_is_refused(call: Callable[[Components], Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call(random_components(0))

@@ -12,10 +12,10 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_sample.envs import make_env
+from sb3_sample.envs.states import save_state
 from sb3_sample.variance.decomposition import Components
-from sb3_sample.variance.estimate import Estimate, Interval, combine, estimate_components
+from sb3_sample.variance.estimate import Estimate, Interval, combine, estimate_components, jackknife
 from sb3_sample.variance.returns import Agent, sample_returns
-from sb3_sample.variance.states import save_state
 from tests.variance.common import GAMMA, Exact, Tabular, softmax_policy, tabular_model
 
 T = 6
@@ -122,6 +122,12 @@ def test_the_jackknife_of_a_mean_is_its_students_interval() -> None:
     interval = result.interval(lambda c: c.policy_variance)
     half = 2.200985 * values.std(ddof=1) / np.sqrt(12)
     assert interval == pytest.approx(Interval(values.mean(), values.mean() - half, values.mean() + half), rel=1e-5)
+
+
+def test_a_confidence_in_percent_is_refused() -> None:
+    for confidence in (95, 1.0, 0.0, float("nan")):
+        with pytest.raises(ValueError, match=f"confidence must be between 0 and 1, not {confidence}"):
+            jackknife(1.0, np.arange(4.0), confidence)
 
 
 def test_replicates_are_the_estimates_without_a_rollout(monkeypatch: pytest.MonkeyPatch) -> None:

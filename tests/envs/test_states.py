@@ -8,7 +8,7 @@ import pytest
 from gymnasium import spaces
 
 from sb3_sample.envs import make_env
-from sb3_sample.variance.states import check_restorable, random_action, restore_state, save_state
+from sb3_sample.envs.states import check_restorable, random_action, restore_state, save_state
 from tests.variance.common import Tabular
 
 #: Among them tasks that draw numbers of the model anew for each episode: a target's place or size, tendons, a terrain.

@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
+from sb3_sample.saving.attributes import is_view_of_foreign_memory
+
 #: Attributes of these types cannot change, so that they are kept as they are.
 _CONSTANTS = (type(None), bool, int, float, complex, str, bytes, np.generic)
 #: Attributes of these types are part of the state, with what they contain.
@@ -48,12 +50,13 @@ def save_state(env: gym.Env) -> EnvState:
     :return: its state
     :raises TypeError: ``env`` is not a ``gymnasium.Env``
     """
-    layers, simulator = _layers(env), _simulator(env)
+    layers, simulator = layers_of(env), simulator_of(env)
     data, model = None, {}
     if simulator is not None:
         data = copy.copy(simulator[1])
-        model = {name: getattr(simulator[0], name).copy() for name in _model_arrays()}
-    return EnvState([_attributes(layer) for layer in layers], data, model)
+        model = {name: getattr(simulator[0], name).copy() for name in model_arrays()}
+    # Copied together, so that a generator that two of them share is shared in the copy.
+    return EnvState(copy.deepcopy([_attributes(layer) for layer in layers]), data, model)
 
 
 def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None = None) -> None:
@@ -66,7 +69,7 @@ def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None
         after its reset goes on at random from the state
     :raises ValueError: ``state`` is of an environment with other wrappers, or of another model
     """
-    layers, simulator = _layers(env), _simulator(env)
+    layers, simulator = layers_of(env), simulator_of(env)
     if len(layers) != len(state.layers):
         raise ValueError(
             f"state must be of an environment wrapped like env: it has {len(state.layers)} layers, env {len(layers)}"
@@ -85,12 +88,11 @@ def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None
         for name, array in state.model.items():
             getattr(model, name)[...] = array
         mujoco.mj_copyData(data, model, state.data)
-    for layer, attributes in zip(layers, state.layers, strict=True):
+    for layer, attributes in zip(layers, copy.deepcopy(state.layers), strict=True):
         for name, value in attributes.items():
             if rng is not None and isinstance(value, _GENERATORS):
-                setattr(layer, name, type(value)(_bit_generator(value, int(rng.integers(2**63)))))
-            else:
-                setattr(layer, name, _copy(value))
+                value = type(value)(_bit_generator(value, int(rng.integers(2**63))))
+            setattr(layer, name, value)
 
 
 def check_restorable(env: gym.Env, other: gym.Env | None = None, n_steps: int = 20, seed: int = 0) -> None:
@@ -140,8 +142,12 @@ def random_action(space: gym.Space, rng: np.random.Generator) -> Any:
 # ---------------------------------------------------------------- where the state is
 
 
-def _layers(env: gym.Env) -> list[Any]:
-    """The objects whose attributes are part of the state: wrappers, environment, dm_control's loop and task."""
+def layers_of(env: gym.Env) -> list[Any]:
+    """
+    :param env: an environment, wrapped or not
+    :return: the objects whose attributes are part of its state: wrappers, environment, dm_control's loop and task
+    :raises TypeError: ``env`` is not a ``gymnasium.Env``
+    """
     if not isinstance(env, gym.Env):
         raise TypeError(f"env must be a gymnasium.Env, not {env!r}")
     layers: list[Any] = [env]
@@ -151,17 +157,20 @@ def _layers(env: gym.Env) -> list[Any]:
     if dm_env is not None:
         return [*layers, dm_env, dm_env.task]
     # An environment around one of another library, such as metaworld/.
-    inside = [layer for value in vars(layers[-1]).values() if isinstance(value, gym.Env) for layer in _layers(value)]
+    inside = [layer for value in vars(layers[-1]).values() if isinstance(value, gym.Env) for layer in layers_of(value)]
     return layers + inside
 
 
-def _simulator(env: gym.Env) -> tuple[Any, Any] | None:
-    """MuJoCo's model and data."""
+def simulator_of(env: gym.Env) -> tuple[Any, Any] | None:
+    """
+    :param env: an environment, wrapped or not
+    :return: MuJoCo's model and data; None if it is not simulated by it
+    """
     base = env.unwrapped
     if hasattr(base, "dm_env"):
         physics = base.dm_env.physics
         return physics.model.ptr, physics.data.ptr
-    for layer in reversed(_layers(env)):
+    for layer in reversed(layers_of(env)):
         model, data = vars(layer).get("model"), vars(layer).get("data")
         if type(model).__module__.startswith("mujoco"):
             return model, data
@@ -169,26 +178,30 @@ def _simulator(env: gym.Env) -> tuple[Any, Any] | None:
 
 
 @functools.cache
-def _model_arrays() -> tuple[str, ...]:
+def model_arrays() -> tuple[str, ...]:
     """
-    Names of the arrays of a model that a task may draw anew: all of MuJoCo's own float type, and heights of the ground.
-    Not meshes and textures, the megabytes of a model, which no task of these suites changes.
+    :return: names of the arrays of a model that a task may draw anew: all of MuJoCo's own float type, and heights of
+        the ground. Not meshes, their search trees and textures, the megabytes of a model, which no task of these
+        suites changes
     """
     import mujoco
 
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    names = [name for name in dir(model) if not name.startswith(("_", "mesh_", "tex_", "skin_"))]
+    names = [name for name in dir(model) if not name.startswith(("_", "mesh_", "tex_", "skin_", "bvh_", "oct_"))]
     arrays = {name: value for name in names if isinstance(value := getattr(model, name), np.ndarray)}
     return tuple(name for name, value in arrays.items() if value.dtype == np.float64 or name == "hfield_data")
 
 
 def _attributes(layer: Any) -> dict[str, Any]:
-    return {name: _copy(value) for name, value in vars(layer).items() if _is_state(value)}
+    return {name: value for name, value in vars(layer).items() if _is_state(value)}
 
 
 def _is_state(value: Any) -> bool:
     """Whether a value is data through and through: numbers, arrays, generators, containers and objects of them."""
-    if isinstance(value, (*_CONSTANTS, np.ndarray, *_GENERATORS)):
+    if isinstance(value, np.ndarray):
+        # A view of the simulator's own memory, as some tasks of Meta-World keep, follows it.
+        return not is_view_of_foreign_memory(value)
+    if isinstance(value, (*_CONSTANTS, *_GENERATORS)):
         return True
     if isinstance(value, dict):
         return all(_is_state(item) for item in value.values())
@@ -201,10 +214,6 @@ def _is_state(value: Any) -> bool:
     return not type(value).__module__.startswith(("mujoco", "dm_control", "gymnasium.envs")) and all(
         _is_state(item) for item in vars(value).values()
     )
-
-
-def _copy(value: Any) -> Any:
-    return value if isinstance(value, _CONSTANTS) else copy.deepcopy(value)
 
 
 def _bit_generator(generator: Any, seed: int) -> Any:

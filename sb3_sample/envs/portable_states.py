@@ -1,0 +1,120 @@
+"""
+The state of an environment as plain values: arrays, numbers, strings, random generators and containers of them, which
+can be written to a file and restored in another process, in an environment that was made in the same way.
+
+MuJoCo's data is not written as it lies in memory. What decides the future is its integration state
+(``mjSTATE_INTEGRATION``); all other numbers follow from it or are left over from the last step, and the latter are read
+by some tasks before they are computed anew, so that they are written too.
+"""
+
+import functools
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_sample.envs.states import layers_of, model_arrays, simulator_of
+from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name
+
+#: Name of what :mod:`sb3_sample.saving.vec_envs` puts into an environment of another process.
+HELPER = "_sb3_sample_state"
+#: Attributes of wrappers that lead to what they wrap, are clocks, or ours.
+_SKIPPED = ("env", HELPER)
+#: Stable-Baselines3's Monitor counts seconds from when it was made, and its file says so.
+_CLOCKS = {"stable_baselines3.common.monitor.Monitor": ("t_start",)}
+#: Arrays whose size depends on the contacts, and on which bodies touch each other; they are computed anew at each step,
+#: before they are read.
+_IN_ARENA = ("efc_", "iefc_", "island_", "map_", "iL", "iM", "iacc", "ifrc")
+
+
+def pack(env: gym.Env) -> tuple[dict[str, Any], list[str]]:
+    """
+    :param env: an environment, wrapped or not
+    :return: its state; and what of it is not in it, because nothing is known about its class, as
+        ``class of the layer: attribute (class)``: the state is all of it if there is nothing of this kind
+    """
+    layers, simulator = layers_of(env), simulator_of(env)
+    describer = Describer([*layers, *(simulator or ()), *_physics(env)], _origin(simulator))
+    described, opaque = [], []
+    for layer in layers:
+        name = class_name(layer)
+        attributes, unknown = describer.attributes(layer, (*_SKIPPED, *_CLOCKS.get(name, ())))
+        described.append({"class": name, "attributes": attributes})
+        opaque += [f"{type(layer).__name__}: {what}" for what in unknown]
+    return {"layers": described, "simulator": None if simulator is None else _pack_simulator(*simulator)}, opaque
+
+
+def unpack(env: gym.Env, state: dict[str, Any]) -> None:
+    """
+    Go back to a state: the same actions then give the same observations and rewards, bit by bit.
+
+    :param env: an environment made as the one that was packed
+    :param state: from :func:`pack`; it stays as it is
+    :raises DoesNotFit: the environment was made in another way
+    """
+    layers, simulator = layers_of(env), simulator_of(env)
+    ours, theirs = [class_name(layer) for layer in layers], [layer["class"] for layer in state["layers"]]
+    if ours != theirs:
+        raise DoesNotFit(f"the environment consists of {ours}, the saved one of {theirs}")
+    if (simulator is None) != (state["simulator"] is None):
+        raise DoesNotFit("only one of the environment and the saved one is simulated by MuJoCo")
+    if simulator is not None:
+        _unpack_simulator(*simulator, state["simulator"])
+    restorer = Restorer(_origin(simulator))
+    for layer, saved in zip(layers, state["layers"], strict=True):
+        restorer.attributes(layer, saved["attributes"])
+
+
+def _physics(env: gym.Env) -> list[Any]:
+    dm_env = getattr(env.unwrapped, "dm_env", None)
+    return [] if dm_env is None else [dm_env.physics]
+
+
+def _origin(simulator: tuple[Any, Any] | None) -> int | None:
+    """Address of the simulator's data, all of which lies in one block; some tasks of Meta-World keep views of it."""
+    return None if simulator is None else int(simulator[1].qpos.__array_interface__["data"][0])
+
+
+def _pack_simulator(model: Any, data: Any) -> dict[str, Any]:
+    import mujoco
+
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    integration = np.empty(mujoco.mj_stateSize(model, kind))
+    mujoco.mj_getState(model, data, integration, kind)
+    return {
+        "integration": integration,
+        "data": {name: getattr(data, name).copy() for name in _data_arrays()},
+        "model": {name: getattr(model, name).copy() for name in model_arrays()},
+    }
+
+
+def _unpack_simulator(model: Any, data: Any, state: dict[str, Any]) -> None:
+    import mujoco
+
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    wrong = [
+        f"{name} {getattr(owner, name).shape} instead of {array.shape}"
+        for owner, part in ((model, "model"), (data, "data"))
+        for name, array in state[part].items()
+        if getattr(owner, name).shape != array.shape
+    ]
+    if mujoco.mj_stateSize(model, kind) != len(state["integration"]) or wrong:
+        raise DoesNotFit(f"the environment has another MuJoCo model than the saved one: {', '.join(wrong[:3])}")
+    for name, array in state["model"].items():
+        getattr(model, name)[...] = array
+    mujoco.mj_setState(model, data, state["integration"], kind)
+    # Contacts and constraints, which dm_control computes at the end of a step for the next one.
+    mujoco.mj_step1(model, data)
+    for name, array in state["data"].items():
+        getattr(data, name)[...] = array
+
+
+@functools.cache
+def _data_arrays() -> tuple[str, ...]:
+    """Names of the arrays of floats whose size the model alone determines."""
+    import mujoco
+
+    data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
+    names = [name for name in dir(data) if not name.startswith(("_", *_IN_ARENA))]
+    arrays = {name: value for name in names if isinstance(value := getattr(data, name), np.ndarray)}
+    return tuple(name for name, value in arrays.items() if value.dtype == np.float64)

@@ -1,0 +1,368 @@
+"""
+Replay buffers that store one observation a step: the next observation of a step is, nearly always, the observation of
+the step after it.
+"""
+
+import functools
+import os
+import warnings
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+
+from sb3_sample.sac import memory_map as files
+from sb3_sample.sac.next_observations import NEXT_ROW, ONLY, NextObservations, SideStore
+
+try:  # As in Stable-Baselines3: without it nobody looks at the memory.
+    import psutil
+except ImportError:
+    psutil = None
+
+
+def _file_name(column: str, key: str) -> str:
+    return f"{column}/{key}" if key else column
+
+
+class CompactReplay:
+    """
+    What a replay buffer gains that stores one observation a step.
+
+    The next observation of row t is the observation of row t + 1, except where the two differ in a bit: at the end of
+    an episode, where ``learn`` reset the environment, wherever else the sequence broke. That is seen when row t + 1
+    comes, and what differs is kept aside. So every transition is the one that Stable-Baselines3's buffer would hold,
+    time limits included, and none is lost when the buffer is full.
+
+    :param buffer_size: capacity in transitions
+    :param observation_space: of the environment
+    :param action_space: of the environment
+    :param device: where samples go
+    :param n_envs: number of environments
+    :param optimize_memory_usage: either value: the buffer always stores one observation a step
+    :param handle_timeout_termination: whether a time limit is no termination
+    :param memory_map: a folder, made if it is not there, whose files hold the buffer instead of the memory. They have
+        no names and go with the buffer: runs cannot meet in them, and nothing is left to delete. None for the memory
+    :raises ValueError: if ``memory_map`` cannot be written to or has not the space
+    """
+
+    buffer_size: int
+    n_envs: int
+    pos: int
+    full: bool
+    observations: Any
+    memory_map: str | None
+    slot: np.ndarray
+    aside: SideStore
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        device: torch.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        memory_map: str | os.PathLike[str] | None = None,
+    ):
+        assert isinstance(self, ReplayBuffer)
+        # The constructors in between make arrays for two observations a step.
+        super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs=n_envs)
+        self.buffer_size = max(buffer_size // n_envs, 1)
+        # True means the layout that overwrites the last next observation of an episode.
+        self.optimize_memory_usage = False
+        self.handle_timeout_termination = handle_timeout_termination
+        rows = (self.buffer_size, self.n_envs)
+        is_dict = isinstance(observation_space, spaces.Dict)
+        one: dict[str, tuple[tuple[int, ...], Any]] = {ONLY: (self.obs_shape, observation_space.dtype)}
+        if isinstance(observation_space, spaces.Dict):
+            shapes: Any = self.obs_shape
+            one = {key: (shapes[key], space.dtype) for key, space in observation_space.spaces.items()}
+        layout = {key: ((*rows, *shape), dtype) for key, (shape, dtype) in one.items()}
+        actions = ((*rows, self.action_dim), self._maybe_cast_dtype(action_space.dtype))
+        needed = sum(files.n_bytes(*array) for array in [*layout.values(), actions, *[(rows, np.float32)] * 4])
+        #: The folder that holds the arrays; None if the memory does.
+        self.memory_map = None if memory_map is None else files.check_folder(memory_map, needed)
+        if memory_map is None and psutil is not None and needed > (available := psutil.virtual_memory().available):
+            warnings.warn(
+                f"the full replay buffer takes {needed / 1e9:.2f} GB, and {available / 1e9:.2f} GB of memory are free: "
+                "pass a smaller buffer_size, or replay_buffer_kwargs={'memory_map': <folder>}",
+                stacklevel=2,
+            )
+        zeros = functools.partial(files.zeros, self.memory_map)
+        stored = {key: zeros(*array) for key, array in layout.items()}
+        self.observations = stored if is_dict else stored[ONLY]
+        self.actions = zeros(*actions)
+        self.rewards, self.dones, self.timeouts = (zeros(rows, np.float32) for _ in range(3))
+        #: Where the next observation is: in the next row, or aside, in this slot; (buffer_size, n_envs).
+        self.slot = zeros(rows, np.int32)
+        self.slot[...] = NEXT_ROW
+        self.aside = SideStore(one, self.n_envs, self.memory_map)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        if self.memory_map is None:
+            return
+        # What is copied or unpickled is in the memory.
+        self.memory_map = files.check_folder(self.memory_map, sum(array.nbytes for array in self.stored().values()))
+        stored = {key: files.moved(self.memory_map, array) for key, array in self.stored().items()}
+        self.observations = stored if isinstance(self.observations, dict) else stored[ONLY]
+        for name in ("actions", "rewards", "dones", "timeouts", "slot"):
+            setattr(self, name, files.moved(self.memory_map, getattr(self, name)))
+        self.aside.arrays = {key: files.moved(self.memory_map, array) for key, array in self.aside.arrays.items()}
+
+    def stored(self) -> dict[str, np.ndarray]:
+        """
+        :return: the observations by key, (buffer_size, n_envs, O) each
+        """
+        return self.observations if isinstance(self.observations, dict) else {ONLY: self.observations}
+
+    @property
+    def next_observations(self) -> Any:
+        """The next observations, or a dict of them, to be read like an array of (buffer_size, n_envs, O)."""
+        if isinstance(self.observations, dict):
+            return {key: NextObservations(self, key) for key in self.observations}
+        return NextObservations(self)
+
+    def _following(self, places: np.ndarray) -> dict[str, np.ndarray]:
+        return {key: NextObservations(self, key).take(places) for key in self.stored()}
+
+    # ---------------------------------------------------------------- adding
+
+    def add(
+        self,
+        obs: Any,
+        next_obs: Any,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store one transition of each environment, as in Stable-Baselines3."""
+        assert isinstance(self, ReplayBuffer)
+        now, after = self._as_stored(obs), self._as_stored(next_obs)
+        action = np.asarray(action).reshape((self.n_envs, self.action_dim))
+        pos = self.pos
+        if self.size() > 0 and self.buffer_size > 1:
+            self._settle((pos - 1) % self.buffer_size, now)
+        if self.full:
+            self.aside.free(self.slot[pos])
+        for key, array in self.stored().items():
+            array[pos] = now[key]
+        self._set_newest(pos, after)
+        self.actions[pos] = action
+        self.rewards[pos] = reward
+        self.dones[pos] = done
+        if self.handle_timeout_termination:
+            self.timeouts[pos] = [info.get("TimeLimit.truncated", False) for info in infos]
+        self.pos = pos + 1
+        if self.pos == self.buffer_size:
+            self.full, self.pos = True, 0
+
+    def _as_stored(self, given: Any) -> dict[str, np.ndarray]:
+        """Observations of all environments in the form in which they are stored, (n_envs, O) each."""
+        by_key = given if isinstance(self.observations, dict) else {ONLY: given}
+        return {
+            key: np.ascontiguousarray(by_key[key], dtype=array.dtype).reshape(array.shape[1:])
+            for key, array in self.stored().items()
+        }
+
+    def _set_newest(self, row: int, following: dict[str, np.ndarray]) -> None:
+        for key, array in self.aside.newest().items():
+            array[...] = following[key]
+        self.slot[row] = self.aside.slots_of_newest
+
+    def _settle(self, row: int, now: dict[str, np.ndarray]) -> None:
+        """The newest row is followed by another: decide where its next observation is, given that one's observation."""
+        pending = self.aside.newest()
+        if all(array.tobytes() == now[key].tobytes() for key, array in pending.items()):
+            self.slot[row] = NEXT_ROW
+            return  # nearly always
+        differs = np.zeros(self.n_envs, dtype=bool)
+        for key, array in pending.items():
+            a, b = (np.ascontiguousarray(x).reshape(self.n_envs, -1).view(np.uint8) for x in (array, now[key]))
+            differs |= (a != b).any(axis=1)
+        # A disk may be found to be full here: nothing has changed yet.
+        slots = self.aside.put({key: array[differs] for key, array in pending.items()})
+        self.slot[row] = NEXT_ROW
+        self.slot[row, differs] = slots
+
+    def reset(self) -> None:
+        """Empty the buffer."""
+        super().reset()  # type: ignore[misc]  # the buffer's
+        self.slot[...] = NEXT_ROW
+        self.aside.clear()
+
+    # ---------------------------------------------------------------- to and from files
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """
+        :return: what a row holds besides its next observation, by name, (buffer_size, n_envs, ...) each; the
+            observations are ``observations``, or ``observations/<key>``
+        """
+        assert isinstance(self, ReplayBuffer)
+        columns = {_file_name("observations", key): array for key, array in self.stored().items()}
+        return columns | {name: getattr(self, name) for name in ("actions", "rewards", "dones", "timeouts")}
+
+    def _apart(self, index: np.ndarray, places: np.ndarray) -> dict[str, np.ndarray]:
+        """Next observations that are not the next row's, named by ``index``, as they lie in files."""
+        values = self._following(places)
+        return {"next_index": index} | {_file_name("next_observations", key): value for key, value in values.items()}
+
+    def new_rows(self, n: int) -> dict[str, np.ndarray]:
+        """
+        The newest steps of every environment, whole in themselves.
+
+        :param n: how many
+        :return: copies of the :meth:`columns`, oldest step first, (n, n_envs, ...) each; ``next_index``, (M,), the
+            places (step * n_envs + environment) whose next observation is not the observation of the next step, among
+            them the whole last step; ``next_observations`` (or ``next_observations/<key>``), (M, O), what it is there
+        :raises ValueError: if the buffer holds fewer
+        """
+        assert isinstance(self, ReplayBuffer)
+        if not 0 <= n <= self.size():
+            raise ValueError(f"n must lie between 0 and {self.size()}, the steps in the replay buffer, not {n}")
+        rows = np.arange(self.pos - n, self.pos) % self.buffer_size
+        index = np.flatnonzero(self.slot[rows] != NEXT_ROW)
+        steps, envs = np.divmod(index, self.n_envs)
+        copies = {name: np.array(array[rows]) for name, array in self.columns().items()}
+        return copies | self._apart(index, rows[steps] * self.n_envs + envs)
+
+    def restore_rows(self, pieces: Iterable[tuple[int, dict[str, np.ndarray]]]) -> None:
+        """
+        Make the buffer the one that :meth:`new_rows` was called on, row for row, whatever it held before.
+
+        :param pieces: the number of the first step, counted over the run such that step i lies in row
+            i % ``buffer_size``; and the steps from there on. A piece goes on where the one before ended, or replaces
+            its last steps
+        :raises ValueError: if they are of another buffer, or a piece is missing
+        """
+        self.reset()
+        begin = end = 0
+        for number, (first, piece) in enumerate(pieces):
+            n = len(piece["actions"])
+            self._check_rows(piece, n, n - 1)
+            begin, end = (first, first) if number == 0 else (begin, end)
+            if not max(begin, end - self.buffer_size) <= first <= end or first + n < end:
+                raise ValueError(f"the steps {begin} to {end} are followed by those from {first} to {first + n}")
+            rows = np.arange(first, first + n) % self.buffer_size
+            if n > 0:
+                self._replace(rows, piece, keeps_before=begin < first and n < self.buffer_size)
+            end = first + n
+            self.pos, self.full = end % self.buffer_size, end - begin >= self.buffer_size
+        if begin % self.buffer_size != 0 and not self.full:
+            raise ValueError(f"the steps before step {begin} are missing")
+        self._restored()
+
+    def _replace(self, rows: np.ndarray, piece: dict[str, np.ndarray], keeps_before: bool) -> None:
+        """
+        :param rows: where the steps go, in their order
+        :param piece: the steps
+        :param keeps_before: whether the row before them holds the step before them
+        """
+        before = (rows[0] - 1) % self.buffer_size
+        if keeps_before:
+            # For now it is the newest: where its next observation is may change.
+            following = self._following(before * self.n_envs + np.arange(self.n_envs))
+            self.aside.free(self.slot[before])
+            self._set_newest(before, following)
+            self._settle(before, {key: piece[_file_name("observations", key)][0] for key in self.stored()})
+        self.aside.free(self.slot[rows].reshape(-1))
+        self._put(rows, piece, len(rows) - 1)
+
+    def _put(self, rows: np.ndarray, piece: dict[str, np.ndarray], newest: int) -> None:
+        """
+        :param rows: where the steps go
+        :param piece: the steps
+        :param newest: which of them is the newest
+        """
+        for name, array in self.columns().items():
+            array[rows] = piece[name]
+        self.slot[rows] = NEXT_ROW
+        steps, envs = np.divmod(piece["next_index"], self.n_envs)
+        values = {key: piece[_file_name("next_observations", key)] for key in self.stored()}
+        last = steps == newest
+        slots = self.aside.put({key: value[~last] for key, value in values.items()})
+        self.slot[rows[steps[~last]], envs[~last]] = slots
+        self._set_newest(rows[newest], {key: value[last] for key, value in values.items()})
+
+    def _check_rows(self, piece: dict[str, np.ndarray], n: int, newest: int) -> None:
+        """
+        :param piece: rows from a file
+        :param n: how many they must be
+        :param newest: which of them is the newest
+        :raises ValueError: if they are no rows of this buffer
+        """
+        shapes = {name: ((n, *array.shape[1:]), array.dtype) for name, array in self.columns().items()}
+        index = piece.get("next_index", np.zeros(0, np.int64))
+        shapes |= {
+            _file_name("next_observations", key): ((len(index), *array.shape[2:]), array.dtype)
+            for key, array in self.stored().items()
+        }
+        if piece.keys() != {*shapes, "next_index"}:
+            raise ValueError(f"this buffer's columns are {sorted({*shapes, 'next_index'})}, the saved {sorted(piece)}")
+        for name, (shape, dtype) in shapes.items():
+            if (piece[name].shape, piece[name].dtype) != (shape, dtype):
+                raise ValueError(
+                    f"{name} must be {dtype} of shape {shape} in this buffer, but the saved ones are "
+                    f"{piece[name].dtype} of shape {piece[name].shape}"
+                )
+        last = np.arange(newest * self.n_envs, (newest + 1) * self.n_envs) if n > 0 else index[:0]
+        if n > self.buffer_size:
+            raise ValueError(f"{n} steps do not fit into a buffer of {self.buffer_size}")
+        rises = index.dtype == np.int64 and index.ndim == 1 and (np.diff(index) > 0).all()
+        if (
+            not rises
+            or not np.isin(last, index).all()
+            or (len(index) and not 0 <= index[0] <= index[-1] < n * self.n_envs)
+        ):
+            raise ValueError("next_index must be rising places of the saved steps, among them all of the newest step")
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: the numbers ``pos``, ``full``, ``buffer_size`` and ``n_envs``, and arrays: what is filled of each of
+            the :meth:`columns`, as it lies and not copied, and what :meth:`new_rows` has of next observations, its
+            ``next_index`` naming places of the buffer
+        """
+        assert isinstance(self, ReplayBuffer)
+        size = self.size()
+        index = np.flatnonzero(self.slot[:size] != NEXT_ROW)
+        numbers = {name: getattr(self, name) for name in ("pos", "full", "buffer_size", "n_envs")}
+        return numbers | {name: array[:size] for name, array in self.columns().items()} | self._apart(index, index)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: from :meth:`state_dict` of a buffer of the same sizes
+        :raises ValueError: if it is of another buffer
+        """
+        for name in ("buffer_size", "n_envs"):
+            if state.get(name) != getattr(self, name):
+                raise ValueError(
+                    f"{name} is {getattr(self, name)} in this buffer, but {state.get(name)!r} in the saved one"
+                )
+        pos, full = state.get("pos"), state.get("full")
+        if type(pos) is not int or type(full) is not bool or not 0 <= pos < self.buffer_size:
+            raise ValueError(f"no state of a replay buffer: pos={pos!r}, full={full!r}")
+        piece = {name: value for name, value in state.items() if name not in ("pos", "full", "buffer_size", "n_envs")}
+        size = self.buffer_size if full else pos
+        newest = (pos - 1) % self.buffer_size
+        self._check_rows(piece, size, newest)
+        self.reset()
+        if size > 0:
+            self._put(np.arange(size), piece, newest)
+        self.pos, self.full = pos, full
+        self._restored()
+
+    def _restored(self) -> None:
+        """The rows have been put back."""
+
+
+class CompactReplayBuffer(CompactReplay, ReplayBuffer):  # type: ignore[misc, override]  # next_observations is a view
+    __doc__ = CompactReplay.__doc__
+
+
+class CompactDictReplayBuffer(CompactReplay, DictReplayBuffer):  # type: ignore[misc, override]  # next_observations is a view
+    """The same for dict observations."""

@@ -1,0 +1,86 @@
+"""Arrays that live in files, for replay buffers larger than the memory."""
+
+import math
+import mmap
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def n_bytes(shape: tuple[int, ...], dtype: Any) -> int:
+    """
+    :param shape: of an array
+    :param dtype: of an array
+    :return: how much memory it takes
+    """
+    return math.prod(shape) * np.dtype(dtype).itemsize
+
+
+def check_folder(folder: Any, needed: int) -> str:
+    """
+    :param folder: where files shall be; it is made if it is not there
+    :param needed: how many bytes they will have
+    :return: its path
+    :raises ValueError: if there can be no files there, or not of this size
+    """
+    if not isinstance(folder, (str, os.PathLike)) or not os.fspath(folder):
+        raise ValueError(f"memory_map must be a folder, or None for the memory, not {folder!r}")
+    path = Path(folder).absolute()
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=path).close()
+        free = shutil.disk_usage(path).free
+    except OSError as error:
+        raise ValueError(
+            f"memory_map={os.fspath(folder)!r} must be a folder that can be written to: {error}"
+        ) from error
+    if needed > free:
+        raise ValueError(
+            f"memory_map={os.fspath(folder)!r} has {free / 1e9:.2f} GB free, and the replay buffer takes "
+            f"{needed / 1e9:.2f} GB: name a folder on another disk, or pass a smaller buffer_size"
+        )
+    return str(path)
+
+
+def zeros(folder: str | None, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """
+    :param folder: where a file shall hold the array; None for the memory
+    :param shape: its shape
+    :param dtype: its type
+    :return: an array of zeros. The file has no name and goes with the array: no other run can meet it, and nothing is
+        left of it when this one is killed
+    :raises OSError: if the disk has not the space
+    """
+    size = n_bytes(shape, dtype)
+    if folder is None or size == 0:
+        return np.zeros(shape, dtype=dtype)
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            if hasattr(os, "posix_fallocate"):
+                # The space is taken now: a disk found to be full at a later write to the array would kill the process.
+                os.posix_fallocate(file.fileno(), 0, size)
+            else:
+                file.truncate(size)
+            mapped = mmap.mmap(file.fileno(), size)
+    except OSError as error:
+        what = f"{error.strerror}, for {size / 1e9:.3f} GB of a replay buffer with memory_map"
+        raise OSError(error.errno, what, folder) from error
+    if hasattr(mmap, "MADV_RANDOM"):
+        # Rows are drawn at random: what lies around them is not worth reading.
+        mapped.madvise(mmap.MADV_RANDOM)
+    return np.frombuffer(mapped, dtype=dtype).reshape(shape)
+
+
+def moved(folder: str, array: np.ndarray) -> np.ndarray:
+    """
+    :param folder: where a file shall hold the array
+    :param array: an array
+    :return: the same in a file
+    """
+    copy = zeros(folder, array.shape, array.dtype)
+    copy[...] = array
+    return copy

@@ -1,0 +1,7 @@
+"""What is kept of models and of training: files that run no code, and checkpoints."""
+
+from sb3_sample.saving.container import BadFile
+from sb3_sample.saving.encoding import NotPortable
+from sb3_sample.saving.normalization import load_vec_normalize, save_vec_normalize
+
+__all__ = ["BadFile", "NotPortable", "load_vec_normalize", "save_vec_normalize"]

@@ -1,0 +1,173 @@
+"""
+The state of callbacks: of those that give one (``state_dict`` and ``load_state_dict``), and of all others what of their
+attributes has changed since the training began, so that what was never changed stays as the present program says.
+"""
+
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, ProgressBarCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_sample.envs.portable_states import pack, unpack
+from sb3_sample.saving import vec_envs
+from sb3_sample.saving.attributes import Describer, DoesNotFit, Node, Restorer, class_name, same
+
+#: What every callback has and that is not its own.
+_NOT_OWN = ("model", "parent", "locals", "globals", "verbose")
+
+
+def without_progress_bar(callback: BaseCallback) -> BaseCallback:
+    """
+    :param callback: the callback of a training
+    :return: the same without the progress bar that ``learn`` put beside it, which may come and go between the parts of
+        a run
+    """
+    if isinstance(callback, CallbackList):
+        others = [child for child in callback.callbacks if not isinstance(child, ProgressBarCallback)]
+        if len(others) == 1 and len(callback.callbacks) == 2:
+            return others[0]
+    return callback
+
+
+def walk(callback: BaseCallback, path: str = "callback") -> Iterator[tuple[str, BaseCallback]]:
+    """
+    :param callback: a callback
+    :param path: its name
+    :return: it and the callbacks that it calls, by their path
+    """
+    if isinstance(callback, ConvertCallback) and callback.callback is None:
+        return  # what Stable-Baselines3 makes of no callback
+    yield path, callback
+    for name, value in vars(callback).items():
+        if name in _NOT_OWN:
+            continue
+        if isinstance(value, BaseCallback):
+            yield from walk(value, f"{path}.{name}")
+        elif isinstance(value, list):
+            for i, item in enumerate(value):
+                if isinstance(item, BaseCallback):
+                    yield from walk(item, f"{path}.{name}[{i}]")
+
+
+def environments(callback: BaseCallback) -> Iterator[tuple[str, VecEnv | gym.Env]]:
+    """
+    :param callback: a callback
+    :return: the environments that it has of its own, by the name of the attribute
+    """
+    for name, value in vars(callback).items():
+        if name not in _NOT_OWN and isinstance(value, (VecEnv, gym.Env)):
+            yield name, value
+
+
+def _gives_state(callback: BaseCallback) -> bool:
+    return hasattr(callback, "state_dict") and hasattr(callback, "load_state_dict")
+
+
+class CallbackStates:
+    """
+    The states of the callbacks of one training.
+
+    :param callback: the callback, when its ``on_training_start`` was called
+    """
+
+    def __init__(self, callback: BaseCallback):
+        self._callbacks = dict(walk(without_progress_bar(callback)))
+        self._before = {path: self._attributes(each)[0] for path, each in self._callbacks.items()}
+        # What an earlier part of the run has changed belongs to the state as well.
+        self._changed: dict[str, set[str]] = {path: set() for path in self._callbacks}
+
+    def _attributes(self, callback: BaseCallback) -> tuple[dict[str, Node], list[str]]:
+        children = {name for name, value in vars(callback).items() if _is_or_holds_callbacks(value)}
+        skip = {*_NOT_OWN, *children, *(name for name, _ in environments(callback))}
+        if _gives_state(callback):
+            skip = vars(callback).keys() - {"n_calls", "num_timesteps"}
+        return Describer().attributes(callback, skip)
+
+    def lost(self) -> list[str]:
+        """
+        :return: what of the callbacks a checkpoint cannot hold
+        """
+        lost = []
+        for path, callback in self._callbacks.items():
+            what = list(self._attributes(callback)[1])
+            for name, env in environments(callback):
+                what += [f"{name}, {reason}" for reason in _save_env(env)[1]]
+            lost += [f"{type(callback).__name__} ({path}): {each}" for each in what]
+        return lost
+
+    def save(self) -> dict[str, Any]:
+        """
+        :return: the state of each callback, by its path
+        """
+        return {path: self._save(path, callback) for path, callback in self._callbacks.items()}
+
+    def _save(self, path: str, callback: BaseCallback) -> dict[str, Any]:
+        now, before = self._attributes(callback)[0], self._before[path]
+        self._changed[path] |= {
+            name for name, node in now.items() if name not in before or not same(node, before[name])
+        }
+        return {
+            "class": class_name(callback),
+            "attributes": {name: now[name] for name in self._changed[path] if name in now},
+            "state": Describer().describe(callback.state_dict()) if _gives_state(callback) else None,  # type: ignore[attr-defined]
+            "environments": {name: _save_env(env)[0] for name, env in environments(callback)},
+        }
+
+    def restore(self, states: dict[str, Any]) -> None:
+        """
+        Give the callbacks the states of those in the same places; warn where there is another one, or none.
+
+        :param states: from :meth:`save`
+        """
+        for path, state in states.items():
+            callback = self._callbacks.get(path)
+            if callback is None or class_name(callback) != state["class"]:
+                warnings.warn(
+                    f"The checkpoint has the state of a {state['class']} ({path}), which this training is without.",
+                    stacklevel=4,
+                )
+                continue
+            try:
+                self._restore(path, callback, state)
+            except DoesNotFit as error:
+                warnings.warn(f"{type(callback).__name__} ({path}) starts anew: {error}", stacklevel=4)
+        for path, callback in self._callbacks.items():
+            if path not in states:
+                warnings.warn(
+                    f"{type(callback).__name__} ({path}) starts anew: it is not in the checkpoint", stacklevel=4
+                )
+
+    def _restore(self, path: str, callback: BaseCallback, state: dict[str, Any]) -> None:
+        Restorer().attributes(callback, state["attributes"])
+        self._changed[path] |= state["attributes"].keys()
+        if state["state"] is not None:
+            callback.load_state_dict(Restorer().restore(state["state"], None, path))  # type: ignore[attr-defined]
+        for name, env in environments(callback):
+            if name in state["environments"]:
+                _restore_env(env, state["environments"][name], f"{type(callback).__name__}.{name}")
+
+
+def _is_or_holds_callbacks(value: Any) -> bool:
+    return isinstance(value, BaseCallback) or (
+        isinstance(value, list) and any(isinstance(item, BaseCallback) for item in value)
+    )
+
+
+def _save_env(env: VecEnv | gym.Env) -> tuple[dict[str, Any] | None, list[str]]:
+    if isinstance(env, VecEnv):
+        return vec_envs.save(env)
+    state, opaque = pack(env)
+    return (None if opaque else state), opaque
+
+
+def _restore_env(env: VecEnv | gym.Env, state: dict[str, Any] | None, name: str) -> None:
+    if isinstance(env, VecEnv):
+        assert state is not None
+        reasons = vec_envs.restore(env, state)
+        if reasons and state["environments"] is not None:
+            raise DoesNotFit(f"{name}: {'; '.join(reasons)}")
+    elif state is not None:
+        unpack(env, state)

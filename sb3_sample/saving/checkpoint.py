@@ -1,0 +1,463 @@
+"""
+Checkpoints of a training, from which it goes on as if it had never been interrupted.
+
+``learn`` calls three methods of a :class:`Checkpointer`: ``resume`` before its callbacks hear that the training starts,
+``start`` after that, and ``after_turn`` at the end of each turn of its loop, after the gradient steps, which is the one
+moment when everything agrees: between the environment's step and ``train`` a transition is in no buffer, or has no
+update yet.
+"""
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+import types
+import warnings
+from collections.abc import Callable, Iterator
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_sample.faults import HoldBack, check_finite_parameters
+from sb3_sample.saving import container, training_state, vec_envs
+from sb3_sample.saving.attributes import DoesNotFit
+from sb3_sample.saving.callbacks import CallbackStates, environments, walk, without_progress_bar
+from sb3_sample.saving.encoding import NotPortable, decode, encode
+from sb3_sample.saving.model import SafeFiles
+from sb3_sample.saving.progress import ProgressFile
+from sb3_sample.saving.rings import Ring
+from sb3_sample.saving.run_folder import RunFolder, Segment
+
+KIND, SEGMENT_KIND = "checkpoint", "replay rows"
+MODEL, STATE = "model.zip", "state.zip"
+
+
+class Checkpointer:
+    """
+    Saves a training and goes on with it. Used as a context, which gives the signals and the folder back; without a
+    folder it does nothing.
+
+    :param model: the algorithm, set up for ``learn``
+    :param callback: its callback
+    :param folder: the run's folder; None for no checkpoints
+    :param every: environment steps between two checkpoints, each at the end of the first turn at or after a multiple
+    :raises ValueError: ``every`` is out of range, the folder cannot be used, or the model cannot be saved
+    """
+
+    def __init__(self, model: SafeFiles, callback: BaseCallback, folder: str | Path | None, every: int):
+        if isinstance(every, bool) or not isinstance(every, (int, np.integer)) or every < 1:
+            raise ValueError(f"checkpoint_freq must be an integer of at least 1, in environment steps, not {every!r}")
+        self._model, self._callback, self._every = model, callback, int(every)
+        self._name = folder
+        self._held: HoldBack | None = None
+        if folder is not None:
+            self._held = HoldBack(callback)
+            self._held.model = model
+        self._folder: RunFolder | None = None
+        #: What was read of the checkpoint that the run goes on from.
+        self._resumed: dict[str, Any] | None = None
+        self._manifest: dict[str, Any] = {"segments": {}}
+        self._saved_at: int | None = None
+        self._whole_at: int | None = None
+        self._interrupts: _Interrupts | None = None
+        # How many times every steps there were when it was last asked.
+        self._period = 0
+
+    @property
+    def callback(self) -> BaseCallback:
+        """
+        :return: what is to be called at every step: the callback, whose exceptions are kept until the turn is saved
+        """
+        return self._callback if self._held is None else self._held
+
+    def __enter__(self) -> "Checkpointer":
+        if self._name is None:
+            return self
+        try:
+            self._folder = RunFolder(self._name)
+        except OSError as error:
+            raise ValueError(f"checkpoint={str(self._name)!r} cannot be used: {error}") from error
+        try:
+            self._open()
+        except BaseException:
+            self._folder.close()
+            raise
+        return self
+
+    def _open(self) -> None:
+        assert self._folder is not None
+        model = self._model
+        assert model.env is not None
+        self._env: VecEnv = model.env
+        self._rings = {"model": _ring_of(model)} if getattr(model, "replay_buffer", None) is not None else {}
+        for path, each in self._callbacks():
+            for name, ring in getattr(each, "checkpoint_rings", dict)().items():
+                self._rings[f"{path}.{name}"] = ring
+        self._identity = _identity(model)
+        found = self._folder.newest_good()
+        if found is not None:
+            folder, self._manifest = found
+            self._resumed = decode(*container.read(folder / STATE, KIND), "checkpoint")
+            self._check_identity(self._resumed["identity"])
+            self._resumed["path"] = folder
+
+    def _callbacks(self) -> Iterator[tuple[str, BaseCallback]]:
+        return walk(without_progress_bar(self._callback))
+
+    def __exit__(self, kind: type[BaseException] | None, *_: Any) -> None:
+        if self._folder is None:
+            return
+        try:
+            if kind is None:
+                self._save_if_whole()
+        finally:
+            self._close(orderly=kind is None)
+
+    def _save_if_whole(self) -> None:
+        # A callback that ends the training does so in the midst of a turn, of which nothing can be saved.
+        if self._whole_at == self._model.num_timesteps != self._saved_at:
+            self._try_to_save()
+
+    def _close(self, orderly: bool) -> None:
+        assert self._folder is not None
+        if self._interrupts is not None:
+            self._interrupts.restore(orderly)
+            logger = self._model.logger
+            logger.output_formats = [each for each in logger.output_formats if each is not self._progress]
+            self._progress.close()
+        self._folder.close()
+
+    # ---------------------------------------------------------------- going on
+
+    def _check_identity(self, theirs: dict[str, list[str]]) -> None:
+        ours = self._identity
+        # An argument that only one of the two has is one of another version, of which the circumstances tell.
+        for name in sorted(ours.keys() & theirs.keys()):
+            present, saved = ours[name], theirs[name]
+            if present[0] != saved[0]:
+                raise ValueError(
+                    f"{name}={present[1]}: the run of checkpoint={str(self._name)!r} was made with {name}={saved[1]}. "
+                    f"Nothing was changed. Train as then, or name another folder."
+                )
+
+    def resume(self) -> None:
+        """Restore the algorithm, if there is something to restore."""
+        if self._resumed is None:
+            return
+        state, model = self._resumed, self._model
+        theirs, ours = self._manifest["circumstances"], training_state.circumstances(model.device)
+        changed = [
+            f"{name} {theirs.get(name)} (now {value})" for name, value in ours.items() if theirs.get(name) != value
+        ]
+        if changed:
+            warnings.warn(
+                f"The run goes on under other circumstances, so that it need not be the same to the last bit: the "
+                f"checkpoint was made with {', '.join(changed)}",
+                stacklevel=3,
+            )
+        model.set_parameters(state["path"] / MODEL, trusted_modules=_own_modules())
+        training_state.restore_attributes(model, state["attributes"])
+        model.start_time = time.time_ns() - state["elapsed_ns"]
+        assert self._folder is not None
+        segments = self._folder.segments(self._manifest)
+        for name, ring in self._rings.items():
+            if name in state["rings"]:
+                ring.restore(state["rings"][name], self._pieces([s for s in segments if s.ring == _file_name(name)]))
+        self._saved_at = self._whole_at = model.num_timesteps
+
+    def _pieces(self, segments: list[Segment]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        assert self._folder is not None
+        for segment in segments:
+            yield segment.first, decode(*container.read(self._folder.path / segment.path, SEGMENT_KIND), "rows")
+
+    def start(self) -> None:
+        """
+        Restore what the start of a training changes: environments, callbacks, logger and generators; or, in a new
+        run, save its beginning, so that what cannot be saved is known at once.
+
+        :raises ValueError: the beginning cannot be saved
+        """
+        if self._folder is None:
+            return
+        model = self._model
+        self._states = CallbackStates(self._callback)
+        self._progress = ProgressFile(self._folder.path)
+        self._interrupts = _Interrupts(self._environments(), self._folder.path)
+        model.logger.output_formats.append(self._progress)
+        self._period = model.num_timesteps // self._every
+        self._warn_of_losses()
+        if self._resumed is not None:
+            self._restore_rest(self._resumed)
+            self._resumed = None
+            return
+        self._progress.restore({"size": 0, "pending": []})
+        try:
+            self._save()
+        except OSError as error:
+            raise ValueError(f"checkpoint={str(self._name)!r} cannot be written to: {error}") from error
+
+    def _warn_of_losses(self) -> None:
+        missing = vec_envs.save(self._env)[1]
+        if missing:
+            warnings.warn(
+                "The state of the environment cannot be saved, so that the episodes in progress start anew when the "
+                f"run goes on: {'; '.join(missing)}",
+                stacklevel=4,
+            )
+        lost = self._states.lost()
+        if lost:
+            warnings.warn(f"A checkpoint does not hold all of the callbacks' state: {'; '.join(lost)}", stacklevel=4)
+
+    def _restore_rest(self, state: dict[str, Any]) -> None:
+        try:
+            reasons = vec_envs.restore(self._env, state["env"])
+        except DoesNotFit as error:
+            raise ValueError(f"env: {error}") from error
+        if reasons:
+            self._start_episodes_anew(reasons)
+        self._states.restore(state["callbacks"])
+        self._progress.restore(state["progress"])
+        training_state.restore_logger(self._model.logger, state["logger"])
+        training_state.restore_generators(state["generators"], self._model.device)
+
+    def _start_episodes_anew(self, reasons: list[str]) -> None:
+        model: Any = self._model
+        warnings.warn(f"The episodes in progress start anew: {'; '.join(reasons)}", stacklevel=5)
+        if model.seed is not None:
+            # Not the episodes of the run's beginning once more.
+            self._env.seed(model.seed + model.num_timesteps)
+        model._last_obs = self._env.reset()
+        model._last_episode_starts = np.ones((self._env.num_envs,), dtype=bool)
+        normalize = model.get_vec_normalize_env()
+        model._last_original_obs = None if normalize is None else normalize.get_original_obs()
+        if model.action_noise is not None:
+            model.action_noise.reset()
+        if "model" in self._rings:
+            self._rings["model"].interrupt()
+        model._on_environment_reset()
+
+    # ---------------------------------------------------------------- saving
+
+    def after_turn(self) -> None:
+        """
+        Save if it is time to, or leave if the process was asked to.
+
+        :raises Exception: what a callback raised during the turn
+        :raises TrainingDiverged: something is not finite that would be saved
+        :raises KeyboardInterrupt: after SIGINT
+        :raises SystemExit: after SIGTERM
+        """
+        if self._folder is None:
+            return
+        assert self._interrupts is not None and self._held is not None
+        now = self._whole_at = self._model.num_timesteps
+        leaves = self._interrupts.received is not None
+        due = now // self._every > self._period
+        self._period = now // self._every
+        try:
+            if (due or leaves or self._held.has_raised()) and now != self._saved_at:
+                self._try_to_save()
+        finally:
+            self._held.raise_kept()
+        if leaves:
+            self._interrupts.leave()
+
+    def finish(self) -> None:
+        """
+        Let the callback hear that the training ends. What it raises does not cost the turns since the last checkpoint.
+
+        :raises Exception: what it raises, or what it raised during a turn that it ended
+        """
+        if self._held is not None:
+            self._held.raise_kept()
+        try:
+            self._callback.on_training_end()
+        except Exception:
+            if self._folder is not None:
+                self._save_if_whole()
+            raise
+
+    def _try_to_save(self) -> None:
+        try:
+            self._save()
+        except (OSError, NotPortable) as error:
+            last = "there is none yet" if self._saved_at is None else f"the last one is of {self._saved_at} steps"
+            warnings.warn(
+                f"No checkpoint at {self._model.num_timesteps} steps, {last}: {self._name} cannot be written to "
+                f"({error}). The training goes on, and it is tried again after {self._every} steps.",
+                stacklevel=4,
+            )
+
+    def _save(self) -> None:
+        """
+        :raises OSError: it cannot be written
+        :raises TrainingDiverged: it would hold what is not finite
+        """
+        check_finite_parameters(self._model)
+        known = self._manifest["segments"]
+        segments = dict(known)
+        try:
+            for name, ring in self._rings.items():
+                segments = self._save_rows(_file_name(name), ring, segments)
+            self._save_rest(segments)
+        except BaseException:
+            assert self._folder is not None
+            self._folder.remove_segments(segments.keys() - known.keys())
+            raise
+        self._manifest = {"segments": segments}
+        self._saved_at = self._model.num_timesteps
+        for ring in self._rings.values():
+            ring.n_written = ring.n_rows
+
+    def _save_rest(self, segments: dict[str, Any]) -> None:
+        assert self._folder is not None
+        model = self._model
+        state = {
+            "identity": self._identity,
+            "attributes": training_state.save_attributes(model),
+            "elapsed_ns": time.time_ns() - model.start_time,
+            "rings": {name: ring.small() for name, ring in self._rings.items()},
+            "env": vec_envs.save(self._env)[0],
+            "callbacks": self._states.save(),
+            "progress": self._progress.state(),
+            "logger": training_state.save_logger(model.logger),
+            "generators": training_state.save_generators(model.device),
+        }
+        files: dict[str, Callable[[Path], None]] = {
+            MODEL: lambda path: model.save(path, trusted_modules=_own_modules()),
+            STATE: lambda path: _write(path, KIND, state),
+        }
+        about = {"circumstances": training_state.circumstances(model.device)}
+        self._folder.write(model.num_timesteps, files, segments, about)
+
+    def _save_rows(self, name: str, ring: Ring, known: dict[str, Any]) -> dict[str, Any]:
+        """Write the rows that the files lack. What the manifest says of all that are needed then."""
+        assert self._folder is not None
+        first, last = ring.advance()
+        oldest = last - ring.size()
+        needed = {k: facts for k, facts in known.items() if facts["ring"] != name or facts["last"] > oldest}
+        if first < last:
+            segment = Segment(name, first, last)
+            needed[segment.path] = self._folder.write_segment(
+                segment, lambda path: _write(path, SEGMENT_KIND, ring.rows(first))
+            )
+        return needed
+
+    def _environments(self) -> list[VecEnv]:
+        theirs = [env for _, each in self._callbacks() for _, env in environments(each)]
+        return [self._env, *(env for env in theirs if isinstance(env, VecEnv))]
+
+
+def _ring_of(model: Any) -> Ring:
+    buffer: ReplayBuffer = model.replay_buffer
+    return Ring(buffer, lambda: model.num_transitions // buffer.n_envs)
+
+
+def _file_name(ring: str) -> str:
+    """A name for files, without what paths of callbacks may have in them."""
+    return "".join(c if c.isalnum() else "_" for c in ring)
+
+
+def _write(path: Path, kind: str, value: Any) -> None:
+    tensors: dict[str, torch.Tensor] = {}
+    container.write(path, kind, encode(value, kind, tensors), tensors)
+
+
+def _own_modules() -> tuple[str, ...]:
+    """
+    Whose classes may be named in what is written: those of this program. Who reads the model's file decides anew whom
+    to trust, and what is restored here never makes an object by its name.
+    """
+    return tuple(sorted({name.split(".")[0] for name in sys.modules}))
+
+
+def _identity(model: SafeFiles) -> dict[str, list[str]]:
+    """
+    What tells a run from another, by the argument's name: a digest to compare, and the value to show.
+
+    :raises ValueError: an argument is nothing that can be saved
+    """
+    assert model.env is not None
+    values = {**training_state.arguments_of(model), "env": vec_envs.fingerprint(model.env)}
+    identity = {}
+    for name, value in values.items():
+        tensors: dict[str, Any] = {}
+        digest = sha256(json.dumps(encode(value, name, tensors, _own_modules()), sort_keys=True).encode())
+        for key in sorted(tensors):
+            digest.update(key.encode())
+            digest.update(np.ascontiguousarray(torch.as_tensor(tensors[key]).cpu().numpy()).tobytes())
+        identity[name] = [digest.hexdigest(), repr(value)]
+    return identity
+
+
+class _Interrupts:
+    """
+    SIGINT and SIGTERM during a training: they are noted, so that the turn is finished and saved; a second one of them
+    ends the process at once. Handlers can be set in the main thread only; in another one signals stay as they are.
+
+    :param envs: whose workers shall ignore the SIGINT that a terminal sends to all processes
+    :param folder: for the message
+    """
+
+    def __init__(self, envs: list[VecEnv], folder: Path):
+        self.received: int | None = None
+        self._process, self._folder = os.getpid(), folder
+        self._before: dict[int, Any] = {}
+        self._envs: list[VecEnv] = []
+        if threading.current_thread() is not threading.main_thread():
+            return
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._receive)
+        for env in envs:
+            vec_envs.set_sigint_ignored(env, True)
+            self._envs.append(env)
+
+    def _receive(self, number: int, frame: types.FrameType | None) -> None:
+        if os.getpid() != self._process:
+            # A process that was forked in the meantime: what it was asked to do is no business of the training.
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+            return
+        if self.received is not None:
+            self.received = number
+            self.leave(orderly=False)
+        self.received = number
+        name = signal.Signals(number).name
+        os.write(
+            2, f"\n{name}: the turn is finished and saved in {self._folder}; once more to leave at once\n".encode()
+        )
+
+    def leave(self, orderly: bool = True) -> None:
+        """
+        :param orderly: whether this is between two turns
+        :raises KeyboardInterrupt: after SIGINT
+        :raises SystemExit: after SIGTERM
+        """
+        number = self.received
+        assert number is not None
+        self.restore(orderly)
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise SystemExit(128 + number)
+
+    def restore(self, orderly: bool) -> None:
+        """
+        Give the signals back.
+
+        :param orderly: whether nobody is in the midst of talking to the workers, so that they can be told too
+        """
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
+        for env in self._envs if orderly else ():
+            if not getattr(env.unwrapped, "closed", False):
+                vec_envs.set_sigint_ignored(env, False)
+        self._envs = []

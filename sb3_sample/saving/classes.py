@@ -1,0 +1,220 @@
+"""What a file may hold: which classes and functions it may name, and objects of which classes. Nothing else."""
+
+import enum
+import importlib
+import inspect
+import re
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.buffers import BaseBuffer
+from stable_baselines3.common.noise import ActionNoise
+from torch import nn
+
+from sb3_sample.saving.container import DTYPES, BadFile
+
+#: How deep trees may be nested: far above what occurs, and far below what Python's stack holds.
+MAX_DEPTH = 60
+INT_MAX = 2**63
+DTYPE_TEXT = re.compile(r"[<>|=][biufcSUMm][0-9]{1,9}(\[[0-9]*[a-zA-Z]+\])?")
+#: Generators, and up to where their position in the numbers drawn beforehand can be: NumPy does not check it.
+BIT_GENERATORS: dict[str, tuple[str, int] | None] = {
+    "PCG64": None, "PCG64DXSM": None, "SFC64": None, "MT19937": ("pos", 624), "Philox": ("buffer_pos", 4),
+}  # fmt: skip
+SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Dict, spaces.Tuple)
+#: Packages whose classes a file may name: as far as they are of the kinds below.
+PACKAGES = ("torch.nn", "torch.optim", "stable_baselines3", "sb3_contrib", "sb3_sample")
+#: What can be an argument of an algorithm: networks, policies, features extractors, activations; optimizers; buffers.
+KINDS = (nn.Module, torch.optim.Optimizer, BaseBuffer)
+
+HOW = (
+    "What can be: numbers, texts, arrays and what holds them; for a schedule a number, or LinearSchedule or "
+    "ConstantSchedule of stable_baselines3.common.utils; classes of torch.nn, torch.optim, stable_baselines3, "
+    "sb3_contrib and sb3_sample; functions and classes at the top of a module that is named in trusted_modules=[...], "
+    "when saving and when loading. allow_pickle=True writes Stable-Baselines3's own format instead, which runs code"
+)
+
+
+class NotPortable(ValueError):
+    """A value that cannot stand in a file that runs no code."""
+
+
+def check_trusted(trusted: Sequence[str]) -> tuple[str, ...]:
+    """
+    :param trusted: names of modules or packages
+    :return: the same
+    :raises ValueError: if it is something else
+    """
+    if isinstance(trusted, str) or not all(isinstance(name, str) and name for name in trusted):
+        raise ValueError(f"trusted_modules must be a list of names of modules, not {trusted!r}")
+    return tuple(trusted)
+
+
+def _within(module: str, packages: Sequence[str]) -> bool:
+    return any(module == package or module.startswith(f"{package}.") for package in packages)
+
+
+def path_of(value: Any) -> str:
+    """
+    :param value: a class or a function
+    :return: where it can be imported from
+    """
+    return f"{value.__module__}:{value.__qualname__}"
+
+
+def resolve(path: str, trusted: Sequence[str]) -> Any:
+    """
+    :param path: what ``path_of`` gave
+    :param trusted: modules, or packages of modules, of which any class and any function may be named
+    :return: the class or function
+    :raises ValueError: if it may not be named, or is not there
+    """
+    module, _, name = path.partition(":")
+    parts = module.split(".")
+    if not (name.isidentifier() and all(part.isidentifier() for part in parts)) or name.startswith("_"):
+        raise ValueError(f"{path!r} is no public name at the top of a module")
+    is_trusted = _within(module, trusted)
+    is_known = _within(module, PACKAGES) and not any(part.startswith("_") for part in parts)
+    if not (is_trusted or is_known):
+        raise ValueError(f"{path!r} is of a module that is not trusted")
+    try:
+        value = vars(importlib.import_module(module)).get(name)
+    except ImportError as error:
+        raise ValueError(f"{path!r} cannot be imported: {error}") from error
+    # Names that a module has imported from elsewhere are not its own.
+    is_own = isinstance(value, type) or inspect.isroutine(value)
+    if not is_own or getattr(value, "__module__", None) != module or getattr(value, "__qualname__", None) != name:
+        raise ValueError(f"{path!r} is no class or function of this module")
+    if not is_trusted and not (isinstance(value, type) and issubclass(value, KINDS)):
+        raise ValueError(f"{path!r} is no network, policy, optimizer or buffer")
+    return value
+
+
+def checked_path(value: Any, name: str, trusted: Sequence[str]) -> str:
+    """
+    :param value: a class or a function
+    :param name: what it is the value of, for messages
+    :param trusted: see ``resolve``
+    :return: its import path, with which ``resolve`` gives the same
+    :raises NotPortable: if a file may not name it
+    """
+    what = "class" if isinstance(value, type) else "function"
+    try:
+        path = path_of(value)
+        if resolve(path, trusted) is value:
+            return path
+        reason = f"{path!r} is another one by now"
+    except (ValueError, AttributeError) as error:
+        reason = str(error)
+    raise NotPortable(f"{name}: the {what} {value!r} cannot be written to a file that runs no code ({reason}). {HOW}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, np.ndarray) or _is_number(value)
+
+
+def _is_optional_array(value: Any) -> bool:
+    return value is None or _is_array(value)
+
+
+def _is_dtype(value: Any) -> bool:
+    return isinstance(value, (str, np.dtype)) or (isinstance(value, type) and issubclass(value, np.generic))
+
+
+def _is_noise(value: Any) -> bool:
+    return isinstance(value, ActionNoise)
+
+
+def _are_noises(value: Any) -> bool:
+    return isinstance(value, list) and all(map(_is_noise, value))
+
+
+#: Attributes of the classes whose objects a file may hold, and what their values must be.
+OBJECTS: dict[str, dict[str, Callable[[Any], bool]]] = {
+    "stable_baselines3.common.utils:ConstantSchedule": {"val": _is_number},
+    "stable_baselines3.common.utils:LinearSchedule": {
+        "start": _is_number, "end": _is_number, "end_fraction": _is_number,
+    },
+    "stable_baselines3.common.utils:FloatSchedule": {"value_schedule": callable},
+    "rl_zoo3.utils:SimpleLinearSchedule": {"initial_value": _is_number},
+    "stable_baselines3.common.running_mean_std:RunningMeanStd": {
+        "mean": _is_array, "var": _is_array, "count": _is_number,
+    },
+    "stable_baselines3.common.noise:NormalActionNoise": {"_mu": _is_array, "_sigma": _is_array, "_dtype": _is_dtype},
+    "stable_baselines3.common.noise:OrnsteinUhlenbeckActionNoise": {
+        "_theta": _is_number, "_mu": _is_array, "_sigma": _is_array, "_dt": _is_number, "_dtype": _is_dtype,
+        "initial_noise": _is_optional_array, "noise_prev": _is_array,
+    },
+    "stable_baselines3.common.noise:VectorizedActionNoise": {
+        "n_envs": _is_number, "_base_noise": _is_noise, "_noises": _are_noises,
+    },
+}  # fmt: skip
+#: Enumerations whose members a file may name.
+ENUMERATIONS = (
+    "stable_baselines3.common.type_aliases:TrainFrequencyUnit",
+    "stable_baselines3.her.goal_selection_strategy:GoalSelectionStrategy",
+)
+#: Named tuples that a file may hold, and the types of their items.
+NAMED_TUPLES: dict[str, tuple[type, ...]] = {
+    "stable_baselines3.common.type_aliases:TrainFreq": (int, enum.Enum),
+}
+
+
+def class_of(path: Any, table: Any, name: str) -> type:
+    """
+    :param path: import path, from a file
+    :param table: the paths that are allowed
+    :param name: what it is for, for messages
+    :return: the class
+    :raises BadFile: if it is not in the table, or not installed
+    """
+    if not isinstance(path, str) or path not in table:
+        raise BadFile(f"{name}: the file holds an object of {path!r}, which is not allowed")
+    module, _, attribute = path.partition(":")
+    try:
+        cls = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise BadFile(f"{name}: the file holds an object of {path!r}, which is not installed: {error}") from error
+    assert isinstance(cls, type)  # the tables name classes
+    return cls
+
+
+def object_path(value: Any, table: Any) -> str | None:
+    """
+    :param value: an object
+    :param table: allowed paths
+    :return: the path of its class if that is in the table, and the class the one found there
+    """
+    path = path_of(type(value))
+    if path not in table:
+        return None
+    module, _, attribute = path.partition(":")
+    return path if getattr(sys.modules.get(module), attribute, None) is type(value) else None
+
+
+def check_attribute(path: str, key: str, value: Any, name: str, error: type[ValueError]) -> None:
+    """
+    :param path: of a class in ``OBJECTS``
+    :param key: its attribute
+    :param value: that attribute's value
+    :param name: what the object is for, for messages
+    :param error: what is raised if the value is not what it must be
+    """
+    if not OBJECTS[path][key](value):
+        raise error(f"{name}: {key} of {path} cannot be {value!r}")
+
+
+def torch_has(dtype: np.dtype) -> bool:
+    """
+    :param dtype: a kind of number of NumPy
+    :return: whether torch's tensors and files have it
+    """
+    return dtype.kind in "biufc" and getattr(torch, dtype.name, None) in DTYPES.values()

@@ -1,0 +1,169 @@
+"""
+Replay buffers as rings of rows: what was added since the last checkpoint, and how it is put back.
+
+A row is one step of all environments. Rows are counted over the whole run: row ``i`` lies at place ``i % capacity``, so
+that rows ``first`` to ``last`` are a piece of the run that never changes once it is written, and of which only the last
+``capacity`` rows are needed.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from sb3_sample.sac.compact_buffer import CompactReplay
+
+#: What a buffer of Stable-Baselines3 keeps of each row.
+COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "ep_start")
+#: What changes in rows that are there already, or is no row; written anew each time.
+_SMALL = ("ep_length", "_current_ep_start")
+#: Never used (infos, without copy_info_dict), or never changes; and what follows from the rows of a compact buffer.
+_DERIVED = ("infos", "obs_shape", "device", "observation_space", "action_space", "env", "slot", "held_out", "_ring")
+
+
+class Ring:
+    """
+    A replay buffer of Stable-Baselines3, or of this package, as a ring of rows.
+
+    :param buffer: the buffer
+    :param counter: gives how many rows were ever added to it, from any start
+    :raises ValueError: it keeps something of which nothing is known here
+    """
+
+    def __init__(self, buffer: ReplayBuffer, counter: Callable[[], int]):
+        self.buffer, self._counter = buffer, counter
+        self.capacity = int(buffer.buffer_size)
+        kind = type(buffer).__name__
+        if getattr(buffer, "copy_info_dict", False):
+            raise ValueError(
+                "replay_buffer_kwargs: copy_info_dict=True keeps what environments say as Python objects, which a "
+                "checkpoint cannot hold: leave it out, or train without checkpoint"
+            )
+        known = (*COLUMNS, *_SMALL, *_DERIVED)
+        for name, value in vars(buffer).items():
+            if name not in known and isinstance(value, (np.ndarray, torch.Tensor, list, dict, set)):
+                raise ValueError(
+                    f"replay_buffer_class={kind} keeps {name!r}, of which checkpoints know nothing: use one of "
+                    "Stable-Baselines3's or this package's buffers, or train without checkpoint"
+                )
+        #: Rows added over the run, and how many of them the files have.
+        self.n_rows = self.size() + (int(buffer.pos) if buffer.full else 0)
+        self.n_written = 0
+        self._count = counter()
+
+    def size(self) -> int:
+        """
+        :return: rows in the buffer
+        """
+        return self.capacity if self.buffer.full else int(self.buffer.pos)
+
+    def advance(self) -> tuple[int, int]:
+        """
+        Count what was added since the last call.
+
+        :return: first and last row (exclusive) that the files lack
+        """
+        count = self._counter()
+        self.n_rows, self._count = self.n_rows + count - self._count, count
+        if self.n_rows % self.capacity != self.buffer.pos or self.n_rows < self.size():
+            # Somebody emptied or filled it otherwise: all of it is new.
+            self.n_rows += self.capacity + (int(self.buffer.pos) - self.n_rows) % self.capacity
+        return max(self.n_written, self.n_rows - self.size()), self.n_rows
+
+    def rows(self, first: int) -> dict[str, np.ndarray]:
+        """
+        :param first: first row
+        :return: copies of the rows from there on, by the column's name
+        """
+        if isinstance(self.buffer, CompactReplay):
+            return self.buffer.new_rows(self.n_rows - first)
+        places = np.arange(first, self.n_rows) % self.capacity
+        return {
+            name: array[torch.from_numpy(places).to(array.device)].cpu().numpy()
+            if isinstance(array, torch.Tensor)
+            else array[places]
+            for name, array in self._columns().items()
+        }
+
+    def _columns(self) -> dict[str, Any]:
+        """The arrays (or tensors) whose first axis is that of the rows, by name."""
+        found: dict[str, Any] = {}
+        for name in COLUMNS:
+            value = getattr(self.buffer, name, None)
+            if isinstance(value, dict):
+                found.update({f"{name}/{key}": array for key, array in value.items()})
+            elif value is not None:
+                found[name] = value
+        return found
+
+    def small(self) -> dict[str, Any]:
+        """
+        :return: everything else of the buffer, as plain values
+        """
+        small: dict[str, Any] = {"n_rows": self.n_rows}
+        if isinstance(self.buffer, CompactReplay):
+            return small
+        own = vars(self.buffer)
+        small["numbers"] = {name: value for name, value in own.items() if isinstance(value, (bool, int, float))}
+        small["arrays"] = {name: own[name] for name in _SMALL if name in own}
+        # The last next observation, which lies where the next row comes.
+        small["head"] = self.buffer.observations[self.buffer.pos] if self.buffer.optimize_memory_usage else None
+        return small
+
+    def restore(self, small: dict[str, Any], pieces: Iterable[tuple[int, dict[str, np.ndarray]]]) -> None:
+        """
+        Put rows back into a buffer made as the saved one.
+
+        :param small: from :meth:`small`
+        :param pieces: first row and rows, oldest first
+        :raises ValueError: they are of another buffer
+        """
+        if isinstance(self.buffer, CompactReplay):
+            self.buffer.restore_rows(pieces)
+        else:
+            self._restore(small, pieces)
+        self.n_rows = self.n_written = int(small["n_rows"])
+        self._count = self._counter()
+
+    def _restore(self, small: dict[str, Any], pieces: Iterable[tuple[int, dict[str, np.ndarray]]]) -> None:
+        columns = self._columns()
+        for first, rows in pieces:
+            if rows.keys() != columns.keys():
+                raise ValueError(f"the buffer has the columns {sorted(columns)}, the saved one {sorted(rows)}")
+            places = np.arange(first, first + len(rows["actions"])) % self.capacity
+            for name, values in rows.items():
+                array = columns[name]
+                if values.shape != (len(places), *array.shape[1:]):
+                    raise ValueError(f"the buffer's {name} are {tuple(array.shape[1:])}, the saved {values.shape[1:]}")
+                if isinstance(array, torch.Tensor):
+                    array[torch.from_numpy(places).to(array.device)] = torch.from_numpy(values).to(array)
+                else:
+                    array[places] = values
+        for name, value in small["numbers"].items():
+            setattr(self.buffer, name, value)
+        for name, value in small["arrays"].items():
+            getattr(self.buffer, name)[...] = value
+        if small["head"] is not None:
+            self.buffer.observations[self.buffer.pos] = small["head"]
+
+    def interrupt(self) -> None:
+        """
+        The episodes in progress end here, without their environments' saying so: nothing that follows belongs to them.
+        """
+        buffer: Any = self.buffer
+        if self.size() == 0:
+            return
+        last = (int(buffer.pos) - 1) % self.capacity
+        if hasattr(buffer, "truncate_last_trajectory"):
+            buffer.truncate_last_trajectory()
+        else:
+            # As Stable-Baselines3 does it where the following row holds the next observation. A time limit, where the
+            # buffer knows them, so that the bootstrap goes on.
+            goes_on = buffer.dones[last] == 0
+            buffer.dones[last][goes_on] = 1
+            if buffer.handle_timeout_termination:
+                buffer.timeouts[last][goes_on] = 1
+        # The last row has changed, and is written once more.
+        self.n_written = max(self.n_rows - 1, 0)

@@ -1,0 +1,171 @@
+"""
+What a training run consists of besides parameters, replay buffer, environments and callbacks: the algorithm's counters,
+random generators and logger; and what tells one run from another.
+"""
+
+import contextlib
+import importlib.metadata
+import inspect
+import platform
+import random
+from typing import Any
+
+import gymnasium
+import numpy as np
+import stable_baselines3
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger
+
+from sb3_sample.saving.attributes import Describer, Node, Opaque, Restorer, without_generators
+from sb3_sample.version import __version__
+
+#: Attributes of an algorithm that its file leaves out and that the future of the run depends on nevertheless.
+KEPT = ("_metrics", "action_noise")
+#: Attributes that follow from the arguments, from what is restored besides, or from the present ``learn``; clocks.
+#: ``_execution``, ``_watch``, ``_batch_memory`` and ``rollout_buffer`` are filled anew before they are used.
+DERIVED = (
+    "start_time", "_total_timesteps", "lr_schedule", "_execution", "_watch", "_batch_memory", "_parts_mode", "_seconds",
+    "rollout_buffer", "redo",
+    "env", "_vec_normalize_env", "_logger", "_custom_logger", "replay_buffer", "device",
+)  # fmt: skip
+#: Arguments that may differ between the parts of a run: where it computes, and what it prints.
+HARMLESS = ("verbose", "device", "tensorboard_log", "compile", "_init_setup_model")
+
+
+def argument_names(model: BaseAlgorithm) -> set[str]:
+    """
+    :param model: the algorithm
+    :return: the arguments of its constructor and of those of its bases
+    """
+    signatures = (inspect.signature(cls).parameters for cls in type(model).__mro__ if issubclass(cls, BaseAlgorithm))
+    return {name for parameters in signatures for name in parameters} - {"args", "kwargs", "_init_setup_model"}
+
+
+def _saved_elsewhere(model: BaseAlgorithm) -> set[str]:
+    modules = {name.split(".")[0] for name in model._get_torch_save_params()[0]}
+    return {*modules, *model._excluded_save_params(), *DERIVED} - set(KEPT)
+
+
+def save_attributes(model: BaseAlgorithm) -> dict[str, Node]:
+    """
+    :param model: the algorithm, at the end of a turn of its loop
+    :return: everything that its turns change and that is not saved elsewhere
+    :raises ValueError: an attribute of a subclass is nothing that can be saved
+    """
+    skip = (_saved_elsewhere(model) | argument_names(model)) - set(KEPT)
+    described, opaque = Describer().attributes(model, skip)
+    if opaque:
+        raise ValueError(f"{type(model).__name__} has attributes that a checkpoint cannot hold: {', '.join(opaque)}")
+    return described
+
+
+def restore_attributes(model: BaseAlgorithm, described: dict[str, Node]) -> None:
+    """
+    :param model: an algorithm made as the saved one
+    :param described: from :func:`save_attributes`
+    """
+    if getattr(model, "compile", "auto") != "auto":
+        # How it is run is said by the present program; what "auto" once decided stays.
+        described = {name: node for name, node in described.items() if name != "compiled"}
+    Restorer().attributes(model, described)
+
+
+# ---------------------------------------------------------------- generators
+
+
+def save_generators(device: torch.device) -> dict[str, Any]:
+    """
+    :param device: where the algorithm computes
+    :return: the states of the generators of Python, NumPy and torch
+    """
+    cuda = torch.cuda.get_rng_state(device) if device.type == "cuda" else None
+    numpy_state = np.random.get_state()  # noqa: NPY002  # Stable-Baselines3 draws from this one
+    return {"python": random.getstate(), "numpy": numpy_state, "torch": torch.get_rng_state(), "cuda": cuda}
+
+
+def restore_generators(state: dict[str, Any], device: torch.device) -> None:
+    """
+    :param state: from :func:`save_generators`
+    :param device: where the algorithm computes
+    """
+    random.setstate(state["python"])
+    np.random.set_state(state["numpy"])  # noqa: NPY002
+    torch.set_rng_state(state["torch"])
+    if device.type == "cuda" and state["cuda"] is not None:
+        torch.cuda.set_rng_state(state["cuda"], device)
+
+
+# ---------------------------------------------------------------- logger
+
+
+def save_logger(logger: Logger) -> dict[str, Any]:
+    """
+    :param logger: the algorithm's
+    :return: what was recorded since the log was last written; without pictures and the like
+    """
+    values = {}
+    describer = Describer()
+    for name, value in logger.name_to_value.items():
+        try:
+            described = describer.describe(value)
+        except Opaque:
+            continue
+        if "value" in described:
+            values[name] = described["value"]
+    counts = {name: count for name, count in logger.name_to_count.items() if name in values}
+    excluded = {name: list(formats) for name, formats in logger.name_to_excluded.items() if name in values}
+    return {"values": values, "counts": counts, "excluded": excluded}
+
+
+def restore_logger(logger: Logger, state: dict[str, Any]) -> None:
+    """
+    :param logger: the algorithm's
+    :param state: from :func:`save_logger`
+    """
+    for own, saved in (
+        (logger.name_to_value, state["values"]),
+        (logger.name_to_count, state["counts"]),
+        (logger.name_to_excluded, {name: tuple(formats) for name, formats in state["excluded"].items()}),
+    ):
+        own.clear()
+        own.update(saved)
+
+
+# ---------------------------------------------------------------- which run it is
+
+
+def arguments_of(model: BaseAlgorithm) -> dict[str, Any]:
+    """
+    :param model: the algorithm, before its training
+    :return: its class and the values of its arguments that decide what is computed
+    """
+    own = vars(model)
+    values: dict[str, Any] = {"class": f"{type(model).__module__}.{type(model).__qualname__}"}
+    values["policy"] = model.policy_class
+    for name in ("observation_space", "action_space"):
+        values[name] = without_generators(getattr(model, name))
+    for name in sorted(argument_names(model) - {"env", "policy", *HARMLESS}):
+        if name in own:
+            values[name] = own[name]
+    return values
+
+
+def circumstances(device: torch.device) -> dict[str, str]:
+    """
+    :param device: where the algorithm computes
+    :return: what else the last bits of a result depend on, by name
+    """
+    found = {
+        "sb3_sample": __version__,
+        "stable_baselines3": stable_baselines3.__version__,
+        "gymnasium": gymnasium.__version__,
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+        "device": device.type if device.type != "cuda" else torch.cuda.get_device_name(device),
+        "torch threads": str(torch.get_num_threads()),
+    }
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        found["mujoco"] = importlib.metadata.version("mujoco")
+    return found

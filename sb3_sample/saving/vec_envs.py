@@ -1,0 +1,216 @@
+"""
+The state of vectorised environments: of their wrappers, and of each environment, in this process or in a worker's.
+
+Stable-Baselines3's workers answer a fixed set of questions. One of them, whether an environment is wrapped in a class,
+is put to each wrapper by ``isinstance``, which a class may answer itself (``__instancecheck__``): :class:`_Attach` gets
+hold of the environment in this way and puts a helper into it, whose methods ``env_method`` then calls. Between the
+processes values are pickled, as always there; in the files they are not.
+"""
+
+import signal
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
+
+from sb3_sample.envs.portable_states import HELPER, pack, unpack
+from sb3_sample.envs.workers import SupervisedSubprocVecEnv
+from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name
+
+#: Of each wrapper: what leads elsewhere, what is an argument, and clocks, which count from when it was made.
+_SKIPPED = (
+    "venv", "class_attributes", "observation_space", "action_space", "num_envs", "render_mode", "metadata",
+    "reset_infos", "_seeds", "_options", "t_start",
+)  # fmt: skip
+#: Arguments by which VecNormalize computes what the model sees.
+_NORMALIZATION = ("norm_obs", "norm_reward", "clip_obs", "clip_reward", "gamma", "epsilon", "norm_obs_keys", "training")
+
+
+class _Helper:
+    """
+    What is put into an environment of another process.
+
+    :param env: the environment
+    """
+
+    def __init__(self, env: gym.Env):
+        self._env = env
+        self._sigint: Any = None
+
+    def pack(self) -> tuple[dict[str, Any], list[str]]:
+        return pack(self._env)
+
+    def unpack(self, state: dict[str, Any]) -> str | None:
+        # An exception would end the worker.
+        try:
+            unpack(self._env, state)
+        except DoesNotFit as error:
+            return str(error)
+        return None
+
+    def spec(self) -> list[str]:
+        return describe_spec(self._env)
+
+    def ignore_sigint(self, ignored: bool) -> None:
+        """A terminal's Ctrl-C goes to every process; a worker that ends by it takes the training down."""
+        if ignored and self._sigint is None:
+            self._sigint = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        elif not ignored and self._sigint is not None:
+            signal.signal(signal.SIGINT, self._sigint)
+            self._sigint = None
+
+    def __call__(self, method: str, *args: Any) -> Any:
+        return getattr(self, method)(*args)
+
+
+class _AttachType(type):
+    def __instancecheck__(cls, env: Any) -> bool:
+        if HELPER not in vars(env):
+            setattr(env, HELPER, _Helper(env))
+        return True  # The outermost wrapper is enough.
+
+
+class _Attach(metaclass=_AttachType):
+    """Asked whether an environment is wrapped in this, the answer is that it has a helper."""
+
+
+def describe_spec(env: gym.Env) -> list[str]:
+    """
+    :param env: an environment
+    :return: its layers, outermost first, and what it was made with, where Gymnasium made it
+    """
+    layers, inner = [], env
+    while isinstance(inner, gym.Wrapper):
+        layers.append(class_name(inner))
+        inner = inner.env
+    layers.append(class_name(inner))
+    if env.spec is not None:
+        kwargs = {name: _shown(value) for name, value in sorted(env.spec.kwargs.items())}
+        layers.append(f"{env.spec.id}, max_episode_steps={env.spec.max_episode_steps}, {kwargs}")
+    return layers
+
+
+def _shown(value: Any) -> str:
+    """A value in words that are the same in every process: without addresses in the memory."""
+    if isinstance(value, dict):
+        return str({str(key): _shown(item) for key, item in value.items()})
+    if isinstance(value, (list, tuple)):
+        return str([_shown(item) for item in value])
+    if isinstance(value, np.ndarray):
+        return str(value.tolist())
+    return repr(value) if isinstance(value, (str, int, float, bool, np.generic, type(None))) else class_name(value)
+
+
+def _wrappers(venv: VecEnv) -> Iterator[VecEnvWrapper]:
+    while isinstance(venv, VecEnvWrapper):
+        yield venv
+        venv = venv.venv
+
+
+def call(venv: VecEnv, method: str, each: list[Any] | None = None) -> list[Any] | None:
+    """
+    Call a method of the helper of each environment.
+
+    :param venv: a vectorised environment
+    :param method: name
+    :param each: an argument for each environment; none if None
+    :return: the answers; None if the environments cannot be reached
+    """
+    innermost = venv.unwrapped
+    arguments: list[tuple[Any, ...]] = [() if each is None else (each[i],) for i in range(innermost.num_envs)]
+    if isinstance(innermost, DummyVecEnv):
+        # A fresh helper, so that nothing is left in environments of this process.
+        return [_Helper(env)(method, *args) for env, args in zip(innermost.envs, arguments, strict=True)]
+    if not isinstance(innermost, SubprocVecEnv) or not all(innermost.env_is_wrapped(_Attach)):  # type: ignore[arg-type]
+        return None
+    return [innermost.env_method(HELPER, method, *args, indices=i)[0] for i, args in enumerate(arguments)]
+
+
+def fingerprint(venv: VecEnv) -> dict[str, Any]:
+    """
+    :param venv: a vectorised environment
+    :return: what it is made of, as plain values by name
+    """
+    made: dict[str, Any] = {"n_envs": venv.num_envs, "wrappers": [class_name(wrapper) for wrapper in _wrappers(venv)]}
+    for wrapper in _wrappers(venv):
+        if class_name(wrapper).endswith(".VecNormalize"):
+            made["VecNormalize"] = {name: getattr(wrapper, name) for name in _NORMALIZATION}
+    specs = call(venv, "spec")
+    if specs is not None:
+        made["environments"] = specs
+    return made
+
+
+def save(venv: VecEnv) -> tuple[dict[str, Any], list[str]]:
+    """
+    :param venv: a vectorised environment, between two steps
+    :return: its state, as plain values; and what keeps the episodes in progress out of it, if anything does
+    """
+    innermost = venv.unwrapped
+    missing: list[str] = []
+    describer = Describer([venv, innermost, *_wrappers(venv)])
+    wrappers = []
+    for wrapper in _wrappers(venv):
+        attributes, opaque = describer.attributes(wrapper, _SKIPPED)
+        wrappers.append({"class": class_name(wrapper), "attributes": attributes})
+        missing += [f"{type(wrapper).__name__}: {what}" for what in opaque]
+    state: dict[str, Any] = {
+        "wrappers": wrappers,
+        "seeds": list(innermost._seeds),
+        "options": list(innermost._options),
+        "environments": None,
+        # What a worker's episode is cut off with, should it die.
+        "last": innermost.last_observations if isinstance(innermost, SupervisedSubprocVecEnv) else None,
+    }
+    packed = call(venv, "pack")
+    if packed is None:
+        kind = class_name(innermost)
+        reason = "an environment in a worker needs a wrapper, such as Monitor, to be reached"
+        missing.append(reason if isinstance(innermost, SubprocVecEnv) else f"{kind} is not known")
+    else:
+        missing += sorted({what for _, opaque in packed for what in opaque})
+        if not missing:
+            state["environments"] = [packed_state for packed_state, _ in packed]
+    return state, missing
+
+
+def restore(venv: VecEnv, state: dict[str, Any]) -> list[str]:
+    """
+    Go back to a saved state. Where the episodes in progress are not in it, or do not fit, the caller has to reset.
+
+    :param venv: a vectorised environment made as the saved one
+    :param state: from :func:`save`
+    :return: why the episodes in progress were not restored; nothing if they were
+    :raises DoesNotFit: the wrappers are others
+    """
+    innermost = venv.unwrapped
+    wrappers = list(_wrappers(venv))
+    ours, theirs = [class_name(wrapper) for wrapper in wrappers], [saved["class"] for saved in state["wrappers"]]
+    if ours != theirs:
+        raise DoesNotFit(f"the environment is wrapped in {ours}, the saved one in {theirs}")
+    restorer = Restorer()
+    for wrapper, saved in zip(wrappers, state["wrappers"], strict=True):
+        restorer.attributes(wrapper, saved["attributes"])
+    if isinstance(innermost, SupervisedSubprocVecEnv) and state.get("last") is not None:
+        innermost.last_observations = list(state["last"])
+    innermost._seeds, innermost._options = list(state["seeds"]), list(state["options"])
+    if state["environments"] is None:
+        return ["they are not in the checkpoint"]
+    answers = call(venv, "unpack", state["environments"])
+    if answers is None:
+        return [f"{class_name(innermost)} cannot be reached"]
+    return [answer for answer in answers if answer is not None]
+
+
+def set_sigint_ignored(venv: VecEnv, ignored: bool) -> None:
+    """
+    Whether the workers of a vectorised environment ignore SIGINT. What has no workers, or cannot be reached, stays as
+    it is.
+
+    :param venv: a vectorised environment
+    :param ignored: whether they do
+    """
+    if isinstance(venv.unwrapped, SubprocVecEnv):
+        call(venv, "ignore_sigint", [ignored] * venv.num_envs)

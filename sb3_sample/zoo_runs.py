@@ -1,0 +1,380 @@
+"""
+Runs of ``sb3-sample train`` that go on where they were interrupted: ``--run-dir``, ``--checkpoint-freq``, ``--resume``.
+
+The folder of such a run has, besides the zoo's files and the checkpoints, a record ``run.json`` of how it was started.
+"""
+
+import argparse
+import contextlib
+import functools
+import json
+import os
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import rl_zoo3.exp_manager
+import rl_zoo3.train
+from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import TensorBoardOutputFormat, configure
+from stable_baselines3.common.monitor import Monitor, get_monitor_files
+from stable_baselines3.common.utils import get_latest_run_id
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_sample.zoo import ALGORITHMS
+from sb3_sample.zoo_files import add_trust, replaced
+
+RECORD = "run.json"
+#: Environment steps between two checkpoints.
+CHECKPOINT_FREQ = 10_000
+#: Arguments of the zoo that make a run what it is, besides its hyperparameters. How long it is, where it computes, what
+#: it prints and which copies of the model it keeps may change.
+COMPARED = (
+    "algo", "env", "seed", "trained_agent", "truncate_last_trajectory", "vec_env", "env_kwargs", "eval_env_kwargs",
+    "eval_freq", "eval_episodes", "n_eval_envs", "save_freq",
+)  # fmt: skip
+
+
+class RunError(ValueError):
+    """A run that cannot be started or go on as the command says."""
+
+
+class Record(NamedTuple):
+    """
+    How a run was started.
+
+    :param algo: name of its algorithm
+    :param env: id of its environment
+    :param seed: its seed, which the zoo draws if none is given
+    :param n_timesteps: ``-n``, or -1 if it was not given
+    :param checkpoint_freq: environment steps between two checkpoints
+    :param settings: arguments and hyperparameters by name, as Python writes them; only compared, never evaluated
+    :param tensorboard: folder of its TensorBoard log, if it has one
+    """
+
+    algo: str
+    env: str
+    seed: int
+    n_timesteps: int
+    checkpoint_freq: int
+    settings: dict[str, str]
+    tensorboard: str | None = None
+
+    def write(self, folder: Path) -> None:
+        """
+        :param folder: the run's
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        beside = folder / f".{RECORD}"
+        beside.write_text(json.dumps(self._asdict(), indent=1))
+        os.replace(beside, folder / RECORD)
+
+    @classmethod
+    def read(cls, folder: Path) -> "Record":
+        """
+        :param folder: the run's
+        :return: its record
+        :raises RunError: there is none, or it is no such record
+        """
+        try:
+            record = cls(**json.loads((folder / RECORD).read_text()))
+        except FileNotFoundError as error:
+            raise RunError(f"{folder} is no folder of a run of sb3-sample train: it has no {RECORD}") from error
+        except (OSError, ValueError, TypeError) as error:
+            raise RunError(f"{folder / RECORD} is not what sb3-sample train has written: {error}") from error
+        kinds: tuple[Any, ...] = (str, str, int, int, int, dict, (str, type(None)))
+        if not all(isinstance(value, kind) for value, kind in zip(record, kinds, strict=True)):
+            raise RunError(f"{folder / RECORD} is not what sb3-sample train has written: a value is of the wrong kind")
+        return record
+
+
+class Start(NamedTuple):
+    """
+    How a run starts or goes on.
+
+    :param arguments: command line for the zoo, without our options
+    :param checkpoint_freq: environment steps between two checkpoints
+    :param folder: the run's; None for a new one where the zoo says
+    :param record: how the run was started, if it goes on
+    """
+
+    arguments: list[str]
+    checkpoint_freq: int
+    folder: Path | None = None
+    record: Record | None = None
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """
+    :param folder: a run's
+    :return: the folders of its checkpoints, oldest first, looked at from outside only
+    """
+    return sorted(path for path in folder.glob("checkpoint-*") if re.fullmatch(r"checkpoint-\d{12,}", path.name))
+
+
+def train_parser() -> argparse.ArgumentParser:
+    """
+    :return: parser of what ``train`` takes besides the zoo's options
+    """
+    parser = argparse.ArgumentParser("sb3-sample train", usage=argparse.SUPPRESS, add_help=False, allow_abbrev=False)
+    group = parser.add_argument_group("runs that go on where they were interrupted (our algorithms)")
+    group.add_argument(
+        "--run-dir",
+        type=Path,
+        metavar="DIR",
+        help="Folder of this run, with checkpoints. The same command, given again, goes on with it",
+    )
+    group.add_argument(
+        "--checkpoint-freq",
+        type=int,
+        metavar="N",
+        help=f"Environment steps between two checkpoints (default: {CHECKPOINT_FREQ}). Without --run-dir the run gets "
+        "a new folder below the log folder, as without checkpoints",
+    )
+    group.add_argument(
+        "--resume",
+        action="store_true",
+        help="Go on with the run in --run-dir, or else with the run of --algo and --env below the log folder that has "
+        "the latest checkpoint; an error if there is none",
+    )
+    add_trust(parser.add_argument_group("files that run no code (our algorithms)"))
+    return parser
+
+
+def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
+    """
+    :param options: what ``train_parser`` has parsed
+    :param arguments: the rest of the command line
+    :return: how the run starts; None for one without checkpoints
+    :raises RunError: if it cannot
+    """
+    if options.run_dir is None and options.checkpoint_freq is None and not options.resume:
+        return None
+    freq = options.checkpoint_freq
+    if freq is not None and freq < 1:
+        raise RunError(f"--checkpoint-freq must be at least 1, in environment steps, not {freq}")
+    folder = options.run_dir
+    if folder is None:
+        if not options.resume:
+            return Start(list(arguments), freq)
+        folder = _latest(arguments)
+    if not checkpoints(folder):
+        if options.resume:
+            raise RunError(f"--resume: {folder} has no checkpoint to go on from")
+        # A run that was interrupted before it had one has its record.
+        if folder.exists() and not (folder.is_dir() and (not any(folder.iterdir()) or (folder / RECORD).exists())):
+            raise RunError(
+                f"--run-dir {folder} holds files, but no run with checkpoints: it must be the folder of such a run, an "
+                "empty one or none"
+            )
+        return Start(list(arguments), freq or CHECKPOINT_FREQ, folder)
+    record = Record.read(folder)
+    # What the command line says besides replaces these.
+    command = ["--seed", str(record.seed), "-n", str(record.n_timesteps), *arguments]
+    return Start(command, freq or record.checkpoint_freq, folder, record)
+
+
+def _latest(arguments: Sequence[str]) -> Path:
+    """The folder of the run with the latest checkpoint of the algorithm and environment in a command line."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--algo")
+    parser.add_argument("--env")
+    parser.add_argument("-f", "--log-folder", type=Path, default=Path("logs"))
+    asked = parser.parse_known_args(arguments)[0]
+    if asked.algo is None or asked.env is None:
+        raise RunError("--resume needs --run-dir, or --algo and --env, to know which run to go on with")
+    found = []
+    for file in asked.log_folder.rglob(RECORD):
+        made = checkpoints(file.parent)
+        with contextlib.suppress(RunError):  # some other program's file of that name
+            record = Record.read(file.parent)
+            if made and (record.algo, record.env) == (asked.algo, asked.env):
+                found.append((made[-1].stat().st_mtime, file.parent))
+    if not found:
+        raise RunError(
+            f"--resume: no run of {asked.algo} on {asked.env} below {asked.log_folder} has a checkpoint. Runs have "
+            "checkpoints if they are started with --run-dir or --checkpoint-freq"
+        )
+    return max(found)[1]
+
+
+def train(start: Start) -> None:
+    """
+    The zoo's ``train`` for a run with checkpoints. It reads ``sys.argv``.
+
+    :param start: how the run starts
+    :raises RunError: if it cannot start or go on so
+    """
+    with replaced(rl_zoo3.train, "ExperimentManager", functools.partial(RunManager, start)):
+        rl_zoo3.train.train()
+
+
+class RunManager(ExperimentManager):
+    """
+    The zoo's manager for a run with checkpoints.
+
+    :param start: how the run starts
+    :param args: what the zoo has parsed of the command line
+    :param positional: the zoo's
+    :param named: the zoo's
+    :raises RunError: if there can be no checkpoints of such a run
+    """
+
+    def __init__(self, start: Start, args: argparse.Namespace, *positional: Any, **named: Any):
+        if args.algo not in ALGORITHMS:
+            raise RunError(
+                f"--algo {args.algo} has no checkpoints to go on from: --run-dir, --checkpoint-freq and --resume are "
+                f"for the algorithms of this package, {', '.join(ALGORITHMS)}"
+            )
+        if args.optimize_hyperparameters:
+            raise RunError(
+                "-optimize has no checkpoints: without --run-dir, --checkpoint-freq and --resume a search goes on with "
+                "the trials in its --storage"
+            )
+        super().__init__(args, *positional, **named)
+        if start.folder is not None:
+            self.save_path = str(start.folder)
+            self.params_path = f"{self.save_path}/{self.env_name}"
+        self._start, self._folder = start, Path(self.save_path)
+        # Of our learn, which leaves it out of the state of the callbacks: it may come and go.
+        self._progress_bar, self.show_progress = self.show_progress, False
+        self._record: Record
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        hyperparams, saved = super().read_hyperparameters()
+        settings = {name: repr(getattr(self.args, name)) for name in COMPARED}
+        settings |= {name: repr(value) for name, value in saved.items() if name != "n_timesteps"}
+        before = self._start.record
+        if before is not None:
+            self._compare(settings, before.settings)
+        self._record = Record(
+            algo=self.algo,
+            env=self.env_name.gym_id,
+            seed=self.seed,
+            n_timesteps=self.args.n_timesteps,
+            checkpoint_freq=self._start.checkpoint_freq,
+            settings=settings,
+            tensorboard=None if self.tensorboard_log is None else self._tensorboard_folder(),
+        )
+        # Before anything else of the run is written.
+        self._record.write(self._folder)
+        return hyperparams, saved
+
+    def _compare(self, ours: Mapping[str, str], theirs: Mapping[str, str]) -> None:
+        differences = [
+            f"{name} {theirs.get(name, 'not given')} (now {ours.get(name, 'not given')})"
+            for name in sorted(ours.keys() | theirs.keys())
+            if ours.get(name) != theirs.get(name)
+        ]
+        if differences:
+            raise RunError(
+                f"the run in {self._folder} was started with {', '.join(differences)}. Nothing was changed. Train as "
+                "then, or name another --run-dir"
+            )
+
+    def _tensorboard_folder(self) -> str:
+        """That of the run's beginning if it lies where the command says, or a new one."""
+        before = self._start.record and self._start.record.tensorboard
+        if before and Path(before).parent == Path(str(self.tensorboard_log)):
+            return before
+        name = ALGORITHMS[self.algo].algorithm.__name__
+        return f"{self.tensorboard_log}/{name}_{get_latest_run_id(str(self.tensorboard_log), name) + 1}"
+
+    def create_callbacks(self) -> None:
+        super().create_callbacks()
+        self.callbacks.append(RunFiles(self._folder))
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        goes_on = self._start.record is not None and get_monitor_files(str(self._folder))
+        # The zoo has no argument for how Monitor is made.
+        make = functools.partial(_make_vec_env, rl_zoo3.exp_manager.make_vec_env)
+        with replaced(rl_zoo3.exp_manager, "make_vec_env", make) if goes_on else contextlib.nullcontext():
+            return super().create_envs(n_envs, eval_env, no_log)
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        if self._record.tensorboard is not None:
+            formats = ["stdout", "tensorboard"] if self.verbose >= 1 else ["tensorboard"]
+            model.set_logger(configure(self._record.tensorboard, formats))
+        arguments = {
+            "checkpoint": self._folder,
+            "checkpoint_freq": self._start.checkpoint_freq,
+            "progress_bar": self._progress_bar,
+        }
+        super().learn(_WithArguments(model, arguments))  # type: ignore[arg-type]  # all that the zoo's learn uses
+
+
+class _WithArguments:
+    """
+    A model whose ``learn`` has arguments that the zoo does not know.
+
+    :param model: the model
+    :param arguments: the arguments
+    """
+
+    def __init__(self, model: Any, arguments: dict[str, Any]):
+        self._model, self._arguments = model, arguments
+
+    def learn(self, *args: Any, **kwargs: Any) -> BaseAlgorithm:
+        return self._model.learn(*args, **kwargs, **self._arguments)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._model, name)
+
+
+def _make_vec_env(make: Any, *args: Any, monitor_kwargs: dict[str, Any], wrapper_class: Any, **kwargs: Any) -> VecEnv:
+    """Environments whose Monitors go on with the files that are there."""
+
+    def wrap(env: Monitor) -> gym.Env:
+        if env.results_writer is not None:
+            # Their times count from the beginning in the file's head.
+            with open(env.results_writer.file_handler.name) as file:
+                env.t_start = json.loads(file.readline().removeprefix("#"))["t_start"]
+        return env if wrapper_class is None else wrapper_class(env)
+
+    return make(*args, monitor_kwargs={**monitor_kwargs, "override_existing": False}, wrapper_class=wrap, **kwargs)
+
+
+class RunFiles(BaseCallback):
+    """
+    Cuts the Monitor files and the TensorBoard log back to the checkpoint that a run goes on from, since what came after
+    it comes once more.
+
+    :param folder: the run's
+    """
+
+    def __init__(self, folder: Path):
+        super().__init__()
+        self.folder = folder
+
+    def state_dict(self) -> dict[str, int]:
+        """
+        :return: the size of each Monitor file, by its name
+        """
+        return {Path(file).name: os.path.getsize(file) for file in get_monitor_files(str(self.folder))}
+
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
+        """
+        :param state: from ``state_dict``
+        """
+        for name, size in state.items():
+            file = self.folder / name
+            there = file.stat().st_size if file.exists() else 0
+            if there < size:
+                warnings.warn(f"{file} has {there} bytes, {size} at the checkpoint: episodes are missing", stacklevel=2)
+            elif there > size:
+                os.truncate(file, size)
+        for each in self.model.logger.output_formats:
+            if isinstance(each, TensorBoardOutputFormat):
+                each.writer.close()
+                # The class of it, which is in another package where tensorboardX stands for it.
+                each.writer = type(each.writer)(
+                    log_dir=self.model.logger.get_dir(), purge_step=self.model.num_timesteps + 1
+                )
+
+    def _on_step(self) -> bool:
+        return True

@@ -1,0 +1,615 @@
+"""What a checkpoint holds, what it refuses, and what happens when it cannot be written or read."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import warnings
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+
+from sb3_sample import MBMAPPO
+from sb3_sample.sac.buffers import DeviceReplayBuffer
+from sb3_sample.sac.policies import MlpPolicy
+from sb3_sample.saving import container, training_state
+from sb3_sample.saving.attributes import Describer, same
+from sb3_sample.saving.callbacks import CallbackStates
+from sb3_sample.saving.run_folder import RunFolder
+from tests.ppo.common import ALGORITHMS, tiny
+from tests.sac.common import MAKERS, bro, differing, sac, state, vec
+from tests.saving.program import Goal, outcome
+
+STEPS = dict(checkpoint_freq=10)
+
+
+def steps_of(folder: Path) -> list[int]:
+    return sorted(int(path.name.split("-")[1]) for path in folder.glob("checkpoint-*"))
+
+
+# ---------------------------------------------------------------- what is held
+
+
+@pytest.mark.parametrize(
+    "maker",
+    [
+        pytest.param(maker, marks=[] if maker in ("BRO", "VPLSAC", MBMAPPO) else pytest.mark.slow)
+        for maker in (*MAKERS, *ALGORITHMS)
+    ],
+)
+def test_every_attribute_that_changes_is_held(maker: Any, tmp_path: Path) -> None:
+    """Fails when somebody adds state to an algorithm that no checkpoint holds."""
+
+    def model() -> Any:
+        return MAKERS[maker](vec(2)) if isinstance(maker, str) else tiny(maker, vec(2), warm_up_until=0.5)
+
+    def look(owner: Any) -> dict[str, Any]:
+        """Everything about an object, its parts by their identity."""
+        seen = {}
+        for name, value in vars(owner).items():
+            one = type("", (), {})()
+            vars(one)[name] = value
+            described, opaque = Describer().attributes(one)
+            seen[name] = described.get(name, id(value)) if not opaque else id(value)
+        return seen
+
+    agent = model()
+    agent.learn(32)
+    before = look(agent)
+    agent.learn(96, reset_num_timesteps=False)
+    after = look(agent)
+    changed = {name for name in after if not same(after[name], before.get(name))}
+    assert len(changed) > 8
+    held = training_state.save_attributes(agent).keys()
+    modules = {name.split(".")[0] for name in agent._get_torch_save_params()[0]}
+    modules |= {"actor", "critic", "critic_target"} & vars(agent).keys()
+    forgotten = changed - held - modules - set(training_state.DERIVED)
+    assert not forgotten
+
+    # And the other way round: what is restored is the same, down to the attributes of the parts.
+    agent = model()
+    agent.learn(128, checkpoint=tmp_path / "run", checkpoint_freq=32)
+    restored = model()
+    restored.learn(128, checkpoint=tmp_path / "run")
+    for name in modules:
+        for (path, ours), (_, theirs) in zip(
+            _with_parts(getattr(agent, name)), _with_parts(getattr(restored, name)), strict=True
+        ):
+            assert same(_plain(ours), _plain(theirs)), (name, path)
+    assert not differing_outcomes(outcome(agent, str(tmp_path / "run")), outcome(restored, str(tmp_path / "run")))
+
+
+def _with_parts(module: Any) -> list[tuple[str, Any]]:
+    return list(module.named_modules()) if isinstance(module, torch.nn.Module) else [("", module)]
+
+
+def _plain(owner: Any) -> dict[str, Any]:
+    skip = ("_modules", "training", "_compiled_call_impl")
+    ours = isinstance(owner, torch.nn.Module) and type(owner).__module__.startswith("sb3_sample")
+    return Describer().attributes(owner, skip)[0] if ours else {}
+
+
+def differing_outcomes(first: dict[str, str], second: dict[str, str]) -> list[str]:
+    return sorted(name for name in first.keys() | second.keys() if first.get(name) != second.get(name))
+
+
+def test_a_finished_run_returns_at_once_with_its_state(tmp_path: Path) -> None:
+    trained = bro().learn(33, checkpoint=tmp_path, **STEPS)
+    assert steps_of(tmp_path) == [30, 33]
+    again = bro(verbose=1)
+    again.learn(33, checkpoint=tmp_path, **STEPS)
+    assert again.num_timesteps == 33 and not differing(state(trained), state(again))
+    assert again._n_updates == trained._n_updates and again.replay_buffer.pos == 33
+    assert steps_of(tmp_path) == [30, 33]
+    # Longer than it was planned.
+    again = bro().learn(45, checkpoint=tmp_path, **STEPS)
+    assert not differing(state(bro().learn(45)), state(again))
+    assert steps_of(tmp_path) == [40, 45]
+
+
+def test_the_training_is_the_same_with_checkpoints_and_without(tmp_path: Path) -> None:
+    assert not differing(state(bro().learn(40)), state(bro().learn(40, checkpoint=tmp_path, **STEPS)))
+
+
+def test_at_the_first_turn_at_or_after_each_multiple(tmp_path: Path) -> None:
+    seen = []
+
+    class Watch(BaseCallback):
+        def _on_step(self) -> bool:
+            seen.extend(step for step in steps_of(tmp_path) if step not in seen)
+            return True
+
+    sac(vec(3)).learn(60, Watch(), checkpoint=tmp_path, checkpoint_freq=20)
+    assert seen == [0, 21, 42]
+    assert steps_of(tmp_path) == [42, 60]
+
+
+def test_the_model_can_be_loaded_alone(tmp_path: Path) -> None:
+    trained = bro().learn(30, checkpoint=tmp_path, **STEPS)
+    loaded = type(trained).load(tmp_path / "checkpoint-000000000030" / "model.zip")
+    assert not differing(state(trained), state(loaded))
+
+
+def test_rows_are_written_once(tmp_path: Path) -> None:
+    sizes: dict[str, tuple[int, int]] = {}
+
+    class Watch(BaseCallback):
+        def _on_step(self) -> bool:
+            for path in (tmp_path / "replay").iterdir():
+                facts = (path.stat().st_mtime_ns, path.stat().st_ino)
+                assert sizes.setdefault(path.name, facts) == facts
+            return True
+
+    sac(buffer_size=35).learn(100, Watch(), checkpoint=tmp_path, **STEPS)
+    assert sorted(sizes) == [f"model-{first:012d}-{first + 10:012d}.zip" for first in range(0, 90, 10)]
+    # What the two checkpoints need, of a buffer of 35 rows.
+    assert len(list((tmp_path / "replay").iterdir())) == 5
+
+
+def test_the_log_goes_on(tmp_path: Path) -> None:
+    for steps in (30, 60):
+        sac().learn(steps, log_interval=1, checkpoint=tmp_path, checkpoint_freq=1000)
+        # What was written after the last checkpoint is written again.
+        with (tmp_path / "progress.jsonl").open("a") as file:
+            file.write('{"step": 1000}\n{"half a li')
+    lines = [json.loads(line) for line in (tmp_path / "progress.jsonl").read_text().splitlines()[:-2]]
+    assert [line["step"] for line in lines] == [7, 14, 21, 28, 35, 42, 49, 56]
+    assert lines[-1]["train/critic_loss"] and lines[-1]["time/episodes"] == 8
+    sac().learn(60, checkpoint=tmp_path)
+    assert (tmp_path / "progress.jsonl").read_text().splitlines()[-1].startswith('{"step": 56')
+
+
+# ---------------------------------------------------------------- what is refused
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (dict(gamma=0.5), r"gamma=0.5: the run .* was made with gamma=0.99"),
+        (dict(seed=1), "seed=1"),
+        (dict(replay_ratio=2), "replay_ratio=2"),
+        (dict(policy_kwargs={"net_arch": [8, 4]}), r"policy_kwargs=.*\[8, 4\]"),
+        (dict(env=vec(2)), "env=.*'n_envs': 2"),
+        (dict(env=VecNormalize(vec())), "env=.*VecNormalize"),
+        (dict(env=vec(action_space=spaces.Box(-2, 2, (2,)))), "action_space=Box"),
+        (dict(cls=type(MAKERS["OAC"]())), "class=.*OAC"),
+    ],
+)  # fmt: skip
+def test_another_run_is_refused(change: dict[str, Any], words: str, tmp_path: Path) -> None:
+    sac().learn(20, checkpoint=tmp_path)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    with pytest.raises(ValueError, match=words):
+        sac(**change).learn(40, checkpoint=tmp_path)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+    # The folder is free again, and where and how loudly it computes makes no difference.
+    sac(verbose=1, compile=False).learn(30, checkpoint=tmp_path)
+
+
+def test_a_time_limit_is_part_of_the_run(tmp_path: Path) -> None:
+    def env(limit: int) -> Any:
+        return gym.make("Pendulum-v1", max_episode_steps=limit)
+
+    sac(env(20)).learn(20, checkpoint=tmp_path)
+    with pytest.raises(ValueError, match="env=.*max_episode_steps=30"):
+        sac(env(30)).learn(40, checkpoint=tmp_path)
+
+
+@pytest.mark.parametrize("freq", [0, -1, 1.5, True, None])
+def test_checkpoint_freq_is_checked(freq: Any, tmp_path: Path) -> None:
+    for model in (sac(), tiny()):
+        with pytest.raises(ValueError, match="checkpoint_freq must be an integer of at least 1"):
+            model.learn(10, checkpoint=tmp_path, checkpoint_freq=freq)
+
+
+class Notes(DeviceReplayBuffer):
+    """A buffer with something that nobody knows."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.notes = np.zeros(self.buffer_size)
+
+
+def test_buffers_that_no_checkpoint_can_hold(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="replay_buffer_class=Notes keeps 'notes'"):
+        sac(replay_buffer_class=Notes).learn(10, checkpoint=tmp_path)
+    model = sac(
+        Monitor(Goal()), policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer,
+        replay_buffer_kwargs={"copy_info_dict": True},
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="copy_info_dict=True"):
+        model.learn(10, checkpoint=tmp_path)
+    assert model.num_timesteps == 0 and not steps_of(tmp_path)
+
+
+def test_a_schedule_that_no_file_can_hold_is_refused_before_training(tmp_path: Path) -> None:
+    model = sac(learning_rate=lambda progress: 1e-3 * progress)
+    with pytest.raises(ValueError, match="learning_rate: .*<lambda>"):
+        model.learn(20, checkpoint=tmp_path)
+    assert model._n_updates == 0 and not steps_of(tmp_path)
+
+
+class OwnPolicy(MlpPolicy):
+    """A policy class of the user's own."""
+
+
+def test_classes_of_ones_own(tmp_path: Path) -> None:
+    for steps in (20, 40):
+        again = sac(policy=OwnPolicy).learn(steps, checkpoint=tmp_path)
+    assert not differing(state(sac(policy=OwnPolicy).learn(40)), state(again))
+    file = tmp_path / "checkpoint-000000000040" / "model.zip"
+    with pytest.raises(ValueError, match="not trusted"):
+        type(again).load(file)
+    loaded = type(again).load(file, trusted_modules=["tests.saving.test_checkpoint"])
+    assert isinstance(loaded.policy, OwnPolicy)
+
+
+def test_no_file_is_pickled(tmp_path: Path) -> None:
+    sac(vec(2)).learn(40, [Counter()], checkpoint=tmp_path, **STEPS)
+    files = sorted(path for path in tmp_path.rglob("*.zip"))
+    assert len(files) > 6
+    for path in files:
+        with zipfile.ZipFile(path) as archive:
+            assert sorted(archive.namelist()) == ["checksums.json", "data.json", "tensors.safetensors"]
+            json.loads(archive.read("data.json"))
+        kind = {"model.zip": "model", "state.zip": "checkpoint"}.get(path.name, "replay rows")
+        container.read(path, kind)
+    others = {path.name for path in tmp_path.rglob("*") if path.is_file()} - {path.name for path in files}
+    assert others == {"manifest.json", "progress.jsonl", ".lock"}
+
+
+def test_a_file_in_place_of_the_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match=r"checkpoint must name a folder, but .*file is a file"):
+        sac().learn(10, checkpoint=tmp_path / "file")
+    with pytest.raises(ValueError, match="checkpoint='.*/file/below' cannot be used"):
+        sac().learn(10, checkpoint=tmp_path / "file" / "below")
+
+
+# ---------------------------------------------------------------- what goes wrong
+
+
+def test_a_full_quota_is_survived(tmp_path: Path) -> None:
+    """The real thing: the system refuses to let files grow."""
+
+    class Limit(BaseCallback):
+        def _on_step(self) -> bool:
+            _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+            limited = 15 <= self.num_timesteps < 35
+            resource.setrlimit(resource.RLIMIT_FSIZE, (500 if limited else hard, hard))
+            return True
+
+    with pytest.warns(UserWarning, match="No checkpoint") as caught:
+        model = sac().learn(40, Limit(), checkpoint=tmp_path, log_interval=1, **STEPS)
+    messages = [str(w.message) for w in caught if "No checkpoint" in str(w.message)]
+    assert len(messages) == 2
+    for message, steps in zip(messages, (20, 30), strict=True):
+        assert message.startswith(f"No checkpoint at {steps} steps, the last one is of 10 steps: {tmp_path} cannot be")
+        assert os.strerror(27) in message
+    assert steps_of(tmp_path) == [10, 40]
+    assert not [path for path in tmp_path.rglob(".*") if path.name != ".lock"]
+    assert len((tmp_path / "progress.jsonl").read_text().splitlines()) == 5
+    again = sac().learn(50, checkpoint=tmp_path, **STEPS)
+    assert not differing(state(sac().learn(50)), state(again)) and model.num_timesteps == 40
+
+
+def test_rows_of_a_checkpoint_that_failed_are_removed_and_written_again(tmp_path: Path, monkeypatch: Any) -> None:
+    write, rows = RunFolder.write, []
+
+    def fail_at_20(self: RunFolder, steps: int, *args: Any) -> Any:
+        if steps == 20:
+            raise OSError(28, "No space left on device")
+        rows.append(sorted(path.name[6:] for path in (tmp_path / "replay").iterdir()))
+        return write(self, steps, *args)
+
+    monkeypatch.setattr(RunFolder, "write", fail_at_20)
+    with pytest.warns(UserWarning, match="No checkpoint at 20 steps"):
+        sac().learn(30, checkpoint=tmp_path, **STEPS)
+    assert rows == [[], ["000000000000-000000000010.zip"],
+                    ["000000000000-000000000010.zip", "000000000010-000000000030.zip"]]  # fmt: skip
+    assert not differing(state(sac().learn(40)), state(sac().learn(40, checkpoint=tmp_path)))
+
+
+def test_no_space_and_a_read_only_file_system(tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=300k", "none", disk], capture_output=True)
+    if mounted.returncode:
+        pytest.skip("file systems can be mounted by root only")
+    try:
+
+        class Fill(BaseCallback):
+            def _on_step(self) -> bool:
+                if self.num_timesteps == 15:
+                    with pytest.raises(OSError, match="No space"):
+                        (disk / "filler").write_bytes(bytes(2**20))
+                if self.num_timesteps == 25:
+                    (disk / "filler").unlink()
+                return True
+
+        with pytest.warns(UserWarning, match="No checkpoint at 20 steps.*No space left"):
+            sac().learn(30, Fill(), checkpoint=disk / "run", log_interval=1, **STEPS)
+        assert steps_of(disk / "run") == [10, 30]
+        subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
+        with pytest.raises(ValueError, match=r"checkpoint='.*' cannot be used: .*Read-only"):
+            sac().learn(40, checkpoint=disk / "other")
+    finally:
+        subprocess.run(["umount", "-l", disk], check=True)
+
+
+def test_a_damaged_checkpoint_is_named_and_the_previous_one_used(tmp_path: Path) -> None:
+    sac().learn(30, checkpoint=tmp_path, **STEPS)
+    damaged = tmp_path / "checkpoint-000000000030" / "state.zip"
+    damaged.write_bytes(damaged.read_bytes()[:-1] + b"x")
+    with pytest.warns(UserWarning, match=r"000030/state.zip is damaged.*Going on from .*000020"):
+        again = sac().learn(50, checkpoint=tmp_path, **STEPS)
+    assert not differing(state(sac().learn(50)), state(again))
+    for path in tmp_path.glob("checkpoint-*/model.zip"):
+        path.unlink()
+    with pytest.raises(ValueError, match="no checkpoint that is whole: .*model.zip is missing"):
+        sac().learn(60, checkpoint=tmp_path)
+
+
+class Stop(BaseCallback):
+    """Ends the training, or fails, at a step."""
+
+    def __init__(self, at: int, error: type[BaseException] | None = None):
+        super().__init__()
+        self.at, self.error = at, error
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.at and self.error is not None:
+            raise self.error
+        return self.num_timesteps != self.at
+
+
+def test_a_callback_that_ends_the_training_leaves_a_whole_state(tmp_path: Path) -> None:
+    for error in (None, RuntimeError, KeyboardInterrupt):
+        run = tmp_path / str(error)
+        if error is None:
+            sac().learn(50, Stop(25), checkpoint=run, **STEPS)
+        else:
+            with pytest.raises(error):
+                sac().learn(50, Stop(25, error), checkpoint=run, **STEPS)
+        # An exception waits until the turn is over and saved (docs/faults.md).
+        assert steps_of(run) == ([20, 25] if error is RuntimeError else [10, 20])
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        assert not differing(state(sac().learn(50)), state(sac().learn(50, checkpoint=run)))
+
+
+# ---------------------------------------------------------------- signals
+
+
+class Signal(BaseCallback):
+    """Sends itself a signal, and looks who is listening."""
+
+    def __init__(self, number: int, at: int = 25, twice: bool = False):
+        super().__init__()
+        self.number, self.at, self.twice, self.reached = number, at, twice, False
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.at:
+            os.kill(os.getpid(), self.number)
+            if self.twice:
+                os.kill(os.getpid(), self.number)
+            self.reached = True
+        return True
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_finish_the_turn_and_save(number: int, tmp_path: Path, capfd: Any) -> None:
+    handlers = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    callback = Signal(number)
+    model = sac()
+    with pytest.raises(KeyboardInterrupt if number == signal.SIGINT else SystemExit) as caught:
+        model.learn(50, callback, checkpoint=tmp_path, **STEPS)
+    assert number == signal.SIGINT or caught.value.code == 128 + 15  # type: ignore[attr-defined]
+    assert callback.reached and model.num_timesteps == 25 and steps_of(tmp_path) == [20, 25]
+    assert "once more to leave at once" in capfd.readouterr().err
+    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == handlers
+    assert not differing(state(sac().learn(50)), state(sac().learn(50, checkpoint=tmp_path)))
+
+
+def test_a_second_signal_leaves_at_once(tmp_path: Path) -> None:
+    callback = Signal(signal.SIGINT, twice=True)
+    with pytest.raises(KeyboardInterrupt):
+        sac().learn(50, callback, checkpoint=tmp_path, **STEPS)
+    assert not callback.reached and steps_of(tmp_path) == [10, 20]
+
+
+class InWorker(gym.Wrapper):
+    """Its process gets a SIGINT at a step, as by a terminal's Ctrl-C."""
+
+    def __init__(self, env: gym.Env, at: int):
+        super().__init__(env)
+        self.at, self.t = at, 0
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        if self.t == self.at:
+            os.kill(os.getpid(), signal.SIGINT)
+        return self.env.step(action)
+
+
+def test_workers_survive_the_terminals_sigint(tmp_path: Path) -> None:
+    def venv(at: int) -> Any:
+        return SubprocVecEnv([lambda: InWorker(Monitor(gym.make("Pendulum-v1")), at)] * 2, start_method="fork")
+
+    env = venv(13)
+    with pytest.raises(KeyboardInterrupt):
+        sac(env).learn(100, Signal(signal.SIGINT, at=26), checkpoint=tmp_path, **STEPS)
+    assert steps_of(tmp_path)[-1] == 26
+    assert all(process.is_alive() for process in env.processes)
+    # They listen again when the training is over.
+    os.kill(env.processes[0].pid, signal.SIGINT)
+    env.processes[0].join(5)
+    assert not env.processes[0].is_alive()
+    again = sac(venv(10**9)).learn(60, checkpoint=tmp_path)
+    assert again.num_timesteps == 60
+
+
+# ---------------------------------------------------------------- callbacks and environments
+
+
+class Counter(BaseCallback):
+    """Remembers things; ``bound`` is an argument."""
+
+    def __init__(self, bound: float = 1.0):
+        super().__init__()
+        self.bound, self.seen, self.best = bound, [], {"step": -1.0}
+
+    def _on_step(self) -> bool:
+        self.seen.append(np.float64(self.num_timesteps))
+        self.best["step"] = float(self.num_timesteps)
+        return True
+
+
+def test_what_a_callback_changed_is_restored_and_its_arguments_are_the_programs(tmp_path: Path) -> None:
+    sac().learn(20, [Counter(), EveryNTimesteps(5, Counter())], checkpoint=tmp_path, **STEPS)
+    first, inner = Counter(bound=2.0), Counter()
+    sac().learn(30, [first, EveryNTimesteps(5, inner)], checkpoint=tmp_path, progress_bar=False)
+    assert first.seen == list(range(1, 31)) and first.n_calls == 30 and first.best == {"step": 30.0}
+    assert inner.seen == [5, 10, 15, 20, 25, 30]
+    assert first.bound == 2.0
+
+
+def test_callbacks_that_come_and_go_are_named(tmp_path: Path) -> None:
+    sac().learn(20, StopTrainingOnMaxEpisodes(100), checkpoint=tmp_path)
+    with pytest.warns(UserWarning, match=r"state of a .*StopTrainingOnMaxEpisodes \(callback\)"):
+        sac().learn(30, Counter(), checkpoint=tmp_path)
+
+
+class Secretive(BaseCallback):
+    def __init__(self) -> None:
+        super().__init__()
+        self.numbers = iter(range(10**6))
+
+    def _on_step(self) -> bool:
+        next(self.numbers)
+        return True
+
+
+def test_a_callback_whose_state_cannot_be_held_is_named(tmp_path: Path) -> None:
+    with pytest.warns(
+        UserWarning, match=r"callbacks' state: Secretive \(callback\): numbers \(builtins.range_iterator"
+    ):
+        sac().learn(20, Secretive(), checkpoint=tmp_path)
+
+
+class Secret(gym.Env):
+    """Its state is where nobody finds it."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (1,))
+    action_space = spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.counter = iter(range(10**6))
+        return self.np_random.normal(size=1).astype(np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        t = next(self.counter)
+        return np.array([t + 1.0], np.float32), 0.0, False, t >= 18, {}
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_an_episode_that_cannot_be_held_starts_anew(n_steps: int, tmp_path: Path) -> None:
+    def model() -> Any:
+        return sac(VecNormalize(DummyVecEnv([lambda: Monitor(Secret())])), n_steps=n_steps, replay_ratio=0.1)
+
+    with pytest.warns(UserWarning, match=r"environment cannot be saved.*Secret: counter \(builtins.range_iterator\)"):
+        first = model().learn(25, checkpoint=tmp_path)
+    with pytest.warns(UserWarning, match="episodes in progress start anew"):
+        again = model().learn(40, checkpoint=tmp_path)
+    buffer = again.replay_buffer
+    # The old episode was cut, as by a time limit, and the new one starts with a reset of its own.
+    assert buffer.dones[24] == buffer.timeouts[24] == 1 and buffer.dones[23] == 0
+    assert buffer.next_observations[24, 0, 0] == 6 and buffer.observations[26, 0, 0] == 1
+    assert buffer.observations[25, 0, 0] not in buffer.observations[:25]
+    assert first.env.obs_rms.count < again.env.obs_rms.count
+    # And what was cut stays cut.
+    with pytest.warns(UserWarning, match="episodes in progress start anew"):
+        third = model().learn(41, checkpoint=tmp_path)
+    assert third.replay_buffer.dones[24] == third.replay_buffer.timeouts[24] == 1
+
+
+def test_hindsight_does_not_reach_over_the_cut(tmp_path: Path) -> None:
+    class SecretGoal(Goal):
+        def __init__(self) -> None:
+            super().__init__()
+            self.secret = iter([])
+
+    def model() -> Any:
+        return sac(
+            Monitor(SecretGoal()), policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer, learning_starts=20
+        )
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model().learn(22, checkpoint=tmp_path)
+        buffer = model().learn(40, checkpoint=tmp_path).replay_buffer
+    # Episodes of 9 steps; the one from 18 on was cut after 4.
+    assert list(buffer.ep_length[16:27, 0]) == [9, 9, 4, 4, 4, 4, 9, 9, 9, 9, 9]
+
+
+def test_workers_without_a_wrapper_say_what_they_need(tmp_path: Path) -> None:
+    env = SubprocVecEnv([Goal] * 2, start_method="fork")
+    model = sac(env, policy="MultiInputPolicy")
+    with pytest.warns(UserWarning, match="an environment in a worker needs a wrapper, such as Monitor"):
+        model.learn(20, checkpoint=tmp_path)
+    env.close()
+
+
+def test_other_circumstances_are_named(tmp_path: Path, monkeypatch: Any) -> None:
+    sac().learn(20, checkpoint=tmp_path)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 77)
+    with pytest.warns(UserWarning, match=r"need not be the same to the last bit: .*torch threads \d+ \(now 77\)"):
+        sac().learn(30, checkpoint=tmp_path)
+
+
+def test_the_elapsed_time_goes_on(tmp_path: Path) -> None:
+    sac().learn(20, checkpoint=tmp_path)
+    model = sac()
+    states: list[float] = []
+
+    class Watch(BaseCallback):
+        def _on_training_start(self) -> None:
+            states.append((model.start_time, model._num_timesteps_at_start))
+
+        def _on_step(self) -> bool:
+            return True
+
+    model.learn(30, Watch(), checkpoint=tmp_path)
+    import time
+
+    assert 0 < time.time_ns() - states[0][0] < 600e9 and states[0][1] == 0
+
+
+def test_compile_is_the_present_programs_and_what_auto_decided_stays() -> None:
+    decided = sac(compile="auto")
+    decided.compiled = True
+    attributes = training_state.save_attributes(decided)
+    for present, compiled in (("auto", True), (False, False)):
+        model = sac(compile=present)
+        training_state.restore_attributes(model, attributes)
+        assert model.compiled is compiled
+
+
+def test_callback_states_notice_changes_in_place() -> None:
+    model = sac()
+    callback = Counter()
+    model._setup_learn(10, callback)
+    states = CallbackStates(callback)
+    assert states.save()["callback"]["attributes"] == {}
+    callback.best["step"] = 3.0
+    assert set(states.save()["callback"]["attributes"]) == {"best"}

@@ -1,0 +1,254 @@
+"""The files of the zoo's commands run no code; what could is refused, unless it is asked for."""
+
+import builtins
+import pickle
+import sys
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+import numpy as np
+import pytest
+import torch
+import yaml
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+pytest.importorskip("rl_zoo3")
+
+import rl_zoo3.exp_manager
+import rl_zoo3.utils
+from sb3_sample.saving.normalization import load_vec_normalize
+
+from sb3_sample import cli, make_env, zoo
+from sb3_sample.saving.container import BadFile, PickledFile
+from sb3_sample.zoo_files import PlottedRuns, check_settings
+
+zoo.register()
+
+SMALL = ["learning_starts:20", "buffer_size:2000", "replay_ratio:0.5", "policy_kwargs:dict(net_arch=[8])"]
+TRAIN = [
+    "train", "--algo", "sac_sample", "--env", "Pendulum-v1", "--device", "cpu", "--eval-freq", "30",
+    "--eval-episodes", "1", "-n", "60", "--verbose", "0", "--save-replay-buffer", "-params", *SMALL, "normalize:True",
+]  # fmt: skip
+SHOW = ["enjoy", "--algo", "sac_sample", "--env", "Pendulum-v1", "-f", "logs", "--no-render", "-n", "5"]
+RUN = Path("logs/sac_sample/Pendulum-v1_1")
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Runs the command in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["sb3-sample"])
+    return lambda *arguments: cli.main([str(argument) for argument in arguments])
+
+
+class Payload:
+    """Leaves a trace when it is unpickled."""
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (Path("code was run"),)
+
+
+@pytest.fixture
+def no_code(tmp_path: Path):
+    """Checks that nothing of a payload was run."""
+    yield
+    assert not (tmp_path / "code was run").exists()
+
+
+def test_no_command_needs_a_pickle(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*args: Any, **kwargs: Any) -> None:
+        raise AssertionError("a pickle is read or written")
+
+    with monkeypatch.context() as patch:
+        for module in (pickle, cloudpickle):
+            for name in ("dump", "dumps", "load", "loads"):
+                patch.setattr(module, name, refuse)
+        for name in ("load", "save"):
+            patch.setattr(torch, name, refuse)
+        run(*TRAIN)
+        assert {"replay_buffer.pkl", "best_model.zip", "Pendulum-v1.zip"} <= {path.name for path in RUN.iterdir()}
+        assert (RUN / "Pendulum-v1/vecnormalize.pkl").exists()
+        run(*TRAIN, "-i", RUN / "Pendulum-v1.zip")
+        run(*SHOW)
+        run(*SHOW, "--load-best")
+    assert rl_zoo3.utils.ALGOS["sac_sample"].load(RUN / "Pendulum-v1.zip").num_timesteps == 60
+
+
+def test_statistics_are_those_of_the_run(run, capsys: pytest.CaptureFixture[str]) -> None:
+    run(*TRAIN)
+    saved = load_vec_normalize(RUN / "Pendulum-v1/vecnormalize.pkl", DummyVecEnv([lambda: make_env("Pendulum-v1")]))
+    # One observation for the reset.
+    assert saved.obs_rms.count == pytest.approx(61, abs=0.01) and saved.norm_reward
+    capsys.readouterr()
+    run(*SHOW)
+    assert "Loading running average" in capsys.readouterr().out
+    run(*TRAIN, "-i", RUN / "Pendulum-v1.zip", "--eval-freq", "-1")
+    second = load_vec_normalize(
+        str(RUN / "Pendulum-v1/vecnormalize.pkl").replace("_1/", "_2/"), DummyVecEnv([lambda: make_env("Pendulum-v1")])
+    )
+    assert second.obs_rms.count == pytest.approx(122, abs=0.01)
+
+
+@pytest.mark.usefixtures("no_code")
+@pytest.mark.parametrize("name", ["Pendulum-v1.zip", "Pendulum-v1/vecnormalize.pkl", "replay_buffer.pkl"])
+def test_a_pickle_in_the_place_of_a_file_is_refused(run, name: str) -> None:
+    run(*TRAIN)
+    (RUN / name).write_bytes(pickle.dumps(Payload()))
+    with pytest.raises(SystemExit, match=rf"train: .*{name} .*pickle.* Here it is the option --allow-pickle"):
+        run(*TRAIN, "-i", RUN / "Pendulum-v1.zip")
+    if name != "replay_buffer.pkl":
+        with pytest.raises(SystemExit, match=rf"enjoy: .*{name} .*pickle.* Here it is the option --allow-pickle"):
+            run(*SHOW, "--exp-id", "1")
+
+
+def test_pickles_are_read_if_they_are_asked_for(run, capsys: pytest.CaptureFixture[str]) -> None:
+    run(*TRAIN)
+    model: Any = rl_zoo3.utils.ALGOS["sac_sample"].load(RUN / "Pendulum-v1.zip")
+    model.load_replay_buffer(RUN / "replay_buffer.pkl")
+    model.save(RUN / "Pendulum-v1.zip", allow_pickle=True)
+    model.save_replay_buffer(RUN / "replay_buffer.pkl", allow_pickle=True)
+    statistics = RUN / "Pendulum-v1/vecnormalize.pkl"
+    load_vec_normalize(statistics, DummyVecEnv([lambda: make_env("Pendulum-v1")])).save(str(statistics))
+    for command in (SHOW, [*TRAIN, "-i", RUN / "Pendulum-v1.zip"]):
+        with pytest.raises(SystemExit, match="--allow-pickle"):
+            run(*command)
+        run(*command, "--allow-pickle")
+    # A run that is refused leaves its empty folder.
+    assert "Loading replay buffer" in capsys.readouterr().out
+    # What is written is safe again; and that pickles were allowed is over.
+    third = RUN.with_name("Pendulum-v1_3")
+    run(*TRAIN, "-i", third / "Pendulum-v1.zip")
+    with pytest.raises(PickledFile):
+        rl_zoo3.utils.ALGOS["sac_sample"].load(RUN / "Pendulum-v1.zip")
+
+
+def test_the_files_of_the_zoos_own_algorithms_are_as_ever(run) -> None:
+    run("train", "--algo", "ppo", "--env", "Pendulum-v1", "-n", "64", "--device", "cpu", "--eval-freq", "-1", "-params",
+        "n_steps:32", "batch_size:32", "normalize:True", "n_envs:1")  # fmt: skip
+    with open("logs/ppo/Pendulum-v1_1/Pendulum-v1/vecnormalize.pkl", "rb") as file:
+        assert type(pickle.load(file)) is VecNormalize
+    run("enjoy", "--algo", "ppo", *SHOW[3:])
+
+
+def test_what_cannot_be_saved_is_known_before_the_training(run) -> None:
+    command = [*TRAIN[:-1], "policy_kwargs:dict(net_arch=[8], activation_fn=lambda: th.nn.ReLU())"]
+    with pytest.raises(SystemExit, match="sb3-sample train: policy_kwargs.*function.*cannot be written"):
+        run(*command)
+    assert not (RUN / "0.monitor.csv").read_text().splitlines()[2:]
+
+
+def test_classes_of_trusted_modules(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("my_networks.py").write_text("from torch import nn\nclass Sine(nn.Tanh):\n    pass\n")
+    monkeypatch.syspath_prepend(Path.cwd())
+    monkeypatch.setattr(builtins, "my_networks", __import__("my_networks"), raising=False)
+    command = [*TRAIN, "policy_kwargs:dict(net_arch=[8], activation_fn=my_networks.Sine)"]
+    with pytest.raises(SystemExit, match="my_networks"):
+        run(*command)
+    trust = ["--trusted-modules", "my_networks"]
+    run(*command, *trust)
+    run(*SHOW, "--exp-id", "2", *trust)
+    with pytest.raises(SystemExit, match="my_networks"):
+        run(*SHOW, "--exp-id", "2")
+
+
+# ---------------------------------------------------------------- settings
+
+
+@pytest.mark.usefixtures("no_code")
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("args.yml", "a: !!python/object/apply:os.system ['touch \"code was run\"']", "it makes an object.*os.system"),
+        ("args.yml", "? !!python/object/new:os.system [x]\n: 1", "it makes an object"),
+        ("args.yml", "a: [{b: !!python/object:argparse.Namespace {}}]", "it makes an object"),
+        ("args.yml", "a: !!python/module:antigravity", "it makes an object"),
+        ("args.yml", "a: !!python/name:os.system", "os:system' is of a module that is not trusted"),
+        ("config.yml", "a: !!python/name:torch.nn.modules.module.warnings", "is no class or function"),
+        ("config.yml", "normalize: __import__('os').system('touch code')", "normalize is Python"),
+        ("config.yml", "normalize: dict(a=print(1))", "normalize is Python"),
+        ("config.yml", "normalize: dict(**vars())", "normalize is Python"),
+        ("config.yml", "env_wrapper: os.system", "env_wrapper is 'os.system'"),
+        ("config.yml", "vec_env_wrapper: [gymnasium.make]", "vec_env_wrapper is 'gymnasium.make'"),
+        ("config.yml", "env_wrapper: [{my.Wrapper: {a: 1}}]", "env_wrapper is"),
+        ("config.yml", "- 1", "does not hold settings"),
+        ("config.yml", "a: [", "is no YAML file"),
+        ("config.yml", "a: " + "[" * 5000, "is no YAML file"),
+    ],
+)
+def test_settings_that_could_run_code_are_refused(
+    name: str, text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).write_text(text)
+    with pytest.raises(BadFile, match=message):
+        check_settings(tmp_path)
+
+
+def test_settings_as_the_zoo_writes_them_are_read(run) -> None:
+    run(
+        *TRAIN[:-1], "normalize:'dict(norm_obs=True, norm_reward=False)'",
+        "policy_kwargs:dict(activation_fn=th.nn.ReLU)",
+        "env_wrapper:[{'gymnasium.wrappers.ClipReward': dict(min_reward=-5.0)}]",
+        "vec_env_wrapper:'stable_baselines3.common.vec_env.VecMonitor'", "resets:(40,)", "--env-kwargs", "g:3.0",
+    )  # fmt: skip
+    text = (RUN / "Pendulum-v1/config.yml").read_text()
+    assert "python/name:torch.nn.modules.activation.ReLU" in text and "python/tuple" in text
+    run(*SHOW)
+
+
+@pytest.mark.usefixtures("no_code")
+def test_enjoy_looks_at_the_settings_first(run) -> None:
+    run(*TRAIN)
+    code = "!!python/object/apply:os.mkdir ['code was run']"
+    (RUN / "Pendulum-v1/args.yml").write_text(f"env_kwargs: {code}")
+    with pytest.raises(SystemExit, match=r"enjoy: .*args\.yml: it makes an object.*--allow-pickle"):
+        run(*SHOW)
+    yaml.load(f"a: {code}", Loader=yaml.UnsafeLoader)
+    assert Path("code was run").exists()  # as it would have been
+    Path("code was run").rmdir()
+
+
+# ---------------------------------------------------------------- runs in folders of their own
+
+
+def test_a_run_is_shown_by_its_folder(run, capsys: pytest.CaptureFixture[str]) -> None:
+    run(*TRAIN, "--run-dir", "runs/a", "--checkpoint-freq", "50")
+    show = ["enjoy", "--run-dir", "runs/a", "--no-render", "-n", "5"]
+    for which, file in (
+        ([], "runs/a/Pendulum-v1.zip"),
+        (["--load-best"], "runs/a/best_model.zip"),
+        (["--load-last-checkpoint"], "runs/a/checkpoint-000000000060/model.zip"),
+    ):
+        capsys.readouterr()
+        run(*show, *which)
+        assert f"Loading {file}" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match=r"logs is no folder of a run of sb3-sample train: it has no run\.json"):
+        run("enjoy", "--run-dir", "logs", "--no-render")
+
+
+def test_help_of_enjoy_has_both_kinds_of_options(run, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        run("enjoy", "--help")
+    output = capsys.readouterr().out
+    assert all(option in output for option in ("--run-dir DIR", "--allow-pickle", "--load-best"))
+
+
+# ---------------------------------------------------------------- plots
+
+
+@pytest.mark.usefixtures("no_code")
+def test_tables_of_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    runs = {"Pendulum-v1": {"bro-logs": {"timesteps": np.arange(3), "mean": np.ones((3, 2)), "last_evals": [1.0, 2.0]}}}
+    with open("all.pkl", "wb") as file:
+        PlottedRuns().dump(runs, file)
+    with open("all.pkl", "rb") as file:
+        read = PlottedRuns().load(file)
+    np.testing.assert_equal(read, runs)
+    Path("evil.pkl").write_bytes(pickle.dumps(Payload()))
+    with open("evil.pkl", "rb") as file, pytest.raises(PickledFile):
+        PlottedRuns().load(file)
+    Path("old.pkl").write_bytes(pickle.dumps(runs))
+    with open("old.pkl", "rb") as file:
+        np.testing.assert_equal(PlottedRuns(allow_pickle=True).load(file), runs)

@@ -1,0 +1,293 @@
+"""Runs of ``sb3-sample train`` with checkpoints: started, interrupted, started again."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("rl_zoo3")
+
+from rl_zoo3 import ALGOS
+
+from sb3_sample import cli, zoo
+from sb3_sample.saving import container
+from sb3_sample.saving.decoding import decode
+from sb3_sample.zoo_runs import Record, RunError, plan, train_parser
+
+zoo.register()
+
+OFF_POLICY = ["learning_starts:20", "buffer_size:2000", "replay_ratio:0.5", "policy_kwargs:dict(net_arch=[8])"]
+ON_POLICY = ["n_steps:16", "batch_size:8", "policy_kwargs:dict(net_arch=[8])", "dynamics_kwargs:dict(width=8)"]
+COMMAND = [
+    "train", "--algo", "sac_sample", "--env", "Pendulum-v1", "--device", "cpu", "--eval-freq", "100",
+    "--eval-episodes", "1", "--log-interval", "1", "--verbose", "0", "--num-threads", "1",
+]  # fmt: skip
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Runs the command in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["sb3-sample"])
+    return lambda *arguments: cli.main([*COMMAND, *arguments, "-params", *OFF_POLICY])
+
+
+def steps(folder: str | Path) -> list[int]:
+    """At which environment steps the checkpoints of a run were made."""
+    return sorted(int(path.name.removeprefix("checkpoint-")) for path in Path(folder).glob("checkpoint-*"))
+
+
+def outcome(folder: str | Path, algo: str = "sac_sample", env: str = "Pendulum-v1") -> dict[str, Any]:
+    """All that a run has left, but times."""
+    folder = Path(folder)
+    found: dict[str, Any] = {}
+    model: Any = ALGOS[algo].load(folder / f"{env}.zip", device="cpu")
+    found["num_timesteps"], found["n_updates"] = model.num_timesteps, model._n_updates
+    for name, state in model.get_parameters().items():
+        found |= {f"{name}.{key}": value.numpy() for key, value in state.items() if isinstance(value, torch.Tensor)}
+    rows: dict[str, list[np.ndarray]] = {}
+    for file in sorted((folder / "replay").glob("*.zip")):
+        for key, value in decode(*container.read(file, "replay rows"), "rows").items():
+            if isinstance(value, np.ndarray):
+                rows.setdefault(key, []).append(value)
+    found |= {f"replay.{key}": np.concatenate(values) for key, values in rows.items()}
+    log = [json.loads(line) for line in (folder / "progress.jsonl").read_text().splitlines()]
+    found["log"] = [{k: v for k, v in line.items() if not k.startswith("time/")} for line in log]
+    for file in folder.glob("*.monitor.csv"):
+        with file.open() as lines:
+            lines.readline()
+            found[file.name] = [(row["r"], row["l"]) for row in csv.DictReader(lines)]
+    if (folder / "evaluations.npz").exists():
+        found |= dict(np.load(folder / "evaluations.npz"))
+    return found
+
+
+def check_equal(first: dict[str, Any], second: dict[str, Any]) -> None:
+    assert first.keys() == second.keys()
+    assert [name for name in first if not np.array_equal(first[name], second[name])] == []
+
+
+# ---------------------------------------------------------------- the command again
+
+
+def test_the_same_command_goes_on_and_the_run_is_the_same(run, capsys: pytest.CaptureFixture[str]) -> None:
+    run("--run-dir", "runs/whole", "--seed", "3", "-n", "440", "--checkpoint-freq", "110", "-tb", "tb")
+    run("--run-dir", "runs/parts", "--seed", "3", "-n", "220", "--checkpoint-freq", "110", "-tb", "tb")
+    assert steps("runs/parts") == [110, 220]
+    before = outcome("runs/parts")
+    # What a run leaves that is killed after its last checkpoint.
+    with open("runs/parts/0.monitor.csv", "a") as file:
+        file.write("-1.0,200,99.0\n")
+    run("--run-dir", "runs/parts", "--seed", "3", "-n", "440", "--checkpoint-freq", "110", "-tb", "tb")
+    whole, parts = outcome("runs/whole"), outcome("runs/parts")
+    check_equal(whole, parts)
+    assert parts["num_timesteps"] == 440 and parts["n_updates"] == 210 > before["n_updates"] == 100
+    assert [length for _, length in parts["0.monitor.csv"]] == ["200", "200"]
+    assert list(parts["timesteps"]) == [100, 200, 300, 400]
+    # TensorBoard has one folder for each of the two runs.
+    assert sorted(path.name for path in Path("tb/Pendulum-v1").iterdir()) == ["SAC_1", "SAC_2"]
+    # When all is done there is nothing to do.
+    run("--run-dir", "runs/parts", "--seed", "3", "-n", "440", "--checkpoint-freq", "110", "-tb", "tb")
+    check_equal(whole, outcome("runs/parts"))
+
+
+def test_times_go_on_too_and_each_step_is_in_the_log_of_tensorboard_once(run) -> None:
+    pytest.importorskip("tensorboard")
+    from stable_baselines3.common.monitor import load_results
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    arguments = ("--run-dir", "a", "--checkpoint-freq", "150", "-tb", "tb", "--eval-freq", "-1")
+    run(*arguments, "-n", "220")
+    # The last checkpoint is lost, so that the end of the log is written once more.
+    assert steps("a") == [150, 220]
+    for file in Path("a/checkpoint-000000000220").iterdir():
+        file.unlink()
+    Path("a/checkpoint-000000000220").rmdir()
+    run(*arguments, "-n", "620")
+    episodes = load_results("a")  # sorted by time
+    assert list(episodes["l"]) == [200, 200, 200] and list(episodes["index"]) == [0, 1, 2]
+    events = EventAccumulator("tb/Pendulum-v1/SAC_1")
+    events.Reload()
+    assert [event.step for event in events.Scalars("rollout/ep_rew_mean")] == [200, 400, 600]
+
+
+def test_the_seed_and_the_number_of_steps_are_remembered(run) -> None:
+    run("--run-dir", "a", "-n", "60")
+    seed, settings = Record.read(Path("a")).seed, Record.read(Path("a")).settings
+    run("--run-dir", "a")
+    record = Record.read(Path("a"))
+    assert (record.seed, record.settings, record.n_timesteps) == (seed, settings, 60)
+    assert outcome("a")["num_timesteps"] == 60
+
+
+def test_a_run_of_other_arguments_is_not_touched(run) -> None:
+    run("--run-dir", "a", "-n", "60", "--seed", "1")
+    before = {path: path.read_bytes() for path in Path("a").rglob("*") if path.is_file()}
+    for arguments, difference in (
+        (["--seed", "2"], r"seed 1 \(now 2\)"),
+        (["--eval-freq", "10", "--algo", "dac"], r"algo 'sac_sample' \(now 'dac'\), eval_freq 100 \(now 10\)"),
+        (["--env-kwargs", "g:3"], r"env_kwargs None \(now \{'g': 3\}\)"),
+    ):
+        with pytest.raises(SystemExit, match=rf"the run in a was started with {difference}\. Nothing was changed"):
+            run("--run-dir", "a", "-n", "60", *arguments)
+    with pytest.raises(SystemExit, match=r"replay_ratio 0\.5 \(now 1\), tau not given \(now 0\.1\)"):
+        cli.main([*COMMAND, "--run-dir", "a", "-params", *OFF_POLICY[:2], "replay_ratio:1", "tau:0.1", OFF_POLICY[3]])
+    assert before == {path: path.read_bytes() for path in Path("a").rglob("*") if path.is_file()}
+
+
+def test_resume_goes_on_with_the_run_of_the_latest_checkpoint(run) -> None:
+    with pytest.raises(SystemExit, match="no run of sac_sample on Pendulum-v1 below logs has a checkpoint"):
+        run("--resume")
+    run("--checkpoint-freq", "30", "-n", "60")
+    run("--checkpoint-freq", "30", "-n", "60")
+    run("--checkpoint-freq", "30", "-n", "60", "--algo", "dac", "--eval-freq", "-1")
+    run("-n", "40")
+    first, second, third = (Path(f"logs/sac_sample/Pendulum-v1_{i}") for i in (1, 2, 3))
+    assert steps(first) == steps(second) == [30, 60] and steps(third) == []
+    run("--resume", "-n", "80")
+    assert steps(first) == [30, 60] and steps(second) == [60, 80]
+    run("--resume", "--run-dir", str(first), "-n", "90")
+    assert steps(first) == [60, 90] and steps("logs/dac/Pendulum-v1_1") == [30, 60]
+    # The first has the latest checkpoint now.
+    run("--resume", "-n", "120")
+    assert steps(first) == [90, 120]
+    with pytest.raises(SystemExit, match="no run of sr_sac on Pendulum-v1"):
+        run("--resume", "--algo", "sr_sac")
+
+
+def test_a_run_that_begins_with_another_ones_model(run) -> None:
+    run("-n", "60", "--save-replay-buffer", "--seed", "1")
+    first = Path("logs/sac_sample/Pendulum-v1_1")
+    begin = ("--seed", "2", "--checkpoint-freq", "40", "-i", str(first / "Pendulum-v1.zip"))
+    run("--run-dir", "whole", "-n", "80", *begin)
+    run("--run-dir", "parts", "-n", "40", *begin)
+    run("--run-dir", "parts", "-n", "80", *begin)
+    check_equal(outcome("whole"), outcome("parts"))
+    assert outcome("parts")["n_updates"] > 40
+
+
+def test_copies_of_the_model_go_on_and_a_progress_bar_may_come(run) -> None:
+    arguments = ("--checkpoint-freq", "30", "--save-freq", "40", "--seed", "1")
+    run("--run-dir", "parts", "-n", "60", *arguments)
+    run("--run-dir", "parts", "-n", "90", *arguments, "--progress")
+    assert {path.name for path in Path("parts").glob("rl_model_*")} == {f"rl_model_{n}_steps.zip" for n in (40, 80)}
+
+
+# ---------------------------------------------------------------- what is refused
+
+
+def test_what_cannot_have_checkpoints_is_refused(run, tmp_path: Path) -> None:
+    for arguments in (["--run-dir", "a"], ["--checkpoint-freq", "10"]):
+        with pytest.raises(SystemExit, match=r"--algo ppo has no checkpoints .* of this package, bro, .*, vpl_sac"):
+            cli.main(["train", "--algo", "ppo", "--env", "Pendulum-v1", *arguments])
+    with pytest.raises(SystemExit, match="-optimize has no checkpoints"):
+        run("--run-dir", "a", "-optimize")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--run-dir", "full"], "--run-dir full holds files, but no run with checkpoints"),
+        (["--run-dir", "full/file"], "--run-dir full/file holds files"),
+        (["--run-dir", "a", "--checkpoint-freq", "0"], "--checkpoint-freq must be at least 1, .*, not 0"),
+        (["--run-dir", "a", "--resume"], "--resume: a has no checkpoint to go on from"),
+        (["--resume"], "--resume needs --run-dir, or --algo and --env"),
+        (["--resume", "--algo", "bro", "--env", "X"], "no run of bro on X below logs has a checkpoint"),
+        (["--run-dir", "lost"], r"lost is no folder of a run of sb3-sample train: it has no run\.json"),
+        (["--run-dir", "odd"], r"odd/run\.json is not what sb3-sample train has written"),
+        (["--run-dir", "wrong"], r"wrong/run\.json is not what sb3-sample train has written: a value"),
+    ],
+)
+def test_bad_arguments(arguments: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("full").mkdir()
+    Path("full/file").touch()
+    for name in ("lost", "odd", "wrong"):
+        Path(name, "checkpoint-000000000010").mkdir(parents=True)
+    Path("odd/run.json").write_text('{"arguments": []}')
+    Path("wrong/run.json").write_text(json.dumps(Record("bro", "X", "--help", 1, 1, {})._asdict()))  # type: ignore[arg-type]
+    with pytest.raises(RunError, match=message):
+        plan(*train_parser().parse_known_args(arguments))
+
+
+def test_a_folder_of_a_run_that_never_had_a_checkpoint_starts_anew(run) -> None:
+    Record("sac_sample", "Pendulum-v1", 1, 60, 30, {}).write(Path("a"))
+    Path("a/0.monitor.csv").write_text("#{}\nr,l,t\n")
+    run("--run-dir", "a", "-n", "220")
+    assert outcome("a")["0.monitor.csv"][0][1] == "200"
+
+
+def test_help_has_both_kinds_of_options(run, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["train", "--help"])
+    assert exit_.value.code == 0
+    output = capsys.readouterr().out
+    assert all(option in output for option in ("--run-dir DIR", "--checkpoint-freq N", "--resume", "--save-freq"))
+
+
+# ---------------------------------------------------------------- killed
+
+
+def start(folder: Path, *arguments: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "sb3_sample.cli", *COMMAND, *arguments],
+        cwd=folder, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.DEVNULL,
+        stderr=(folder / "stderr.txt").open("ab"), start_new_session=True,
+    )  # fmt: skip
+
+
+def finish(process: subprocess.Popen[bytes], folder: Path) -> None:
+    assert process.wait(240) == 0, (folder / "stderr.txt").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("algo", "arguments"),
+    [
+        ("sac_sample", ["-params", *OFF_POLICY]),
+        ("sac_sample", ["--vec-env", "subproc", "-params", *OFF_POLICY, "n_envs:4", "normalize:True"]),
+        ("mbma_ppo", ["--vec-env", "subproc", "-params", *ON_POLICY, "n_envs:4"]),
+    ],
+)
+def test_a_killed_run_is_started_again_and_ends_as_one_that_never_was(
+    algo: str, arguments: list[str], tmp_path: Path
+) -> None:
+    common = ["--algo", algo, "--seed", "5", "-n", "3200", "--eval-freq", "600", "--checkpoint-freq", "400"]
+    finish(start(tmp_path, *common, "--run-dir", "whole", *arguments), tmp_path)
+    for after in (400, 1200, 2000):
+        process = start(tmp_path, *common, "--run-dir", "killed", *arguments)
+        until = time.monotonic() + 120
+        while max(steps(tmp_path / "killed"), default=0) < after and time.monotonic() < until:
+            time.sleep(0.001)
+        time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+        assert process.wait(10) == -signal.SIGKILL
+    assert max(steps(tmp_path / "killed")) < 3200
+    finish(start(tmp_path, *common, "--run-dir", "killed", *arguments), tmp_path)
+    check_equal(outcome(tmp_path / "whole", algo), outcome(tmp_path / "killed", algo))
+
+
+@pytest.mark.slow
+def test_a_run_that_is_interrupted_saves_and_leaves(tmp_path: Path) -> None:
+    arguments = ["--run-dir", "a", "--checkpoint-freq", "400", "--eval-freq", "-1"]
+    for sign, code in ((signal.SIGTERM, 128 + signal.SIGTERM), (signal.SIGINT, 0)):
+        before = max(steps(tmp_path / "a"), default=0)
+        process = start(tmp_path, *arguments, "-n", "1000000", "-params", *OFF_POLICY)
+        until = time.monotonic() + 120
+        while max(steps(tmp_path / "a"), default=0) < before + 800 and time.monotonic() < until:
+            time.sleep(0.01)
+        process.send_signal(sign)
+        # The zoo takes a KeyboardInterrupt for the end, and saves the model.
+        assert process.wait(60) == code
+        assert max(steps(tmp_path / "a")) % 400 != 0 or before > 0
+        assert (tmp_path / "a/Pendulum-v1.zip").exists() == (sign == signal.SIGINT)
