@@ -13,15 +13,10 @@ import numpy as np
 from torch import nn
 from torch.optim import Optimizer
 
+from sb3_sample.saving.checks import ParametersDoNotFit as ParametersDoNotFit
+
 if TYPE_CHECKING:
     from sb3_sample.sac.algorithm import SAC
-
-
-class ParametersDoNotFit(ValueError, RuntimeError):
-    """
-    Parameters that are loaded are not those of this model. Also a ``RuntimeError``, as torch's own, since
-    Stable-Baselines3's ``load`` takes a mere ``ValueError`` for a file of an old version of its own.
-    """
 
 
 class Part(nn.Module):

@@ -28,6 +28,8 @@ BIT_GENERATORS: dict[str, tuple[str, int] | None] = {
 SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Dict, spaces.Tuple)
 #: Packages whose classes a file may name: as far as they are of the kinds below.
 PACKAGES = ("torch.nn", "torch.optim", "stable_baselines3", "sb3_contrib", "sb3_sample")
+#: Of these, what reading a file imports. Modules of the others must be there already: some write files when they are.
+IMPORTED = ("sb3_contrib", "stable_baselines3.common.sb2_compat")
 #: What can be an argument of an algorithm: networks, policies, features extractors, activations; optimizers; buffers.
 KINDS = (nn.Module, torch.optim.Optimizer, BaseBuffer)
 
@@ -81,6 +83,8 @@ def resolve(path: str, trusted: Sequence[str]) -> Any:
     is_known = _within(module, PACKAGES) and not any(part.startswith("_") for part in parts)
     if not (is_trusted or is_known):
         raise ValueError(f"{path!r} is of a module that is not trusted")
+    if not is_trusted and module not in sys.modules and not _within(module, IMPORTED):
+        raise ValueError(f"{path!r} is of a module that is not there, or not imported")
     try:
         value = vars(importlib.import_module(module)).get(name)
     except ImportError as error:

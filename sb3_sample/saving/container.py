@@ -7,6 +7,7 @@ else is refused before it is read.
 """
 
 import contextlib
+import gc
 import hashlib
 import io
 import json
@@ -35,6 +36,8 @@ FORMAT = 1
 #: Bytes of JSON, in general and of some kinds: as objects of Python they take up to some thirty times as much memory.
 MAX_JSON = 32 * 2**20
 MAX_JSON_OF = {"model": 8 * 2**20}
+#: Characters of a message.
+MAX_MESSAGE = 1000
 #: Dimensions of a tensor, as many as NumPy has.
 MAX_DIMENSIONS = 64
 #: The kinds of number of the safetensors format.
@@ -55,7 +58,14 @@ PathOrFile = str | pathlib.Path | IO[bytes]
 
 
 class BadFile(ValueError):
-    """A file that is damaged, of another kind, or not made by this package."""
+    """
+    A file that is damaged, of another kind, or not made by this package.
+
+    :param message: what it is; cut where a file makes it longer than anybody reads
+    """
+
+    def __init__(self, message: str):
+        super().__init__(message if len(message) <= MAX_MESSAGE else f"{message[:MAX_MESSAGE]} ...")
 
 
 class PickledFile(BadFile):
@@ -297,10 +307,16 @@ def _json(data: bytes, name: str) -> Any:
         value = float(text)
         return value if math.isfinite(value) else refuse(text)
 
+    collecting = gc.isenabled()
+    # What is read has no cycles, and looking for them again and again takes ten times as long as reading.
+    gc.disable()
     try:
         return json.loads(data, parse_constant=refuse, parse_float=finite)
     except RecursionError as error:
         raise BadFile(f"{name} is nested too deeply") from error
+    finally:
+        if collecting:
+            gc.enable()
 
 
 def _checked(content: Any, kind: str, name: str) -> tuple[Any, dict[str, str]]:

@@ -4,7 +4,7 @@ import io
 import pathlib
 import warnings
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -12,22 +12,24 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
-from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.saving import container, paths
 from sb3_sample.saving.budget import Budget
+from sb3_sample.saving.checks import (
+    ParametersDoNotFit,
+    check_extra,
+    check_finite,
+    check_kinds,
+    check_metadata,
+    check_moments,
+    check_names,
+    check_sizes,
+)
 from sb3_sample.saving.classes import check_trusted, path_of
 from sb3_sample.saving.container import BadFile, PickledFile
 from sb3_sample.saving.encoding import decode, encode
-from sb3_sample.saving.replay import MAX_TRANSITIONS
 
 KIND = "model"
-#: Environments and, of a HerReplayBuffer, which makes an object for each, transitions that a file can ask for.
-MAX_ENVS, MAX_HER_TRANSITIONS = 100_000, 20_000_000
-#: The largest width, depth or number of networks that a file can ask for. Python makes lists of such lengths.
-MAX_WIDTH = 1_000_000
-#: What the common optimizers keep of each parameter, in its shape. torch's fused kernels do not check it.
-_MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq", "momentum_buffer", "square_avg", "grad_avg")
 Self = TypeVar("Self", bound="SafeFiles")
 
 
@@ -77,7 +79,7 @@ class SafeFiles(BaseAlgorithm):
         }
         parameters = self.get_parameters()
         for name, state in parameters.items():
-            _check_finite(recursive_getattr(self, name), state, name, "cannot be saved, since it", ValueError)
+            check_finite(recursive_getattr(self, name), state, name, "cannot be saved, since it", ValueError)
         metadata = {name: getattr(state, "_metadata", None) for name, state in parameters.items()}
         classes = [path_of(cls) for cls in type(self).__mro__ if issubclass(cls, SafeFiles)]
         tree = {
@@ -118,6 +120,7 @@ class SafeFiles(BaseAlgorithm):
         :param kwargs: arguments of the constructor that shall differ from the saved ones
         :return: the model
         :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
+        :raises ParametersDoNotFit: (a ``ValueError``) if its parameters are not those of the model that it describes
         """
         trusted = check_trusted(trusted_modules)
         try:
@@ -149,18 +152,22 @@ class SafeFiles(BaseAlgorithm):
         try:
             with Budget(content.tensors, content.name):
                 model = cls(policy=attributes["policy_class"], env=env, device=device, _init_setup_model=False)  # type: ignore[call-arg]
-                _check_names(model, attributes, content.name)
+                check_names(model, attributes, content.name)
+                given = {*kwargs, *(custom_objects or ())}
+                check_kinds(model, {k: v for k, v in attributes.items() if k not in given}, content.name)
                 vars(model).update(attributes)
                 vars(model).update(kwargs)
-                _check_sizes(model, content.name)
+                check_sizes(model, content.name)
                 model._setup_model()
             content.check_parameters(model)
             model.set_parameters(content.parameters(), exact_match=True, device=device)
             if model.use_sde:
                 model.policy.reset_noise()  # type: ignore[operator]
+        except (BadFile, ParametersDoNotFit):
+            raise
         except Exception as error:
             # With arguments that the file does not have, its content need not be to blame.
-            if isinstance(error, ValueError) or kwargs or custom_objects:
+            if kwargs or custom_objects:
                 raise
             raise BadFile(
                 f"{content.name}: no {cls.__name__} can be made of what it holds: {type(error).__name__}: {error}"
@@ -186,8 +193,10 @@ class SafeFiles(BaseAlgorithm):
         :param allow_pickle: see ``load``
         :param trusted_modules: see ``load``
         :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
+        :raises ParametersDoNotFit: (a ``ValueError``) if the file's parameters are not those of this model
         """
         parameters: Any = load_path_or_dict
+        content = None
         if not isinstance(load_path_or_dict, dict):
             try:
                 with paths.opened(load_path_or_dict, "zip") as file:
@@ -203,7 +212,12 @@ class SafeFiles(BaseAlgorithm):
             [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
             for optimizer in optimizers
         ]
-        super().set_parameters(parameters, exact_match, device)
+        try:
+            super().set_parameters(parameters, exact_match, device)
+        except Exception as error:
+            if content is None or isinstance(error, (BadFile, ParametersDoNotFit)):
+                raise
+            raise ParametersDoNotFit(f"{content.name}: {error}") from error
         for optimizer, own_groups in zip(optimizers, settings, strict=True):
             for group, own in zip(optimizer.param_groups, own_groups, strict=True):
                 group.update(own)
@@ -273,7 +287,8 @@ class _Content:
             self._parameters = {name: self._decoded(tree, name) for name, tree in self.tree["parameters"].items()}
             for name, tree in self.tree["metadata"].items():
                 if isinstance(state := self._parameters.get(name), OrderedDict):
-                    vars(state)["_metadata"] = self._decoded(tree, name)
+                    metadata = vars(state)["_metadata"] = self._decoded(tree, name)
+                    check_metadata(metadata, f"{self.name}: {name}")
         return self._parameters
 
     def check_parameters(self, model: SafeFiles) -> None:
@@ -285,50 +300,11 @@ class _Content:
         for name, state in self.parameters().items():
             # Others are refused by ``set_parameters``.
             owner = recursive_getattr(model, name) if name in known else None
-            _check_finite(owner, state, f"{self.name}: {name}", "", BadFile)
+            check_finite(owner, state, f"{self.name}: {name}", "", BadFile)
+            if isinstance(owner, torch.nn.Module):
+                check_extra(owner, state, f"{self.name}: {name}")
             if isinstance(owner, torch.optim.Optimizer):
-                _check_moments(owner, state, f"{self.name}: {name}")
-
-
-def _tensors_in(value: Any, name: str) -> Iterator[tuple[str, torch.Tensor]]:
-    if isinstance(value, torch.Tensor):
-        yield name, value
-    elif isinstance(value, dict):
-        for key, item in value.items():
-            yield from _tensors_in(item, f"{name}.{key}")
-    elif isinstance(value, (list, tuple)):
-        for i, item in enumerate(value):
-            yield from _tensors_in(item, f"{name}.{i}")
-
-
-def _check_finite(owner: Any, state: Any, name: str, words: str, error: type[ValueError]) -> None:
-    """Parameters and what optimizers keep must be finite; a buffer, such as a mask, may hold infinity, but not NaN."""
-    learned = None
-    if isinstance(owner, torch.nn.Module):
-        learned = {f"{name}.{key}" for key, _ in owner.named_parameters(remove_duplicate=False)}
-    for key, tensor in _tensors_in(state, name):
-        if not (tensor.is_floating_point() or tensor.is_complex()):
-            continue
-        bad = tensor.float().isnan() if learned is not None and key not in learned else ~tensor.float().isfinite()
-        if bad.any():
-            raise error(f"{key} {words + ' ' if words else ''}holds {int(bad.sum())} numbers that are not finite")
-
-
-def _check_moments(optimizer: torch.optim.Optimizer, state: Any, name: str) -> None:
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    moments = state.get("state") if isinstance(state, dict) else None
-    groups = state.get("param_groups") if isinstance(state, dict) else None
-    if not isinstance(moments, dict) or not isinstance(groups, list):
-        raise BadFile(f"{name} is no state of an optimizer")
-    order = [i for group in groups if isinstance(group, dict) for i in group.get("params", ())]
-    for index, kept in moments.items():
-        if index not in order or order.index(index) >= len(parameters) or not isinstance(kept, dict):
-            raise BadFile(f"{name} keeps something of a parameter {index!r:.50} that is not there")
-        shape = parameters[order.index(index)].shape
-        for key, value in kept.items():
-            wanted = shape if key in _MOMENTS else torch.Size(()) if key == "step" else None
-            if wanted is not None and (not isinstance(value, torch.Tensor) or value.shape != wanted):
-                raise BadFile(f"{name}: {key} of parameter {index} must be a tensor of shape {tuple(wanted)}")
+                check_moments(owner, state, f"{self.name}: {name}")
 
 
 def _forget_folder(attributes: dict[str, Any], warn: bool) -> None:
@@ -341,37 +317,3 @@ def _forget_folder(attributes: dict[str, Any], warn: bool) -> None:
             "replay_buffer_kwargs={'memory_map': <folder>} to load for another folder",
             stacklevel=4,
         )
-
-
-def _check_names(model: SafeFiles, attributes: dict[str, Any], name: str) -> None:
-    """A file sets attributes, but never in the place of a method or of what belongs to the class."""
-    own = vars(model)
-    for key in attributes:
-        if not key.isidentifier() or key.startswith("__") or (hasattr(type(model), key) and key not in own):
-            raise BadFile(f"{name} is damaged or hostile: it sets {key!r:.100}, which is no attribute of a model")
-
-
-def _check_sizes(model: Any, name: str) -> None:
-    """What is allocated without torch, or object by object, and so out of the budget's sight."""
-    if type(model.n_envs) is not int or not 1 <= model.n_envs <= MAX_ENVS:
-        raise BadFile(f"{name}: n_envs must lie in [1, {MAX_ENVS}], not be {model.n_envs!r:.100}")
-    for key, value in vars(model).items():
-        if key.endswith("_kwargs") and key not in ("replay_buffer_kwargs", "rollout_buffer_kwargs"):
-            _check_widths(value, f"{name}: {key}")
-    buffer_class, size = getattr(model, "replay_buffer_class", None), getattr(model, "buffer_size", 1)
-    most = MAX_TRANSITIONS
-    if isinstance(buffer_class, type) and issubclass(buffer_class, HerReplayBuffer):
-        most = MAX_HER_TRANSITIONS
-    if type(size) is not int or not 1 <= size <= most:
-        raise BadFile(f"{name}: buffer_size must lie in [1, {most}], not be {size!r:.100}: pass another one to load")
-
-
-def _check_widths(value: Any, name: str) -> None:
-    if isinstance(value, int) and abs(value) > MAX_WIDTH:
-        raise BadFile(f"{name} holds {value!r:.100}, but sizes of networks are at most {MAX_WIDTH}")
-    if isinstance(value, dict):
-        for key, item in value.items():
-            _check_widths(item, f"{name}.{key}")
-    elif isinstance(value, (list, tuple)):
-        for item in value:
-            _check_widths(item, name)

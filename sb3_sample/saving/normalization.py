@@ -67,7 +67,10 @@ def load_vec_normalize(path: str | pathlib.Path, venv: VecEnv, *, allow_pickle: 
         if not isinstance(state[name], allowed) or (isinstance(state[name], bool) and bool not in allowed):
             raise BadFile(f"{path}: {name} of a VecNormalize cannot be {state[name]!r:.100}")
     arguments = {name: state[name] for name in _ARGUMENTS}
-    wanted = VecNormalize(venv, **arguments)
+    try:
+        wanted = VecNormalize(venv, **arguments)
+    except (ValueError, TypeError, AssertionError) as error:
+        raise BadFile(f"{path} does not fit to the environment: {error}") from error
     for name in ("obs_rms", "ret_rms"):
         own, saved = getattr(wanted, name, None), state[name]
         if _shapes(own, f"{path}: {name}") != _shapes(saved, f"{path}: {name}"):

@@ -13,7 +13,7 @@ from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.saving import container, paths
 from sb3_sample.saving.classes import NotPortable, check_trusted, checked_path
-from sb3_sample.saving.container import BadFile, PickledFile
+from sb3_sample.saving.container import MAX_MESSAGE, BadFile, PickledFile
 from sb3_sample.saving.encoding import decode, encode
 
 KIND = "replay buffer"
@@ -186,8 +186,10 @@ def decode_buffer(
         raise BadFile(
             f"{name}: no replay buffer can be made of what it holds: {type(error).__name__}: {error}"
         ) from error
+    except BadFile as error:
+        raise BadFile(f"{name}: {error}") from error
     except ValueError as error:
-        raise type(error)(f"{name}: {error}") from error
+        raise ValueError(f"{name}: {error!s:.{MAX_MESSAGE}}") from error
 
 
 def _with_state(
@@ -224,6 +226,8 @@ def _with_attributes(
         if not name.isidentifier() or name.startswith("__") or name in _NOT_SAVED or hasattr(cls, name):
             raise BadFile(f"it sets {name!r:.100}, which is no attribute of a {cls.__name__}")
         vars(buffer)[name] = _decode_attribute(value, (size, n_envs), f"replay_buffer.{name}", tensors, trusted)
+    if type(model.replay_buffer) is cls:
+        _check_alike(buffer, model.replay_buffer)
     buffer.device = model.device
     if issubclass(cls, HerReplayBuffer):
         buffer.env = None
@@ -246,6 +250,22 @@ def _check_size(size: Any, n_envs: Any) -> None:
     fits = type(size) is int and type(n_envs) is int and size >= 1 and n_envs >= 1
     if not fits or size * n_envs > MAX_TRANSITIONS:
         raise BadFile(f"its size is {size!r:.50} rows of {n_envs!r:.50} environments, at most {MAX_TRANSITIONS} in all")
+
+
+def _check_alike(buffer: Any, own: Any) -> None:
+    """A class that does not look at its state itself: a buffer must have what another has, of the same kinds."""
+    for name, value in vars(own).items():
+        if name in _NOT_SAVED:
+            continue
+        if name not in vars(buffer):
+            raise BadFile(f"it has no {name}")
+        read = vars(buffer)[name]
+        if value is not None and type(read) is not type(value):
+            raise BadFile(f"its {name} is a {type(read).__name__}, not a {type(value).__name__}")
+        if isinstance(value, np.ndarray) and (value.dtype.kind, value.ndim) != (read.dtype.kind, read.ndim):
+            raise BadFile(
+                f"its {name} is of {read.dtype} and shape {read.shape}, not of {value.dtype} and {value.shape}"
+            )
 
 
 def _check_spaces(buffer: Any, model: OffPolicyAlgorithm) -> None:

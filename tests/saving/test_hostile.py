@@ -2,8 +2,8 @@
 Thousands of damaged, truncated and hostile files: each is a clean error, or harmless; none runs code, takes the
 interpreter down, or takes more than a moment and some memory.
 
-``python -m tests.saving.test_hostile TARGET SEED FIRST N FOLDER`` throws N files at one loader and prints a line of JSON
-for each, before and after: who watches it knows by which it was taken down.
+``python -m tests.saving.test_hostile TARGET SEED FIRST N FOLDER`` throws N files at one loader and prints a line of
+JSON for each, before and after: who watches it knows by which it was taken down.
 """
 
 import contextlib
@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -23,6 +24,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.save_util import recursive_getattr
 
 from sb3_sample.ppo import MBMAPPO
 from sb3_sample.sac import SAC
@@ -31,12 +34,12 @@ from sb3_sample.sac.parts import ParametersDoNotFit
 from sb3_sample.saving import BadFile, load_vec_normalize, save_vec_normalize
 from tests.ppo.common import tiny
 from tests.sac.common import bro, differing, sac, state, vec
-from tests.saving.hostile import FAMILIES, Case, Original, case_of
+from tests.saving.hostile import FAMILIES, Case, Original, case_of, with_entries
 from tests.saving.test_replay import goals
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
-#: Seconds of the processor and bytes that one file may take; measured: see the slow test's output.
-SECONDS, BYTES = 2.0, 400 * 2**20
+#: Seconds of the processor and bytes that one file may take; measured were at most 0.3 s and 64 MiB, for 3 MB of JSON.
+SECONDS, BYTES = 2.0, 128 * 2**20
 #: Of address space, in which more is taken than is ever filled: a crash before the machine's memory is gone.
 HEADROOM = 16 * 2**30
 
@@ -99,8 +102,8 @@ def content(target: str, loaded: Any) -> Any:
         rms = loaded.obs_rms
         return {"mean": torch.tensor(rms.mean), "var": torch.tensor(rms.var), "clip": torch.tensor(loaded.clip_obs)}
     if target in ("buffer", "her"):
-        arrays = {k: v for k, v in _flat(vars(loaded)) if isinstance(v, (np.ndarray, torch.Tensor)) and v.dtype != object}
-        return {key: torch.as_tensor(value).clone() for key, value in arrays.items()}
+        arrays = {key: value for key, value in _flat(vars(loaded)) if isinstance(value, (np.ndarray, torch.Tensor))}
+        return {key: torch.as_tensor(value).clone() for key, value in arrays.items() if value.dtype != object}
     return state(loaded)
 
 
@@ -114,6 +117,7 @@ def _flat(values: dict[str, Any]) -> Iterator[tuple[str, Any]]:
 
 @cache
 def wanted(target: str, folder: Path) -> Any:
+    model_of("SAC")  # whose transitions the others learn from
     path = folder / "good.zip"
     path.write_bytes(original_of(target).data)
     good = content(target, load(target, path))
@@ -132,7 +136,8 @@ class Watch:
 
     EVENTS = (
         "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "subprocess.Popen", "pickle.find_class",
-        "os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod", "os.putenv",
+        "os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod",
+        "os.putenv",
         "shutil.rmtree", "shutil.copyfile", "shutil.unpack_archive", "socket.connect", "socket.bind", "ctypes.dlopen",
         "webbrowser.open", "urllib.Request",
     )  # fmt: skip
@@ -203,15 +208,25 @@ def throw(target: str, case: Case, folder: Path) -> dict[str, Any]:
             outcome = type(error).__name__
             if len(str(error)) > 3000:
                 wrong = f"a message of {len(str(error))} characters"
+        except ValueError as error:
+            outcome = "ValueError"
+            # Documented of a buffer or statistics of other spaces.
+            documented = target in ("buffer", "her", "VecNormalize") and str(error).startswith(str(path))
+            wrong = None if documented and len(str(error)) < 3000 else f"ValueError: {error!s:.300}"
         except BaseException as error:  # of any kind: that is what is tested
             outcome = type(error).__name__
             wrong = f"{outcome}: {error!s:.300}"
     taken = {"seconds": time.process_time() - start, "wall": time.perf_counter() - wall, "bytes": peak() - before}
     path.unlink()
+    seen = watch().seen
     if loaded is not None:
-        wrong = wrong or _wrong_with(target, case, content(target, loaded), good)
-    if watch().seen:
-        wrong = f"{wrong or ''} it did {watch().seen}"
+        wrong = wrong or _wrong_with(target, case, loaded, good)
+        with warnings.catch_warnings(), watch().watching():
+            warnings.simplefilter("ignore")
+            outcome = f"loaded, {use(target, loaded)}"
+        seen += watch().seen
+    if seen:
+        wrong = f"{wrong or ''} it did {seen}"
     if left := os.listdir(folder):
         wrong = f"{wrong or ''} it left {left}"
     if taken["seconds"] > SECONDS or taken["bytes"] > BYTES:
@@ -219,15 +234,46 @@ def throw(target: str, case: Case, folder: Path) -> dict[str, Any]:
     return {"case": case.words, "outcome": outcome, "wrong": wrong, **taken}
 
 
-def _wrong_with(target: str, case: Case, found: Any, good: Any) -> str | None:
-    if case.damaged and differing(found, good):
-        return f"it was loaded, with other {differing(found, good)}"
+def _wrong_with(target: str, case: Case, loaded: Any, good: Any) -> str | None:
+    found = content(target, loaded)
+    if case.damaged:
+        return f"it was loaded, with other {differing(found, good)}" if differing(found, good) else None
     if target in ("buffer", "her", "VecNormalize"):
         return None
-    if found.keys() != good.keys() or any(found[key].shape != good[key].shape for key in good):
-        return "it was loaded, as another network"
-    bad = [key for key in found if not found[key].isfinite().all()]
+    # What optimizers keep can be missing, as in a new one.
+    named = {f"{name}/{key}" for name in loaded.get_parameters() for key in _learned(loaded, name)}
+    if other := [key for key in named if key not in found or key not in good or found[key].shape != good[key].shape]:
+        return f"it was loaded, as another network: {other}"
+    bad = [key for key in named if not found[key].isfinite().all()]
     return f"it was loaded, with {bad} not finite" if bad else None
+
+
+def _learned(model: Any, name: str) -> list[str]:
+    owner = recursive_getattr(model, name)
+    return [key for key, _ in owner.named_parameters()] if isinstance(owner, torch.nn.Module) else []
+
+
+def use(target: str, loaded: Any) -> str:
+    """
+    Act and learn with a forged model, buffer or optimizer: what a file says can be wrong, as a discount of 7 can, and
+    raise sooner or later, but torch's kernels must not be given what they write beside.
+    """
+    try:
+        if target in ("SAC", "BRO", "set_parameters"):
+            loaded.predict(OBSERVATIONS)
+            loaded.replay_buffer = model_of("SAC").replay_buffer
+            loaded.set_logger(Logger(None, []))
+            loaded.compiled = False  # a file may ask for it, and then a compiler is run
+            loaded.train(1, 4)
+        elif target == "MBMAPPO":
+            loaded.predict(OBSERVATIONS)
+        elif target in ("buffer", "her"):
+            loaded.sample(8)
+        else:
+            loaded.step(np.zeros((1, 2)))
+    except Exception as error:
+        return f"{type(error).__name__}: {error!s:.200}"
+    return "used"
 
 
 TARGETS = ("SAC", "BRO", "MBMAPPO", "set_parameters", "buffer", "her", "VecNormalize")
@@ -268,7 +314,59 @@ def test_a_good_file_is_loaded(empty: Path) -> None:
     """What is thrown is refused for what was done to it."""
     for target in TARGETS:
         result = throw(target, Case("nothing changed", original_of(target).data, True), empty)
-        assert result["outcome"] == "loaded" and result["wrong"] is None, result
+        assert result["outcome"] == "loaded, used" and result["wrong"] is None, result
+
+
+def forged(target: str, change: Callable[[Any], Any]) -> Case:
+    """A good file with its tree changed, behind right checksums."""
+    original = original_of(target)
+    content = json.loads(json.dumps(original.content))
+    change(content["tree"])
+    return Case("", with_entries(original, data=json.dumps(content).encode()), False)
+
+
+def _attribute(name: str, value: Any) -> Callable[[Any], Any]:
+    return lambda tree: tree["attributes"].update({name: value})
+
+
+@pytest.mark.parametrize(
+    ("target", "change", "words"),
+    [
+        ("SAC", _attribute("gamma", "x"), "gamma cannot be 'x'"), ("SAC", _attribute("n_steps", []), "n_steps cannot"),
+        ("SAC", _attribute("num_timesteps", "x"), "num_timesteps cannot be 'x'"),
+        ("MBMAPPO", _attribute("clip_range", "x"), "clip_range cannot be 'x'"),
+        ("SAC", _attribute("policy_delay", {"dict": {}}), "policy_delay cannot be {}"),
+        ("SAC", _attribute("exploration_kwargs", {"dict": {"x": 1}}), r"case\.zip: no SAC can be made .* takes none"),
+        ("SAC", _attribute("replay_buffer_class", {"import": "stable_baselines3.common.results_plotter:X"}), "imported"),
+        ("SAC", lambda tree: tree["parameters"]["plasticity"]["ordered_dict"]["_extra_state"]["dict"].update(n_done=[]),
+         "plasticity._extra_state cannot be"),
+        ("SAC", lambda tree: tree["parameters"]["actor.optimizer"]["dict"]["state"]["dict_items"][0][1]["dict"].pop(
+            "exp_avg"), "but others of other parameters"),
+        ("set_parameters", lambda tree: tree["metadata"]["policy"]["ordered_dict"].update({"": "x"}), "no versions of"),
+        ("set_parameters", lambda tree: tree["parameters"]["policy"]["ordered_dict"].popitem(), "Missing key"),
+        ("set_parameters", lambda tree: tree["parameters"]["actor.optimizer"]["dict"]["param_groups"][0]["dict"].update(
+            params=[[]]), "which parameters are in group 0"),
+        ("her", lambda tree: tree["attributes"].pop("handle_timeout_termination"), "has no handle_timeout_termination"),
+        ("her", lambda tree: tree["attributes"].update(her_ratio={"whole": "x"}), "her_ratio is a str, not a float"),
+        ("VecNormalize", lambda tree: tree["dict"].update(norm_obs_keys=["x"]), "case.zip does not fit to the env"),
+        ("VecNormalize", lambda tree: tree["dict"].update(norm_reward=["x" * 999]), "cannot be"),
+    ],
+)  # fmt: skip
+def test_what_was_found(target: str, change: Any, words: str, empty: Path) -> None:
+    """Files that once raised something else, were loaded as something else, or had a plotting library write files."""
+    path = empty / "case.zip"
+    path.write_bytes(forged(target, change).data)
+    with warnings.catch_warnings(), pytest.raises((BadFile, ParametersDoNotFit), match=words) as raised:
+        warnings.simplefilter("ignore")
+        load(target, path)
+    assert len(str(raised.value)) < 1100 or target == "set_parameters"
+
+
+def test_large_json_is_read_as_fast_as_small(empty: Path) -> None:
+    """Python's collector went through all of it again and again."""
+    data = b"[" + b"[]," * 10**6 + b"[]]"
+    result = throw("SAC", Case("", with_entries(original_of("SAC"), data=data), False), empty)
+    assert result["wrong"] is None and result["seconds"] < 0.7, result
 
 
 @pytest.mark.slow
@@ -288,9 +386,9 @@ def test_thousands_of_files(target: str, tmp_path: Path) -> None:
     wrong = [(line["number"], line["case"], line["wrong"]) for line in results if line["wrong"]]
     assert not wrong, f"{len(wrong)} of {n}: {wrong[:20]}"
     worst = {key: max(line[key] for line in results) for key in ("seconds", "wall", "bytes")}
-    counts = {kind: sum(line["outcome"] == kind for line in results) for kind in {line["outcome"] for line in results}}
+    counts = Counter(line["outcome"].split(",")[0] for line in results)
     print(f"{target}: {counts}, at most {worst}")
-    assert counts.get("BadFile", 0) > n / 2
+    assert counts["BadFile"] > n / 2
 
 
 def main(target: str, seed: str, first: str, n: str, folder: str) -> None:
