@@ -1,7 +1,8 @@
 """Sample-efficient reinforcement learning for users of Stable-Baselines3."""
 
 from sb3_sample.diagnostics import DiagnosticsCallback
-from sb3_sample.envs import make_env
+from sb3_sample.envs import EnvironmentDied, SupervisedSubprocVecEnv, make_env
+from sb3_sample.faults import TrainingDiverged
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
 from sb3_sample.sac.buffers import DeviceReplayBuffer
@@ -27,7 +28,10 @@ __all__ = [
     "CompactReplayBuffer",
     "DeviceReplayBuffer",
     "DiagnosticsCallback",
+    "EnvironmentDied",
     "RegularizedSAC",
+    "SupervisedSubprocVecEnv",
+    "TrainingDiverged",
     "__version__",
     "make_env",
 ]

@@ -70,29 +70,28 @@ def reading(allow_pickle: bool = False, trusted_modules: Sequence[str] = ()) -> 
     :param allow_pickle: whether pickled files are read too, which can run any code that their author wanted
     :param trusted_modules: modules, or packages of modules, whose classes and functions a file may name
     """
-    given = {"trusted_modules": tuple(trusted_modules), **({"allow_pickle": True} if allow_pickle else {})}
-    written = {"trusted_modules": tuple(trusted_modules)}
-    methods: list[tuple[Any, str, dict[str, Any]]] = [
-        (SafeFiles, "save", written),
-        (SafeFiles, "load", given),
-        (SafeFiles, "set_parameters", given),
-        (SafeReplayBuffers, "save_replay_buffer", written),
-        (SafeReplayBuffers, "load_replay_buffer", given),
+    methods: list[tuple[Any, str, bool]] = [
+        (SafeFiles, "save", False),
+        (SafeFiles, "load", allow_pickle),
+        (SafeFiles, "set_parameters", allow_pickle),
+        (SafeReplayBuffers, "save_replay_buffer", False),
+        (SafeReplayBuffers, "load_replay_buffer", allow_pickle),
     ]
     with contextlib.ExitStack() as stack:
         stack.enter_context(replaced(sys.modules[__name__], "_allow_pickle", allow_pickle))
-        for owner, name, arguments in methods:
-            stack.enter_context(replaced(owner, name, _with(vars(owner)[name], arguments)))
+        for owner, name, pickles in methods:
+            stack.enter_context(replaced(owner, name, _with(vars(owner)[name], pickles, tuple(trusted_modules))))
         yield
 
 
-def _with(method: Any, arguments: dict[str, Any]) -> Any:
-    """A method that is always called with some arguments, since the zoo cannot pass them."""
+def _with(method: Any, pickles: bool, trusted: tuple[str, ...]) -> Any:
+    """A method that trusts more than its caller says, since the zoo cannot say anything."""
     function = method.__func__ if isinstance(method, classmethod) else method
 
     @functools.wraps(function)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        return function(*args, **{**kwargs, **arguments})
+    def call(*args: Any, allow_pickle: bool = False, trusted_modules: Sequence[str] = (), **kwargs: Any) -> Any:
+        more = (*trusted_modules, *trusted)
+        return function(*args, allow_pickle=allow_pickle or pickles, trusted_modules=more, **kwargs)
 
     return classmethod(call) if isinstance(method, classmethod) else call
 

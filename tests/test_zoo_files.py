@@ -17,10 +17,10 @@ pytest.importorskip("rl_zoo3")
 
 import rl_zoo3.exp_manager
 import rl_zoo3.utils
-from sb3_sample.saving.normalization import load_vec_normalize
 
 from sb3_sample import cli, make_env, zoo
 from sb3_sample.saving.container import BadFile, PickledFile
+from sb3_sample.saving.normalization import load_vec_normalize
 from sb3_sample.zoo_files import PlottedRuns, check_settings
 
 zoo.register()
@@ -150,6 +150,10 @@ def test_classes_of_trusted_modules(run, monkeypatch: pytest.MonkeyPatch) -> Non
     run(*SHOW, "--exp-id", "2", *trust)
     with pytest.raises(SystemExit, match="my_networks"):
         run(*SHOW, "--exp-id", "2")
+    # With checkpoints as well, and when the run goes on.
+    for n in ("60", "90"):
+        run("train", "--run-dir", "a", "--seed", "1", *trust, *command[1:11], "-n", n, *command[13:])
+    assert Path("a/checkpoint-000000000090").is_dir()
 
 
 # ---------------------------------------------------------------- settings

@@ -15,8 +15,18 @@ from sb3_sample.envs.registration import (
     register_in_workers,
 )
 from sb3_sample.envs.suites import published_key
+from sb3_sample.envs.workers import EnvironmentDied, SupervisedSubprocVecEnv
 
 register_all()
 register_in_workers()
 
-__all__ = ["ALL_IDS", "DMC_IDS", "METAWORLD_IDS", "MYOSUITE_IDS", "make_env", "published_key"]
+__all__ = [
+    "ALL_IDS",
+    "DMC_IDS",
+    "METAWORLD_IDS",
+    "MYOSUITE_IDS",
+    "EnvironmentDied",
+    "SupervisedSubprocVecEnv",
+    "make_env",
+    "published_key",
+]

@@ -28,7 +28,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_known, check_unused
 from sb3_sample.envs.finite_check import FiniteCheck
+from sb3_sample.envs.workers import watch_workers
 from sb3_sample.export import Exportable
+from sb3_sample.faults import TrainingDiverged, check_finite_parameters, not_finite
 from sb3_sample.ppo.dynamics import minibatches
 from sb3_sample.ppo.spaces import FlatObservations, ModelActions
 from sb3_sample.saving.checkpoint import Checkpointer
@@ -308,6 +310,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         venv = PPO._wrap_env(env, verbose, monitor_wrapper)
         FiniteCheck.install(venv)
+        watch_workers(venv)
         return venv
 
     # ---------------------------------------------------------------- saving and loading
@@ -402,6 +405,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         :return: the trained model
         :raises ValueError: if the folder is of another run (the message names what differs), cannot be used, or has
             checkpoints that are all damaged
+        :raises TrainingDiverged: if a loss or a parameter is NaN or infinite
         """
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
@@ -413,7 +417,8 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
             checkpointer.start()
             assert self.env is not None
             while self.num_timesteps < total_timesteps:
-                if not self.collect_rollouts(self.env, callback, self.rollout_buffer, n_rollout_steps=self.n_steps):
+                heard = checkpointer.callback
+                if not self.collect_rollouts(self.env, heard, self.rollout_buffer, n_rollout_steps=self.n_steps):
                     break
                 self._iteration += 1
                 self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
@@ -421,7 +426,8 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
                     self.dump_logs(self._iteration)
                 self.train()
                 checkpointer.after_turn()
-            callback.on_training_end()
+            check_finite_parameters(self)
+            checkpointer.finish()
         return self
 
     def _on_environment_reset(self) -> None:
@@ -466,7 +472,33 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
     def train(self) -> None:
         """
         Update models, policy and value with the present rollout (P1, algorithm 1, lines 5 to 13).
+
+        :raises TrainingDiverged: if a loss or a parameter is NaN or infinite
         """
+        try:
+            self._train()
+        except TrainingDiverged:
+            raise
+        except ValueError:
+            # As torch's distributions raise where a mean is not finite: say what it comes from.
+            check_finite_parameters(self)
+            raise
+        self._check_losses()
+        check_finite_parameters(self)
+
+    def _check_losses(self) -> None:
+        """Those that the present iteration has logged."""
+        logged = {
+            name: value
+            for name, value in self.logger.name_to_value.items()
+            # The share that is explained is NaN where all returns are equal.
+            if name.startswith(("train/", "dynamics/")) and name != "train/explained_variance"
+        }
+        bad = not_finite(logged)
+        if bad:
+            raise TrainingDiverged(bad, f"update {self._n_updates}", self.num_timesteps)
+
+    def _train(self) -> None:
         n_simulated = self.current_n_simulated()
         # While X is still rising from 0 the models learn already.
         if self.n_simulated > 0 and (self.anneal_until is None or self._progress < self.anneal_until):
@@ -643,7 +675,12 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
             order = torch.as_tensor(np.random.permutation(len(rollout.values)), device=self.device)  # noqa: NPY002
             shuffled = {name: values[order] for name, values in columns.items()}
             for batch in minibatches(list(shuffled.values()), self.batch_size):
-                loss, step = self._losses(dict(zip(shuffled, batch, strict=True)), clip_range, clip_range_vf)
+                try:
+                    loss, step = self._losses(dict(zip(shuffled, batch, strict=True)), clip_range, clip_range_vf)
+                except ValueError:
+                    # What torch's distributions say of a mean that is not finite comes one minibatch late.
+                    self._stop_if_diverged(metrics)
+                    raise
                 metrics.append({name: value.detach() for name, value in step.items()})
                 divergences.append(metrics[-1].pop("approx_kl"))
                 if self.target_kl is not None and divergences[-1] > 1.5 * self.target_kl:
@@ -660,7 +697,10 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
                 break
 
         for name in ("entropy_loss", "policy_gradient_loss", "value_loss", "clip_fraction"):
-            self.logger.record(f"train/{name}", torch.stack([step[name] for step in metrics]).mean().item())
+            mean = torch.stack([step[name] for step in metrics]).mean().item()
+            if not math.isfinite(mean):
+                self._stop_if_diverged(metrics)
+            self.logger.record(f"train/{name}", mean)
         self.logger.record("train/approx_kl", torch.stack(divergences).mean().item())
         self.logger.record("train/loss", loss.item())
         variance = explained_variance(self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten())
@@ -671,6 +711,13 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         self.logger.record("train/clip_range", clip_range)
         if clip_range_vf is not None:
             self.logger.record("train/clip_range_vf", clip_range_vf)
+
+    def _stop_if_diverged(self, metrics: list[dict[str, torch.Tensor]]) -> None:
+        """Name the first of the present iteration's minibatches whose metrics are not finite, if there is one."""
+        for i, step in enumerate(metrics, 1):
+            bad = not_finite({f"train/{name}": value.item() for name, value in step.items()})
+            if bad:
+                raise TrainingDiverged(bad, f"minibatch {i} of the iteration", self.num_timesteps)
 
     def _losses(
         self, batch: dict[str, torch.Tensor], clip_range: float, clip_range_vf: float | None

@@ -22,7 +22,9 @@ from torch import nn
 
 from sb3_sample.arguments import check_known
 from sb3_sample.envs.finite_check import FiniteCheck
+from sb3_sample.envs.workers import watch_workers
 from sb3_sample.export import Exportable
+from sb3_sample.faults import MetricWatch, TrainingDiverged, check_finite_parameters, not_finite
 from sb3_sample.networks.spectral_norm import SpectralNorm
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 from sb3_sample.sac import arguments, losses
@@ -275,6 +277,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         self._execution = None
         self._parts_mode = ModeSwitch(*self._parts().values())
         self._batch_memory = BatchMemory()
+        self._watch = MetricWatch(self.device)
         self._set_training_mode(False)
 
     def _check_arguments(self) -> None:
@@ -457,6 +460,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
             raise ValueError(f"env must have an action space with low < high in every dimension, not {space}")
         venv = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         FiniteCheck.install(venv)
+        watch_workers(venv)
         return venv
 
     def make_optimizer(self, parameters: Any) -> torch.optim.Optimizer:
@@ -497,6 +501,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
             "_execution",
             "_parts_mode",
             "_batch_memory",
+            "_watch",
         ]
 
     def reinitialize(self, shrink: float = 0.0) -> None:
@@ -554,9 +559,17 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
                 observations, _ = self.policy.obs_to_tensor(self._last_obs)
                 actions = self.explorer.act(self, observations)
             scaled = actions.cpu().numpy().reshape((n_envs, *self.action_space.shape))
+            if not np.isfinite(scaled).all():
+                self._stop_diverged(scaled)
         if action_noise is not None:
             scaled = np.clip(scaled + action_noise(), -1, 1)
         return self.policy.unscale_action(scaled), scaled
+
+    def _stop_diverged(self, actions: np.ndarray) -> None:
+        """An action is not finite, and no environment shall see it: say why."""
+        check_finite_parameters(self)
+        worst = not_finite({"the policy's action": actions.sum()})
+        raise TrainingDiverged(worst, f"gradient step {self._n_updates}", self.num_timesteps)
 
     def _store_transition(
         self,
@@ -634,6 +647,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         :return: the trained model
         :raises ValueError: if the folder is of another run (the message names what differs), cannot be used, or has
             checkpoints that are all damaged
+        :raises TrainingDiverged: if a loss, another metric or a parameter is NaN or infinite
         """
         resets_environment = reset_num_timesteps or self._last_obs is None
         total_timesteps, callback = self._setup_learn(
@@ -652,7 +666,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
                     self.env,
                     train_freq=self.train_freq,  # type: ignore[arg-type]  # converted in _setup_model
                     action_noise=self.action_noise,
-                    callback=callback,
+                    callback=checkpointer.callback,
                     learning_starts=self.learning_starts,
                     replay_buffer=self.replay_buffer,
                     log_interval=log_interval,
@@ -663,7 +677,8 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
                 if n_updates > 0:
                     self.train(n_updates, self.batch_size)
                 checkpointer.after_turn()
-            callback.on_training_end()
+            check_finite_parameters(self)
+            checkpointer.finish()
         return self
 
     def _on_environment_reset(self) -> None:
@@ -717,6 +732,8 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
 
         :param gradient_steps: how many
         :param batch_size: transitions a step
+        :raises TrainingDiverged: if a metric is NaN or infinite; on a GPU that may be noticed later, at the latest when
+            the log is written
         """
         assert self.replay_buffer is not None
         self._set_training_mode(True)
@@ -732,8 +749,12 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
             n_batches = min(MAX_BATCHES_AT_ONCE, gradient_steps - first)
             for i, batch in enumerate(self._draw_batches(n_batches, batch_size), first + 1):
                 self._keeps_gradients = self.keep_next_gradients and i == gradient_steps
-                self._metrics.update(self._update(batch))
+                metrics = self._update(batch)
+                self._watch.note(metrics, self._n_updates, self.num_timesteps)
+                self._metrics.update(metrics)
         self._set_training_mode(False)
+        if self.device.type == "cpu":
+            self._watch.check()
 
     def _set_training_mode(self, mode: bool) -> None:
         """Dropout and power iterations: on during gradient steps, off whoever acts."""
@@ -896,7 +917,10 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
     def dump_logs(self) -> None:
         """
         Write the log. Only here are the metrics fetched from the device.
+
+        :raises TrainingDiverged: if one of them was NaN or infinite since the last time
         """
+        self._watch.check()
         for name, value in self._metrics.items():
             self.logger.record(name, value.item())
         self.logger.record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))

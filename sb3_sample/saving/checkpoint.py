@@ -26,6 +26,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_sample.faults import HoldBack, check_finite_parameters
 from sb3_sample.saving import container, training_state, vec_envs
 from sb3_sample.saving.attributes import DoesNotFit
 from sb3_sample.saving.callbacks import CallbackStates, environments, walk, without_progress_bar
@@ -56,6 +57,10 @@ class Checkpointer:
             raise ValueError(f"checkpoint_freq must be an integer of at least 1, in environment steps, not {every!r}")
         self._model, self._callback, self._every = model, callback, int(every)
         self._name = folder
+        self._held: HoldBack | None = None
+        if folder is not None:
+            self._held = HoldBack(callback)
+            self._held.model = model
         self._folder: RunFolder | None = None
         #: What was read of the checkpoint that the run goes on from.
         self._resumed: dict[str, Any] | None = None
@@ -65,6 +70,13 @@ class Checkpointer:
         self._interrupts: _Interrupts | None = None
         # How many times every steps there were when it was last asked.
         self._period = 0
+
+    @property
+    def callback(self) -> BaseCallback:
+        """
+        :return: what is to be called at every step: the callback, whose exceptions are kept until the turn is saved
+        """
+        return self._callback if self._held is None else self._held
 
     def __enter__(self) -> "Checkpointer":
         if self._name is None:
@@ -104,11 +116,15 @@ class Checkpointer:
         if self._folder is None:
             return
         try:
-            # A callback that ends the training does so in the midst of a turn, of which nothing can be saved.
-            if kind is None and self._whole_at == self._model.num_timesteps != self._saved_at:
-                self._try_to_save()
+            if kind is None:
+                self._save_if_whole()
         finally:
             self._close(orderly=kind is None)
+
+    def _save_if_whole(self) -> None:
+        # A callback that ends the training does so in the midst of a turn, of which nothing can be saved.
+        if self._whole_at == self._model.num_timesteps != self._saved_at:
+            self._try_to_save()
 
     def _close(self, orderly: bool) -> None:
         assert self._folder is not None
@@ -234,20 +250,40 @@ class Checkpointer:
         """
         Save if it is time to, or leave if the process was asked to.
 
+        :raises Exception: what a callback raised during the turn
+        :raises TrainingDiverged: something is not finite that would be saved
         :raises KeyboardInterrupt: after SIGINT
         :raises SystemExit: after SIGTERM
         """
         if self._folder is None:
             return
-        assert self._interrupts is not None
+        assert self._interrupts is not None and self._held is not None
         now = self._whole_at = self._model.num_timesteps
         leaves = self._interrupts.received is not None
         due = now // self._every > self._period
         self._period = now // self._every
-        if (due or leaves) and now != self._saved_at:
-            self._try_to_save()
+        try:
+            if (due or leaves or self._held.has_raised()) and now != self._saved_at:
+                self._try_to_save()
+        finally:
+            self._held.raise_kept()
         if leaves:
             self._interrupts.leave()
+
+    def finish(self) -> None:
+        """
+        Let the callback hear that the training ends. What it raises does not cost the turns since the last checkpoint.
+
+        :raises Exception: what it raises, or what it raised during a turn that it ended
+        """
+        if self._held is not None:
+            self._held.raise_kept()
+        try:
+            self._callback.on_training_end()
+        except Exception:
+            if self._folder is not None:
+                self._save_if_whole()
+            raise
 
     def _try_to_save(self) -> None:
         try:
@@ -263,7 +299,9 @@ class Checkpointer:
     def _save(self) -> None:
         """
         :raises OSError: it cannot be written
+        :raises TrainingDiverged: it would hold what is not finite
         """
+        check_finite_parameters(self._model)
         known = self._manifest["segments"]
         segments = dict(known)
         try:

@@ -16,6 +16,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_sample.envs.portable_states import HELPER, pack, unpack
+from sb3_sample.envs.workers import SupervisedSubprocVecEnv
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name
 
 #: Of each wrapper: what leads elsewhere, what is an argument, and clocks, which count from when it was made.
@@ -160,6 +161,8 @@ def save(venv: VecEnv) -> tuple[dict[str, Any], list[str]]:
         "seeds": list(innermost._seeds),
         "options": list(innermost._options),
         "environments": None,
+        # What a worker's episode is cut off with, should it die.
+        "last": innermost.last_observations if isinstance(innermost, SupervisedSubprocVecEnv) else None,
     }
     packed = call(venv, "pack")
     if packed is None:
@@ -190,6 +193,8 @@ def restore(venv: VecEnv, state: dict[str, Any]) -> list[str]:
     restorer = Restorer()
     for wrapper, saved in zip(wrappers, state["wrappers"], strict=True):
         restorer.attributes(wrapper, saved["attributes"])
+    if isinstance(innermost, SupervisedSubprocVecEnv) and state.get("last") is not None:
+        innermost.last_observations = list(state["last"])
     innermost._seeds, innermost._options = list(state["seeds"]), list(state["options"])
     if state["environments"] is None:
         return ["they are not in the checkpoint"]

@@ -381,7 +381,8 @@ def test_a_callback_that_ends_the_training_leaves_a_whole_state(tmp_path: Path) 
         else:
             with pytest.raises(error):
                 sac().learn(50, Stop(25, error), checkpoint=run, **STEPS)
-        assert steps_of(run) == [10, 20]
+        # An exception waits until the turn is over and saved (docs/faults.md).
+        assert steps_of(run) == ([20, 25] if error is RuntimeError else [10, 20])
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         assert not differing(state(sac().learn(50)), state(sac().learn(50, checkpoint=run)))
 
