@@ -7,7 +7,7 @@ Every off-policy agent has the papers' shared settings: two hidden layers of 256
 transition, 10,000 random steps, target entropy -|A|/2, Adam 3e-4. SRSAC takes eight gradient steps and is reset every
 10,000 steps, the papers' 16 and 160,000 scaled to a short run.
 
-    OMP_NUM_THREADS=1 python benchmarks/learning_curves.py --agent MBMAPPO --action-repeat 4 --steps 40960 --eval-freq 2048
+    python benchmarks/learning_curves.py --agent MBMAPPO --action-repeat 4 --steps 40960 --eval-freq 2048
 
 The on-policy agents have P1's settings, and observations and rewards normalised by VecNormalize; "PPO" is MBMAPPO
 without simulated actions, which is stable_baselines3's PPO step for step. The run goes to ``OUTPUT/AGENT/seed_SEED``
