@@ -3,9 +3,14 @@ Train one agent with the settings of the papers' comparison, evaluating as it le
 
     OMP_NUM_THREADS=1 python benchmarks/learning_curves.py --agent SAC --seed 0 --output runs
 
-Every agent has the papers' shared settings: two hidden layers of 256, batch 256, two gradient steps a transition,
-10,000 random steps, target entropy -|A|/2, Adam 3e-4. SRSAC takes eight gradient steps and is reset every 10,000
-steps, the papers' 16 and 160,000 scaled to a short run. The run goes to ``OUTPUT/AGENT/seed_SEED``
+Every off-policy agent has the papers' shared settings: two hidden layers of 256, batch 256, two gradient steps a
+transition, 10,000 random steps, target entropy -|A|/2, Adam 3e-4. SRSAC takes eight gradient steps and is reset every
+10,000 steps, the papers' 16 and 160,000 scaled to a short run.
+
+    python benchmarks/learning_curves.py --agent MBMAPPO --action-repeat 4 --steps 40960 --eval-freq 2048
+
+The on-policy agents have P1's settings, and observations and rewards normalised by VecNormalize; "PPO" is MBMAPPO
+without simulated actions, which is stable_baselines3's PPO step for step. The run goes to ``OUTPUT/AGENT/seed_SEED``
 (``evaluations.npz``, Monitor files), ``learning_summary.py`` makes a table and a picture of all of them.
 """
 
@@ -18,6 +23,7 @@ import torch
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 import sb3_sample
 
@@ -32,12 +38,27 @@ AGENTS: dict[str, dict[str, Any]] = {
     "OAC": {},
     "SRSAC": {"replay_ratio": 8, "resets": 10_000},
 }
+#: Class and arguments of the on-policy agents.
+ON_POLICY: dict[str, tuple[str, dict[str, Any]]] = {
+    "PPO": ("MBMAPPO", {"n_simulated": 0}),
+    "MBMAPPO": ("MBMAPPO", {}),
+    "MBPOPPO": ("MBPOPPO", {}),
+    "QMAPPO": ("QMAPPO", {}),
+}
 #: stable_baselines3.SAC with the same settings.
 SB3 = "SAC (stable_baselines3)"
 
 
-def build(agent: str, env_id: str, seed: int) -> Any:
-    env = make_vec_env(env_id, seed=seed)
+def environment(args: argparse.Namespace, seed: int, training: bool) -> VecEnv:
+    kwargs = {} if args.action_repeat is None else {"action_repeat": args.action_repeat}
+    env = make_vec_env(args.env, seed=seed, env_kwargs=kwargs)
+    return VecNormalize(env, training=training, norm_reward=training) if args.agent in ON_POLICY else env
+
+
+def build(agent: str, env: VecEnv, seed: int) -> Any:
+    if agent in ON_POLICY:
+        name, arguments = ON_POLICY[agent]
+        return getattr(sb3_sample, name)("MlpPolicy", env, seed=seed, device="cpu", **arguments)
     if agent == SB3:
         return stable_baselines3.SAC(
             "MlpPolicy", env, learning_starts=10_000, gradient_steps=2, target_entropy=-env.action_space.shape[0] / 2,
@@ -48,9 +69,10 @@ def build(agent: str, env_id: str, seed: int) -> Any:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--agent", required=True, choices=[SB3, *AGENTS])
+    parser.add_argument("--agent", required=True, choices=[SB3, *AGENTS, *ON_POLICY])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--env", default="dmc/cartpole-swingup-v0")
+    parser.add_argument("--action-repeat", type=int, help="of dmc/ environments; steps are decisions")
     parser.add_argument("--steps", type=int, default=30_000)
     parser.add_argument("--eval-freq", type=int, default=5_000)
     parser.add_argument("--output", type=Path, default=Path("runs"))
@@ -59,9 +81,9 @@ def main() -> None:
 
     folder = args.output / args.agent / f"seed_{args.seed}"
     folder.mkdir(parents=True, exist_ok=True)
-    model = build(args.agent, args.env, args.seed)
+    model = build(args.agent, environment(args, args.seed, training=True), args.seed)
     evaluation = EvalCallback(
-        make_vec_env(args.env, seed=args.seed + 1_000), n_eval_episodes=5, eval_freq=args.eval_freq,
+        environment(args, args.seed + 1_000, training=False), n_eval_episodes=5, eval_freq=args.eval_freq,
         log_path=str(folder), verbose=0,
     )  # fmt: skip
     model.set_logger(configure(str(folder), ["csv"]))

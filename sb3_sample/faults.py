@@ -131,7 +131,8 @@ def check_finite_parameters(model: BaseAlgorithm) -> None:
 def _learned(model: BaseAlgorithm) -> Iterator[tuple[str, torch.Tensor]]:
     """Everything that gradient steps change, by name."""
     for path in model._get_torch_save_params()[0]:
-        value = recursive_getattr(model, path)
+        # Whoever puts something else in a learned model's place need not give it an optimizer.
+        value = recursive_getattr(model, path, None)
         if isinstance(value, nn.Module):
             for name, parameter in value.named_parameters():
                 yield f"{path}.{name}", parameter.detach()

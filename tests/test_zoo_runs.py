@@ -112,6 +112,8 @@ def test_times_go_on_too_and_each_step_is_in_the_log_of_tensorboard_once(run) ->
     for file in Path("a/checkpoint-000000000220").iterdir():
         file.unlink()
     Path("a/checkpoint-000000000220").rmdir()
+    # TensorBoard reads its files in the order of the second in their names, in which two programs never start.
+    time.sleep(1.1)
     run(*arguments, "-n", "620")
     episodes = load_results("a")  # sorted by time
     assert list(episodes["l"]) == [200, 200, 200] and list(episodes["index"]) == [0, 1, 2]
