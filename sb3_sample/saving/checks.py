@@ -83,8 +83,10 @@ def check_moments(optimizer: torch.optim.Optimizer, state: Any, name: str) -> No
 
 def check_names(model: Any, attributes: dict[str, Any], name: str) -> None:
     """A file sets attributes, but never in the place of a method or of what belongs to the class."""
-    own = vars(model)
-    for key in attributes:
+    own, left_out = vars(model), model._excluded_save_params()
+    for key, value in attributes.items():
+        if key in left_out and value is not None:
+            raise BadFile(f"{name} is damaged or hostile: it sets {key!r:.100}, which is not in a model's file")
         if not key.isidentifier() or key.startswith("__") or (hasattr(type(model), key) and key not in own):
             raise BadFile(f"{name} is damaged or hostile: it sets {key!r:.100}, which is no attribute of a model")
 

@@ -271,6 +271,8 @@ class _Content:
             if name not in attributes:
                 raise BadFile(f"{self.name} is damaged: it has no {name}")
         attributes["policy_kwargs"].pop("device", None)
+        # Where the model is to be says the one who loads it.
+        attributes.pop("device", None)
         return attributes
 
     def _decoded(self, tree: Any, name: str) -> Any:

@@ -356,7 +356,7 @@ HUGE = 10**9
         ("SAC", attribute("policy_kwargs", [1])), ("SAC", attribute("seed", "x")), ("SAC", attribute("verbose", [])),
         ("SAC", attribute("predict", 3)), ("SAC", attribute("_setup_model", None)), ("SAC", attribute("__class__", 1)),
         ("SAC", attribute("temperature_beta1", 1)), ("SAC", attribute("a.b", 1)),
-        ("SAC", attribute("learning_rate", {"import": "os:system"})), ("SAC", attribute("device", "cpu")),
+        ("SAC", attribute("learning_rate", {"import": "os:system"})), ("SAC", attribute("env", "cpu")),
         ("SAC", lambda tree, tensors: tree["attributes"].clear()),
         ("SAC", lambda tree, tensors: tree["parameters"].clear()),
         ("SAC", lambda tree, tensors: tree["parameters"].update(policy=3)),
@@ -384,6 +384,11 @@ def test_hostile_files(maker: str, change: Any, files: dict[str, Path]) -> None:
         with pytest.raises(ValueError):
             type(MAKE[maker]()).load(file, device="cpu")
         assert time.perf_counter() - start < 5
+
+
+@pytest.mark.parametrize("device", [{"device": "meta"}, "x"])
+def test_a_file_does_not_choose_the_device(device: Any, files: dict[str, Path]) -> None:
+    assert SAC.load(changed(files["SAC"], attribute("device", device)), device="cpu").device == torch.device("cpu")
 
 
 def tensor_of(name: str, value: Any) -> Any:
