@@ -22,6 +22,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
+from sb3_sample.faults import check_finite_parameters
 from sb3_sample.version import __version__
 
 #: The ONNX operator set of exported files; onnxruntime has had it since 1.14.
@@ -52,8 +53,9 @@ class Exportable:
             environment, if there is one
         :return: the two files
         :raises ImportError: if the extra is missing
-        :raises ValueError: if the observation space is not supported, the normalisation is not this model's, or a
-            policy of the user's own computes differently for another length of the batch
+        :raises TrainingDiverged: if a parameter is not finite
+        :raises ValueError: if the observation space is not supported, the normalisation is not this model's or missing,
+            or a policy of the user's own computes differently for another length of the batch
         """
         assert isinstance(self, BaseAlgorithm)
         for package in ("onnx", "onnxscript"):
@@ -61,6 +63,12 @@ class Exportable:
                 raise ImportError(f"export needs {package}: pip install 'sb3_sample[export]'")
         if vec_normalize is not None and not isinstance(vec_normalize, VecNormalize):
             raise ValueError(f"vec_normalize must be a VecNormalize, or None, not {vec_normalize!r}")
+        if vec_normalize is None and self.env is None and self._last_original_obs is not None:
+            raise ValueError(
+                "vec_normalize must be given: this model learned from normalised observations, and was loaded without "
+                "its environment, which has their statistics"
+            )
+        check_finite_parameters(self)
         path = Path(path)
         if path.suffix in (".onnx", ".pt"):
             path = path.with_suffix("")

@@ -139,7 +139,8 @@ def train_parser() -> argparse.ArgumentParser:
     group.add_argument(
         "--resume",
         action="store_true",
-        help="Go on with the run in --run-dir, or else with the run of --algo and --env below the log folder that has "
+        help="Go on, with the same arguments as before, with the run in --run-dir, or else with the run of --algo "
+        "and --env below the log folder that has "
         "the latest checkpoint; an error if there is none",
     )
     add_trust(parser.add_argument_group("files that run no code (our algorithms)"))

@@ -97,6 +97,12 @@ def model_path(
     if load_last_checkpoint and made and not (load_best or load_checkpoint is not None):
         steps = int(made[-1].name.removeprefix("checkpoint-"))
         return f"checkpoint-{steps}-{algo}-{env_name}", str(made[-1] / MODEL), str(run_dir)
+    if not (load_best or load_last_checkpoint or load_checkpoint is not None or (run_dir / f"{env_name}.zip").exists()):
+        if not made:
+            # Not an error that the zoo answers by looking for a model on a hub.
+            raise SystemExit(f"sb3-sample: {run_dir} has neither a model of a finished run nor a checkpoint")
+        print(f"The run in {run_dir} is not finished: its last checkpoint, {made[-1].name}, is taken")
+        return model_path(run_dir, algo, env_name, load_last_checkpoint=True)
     # The zoo adds the algorithm's name to the folder.
     prefix, path, _ = get_model_path(-1, str(run_dir), "", env_name, load_best, load_checkpoint, load_last_checkpoint)
     return prefix.replace(f"-{env_name}", f"{algo}-{env_name}"), path, str(run_dir)

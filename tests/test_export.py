@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 
-from sb3_sample import MBMAPPO, export
+from sb3_sample import MBMAPPO, TrainingDiverged, export
 from sb3_sample.export import OPSET
 from tests.ppo.common import ALGORITHMS, tiny
 from tests.sac.common import MAKERS, Toy, bro, sac, vec
@@ -284,3 +284,23 @@ def test_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="file"):
         model.export(tmp_path / "file" / "policy")
+
+
+@pytest.mark.parametrize("family", ["sac", "ppo"])
+def test_statistics_that_are_missing_are_asked_for(family: str, tmp_path: Path) -> None:
+    env = VecNormalize(vec())
+    model = sac(env).learn(12) if family == "sac" else tiny(MBMAPPO, env).learn(16)
+    model.save(tmp_path / "m")
+    loaded = type(model).load(tmp_path / "m")
+    with pytest.raises(ValueError, match="vec_normalize must be given"):
+        loaded.export(tmp_path / "policy")
+    loaded.export(tmp_path / "policy", vec_normalize=env)
+    assert (tmp_path / "policy.onnx").exists()
+
+
+def test_parameters_that_are_not_finite_are_not_exported(tmp_path: Path) -> None:
+    model = sac()
+    with torch.no_grad():
+        next(model.actor.parameters()).fill_(torch.nan)
+    with pytest.raises(TrainingDiverged, match="nan"):
+        model.export(tmp_path / "policy")

@@ -22,6 +22,7 @@ from sb3_sample import cli, zoo
 from sb3_sample.saving import container
 from sb3_sample.saving.decoding import decode
 from sb3_sample.zoo_runs import Record, RunError, plan, train_parser
+from sb3_sample.zoo_watch import model_path
 
 zoo.register()
 
@@ -220,6 +221,20 @@ def test_bad_arguments(arguments: list[str], message: str, tmp_path: Path, monke
     Path("wrong/run.json").write_text(json.dumps(Record("bro", "X", "--help", 1, 1, {})._asdict()))  # type: ignore[arg-type]
     with pytest.raises(RunError, match=message):
         plan(*train_parser().parse_known_args(arguments))
+
+
+def test_the_last_checkpoint_of_a_run_that_is_not_finished_is_watched(
+    run, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    run("--run-dir", "a", "--checkpoint-freq", "50", "-n", "120", "--eval-freq", "-1")
+    assert model_path(Path("a"), "sac_sample", "Pendulum-v1")[1].endswith("Pendulum-v1.zip")
+    Path("a/Pendulum-v1.zip").unlink()
+    last = f"checkpoint-{steps('a')[-1]:012d}"
+    assert Path(model_path(Path("a"), "sac_sample", "Pendulum-v1")[1]) == Path("a") / last / "model.zip"
+    assert f"not finished: its last checkpoint, {last}, is taken" in capsys.readouterr().out
+    (tmp_path / "b").mkdir()
+    with pytest.raises(SystemExit, match="neither a model of a finished run nor a checkpoint"):
+        model_path(tmp_path / "b", "sac_sample", "Pendulum-v1")
 
 
 def test_a_folder_of_a_run_that_never_had_a_checkpoint_starts_anew(run) -> None:

@@ -71,7 +71,8 @@ class FiniteCheck:
                 continue
             index = int(np.argwhere(~np.isfinite(array))[0][0])
             name = f"{what} {key!r}" if key else what
+            article = "an" if what == "observation" else "a"
             raise ValueError(
-                f"environment {index + offset} gave a {name} that is not finite {when}: {array[index]}. Allowed are "
-                "finite numbers. Training stopped before the value reached the replay buffer."
+                f"environment {index + offset} gave {article} {name} that is not finite {when}: {array[index]}. "
+                "Allowed are finite numbers. Training stopped before the value reached the replay buffer."
             )

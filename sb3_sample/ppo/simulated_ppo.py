@@ -326,7 +326,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
     def load(
         cls: type[Self],
         path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
+        env: GymEnv | str | None = None,
         device: torch.device | str = "auto",
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
@@ -341,7 +341,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         models, their optimizers and their transitions.
 
         :param path: file, or where ``save`` wrote it
-        :param env: environment to go on with; none is needed for prediction
+        :param env: environment to go on with, or its id; none is needed for prediction
         :param device: "auto", "cpu", "cuda", ...
         :param custom_objects: objects that replace what the file holds under their names
         :param print_system_info: whether to print the saved and the present versions

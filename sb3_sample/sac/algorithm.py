@@ -366,7 +366,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
     def load(
         cls: type[Self],
         path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
+        env: GymEnv | str | None = None,
         device: torch.device | str = "auto",
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
@@ -380,7 +380,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         Load a model, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it.
 
         :param path: file, or where ``save`` wrote it
-        :param env: environment to go on with; none is needed for prediction
+        :param env: environment to go on with, or its id; none is needed for prediction
         :param device: "auto", "cpu", "cuda", ...
         :param custom_objects: objects that replace what the file holds under their names
         :param print_system_info: whether to print the saved and the present versions

@@ -432,7 +432,7 @@ class _Interrupts:
         self.received = number
         name = signal.Signals(number).name
         os.write(
-            2, f"\n{name}: the turn is finished and saved in {self._folder}; once more to leave at once\n".encode()
+            2, f"\n{name}: finishing the turn, to save it in {self._folder}; once more to leave at once\n".encode()
         )
 
     def leave(self, orderly: bool = True) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
 import torch
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
@@ -95,7 +95,7 @@ class SafeFiles(BaseAlgorithm):
     def load(
         cls: type[Self],
         path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
+        env: GymEnv | str | None = None,
         device: torch.device | str = "auto",
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
@@ -109,7 +109,7 @@ class SafeFiles(BaseAlgorithm):
         Load a model, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it.
 
         :param path: file, or where ``save`` wrote it
-        :param env: environment to go on with; none is needed for prediction
+        :param env: environment to go on with, or its id; none is needed for prediction
         :param device: "auto", "cpu", "cuda", ...
         :param custom_objects: objects that replace what the file holds under their names
         :param print_system_info: whether to print the saved and the present versions
@@ -129,7 +129,14 @@ class SafeFiles(BaseAlgorithm):
         except PickledFile:
             if not allow_pickle:
                 raise
-            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+            try:
+                made = None if env is None else maybe_make_env(env, 0)
+                return super().load(path, made, device, custom_objects, print_system_info, force_reset, **kwargs)
+            except TypeError as error:
+                raise ValueError(
+                    f"{path} holds no model of {cls.__name__} ({error}): a model of one of Stable-Baselines3's own "
+                    "algorithms has other networks, and is loaded by its own class"
+                ) from error
         if print_system_info:
             print("== CURRENT SYSTEM INFO ==")
             get_system_info()
@@ -144,7 +151,7 @@ class SafeFiles(BaseAlgorithm):
                 f"policy_kwargs must be those of the file, {attributes['policy_kwargs']}, or be left out, not {given}"
             )
         if env is not None:
-            env = cls._wrap_env(env, attributes["verbose"])
+            env = cls._wrap_env(maybe_make_env(env, attributes["verbose"]), attributes["verbose"])
             check_for_correct_spaces(env, attributes["observation_space"], attributes["action_space"])
             attributes["n_envs"] = env.num_envs
             if force_reset:

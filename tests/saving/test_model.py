@@ -495,3 +495,19 @@ def test_a_real_environment(tmp_path: Path) -> None:
     loaded = SAC.load(tmp_path / "m", env=make_vec_env("Pendulum-v1", 2))
     assert not differing(state(model), state(loaded))
     loaded.learn(10)
+
+
+def test_an_environment_by_its_id(tmp_path: Path) -> None:
+    model = sac("Pendulum-v1").learn(12)
+    model.save(tmp_path / "m")
+    assert SAC.load(tmp_path / "m", env="Pendulum-v1").learn(5).num_timesteps == 5
+
+
+def test_a_model_of_stable_baselines3_is_refused_by_its_reason(tmp_path: Path) -> None:
+    import stable_baselines3
+
+    stable_baselines3.SAC("MlpPolicy", "Pendulum-v1", buffer_size=10, device="cpu").save(tmp_path / "m")
+    with pytest.raises(BadFile, match="allow_pickle=True"):
+        SAC.load(tmp_path / "m")
+    with pytest.raises(ValueError, match="no model of SAC.*loaded by its own class"):
+        SAC.load(tmp_path / "m", allow_pickle=True)

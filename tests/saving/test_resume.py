@@ -121,6 +121,6 @@ def test_signals_of_a_terminal_and_of_a_scheduler(number: int, code: int, tmp_pa
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode in (code, -number), errors.decode()
-    assert b"the turn is finished and saved" in errors and b"BrokenPipe" not in errors and b"EOFError" not in errors
+    assert b"finishing the turn, to save it" in errors and b"BrokenPipe" not in errors and b"EOFError" not in errors
     first, last = sorted(int(path.name.split("-")[1]) for path in (tmp_path / "run").glob("checkpoint-*"))
     assert first == 0 < last
