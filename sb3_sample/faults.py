@@ -66,6 +66,8 @@ class MetricWatch:
         :param environment_step: environment steps taken by then
         :raises TrainingDiverged: it is time to look, and something is not finite
         """
+        if not metrics:
+            return
         n = len(metrics)
         if n > self._kept.shape[1]:
             self.check()
