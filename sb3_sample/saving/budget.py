@@ -13,7 +13,7 @@ from sb3_sample.saving.container import BadFile
 #: What building the algorithms of this package takes is 4 to 8 times the bytes of their parameters (initial values are
 #: drawn, made orthogonal and copied), and up to 13 operations a tensor.
 BYTES, BYTES_PER_BYTE = 128 * 2**20, 20
-OPERATIONS, OPERATIONS_PER_TENSOR = 5000, 100
+OPERATIONS, OPERATIONS_PER_TENSOR = 5000, 50
 _SIZED = ("empty", "zeros", "ones", "full", "rand", "randn", "empty_strided")
 _SIZED_LIKE = ("new_empty", "new_zeros", "new_ones", "new_full", "new_empty_strided")
 _COUNTED = ("arange", "linspace", "logspace", "randperm", "eye")

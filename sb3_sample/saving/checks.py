@@ -13,10 +13,10 @@ import torch
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.saving.container import BadFile
-from sb3_sample.saving.replay import MAX_TRANSITIONS
+from sb3_sample.saving.replay import MAX_HER_TRANSITIONS, MAX_TRANSITIONS
 
-#: Environments and, of a HerReplayBuffer, which makes an object for each, transitions that a file can ask for.
-MAX_ENVS, MAX_HER_TRANSITIONS = 100_000, 20_000_000
+#: Environments that a file can ask for.
+MAX_ENVS = 100_000
 #: The largest width, depth or number of networks that a file can ask for. Python makes lists of such lengths.
 MAX_WIDTH = 1_000_000
 #: What the common optimizers keep of each parameter, in its shape. torch's fused kernels do not check it.
@@ -91,8 +91,11 @@ def check_names(model: Any, attributes: dict[str, Any], name: str) -> None:
             raise BadFile(f"{name} is damaged or hostile: it sets {key!r:.100}, which is no attribute of a model")
 
 
-def check_sizes(model: Any, name: str) -> None:
-    """What is allocated without torch, or object by object, and so out of the budget's sight."""
+def check_sizes(model: Any, name: str, own_buffer: bool) -> None:
+    """
+    What is allocated without torch, or object by object, and so out of the budget's sight. With ``own_buffer`` the size
+    of the replay buffer is the caller's.
+    """
     if type(model.n_envs) is not int or not 1 <= model.n_envs <= MAX_ENVS:
         raise BadFile(f"{name}: n_envs must lie in [1, {MAX_ENVS}], not be {model.n_envs!r:.100}")
     for key, value in vars(model).items():
@@ -102,7 +105,7 @@ def check_sizes(model: Any, name: str) -> None:
     most = MAX_TRANSITIONS
     if isinstance(buffer_class, type) and issubclass(buffer_class, HerReplayBuffer):
         most = MAX_HER_TRANSITIONS
-    if type(size) is not int or not 1 <= size <= most:
+    if not own_buffer and (type(size) is not int or not 1 <= size <= most):
         raise BadFile(f"{name}: buffer_size must lie in [1, {most}], not be {size!r:.100}: pass another one to load")
 
 

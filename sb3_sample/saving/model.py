@@ -164,7 +164,7 @@ class SafeFiles(BaseAlgorithm):
                 check_kinds(model, {k: v for k, v in attributes.items() if k not in given}, content.name)
                 vars(model).update(attributes)
                 vars(model).update(kwargs)
-                check_sizes(model, content.name)
+                check_sizes(model, content.name, "buffer_size" in kwargs)
                 model._setup_model()
             content.check_parameters(model)
             model.set_parameters(content.parameters(), exact_match=True, device=device)
@@ -227,6 +227,8 @@ class SafeFiles(BaseAlgorithm):
             raise ParametersDoNotFit(f"{content.name}: {error}") from error
         for optimizer, own_groups in zip(optimizers, settings, strict=True):
             for group, own in zip(optimizer.param_groups, own_groups, strict=True):
+                for key in group.keys() - own.keys() - {"params"}:
+                    del group[key]
                 group.update(own)
 
 

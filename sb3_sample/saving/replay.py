@@ -18,8 +18,11 @@ from sb3_sample.saving.encoding import decode, encode
 
 KIND = "replay buffer"
 SUFFIX = "buffer.zip"
-#: Transitions that a file can ask memory for.
-MAX_TRANSITIONS = 100_000_000
+#: Transitions that a model's file can ask memory for, which is not touched before they come; and of a HerReplayBuffer,
+#: which makes an object for each.
+MAX_TRANSITIONS, MAX_HER_TRANSITIONS = 100_000_000, 5_000_000
+#: The same of a replay buffer's file, if it is larger than the model's own.
+MAX_OTHER, MAX_OTHER_HER = 20_000_000, 1_000_000
 #: What belongs to the model and its environment.
 _NOT_SAVED = ("device", "env")
 #: Arguments with which a buffer is made again that gives and takes its own state.
@@ -199,7 +202,7 @@ def _with_state(
     if not arguments.keys() <= set(_ARGUMENTS):
         raise BadFile(f"it makes the buffer with {sorted(arguments)!r:.200}")
     size, n_envs = arguments["buffer_size"], arguments["n_envs"]
-    _check_size(size, n_envs)
+    _check_size(size, n_envs, cls, model)
     state = decode(tree["state"], tensors, "replay_buffer", trusted)
     own: Any = model.replay_buffer
     buffer = own
@@ -220,7 +223,7 @@ def _with_attributes(
 ) -> ReplayBuffer:
     described = tree["attributes"]
     size, n_envs = described["buffer_size"]["whole"], described["n_envs"]["whole"]
-    _check_size(size, n_envs)
+    _check_size(size, n_envs, cls, model)
     buffer: Any = cls.__new__(cls)
     for name, value in described.items():
         if not name.isidentifier() or name.startswith("__") or name in _NOT_SAVED or hasattr(cls, name):
@@ -246,10 +249,19 @@ def _with_attributes(
     return buffer
 
 
-def _check_size(size: Any, n_envs: Any) -> None:
-    fits = type(size) is int and type(n_envs) is int and size >= 1 and n_envs >= 1
-    if not fits or size * n_envs > MAX_TRANSITIONS:
-        raise BadFile(f"its size is {size!r:.50} rows of {n_envs!r:.50} environments, at most {MAX_TRANSITIONS} in all")
+def _check_size(size: Any, n_envs: Any, cls: type, model: OffPolicyAlgorithm) -> None:
+    if type(size) is not int or type(n_envs) is not int or size < 1 or n_envs < 1:
+        raise BadFile(f"its size is {size!r:.50} rows of {n_envs!r:.50} environments")
+    own = model.replay_buffer
+    most = max(
+        MAX_OTHER_HER if issubclass(cls, HerReplayBuffer) else MAX_OTHER,
+        model.buffer_size if own is None else own.buffer_size * own.n_envs,
+    )
+    if size * n_envs > most:
+        raise BadFile(
+            f"its size is {size} rows of {n_envs} environments, at most {most} transitions in all: load the model with "
+            "a buffer_size as large first"
+        )
 
 
 def _check_alike(buffer: Any, own: Any) -> None:

@@ -185,6 +185,13 @@ def truncated(rng: random.Random, original: Original) -> Case:
 
 
 def flipped(rng: random.Random, original: Original) -> Case:
+    if rng.random() < 0.3:
+        # The archive's own checksums right, as after a repair.
+        name = rng.choice(["data", "tensors"])
+        entry = bytearray(original.entries[{"data": DATA, "tensors": TENSORS}[name]])
+        place = rng.randrange(len(entry) // 2, len(entry))
+        entry[place] ^= 1
+        return Case(f"a bit of {name} flipped at {place}", with_entries(original, False, **{name: bytes(entry)}), True)
     data = bytearray(original.data)
     # The tables at the end are a small part of the bytes and the larger part of what can go wrong.
     start = rng.choice([0, 0, len(data) - 400])
@@ -384,8 +391,11 @@ def tree(rng: random.Random, original: Original) -> Case:
             value = parent[key] = hostile_value(rng, original)
         case _:
             parent.append(hostile_value(rng, original))
+    # At times the archive's checksums are right, and only ours are not.
+    honest = rng.random() < 0.9
     text = json.dumps(content).encode()
-    return Case(f"tree: {what} at {path} {value!r:.150}", with_entries(original, data=text), False)
+    words = f"tree: {what} at {path} {value!r:.150}{'' if honest else ', checksums kept'}"
+    return Case(words, with_entries(original, honest, data=text), not honest)
 
 
 def sizes(rng: random.Random, original: Original) -> Case:
@@ -400,7 +410,12 @@ def sizes(rng: random.Random, original: Original) -> Case:
     ])()  # fmt: skip
     nested = [name for name in attributes if name.endswith("_kwargs")]
     owner = rng.choice([None, *nested]) if nested else None
-    if key in attributes and owner is None:
+    present = [p for p in places(attributes) if p and p[-1] in SIZES]
+    if present and rng.random() < 0.5:
+        path = rng.choice(present)
+        at(attributes, path[:-1])[path[-1]] = value
+        owner, key = None, str(path)
+    elif key in attributes and owner is None:
         attributes[key] = value
     elif owner is not None:
         held = attributes[owner]["dict"] if isinstance(attributes[owner], dict) and "dict" in attributes[owner] else {}

@@ -107,6 +107,15 @@ def content(target: str, loaded: Any) -> Any:
     return state(loaded)
 
 
+def attributes(target: str, loaded: Any) -> Any:
+    """All attributes of a model, by what would be saved again."""
+    if target not in ("SAC", "BRO", "MBMAPPO"):
+        return None
+    file = io.BytesIO()
+    loaded.save(file)
+    return Original(target, file.getvalue()).content["tree"]["attributes"]
+
+
 def _flat(values: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     for key, value in values.items():
         if isinstance(value, dict):
@@ -120,9 +129,9 @@ def wanted(target: str, folder: Path) -> Any:
     model_of("SAC")  # whose transitions the others learn from
     path = folder / "good.zip"
     path.write_bytes(original_of(target).data)
-    good = content(target, load(target, path))
+    loaded = load(target, path)
     path.unlink()
-    return good
+    return {"content": content(target, loaded), "attributes": attributes(target, loaded)}
 
 
 # ---------------------------------------------------------------- watching
@@ -237,13 +246,16 @@ def throw(target: str, case: Case, folder: Path) -> dict[str, Any]:
 def _wrong_with(target: str, case: Case, loaded: Any, good: Any) -> str | None:
     found = content(target, loaded)
     if case.damaged:
-        return f"it was loaded, with other {differing(found, good)}" if differing(found, good) else None
+        same = not differing(found, good["content"]) and attributes(target, loaded) == good["attributes"]
+        return None if same else f"it was loaded, with other {differing(found, good['content']) or 'attributes'}"
     if target in ("buffer", "her", "VecNormalize"):
         return None
     # What optimizers keep can be missing, as in a new one.
     named = {f"{name}/{key}" for name in loaded.get_parameters() for key in _learned(loaded, name)}
-    if other := [key for key in named if key not in found or key not in good or found[key].shape != good[key].shape]:
+    if other := [key for key in named if key not in found or key not in good["content"]]:
         return f"it was loaded, as another network: {other}"
+    if other := [key for key in named if found[key].shape != good["content"][key].shape]:
+        return f"it was loaded, with other shapes of {other}"
     bad = [key for key in named if not found[key].isfinite().all()]
     return f"it was loaded, with {bad} not finite" if bad else None
 

@@ -257,3 +257,22 @@ def test_a_large_buffer_is_not_copied(tmp_path: Path) -> None:
     tensors: dict[str, torch.Tensor] = {}
     encode_buffer(model.replay_buffer, tensors)
     assert tensors["replay_buffer.observations"].data_ptr() == model.replay_buffer.observations.ctypes.data
+
+
+def test_a_buffer_far_larger_than_the_models_own(tmp_path: Path) -> None:
+    """What a file does not hold, it cannot make memory of, unless the model has as much anyway."""
+    for env, kwargs, size in (
+        (vec(), {}, 20_000_001),
+        (goals(1), {"policy": "MultiInputPolicy", "replay_buffer_class": HerReplayBuffer}, 1_000_001),
+    ):
+        model = sac(env, **kwargs)
+        model.save_replay_buffer(tmp_path / "b")
+        tree, tensors = container.read(tmp_path / "b.buffer.zip", "replay buffer")
+        arguments = tree.get("arguments")
+        if arguments is None:
+            tree["attributes"]["buffer_size"]["whole"] = size
+        else:
+            arguments["buffer_size"] = size
+        container.write(tmp_path / "c.buffer.zip", "replay buffer", tree, tensors)
+        with pytest.raises(BadFile, match=f"{size} rows of 1 environments, at most {size - 1} transitions in all"):
+            model.load_replay_buffer(tmp_path / "c")
