@@ -18,6 +18,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sb3_sample.saving.container import sync_folder
+
 MANIFEST = "manifest.json"
 SEGMENTS = "replay"
 _LOCK = ".lock"
@@ -177,7 +179,7 @@ class RunFolder:
             with contextlib.suppress(OSError):
                 hidden.unlink(missing_ok=True)
             raise
-        _sync(path.parent)
+        sync_folder(path.parent)
         _verify_file(path, facts)
         return {"ring": segment.ring, "first": segment.first, "last": segment.last, **facts}
 
@@ -210,11 +212,11 @@ class RunFolder:
                 write(hidden / name)
             facts = {name: _facts(hidden / name) for name in files}
             _write_manifest(hidden / MANIFEST, {"steps": steps, **about, "files": facts, "segments": segments})
-            _sync(hidden)
+            sync_folder(hidden)
             if target.exists():
                 self._remove(target)
             os.rename(hidden, target)
-            _sync(self.path)
+            sync_folder(self.path)
         except BaseException:
             shutil.rmtree(hidden, ignore_errors=True)
             raise
@@ -308,14 +310,3 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     if not whole or not {"files", "segments", "steps"} <= manifest.keys():
         raise Damaged(f"{path} is damaged: its checksum is not that of what was written")
     return manifest
-
-
-def _sync(folder: Path) -> None:
-    """Have the names in a folder on the disk, where folders can be opened."""
-    if os.name != "posix":
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
