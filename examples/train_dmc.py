@@ -1,6 +1,6 @@
 """
 Train BRO Fast on a DeepMind Control task, with evaluations as the published curves have them: 5 episodes of the
-pessimistic actor's mean action. The model and its buffer are saved on the way.
+pessimistic actor's mean action. Interrupted and started again, it goes on where it was.
 
     python examples/train_dmc.py --env dmc/cartpole-swingup-v0 --steps 50000 --seed 0
 """
@@ -8,7 +8,7 @@ pessimistic actor's mean action. The model and its buffer are saved on the way.
 import argparse
 from pathlib import Path
 
-from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_sample import BROFast
@@ -29,7 +29,6 @@ if __name__ == "__main__":
         log_path=str(folder),
         best_model_save_path=str(folder),
     )
-    checkpoint = CheckpointCallback(5_000, str(folder), save_replay_buffer=True)
     model = BROFast("MlpPolicy", make_vec_env(args.env, seed=args.seed), seed=args.seed, verbose=1)
-    model.learn(args.steps, callback=[evaluation, checkpoint], progress_bar=False)
+    model.learn(args.steps, callback=evaluation, checkpoint=folder / "checkpoints", checkpoint_freq=5_000)
     model.save(folder / "final_model")
