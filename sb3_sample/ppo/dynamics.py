@@ -78,12 +78,20 @@ class TransitionBuffer:
         """
         return self.take(self._by_age(min(n, self.size)))
 
-    def sample(self, n: int) -> Transitions:
+    def stored(self) -> Transitions:
         """
-        :param n: how many
-        :return: transitions drawn uniformly with replacement, by NumPy's global generator
+        :return: all transitions, in no order of their age; no copies
         """
-        return self.take(np.random.randint(self.size, size=n))  # noqa: NPY002  # Stable-Baselines3 seeds this one
+        return Transitions(*(kept[: self.size] for kept in self.data))
+
+    def draw(self, n_batches: int, batch_size: int) -> np.ndarray:
+        """
+        :param n_batches: how many batches
+        :param batch_size: transitions a batch
+        :return: rows of ``stored``, drawn uniformly by NumPy's global generator, (n_batches, batch_size)
+        """
+        # Stable-Baselines3 seeds this one.
+        return np.random.randint(self.size, size=(n_batches, batch_size))  # noqa: NPY002
 
     def take(self, rows: np.ndarray) -> Transitions:
         """
@@ -106,8 +114,10 @@ class TransitionBuffer:
         :param strict: there for Stable-Baselines3, which passes it
         """
         self.size = 0
-        # Files of earlier versions are without it.
-        self._next = (int(state.get("next", 0)) - len(state["rewards"])) % self.capacity
+        n = len(state["rewards"])
+        # Full arrays are turned as they were, so that the same rows are drawn; others fill up from the first row on,
+        # which drawing relies on. Files of earlier versions are without "next".
+        self._next = (int(state.get("next", 0)) - n) % self.capacity if n >= self.capacity else 0
         self.add(Transitions(*(state[name].cpu().numpy() for name in Transitions._fields)))
 
 
@@ -246,19 +256,20 @@ class Dynamics(nn.Module):
             losses["termination_loss"] = F.binary_cross_entropy_with_logits(outputs[:, 1], batch.terminations)
         return losses
 
-    def fit(self, transitions: Transitions, batch_size: int) -> dict[str, torch.Tensor]:
+    def fit(self, transitions: Transitions, batches: torch.Tensor) -> dict[str, torch.Tensor]:
         """
         One step of Adam for each batch, in the given order.
 
-        :param transitions: transitions, as tensors
-        :param batch_size: transitions a step
+        :param transitions: transitions, as tensors; those that inputs and errors are scaled by
+        :param batches: their rows that each step learns from, (steps, B)
         :return: losses before each step, their mean, by name
         """
         if self.normalize:
             self.observation_scale.fit(transitions.observations)
             self.reward_scale.fit(transitions.rewards[:, None])
-        batches = minibatches(transitions, batch_size)
-        return fit(self, self.optimizer, (self.losses(Transitions(*batch)) for batch in batches))
+        # Gathered one by one: all together they can be many times as large as the buffer.
+        drawn = (Transitions(*(column[rows] for column in transitions)) for rows in batches)
+        return fit(self, self.optimizer, (self.losses(batch) for batch in drawn))
 
 
 def fit(

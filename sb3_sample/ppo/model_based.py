@@ -196,8 +196,8 @@ class ModelBasedPPO(SimulatedPPO):
                 self._compare_returns()
         n_minibatches = -(-self.n_steps * self.n_envs // self.batch_size)
         n_steps = (self._model_kwargs["epochs"] or self.n_epochs) * n_minibatches
-        drawn = self._as_tensors(self.transitions.sample(n_steps * self.dynamics_batch_size))
-        for name, loss in self.dynamics.fit(drawn, self.dynamics_batch_size).items():
+        batches = torch.as_tensor(self.transitions.draw(n_steps, self.dynamics_batch_size), device=self.device)
+        for name, loss in self.dynamics.fit(self._as_tensors(self.transitions.stored()), batches).items():
             self.logger.record(f"dynamics/train_{name}", loss.item())
         self.logger.record("dynamics/buffer_size", self.transitions.size)
 

@@ -34,7 +34,9 @@ def test_the_buffer_keeps_the_most_recent() -> None:
     assert buffer.recent(2).observations.tolist() == [[5], [6]]
     buffer.add(numbered(7, 12))
     assert buffer.recent(5).rewards.tolist() == [140, 150, 160, 170, 180]
-    drawn = buffer.sample(400)
+    rows = buffer.draw(4, 100)
+    assert rows.shape == (4, 100)
+    drawn = Transitions(*(column[rows.flatten()] for column in buffer.stored()))
     assert set(drawn.rewards.tolist()) == {140, 150, 160, 170, 180}
     np.testing.assert_array_equal(drawn.next_observations[:, 0], drawn.rewards / 10 + 1)
 
@@ -47,8 +49,11 @@ def test_the_buffers_state_goes_into_one_of_another_capacity(capacity: int) -> N
     other.add(numbered(50, 2))
     other.load_state_dict(buffer.state_dict())
     assert other.recent(10).rewards.tolist() == [20, 30, 40, 50, 60][-capacity:]
+    # What can be drawn are the transitions, and no empty rows.
+    assert sorted(other.stored().rewards.tolist()) == [20, 30, 40, 50, 60][-capacity:]
     other.add(numbered(7, 1))
     assert other.recent(1).rewards.tolist() == [70]
+    assert sorted(other.stored().rewards.tolist()) == [20, 30, 40, 50, 60, 70][-capacity:]
 
 
 class Remember(BaseCallback):
@@ -157,7 +162,7 @@ def test_it_learns_a_linear_environment_with_ends(normalize: bool) -> None:
     model = Dynamics(2, 1, width=64, depth=1, learning_rate=3e-3, normalize=normalize, terminations=True)
     first = {name: loss.item() for name, loss in model.losses(data).items()}
     for _ in range(60):
-        trained = model.fit(data, 100)
+        trained = model.fit(data, torch.randperm(2_000).view(20, 100))
     assert trained.keys() == first.keys() == {"transition_loss", "reward_loss", "termination_loss"}
     with torch.no_grad():
         prediction = model.predict(observations, actions)
