@@ -34,6 +34,13 @@ class Transitions(NamedTuple):
     rewards: Any
     terminations: Any
 
+    def take(self, rows: Any) -> "Transitions":
+        """
+        :param rows: indices, or a slice
+        :return: these transitions; copies, but for a slice
+        """
+        return Transitions(*(column[rows] for column in self))
+
 
 class TransitionBuffer:
     """
@@ -76,13 +83,13 @@ class TransitionBuffer:
         :param n: how many
         :return: the most recent transitions, fewer if there are not so many
         """
-        return self.take(self._by_age(min(n, self.size)))
+        return self.data.take(self._by_age(min(n, self.size)))
 
     def stored(self) -> Transitions:
         """
         :return: all transitions, in no order of their age; no copies
         """
-        return Transitions(*(kept[: self.size] for kept in self.data))
+        return self.data.take(slice(self.size))
 
     def draw(self, n_batches: int, batch_size: int) -> np.ndarray:
         """
@@ -93,18 +100,11 @@ class TransitionBuffer:
         # Stable-Baselines3 seeds this one.
         return np.random.randint(self.size, size=(n_batches, batch_size))  # noqa: NPY002
 
-    def take(self, rows: np.ndarray) -> Transitions:
-        """
-        :param rows: rows of the arrays
-        :return: copies of these transitions
-        """
-        return Transitions(*(kept[rows] for kept in self.data))
-
     def state_dict(self) -> dict[str, torch.Tensor]:
         """
         :return: the transitions by name, oldest first; and the row that comes next, since ``sample`` draws rows
         """
-        kept = self.take(self._by_age(self.size))
+        kept = self.recent(self.size)
         named = {name: torch.from_numpy(values) for name, values in kept._asdict().items()}
         return {**named, "next": torch.tensor(self._next)}
 
@@ -268,8 +268,7 @@ class Dynamics(nn.Module):
             self.observation_scale.fit(transitions.observations)
             self.reward_scale.fit(transitions.rewards[:, None])
         # Gathered one by one: all together they can be many times as large as the buffer.
-        drawn = (Transitions(*(column[rows] for column in transitions)) for rows in batches)
-        return fit(self, self.optimizer, (self.losses(batch) for batch in drawn))
+        return fit(self, self.optimizer, (self.losses(transitions.take(rows)) for rows in batches))
 
 
 def fit(

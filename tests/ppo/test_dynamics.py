@@ -36,7 +36,7 @@ def test_the_buffer_keeps_the_most_recent() -> None:
     assert buffer.recent(5).rewards.tolist() == [140, 150, 160, 170, 180]
     rows = buffer.draw(4, 100)
     assert rows.shape == (4, 100)
-    drawn = Transitions(*(column[rows.flatten()] for column in buffer.stored()))
+    drawn = buffer.stored().take(rows.flatten())
     assert set(drawn.rewards.tolist()) == {140, 150, 160, 170, 180}
     np.testing.assert_array_equal(drawn.next_observations[:, 0], drawn.rewards / 10 + 1)
 
