@@ -102,7 +102,7 @@ class TransitionBuffer:
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """
-        :return: the transitions by name, oldest first; and the row that comes next, since ``sample`` draws rows
+        :return: the transitions by name, oldest first; and the row that comes next, since ``draw`` draws rows
         """
         kept = self.recent(self.size)
         named = {name: torch.from_numpy(values) for name, values in kept._asdict().items()}

@@ -401,7 +401,9 @@ def _identity(model: SafeFiles) -> dict[str, list[str]]:
 class _Interrupts:
     """
     SIGINT and SIGTERM during a training: they are noted, so that the turn is finished and saved; a second one of them
-    ends the process at once. Handlers can be set in the main thread only; in another one signals stay as they are.
+    ends the process at once. Handlers can be set in the main thread only; in another one signals stay as they are. What
+    the process ignores stays ignored: a shell's background jobs ignore SIGINT, so that a Ctrl-C meant for the job in
+    the foreground does not end them.
 
     :param envs: whose workers shall ignore the SIGINT that a terminal sends to all processes
     :param folder: for the message
@@ -415,7 +417,9 @@ class _Interrupts:
         if threading.current_thread() is not threading.main_thread():
             return
         for number in (signal.SIGINT, signal.SIGTERM):
-            self._before[number] = signal.signal(number, self._receive)
+            # None: a handler that is not Python's, which could not be given back.
+            if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                self._before[number] = signal.signal(number, self._receive)
         for env in envs:
             vec_envs.set_sigint_ignored(env, True)
             self._envs.append(env)

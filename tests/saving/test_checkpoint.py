@@ -420,6 +420,19 @@ def test_signals_finish_the_turn_and_save(number: int, tmp_path: Path, capfd: An
     assert not differing(state(sac().learn(50)), state(sac().learn(50, checkpoint=tmp_path)))
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_ignored_signal_stays_ignored(number: int, tmp_path: Path) -> None:
+    """As a shell's background jobs ignore the Ctrl-C of the foreground."""
+    before = signal.signal(number, signal.SIG_IGN)
+    try:
+        callback = Signal(number, twice=True)
+        model = sac().learn(50, callback, checkpoint=tmp_path, **STEPS)
+        assert callback.reached and model.num_timesteps == 50
+        assert signal.getsignal(number) is signal.SIG_IGN
+    finally:
+        signal.signal(number, before)
+
+
 def test_a_second_signal_leaves_at_once(tmp_path: Path) -> None:
     callback = Signal(signal.SIGINT, twice=True)
     with pytest.raises(KeyboardInterrupt):
