@@ -1,8 +1,11 @@
 """Arguments of the algorithms' constructors, of both families."""
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
+
+from sb3_sample.saving.checks import ParametersDoNotFit
 
 
 def names_for_load(cls: type, base: type) -> set[str]:
@@ -27,6 +30,36 @@ def check_known(cls: type, base: type, kwargs: dict[str, Any]) -> None:
         raise ValueError(f"{', '.join(unknown)}: not an argument of {cls.__name__}, so load cannot change it")
 
 
+def default_of(cls: type, name: str) -> Any:
+    """
+    :param cls: class of an algorithm
+    :param name: an argument of its constructor, or of a base's that it hands it on to
+    :return: the argument's default
+    """
+    signatures = (inspect.signature(c).parameters for c in cls.__mro__)
+    return next(parameters[name].default for parameters in signatures if name in parameters)
+
+
+@contextmanager
+def naming_changes(kwargs: dict[str, Any]) -> Iterator[None]:
+    """
+    Where a file is loaded: that its parameters do not fit is laid to the arguments that are to differ from the file's.
+
+    :param kwargs: these arguments
+    :raises ValueError: if they are not of the model's networks and parts
+    """
+    try:
+        yield
+    except (RuntimeError, ValueError) as error:
+        words = ("loading state_dict", "is an invalid object name", "do not match agents' parameters")
+        if kwargs and (isinstance(error, ParametersDoNotFit) or any(word in str(error) for word in words)):
+            raise ValueError(
+                f"{', '.join(sorted(kwargs))}: with these arguments the model has other networks or parts than the "
+                f"file ({str(error).splitlines()[0]})"
+            ) from error
+        raise
+
+
 def check_unused(agent: Any, names: Sequence[str], choice: str) -> None:
     """
     :param agent: an algorithm
@@ -35,7 +68,8 @@ def check_unused(agent: Any, names: Sequence[str], choice: str) -> None:
     :raises ValueError: if one of them is not at its default
     """
     for name in names:
-        signatures = (inspect.signature(cls).parameters for cls in type(agent).__mro__)
-        default = next(parameters[name].default for parameters in signatures if name in parameters)
+        default = default_of(type(agent), name)
         if getattr(agent, name) != default:
-            raise ValueError(f"{name}={getattr(agent, name)!r} means nothing with {choice}: leave it out")
+            raise ValueError(
+                f"{name}={getattr(agent, name)!r} means nothing with {choice}: leave it out, or at {default!r}"
+            )

@@ -136,12 +136,13 @@ OPL_SPACE: Space = {
 }
 VPL_SPACE: Space = {**GPL_SPACE, "validation_proportion": _float(1 / 128, 1 / 4, log=True)}
 #: PPO with simulated samples. The share of the training in which there are some is not searched: a trial is shorter
-#: than the training that its parameters are for.
+#: than the training that its parameters are for. A trial has to be longer than an iteration, of n_steps times the
+#: environments, since nothing is simulated in the first one.
 ON_POLICY_SPACE: Space = {
     "learning_rate": _float(1e-5, 2e-3, log=True),
     "one_minus_gamma": _float(1e-4, 0.03, log=True),
     "one_minus_gae_lambda": _float(1e-3, 0.2, log=True),
-    "n_steps_pow": _int(9, 13),
+    "n_steps_pow": _int(9, 12),
     "batch_size_pow": _int(5, 9),
     "n_epochs": _int(3, 20),
     "clip_range": _float(0.1, 0.4),

@@ -1,6 +1,5 @@
 """The learned model of the environment: a transition and a reward network (P1, appendix E), and their transitions."""
 
-import math
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -256,6 +255,16 @@ class Dynamics(nn.Module):
             losses["termination_loss"] = F.binary_cross_entropy_with_logits(outputs[:, 1], batch.terminations)
         return losses
 
+    def scale_by(self, transitions: Transitions) -> None:
+        """
+        With ``normalize``, take the scales of inputs and errors from transitions.
+
+        :param transitions: as tensors
+        """
+        if self.normalize:
+            self.observation_scale.fit(transitions.observations)
+            self.reward_scale.fit(transitions.rewards[:, None])
+
     def fit(self, transitions: Transitions, batches: torch.Tensor) -> dict[str, torch.Tensor]:
         """
         One step of Adam for each batch, in the given order.
@@ -264,9 +273,7 @@ class Dynamics(nn.Module):
         :param batches: their rows that each step learns from, (steps, B)
         :return: losses before each step, their mean, by name
         """
-        if self.normalize:
-            self.observation_scale.fit(transitions.observations)
-            self.reward_scale.fit(transitions.rewards[:, None])
+        self.scale_by(transitions)
         # Gathered one by one: all together they can be many times as large as the buffer.
         return fit(self, self.optimizer, (self.losses(transitions.take(rows)) for rows in batches))
 
@@ -304,27 +311,3 @@ def minibatches(tensors: Any, batch_size: int) -> Iterator[tuple[torch.Tensor, .
     """
     for first in range(0, len(tensors[0]), batch_size):
         yield tuple(tensor[first : first + batch_size] for tensor in tensors)
-
-
-def check_network_kwargs(name: str, kwargs: dict[str, Any], allowed: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    :param name: name of the argument
-    :param kwargs: its value: width, depth, learning rate, epochs, and switches
-    :param allowed: what it may hold, with the defaults
-    :return: the value with the defaults filled in
-    :raises ValueError: if there is something else in it, or a value is out of range
-    """
-    for key, value in kwargs.items():
-        if key not in allowed:
-            raise ValueError(f"{name} has {key!r}, but takes {list(allowed)}")
-        if isinstance(allowed[key], bool):
-            if not isinstance(value, bool):
-                raise ValueError(f"{name}[{key!r}] must be True or False, not {value!r}")
-        elif key == "learning_rate":
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < math.inf:
-                raise ValueError(f"{name}['learning_rate'] must be at least 0 and finite, not {value!r}")
-        elif not (key == "epochs" and value is None) and (
-            isinstance(value, bool) or not isinstance(value, int) or value < 1
-        ):
-            raise ValueError(f"{name}[{key!r}] must be an integer of at least 1, not {value!r}")
-    return {**allowed, **kwargs}

@@ -12,8 +12,9 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.ppo.dynamics import Dynamics, TransitionBuffer, Transitions, check_network_kwargs
-from sb3_sample.ppo.simulated_ppo import SimulatedPPO, check_integer
+from sb3_sample.ppo.arguments import check_integer, check_network_kwargs
+from sb3_sample.ppo.dynamics import Dynamics, TransitionBuffer, Transitions
+from sb3_sample.ppo.simulated_ppo import SimulatedPPO
 
 #: What ``dynamics_kwargs`` may hold, with the defaults (P1, appendix B.2; ``normalize`` is decided here).
 DYNAMICS_DEFAULTS: dict[str, Any] = {
@@ -133,8 +134,8 @@ class ModelBasedPPO(SimulatedPPO):
         super()._check_arguments()
         for name in ("simulation_horizon", "dynamics_buffer_size", "dynamics_batch_size"):
             check_integer(name, getattr(self, name), 1)
-        check_network_kwargs("dynamics_kwargs", self.dynamics_kwargs or {}, DYNAMICS_DEFAULTS)
-        if self.predict_termination not in (None, True, False):
+        check_network_kwargs("dynamics_kwargs", self.dynamics_kwargs, DYNAMICS_DEFAULTS)
+        if self.predict_termination is not None and not isinstance(self.predict_termination, bool):
             raise ValueError(f"predict_termination must be True, False or None, not {self.predict_termination!r}")
         normalizer = self._vec_normalize_env
         if self.n_simulated > 0 and normalizer is not None and normalizer.observation_space != self.observation_space:
@@ -147,10 +148,10 @@ class ModelBasedPPO(SimulatedPPO):
     def _setup_models(self) -> None:
         if self.predict_termination is None:
             self.predict_termination = not self._never_terminates()
-        self._model_kwargs = check_network_kwargs("dynamics_kwargs", self.dynamics_kwargs or {}, DYNAMICS_DEFAULTS)
+        self._model_kwargs = check_network_kwargs("dynamics_kwargs", self.dynamics_kwargs, DYNAMICS_DEFAULTS)
         network = {name: value for name, value in self._model_kwargs.items() if name != "epochs"}
         sizes = self.flat_observations.size, self.model_actions.size
-        #: The model. Anything with its ``predict`` can take its place in a simulation.
+        #: The model. Anything with its ``predict`` can take its place in ``simulate``, a subclass everywhere.
         self.dynamics = Dynamics(*sizes, **network, terminations=self.predict_termination).to(self.device)
         #: The transitions that it learns from, as the environments gave them, not normalised by ``VecNormalize``.
         self.transitions = TransitionBuffer(self.dynamics_buffer_size, *sizes)
@@ -177,7 +178,8 @@ class ModelBasedPPO(SimulatedPPO):
             return super()._collect(env, callback, rollout_buffer, n_rollout_steps)
         recorder = _Recorder(self, callback)
         goes_on = super()._collect(env, recorder, rollout_buffer, n_rollout_steps)
-        self._n_new += recorder.store()
+        # A callback that ends the training ends the rollout without its end.
+        recorder.store()
         return goes_on
 
     # ---------------------------------------------------------------- the model
@@ -187,7 +189,14 @@ class ModelBasedPPO(SimulatedPPO):
         Train the model for ``epochs`` times PPO's minibatches on batches drawn from the transitions so far (P1,
         algorithm 1, lines 5 to 7), and log its losses: before the training on the new transitions, which it has not
         seen (``dynamics/heldout_...``), and during it (``dynamics/train_...``).
+
+        :raises ValueError: if there is no rollout
         """
+        self._check_has_rollout()
+        stored = self._as_tensors(self.transitions.stored())
+        if not self.dynamics.optimizer.state:
+            # A model that was never trained has no scale to measure its losses by.
+            self.dynamics.scale_by(stored)
         n_new, self._n_new = min(self._n_new, self.transitions.size), 0
         if n_new > 0:
             with torch.no_grad():
@@ -197,7 +206,7 @@ class ModelBasedPPO(SimulatedPPO):
         n_minibatches = -(-self.n_steps * self.n_envs // self.batch_size)
         n_steps = (self._model_kwargs["epochs"] or self.n_epochs) * n_minibatches
         batches = torch.as_tensor(self.transitions.draw(n_steps, self.dynamics_batch_size), device=self.device)
-        for name, loss in self.dynamics.fit(self._as_tensors(self.transitions.stored()), batches).items():
+        for name, loss in self.dynamics.fit(stored, batches).items():
             self.logger.record(f"dynamics/train_{name}", loss.item())
         self.logger.record("dynamics/buffer_size", self.transitions.size)
 
@@ -345,6 +354,8 @@ class _Recorder(BaseCallback):
         self.callback.on_rollout_start()
 
     def on_rollout_end(self) -> None:
+        # First, since the callback may want to train the model.
+        self.store()
         self.callback.on_rollout_end()
 
     def update_locals(self, locals_: dict[str, Any]) -> None:
@@ -376,21 +387,18 @@ class _Recorder(BaseCallback):
         self.observations = new.copy()
         return self.callback.on_step()
 
-    def store(self) -> int:
-        """
-        Put what was noted into the model's buffer.
-
-        :return: number of transitions
-        """
+    def store(self) -> None:
+        """Put what was noted into the model's buffer."""
         if not self.noted:
-            return 0
+            return
         columns = [np.concatenate(column) for column in zip(*self.noted, strict=True)]
         actions = torch.as_tensor(columns[1], device=self.agent.device)
         if isinstance(self.agent.action_space, spaces.Box):
             actions = actions.reshape(len(actions), -1)
         columns[1] = self.agent.model_actions(actions).cpu().numpy()
         self.agent.transitions.add(Transitions(*columns))
-        return len(actions)
+        self.agent._n_new += len(actions)
+        self.noted = []
 
     def _on_step(self) -> bool:
         return True

@@ -11,7 +11,8 @@ from torch import nn
 from sb3_sample.networks.initialization import linear
 from sb3_sample.networks.mlp import MLP
 from sb3_sample.optim import AdamW
-from sb3_sample.ppo.dynamics import ADAM_EPS, Standardizer, check_network_kwargs, fit, minibatches
+from sb3_sample.ppo.arguments import check_network_kwargs
+from sb3_sample.ppo.dynamics import ADAM_EPS, Standardizer, fit, minibatches
 from sb3_sample.ppo.simulated_ppo import SimulatedPPO, SimulatedSamples
 
 #: What ``q_kwargs`` may hold, with the defaults (P1, appendix B.2; ``normalize`` is decided here).
@@ -103,10 +104,10 @@ class QMAPPO(SimulatedPPO):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_network_kwargs("q_kwargs", self.q_kwargs or {}, Q_DEFAULTS)
+        check_network_kwargs("q_kwargs", self.q_kwargs, Q_DEFAULTS)
 
     def _setup_models(self) -> None:
-        self._network_kwargs = check_network_kwargs("q_kwargs", self.q_kwargs or {}, Q_DEFAULTS)
+        self._network_kwargs = check_network_kwargs("q_kwargs", self.q_kwargs, Q_DEFAULTS)
         network = {name: value for name, value in self._network_kwargs.items() if name != "epochs"}
         #: The Q-networks.
         self.q_networks = QNetworks(self.flat_observations.size, self.model_actions.size, **network).to(self.device)
@@ -121,6 +122,8 @@ class QMAPPO(SimulatedPPO):
         """
         Train the Q-networks on the TD(lambda) returns of the present rollout, and log their loss: before the training,
         on samples that they have not seen (``dynamics/heldout_q_loss``), and during it (``dynamics/train_q_loss``).
+
+        :raises ValueError: if there is no rollout
         """
         rollout = self.current_rollout()
         columns = rollout.observations, self.model_actions(rollout.actions), rollout.returns

@@ -9,6 +9,7 @@ import io
 import math
 import pathlib
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -16,9 +17,8 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import numpy as np
 import torch
 import torch.nn.functional as F
-from gymnasium import spaces
 from stable_baselines3 import PPO
-from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import CategoricalDistribution, DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -26,11 +26,12 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.arguments import check_known, check_unused
+from sb3_sample.arguments import check_known, default_of, naming_changes
 from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.envs.workers import watch_workers
 from sb3_sample.export import Exportable
 from sb3_sample.faults import TrainingDiverged, check_finite_parameters, not_finite
+from sb3_sample.ppo import arguments
 from sb3_sample.ppo.dynamics import minibatches
 from sb3_sample.ppo.spaces import FlatObservations, ModelActions
 from sb3_sample.saving.checkpoint import Checkpointer
@@ -173,6 +174,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         anneal_until: float | None = None,
         warm_up_until: float | None = None,
     ):
+        arguments.check_counts(n_steps, batch_size, n_epochs, normalize_advantage)
         super().__init__(
             policy,
             env,
@@ -255,41 +257,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         """
         :raises ValueError: if an argument is out of range or contradicts another
         """
-        check_integer("n_simulated", self.n_simulated, 0)
-        if self.anneal_until is not None and (not _is_number(self.anneal_until) or not 0 < self.anneal_until <= 1):
-            raise ValueError(
-                f"anneal_until must lie in (0, 1], a share of the training, or be None, not {self.anneal_until!r}"
-            )
-        if self.warm_up_until is not None and (not _is_number(self.warm_up_until) or not 0 <= self.warm_up_until < 1):
-            raise ValueError(
-                "warm_up_until must be at least 0 and below 1, a share of the training, or be None, not "
-                f"{self.warm_up_until!r}"
-            )
-        if self.anneal_until is not None and (self.warm_up_until or 0) >= self.anneal_until:
-            raise ValueError(f"warm_up_until must be below anneal_until={self.anneal_until}, not {self.warm_up_until}")
-        if self.n_simulated == 0:
-            check_unused(self, self.simulation_arguments, "n_simulated=0")
-            return
-        if self.use_sde:
-            raise ValueError(
-                "use_sde=True draws one noise for all actions at a state, so that simulated actions would be equal: "
-                "leave it out, or pass n_simulated=0"
-            )
-        space = self.action_space
-        if isinstance(space, spaces.Discrete):
-            if space.start != 0:
-                raise ValueError(f"the action space must start at 0, not be {space}")
-        elif not isinstance(space, spaces.Box):
-            raise ValueError(
-                f"the action space must be a Box or Discrete, whose actions can be drawn or enumerated, not {space}: "
-                "pass n_simulated=0 for plain PPO"
-            )
-        cls = self.rollout_buffer_class
-        if cls is not None and cls.get not in (RolloutBuffer.get, DictRolloutBuffer.get):
-            raise ValueError(
-                f"rollout_buffer_class={cls.__name__} draws its minibatches itself, but here they hold simulated "
-                "samples too: leave it out, or pass n_simulated=0"
-            )
+        arguments.check(self)
 
     def _setup_models(self) -> None:
         """Build what the simulated samples come from."""
@@ -355,7 +323,13 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         :raises ValueError: if ``kwargs`` holds something else, or values with which the file's parameters do not fit
         """
         check_known(cls, PPO, kwargs)
-        try:
+        if kwargs.get("n_simulated") == 0:
+            # What the file says of simulated samples is not what the caller has asked for.
+            unused = {name: default_of(cls, name) for name in cls.simulation_arguments}
+            changes = {**unused, **kwargs}
+        else:
+            changes = kwargs
+        with naming_changes(kwargs):
             return super().load(
                 path,
                 env,
@@ -365,16 +339,8 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
                 force_reset,
                 allow_pickle=allow_pickle,
                 trusted_modules=trusted_modules,
-                **kwargs,
+                **changes,
             )
-        except (RuntimeError, ValueError) as error:
-            words = ("loading state_dict", "is an invalid object name", "do not match agents' parameters")
-            if kwargs and any(word in str(error) for word in words):
-                raise ValueError(
-                    f"{', '.join(sorted(kwargs))}: with these arguments the model has other networks than the file "
-                    f"({str(error).splitlines()[0]})"
-                ) from error
-            raise
 
     # ---------------------------------------------------------------- the iteration
 
@@ -411,6 +377,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         self._iteration = 0
+        self._warn_of_one_iteration(total_timesteps)
         with Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
             checkpointer.resume()
             callback.on_training_start(locals(), globals())
@@ -429,6 +396,17 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
             check_finite_parameters(self)
             checkpointer.finish()
         return self
+
+    def _warn_of_one_iteration(self, total_timesteps: int) -> None:
+        if self.n_simulated > 0 and self._warm_up > 0 and self.num_timesteps == 0:
+            n = self.n_steps * self.n_envs
+            if total_timesteps <= n:
+                warnings.warn(
+                    f"{total_timesteps} steps are a single iteration (n_steps={self.n_steps} times {self.n_envs} "
+                    "environments), in which nothing is simulated: the number of simulated samples rises from 0. Train "
+                    "longer, or pass warm_up_until=0",
+                    stacklevel=3,
+                )
 
     def _on_environment_reset(self) -> None:
         """The environments were reset in the midst of their episodes, of which nothing is remembered here."""
@@ -454,6 +432,13 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
     ) -> bool:
         return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
 
+    @property
+    def _warm_up(self) -> float:
+        """Share of the training over which X rises."""
+        if self.warm_up_until is not None:
+            return self.warm_up_until
+        return WARM_UP if self.anneal_until is None else 0.0
+
     def current_n_simulated(self) -> int:
         """
         :return: X of the present iteration, by ``n_simulated``, ``anneal_until`` and ``warm_up_until``
@@ -461,11 +446,8 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         share = 1.0
         if self.anneal_until is not None:
             share *= max(0.0, 1 - self._progress / self.anneal_until)
-        warm_up = self.warm_up_until
-        if warm_up is None:
-            warm_up = WARM_UP if self.anneal_until is None else 0.0
-        if warm_up > 0:
-            share *= min(1.0, self._progress / warm_up)
+        if self._warm_up > 0:
+            share *= min(1.0, self._progress / self._warm_up)
         # The tolerance keeps 8 times 0.5 from being rounded up to 5 by rounding errors.
         return math.ceil(self.n_simulated * share - 1e-9)
 
@@ -482,8 +464,10 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         except ValueError:
             # As torch's distributions raise where a mean is not finite: say what it comes from.
             check_finite_parameters(self)
+            self._check_standard_deviation()
             raise
         self._check_losses()
+        self._check_standard_deviation()
         check_finite_parameters(self)
 
     def _check_losses(self) -> None:
@@ -497,6 +481,16 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         bad = not_finite(logged)
         if bad:
             raise TrainingDiverged(bad, f"update {self._n_updates}", self.num_timesteps)
+
+    def _check_standard_deviation(self) -> None:
+        """The exponential of a finite parameter can be 0 or infinite, which no distribution takes."""
+        if not hasattr(self.policy, "log_std") or self.use_sde:
+            return
+        std = self.policy.log_std.detach().exp()
+        bad = std[~(torch.isfinite(std) & (std > 0))]
+        if len(bad) > 0:
+            values = {"the policy's standard deviation": bad[0].item()}
+            raise TrainingDiverged(values, f"update {self._n_updates}", self.num_timesteps)
 
     def _train(self) -> None:
         n_simulated = self.current_n_simulated()
@@ -523,9 +517,10 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
     def current_rollout(self) -> Rollout:
         """
         :return: the rollout buffer's samples as tensors, the steps of one environment after those of another
-        :raises ValueError: with ``n_simulated=0``, which allows for observations that are no vectors
+        :raises ValueError: if there is none yet, as after ``load``; with ``n_simulated=0``, which allows for
+            observations that are no vectors
         """
-        self._check_simulates()
+        self._check_has_rollout()
         buffer = self.rollout_buffer
 
         def tensor(values: np.ndarray) -> torch.Tensor:
@@ -549,6 +544,13 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
     def _check_simulates(self) -> None:
         if self.n_simulated == 0:
             raise ValueError("n_simulated=0: this model has nothing to simulate with")
+
+    def _check_has_rollout(self) -> None:
+        self._check_simulates()
+        if not self.rollout_buffer.full:
+            raise ValueError(
+                "there is no rollout: call this after learn, or in a callback's on_rollout_end; files do not keep it"
+            )
 
     def fit_models(self) -> None:
         """
@@ -580,7 +582,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         """
         self._check_simulates()
         n = self.current_n_simulated() if n_simulated is None else n_simulated
-        check_integer("n_simulated", n, 1)
+        arguments.check_integer("n_simulated", n, 1)
         self.policy.set_training_mode(False)
         with torch.no_grad():
             if values is None:
@@ -808,18 +810,3 @@ def _entropy(distribution: Distribution) -> torch.Tensor:
     entropy = distribution.entropy()
     assert entropy is not None  # Gaussian and categorical distributions have one in closed form
     return entropy
-
-
-def check_integer(name: str, value: Any, low: int) -> None:
-    """
-    :param name: name of an argument
-    :param value: its value
-    :param low: the smallest allowed
-    :raises ValueError: if it is no integer, or below that
-    """
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < low:
-        raise ValueError(f"{name} must be an integer of at least {low}, not {value!r}")
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)

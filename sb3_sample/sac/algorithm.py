@@ -20,7 +20,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from sb3_sample.arguments import check_known
+from sb3_sample.arguments import check_known, naming_changes
 from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.envs.workers import watch_workers
 from sb3_sample.export import Exportable
@@ -399,7 +399,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
             kwargs["compiled"] = None
         if "train_freq" in kwargs or "gradient_steps" in kwargs:
             kwargs.setdefault("replay_ratio", None)
-        try:
+        with naming_changes(kwargs):
             return super().load(
                 path,
                 env,
@@ -411,13 +411,6 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
                 trusted_modules=trusted_modules,
                 **kwargs,
             )
-        except RuntimeError as error:
-            if kwargs and ("loading state_dict" in str(error) or isinstance(error, ParametersDoNotFit)):
-                raise ValueError(
-                    f"{', '.join(sorted(kwargs))}: with these arguments the model has other networks or parts than the "
-                    f"file ({str(error).splitlines()[0]})"
-                ) from error
-            raise
 
     def set_parameters(
         self,

@@ -166,6 +166,8 @@ class SafeFiles(BaseAlgorithm):
                 vars(model).update(kwargs)
                 check_sizes(model, content.name, "buffer_size" in kwargs)
                 model._setup_model()
+            if kwargs:
+                content.check_shapes(model)
             content.check_parameters(model)
             model.set_parameters(content.parameters(), exact_match=True, device=device)
             if model.use_sde:
@@ -230,6 +232,18 @@ class SafeFiles(BaseAlgorithm):
                 for key in group.keys() - own.keys() - {"params"}:
                     del group[key]
                 group.update(own)
+
+
+def class_of(path: str | pathlib.Path) -> str:
+    """
+    :param path: file of a model, or where ``save`` wrote it
+    :return: the class that the file says the model is of, as "module:name"
+    :raises PickledFile: (a ``BadFile``) if it is in Stable-Baselines3's own format
+    :raises BadFile: (a ``ValueError``) if it is damaged
+    """
+    anything: Any = SafeFiles
+    with paths.opened(path, "zip") as file:
+        return _Content(file, anything, ()).tree["classes"][0]
 
 
 class _Content:
@@ -301,6 +315,25 @@ class _Content:
                     metadata = vars(state)["_metadata"] = self._decoded(tree, name)
                     check_metadata(metadata, f"{self.name}: {name}")
         return self._parameters
+
+    def check_shapes(self, model: SafeFiles) -> None:
+        """
+        Before the file is asked whether it fits in every other respect: with arguments of the caller's own it is not to
+        blame if it does not.
+
+        :param model: for which the parameters are
+        :raises ParametersDoNotFit: if a tensor has another shape there
+        """
+        for name in model._get_torch_save_params()[0]:
+            owner, state = recursive_getattr(model, name), self.parameters().get(name)
+            if not isinstance(owner, torch.nn.Module) or not isinstance(state, dict):
+                continue
+            for key, own in owner.state_dict().items():
+                theirs = state.get(key)
+                if isinstance(own, torch.Tensor) and isinstance(theirs, torch.Tensor) and own.shape != theirs.shape:
+                    raise ParametersDoNotFit(
+                        f"{name}.{key} has the shape {tuple(theirs.shape)} in the file and {tuple(own.shape)} here"
+                    )
 
     def check_parameters(self, model: SafeFiles) -> None:
         """

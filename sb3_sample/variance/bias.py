@@ -211,9 +211,13 @@ def compare_gradients(
     :param seed: of everything that is random; the global generators are left as they are
     :param on_estimate: called after each estimate, with the number of them so far
     :return: the gradients by method: "PPO", the oracle, "MBMA", "QMA", "MBPO"
+    :raises TypeError: ``model`` is of another family
+    :raises ValueError: an argument is out of range, or the model is of a kind that :class:`Agent` refuses
     """
     Agent(model)
-    check_comparison(n_estimates, n_steps, n_fits)
+    check_counts({"n_estimates": (n_estimates, 4), "n_steps": (n_steps, 2), "n_fits": (n_fits, 1), "seed": (seed, 0)})
+    check_counts({"n_simulated": (n_simulated, 1)})
+    check_counts({"simulation_horizon": (simulation_horizon, n_simulated + 1)})
     rng = np.random.default_rng(seed)
     env = _environment(model, make_env)
     try:
@@ -270,15 +274,6 @@ def compare_gradients(
             )
     finally:
         env.close()
-
-
-def check_comparison(n_estimates: int, n_steps: int, n_fits: int = 1) -> None:
-    """
-    Arguments of :func:`compare_gradients`.
-
-    :raises ValueError: one of them is out of range
-    """
-    check_counts({"n_estimates": (n_estimates, 4), "n_steps": (n_steps, 2), "n_fits": (n_fits, 1)})
 
 
 def jackknife_squares(samples: np.ndarray) -> tuple[float, np.ndarray]:

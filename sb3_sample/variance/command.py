@@ -19,8 +19,10 @@ from sb3_sample.envs import make_env
 from sb3_sample.envs.states import check_restorable
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.saving import load_vec_normalize
-from sb3_sample.saving.model import SafeFiles
-from sb3_sample.variance.bias import GradientSamples, check_comparison, compare_gradients
+from sb3_sample.saving.classes import path_of
+from sb3_sample.saving.container import PickledFile
+from sb3_sample.saving.model import SafeFiles, class_of
+from sb3_sample.variance.bias import GradientSamples, compare_gradients
 from sb3_sample.variance.decomposition import Components, at_equal_cost, relative_cost
 from sb3_sample.variance.estimate import Estimate, Interval, check_arguments, check_counts, estimate_components
 from sb3_sample.variance.returns import Agent
@@ -35,6 +37,10 @@ ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {
     "qma_ppo": QMAPPO,
     "mbpo_ppo": MBPOPPO,
 }
+#: Steps that a model is trained which is not given.
+TRAIN_STEPS = 10_240
+#: States of each gradient whose bias is measured.
+BIAS_STEPS = 2_048
 #: Largest number of actions in the comparison at equal cost.
 MAX_ACTIONS = 16
 
@@ -270,11 +276,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--env", required=True, help="id of the environment: dmc/, Gymnasium's MuJoCo, classic control")
     parser.add_argument("--env-kwargs", nargs="+", default=[], metavar="NAME=VALUE", help="such as action_repeat=4")
-    parser.add_argument("--model", type=Path, help="saved model; without one a PPO is trained")
-    parser.add_argument("--algo", choices=list(ALGORITHMS), default="ppo", help="what the model was saved by")
+    parser.add_argument("--model", type=Path, help="saved model; without one a model is trained")
+    parser.add_argument(
+        "--algo",
+        choices=list(ALGORITHMS),
+        help="what is trained without a model, or what saved the model, if it is pickled: ppo; other files say it",
+    )
     parser.add_argument("--vecnormalize", type=Path, help="saved VecNormalize of the model")
     parser.add_argument("--allow-pickle", action="store_true", help="load pickled files too, which may run any code")
-    parser.add_argument("--train-steps", type=int, default=10_240, help="steps of the PPO that is trained; 0 for none")
+    parser.add_argument(
+        "--train-steps", type=int, help=f"steps that a model is trained without --model, 0 for none; {TRAIN_STEPS:,}"
+    )
     parser.add_argument("--n-steps", type=int, default=128, help="T of the measured rollouts")
     parser.add_argument("--n-rollouts", type=int, default=16, help="independent rollouts")
     parser.add_argument("--n-actions", type=int, default=2, help="actions tried at each state")
@@ -292,13 +304,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--bias", type=int, default=0, metavar="M", help="also compare M gradients of PPO, MBMA, QMA and MBPO"
     )
-    parser.add_argument("--bias-steps", type=int, default=2048, metavar="T", help="states of each of these gradients")
+    parser.add_argument(
+        "--bias-steps", type=int, metavar="T", help=f"states of each of these gradients; {BIAS_STEPS:,}"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of everything that is random")
     parser.add_argument("-o", "--output", type=Path, help="picture to write; default: the id, as -variance.png")
     args = parser.parse_args(arguments)
     try:
         _run(args)
-    except (ValueError, TypeError, ImportError, OSError, gym.error.Error) as error:
+    except (ValueError, TypeError, ImportError, OSError, NotImplementedError, gym.error.Error) as error:
         sys.exit(f"sb3-sample variance: {error}")
 
 
@@ -310,9 +324,25 @@ def _run(args: argparse.Namespace) -> None:
     # Before the minutes that training and rollouts take.
     check_arguments(**settings, n_envs=1)
     trajectory = args.n_steps if args.trajectory is None else args.trajectory
-    check_counts({"train_steps": (args.train_steps, 0), "trajectory": (trajectory, 1), "now": (args.now, 1)})
+    train_steps = TRAIN_STEPS if args.train_steps is None else args.train_steps
+    bias_steps = BIAS_STEPS if args.bias_steps is None else args.bias_steps
+    check_counts(
+        {
+            "train_steps": (train_steps, 0),
+            "trajectory": (trajectory, 1),
+            "now": (args.now, 1),
+            "seed": (args.seed, 0),
+            "bias_steps": (bias_steps, 2),
+        }
+    )
     if args.bias:
-        check_comparison(n_estimates=args.bias, n_steps=args.bias_steps)
+        check_counts({"bias": (args.bias, 4)})
+    elif args.bias_steps is not None:
+        raise ValueError(f"bias_steps={args.bias_steps} means nothing without --bias: leave it out")
+    if args.model is not None and args.train_steps is not None:
+        raise ValueError(f"train_steps={args.train_steps} means nothing with --model: leave it out")
+    output = args.output or Path(args.env.replace("/", "-") + "-variance.png")
+    _check_picture(output)
     if not 0 < args.action_cost < np.inf:
         raise ValueError(f"action_cost must be above 0 and finite, not {args.action_cost}")
     if not 0 < args.confidence < 1:
@@ -321,7 +351,7 @@ def _run(args: argparse.Namespace) -> None:
         raise ValueError("vecnormalize must come with the model that it belongs to: give --model")
     make = partial(make_env, args.env, **_keyword_arguments(args.env_kwargs))
     check_restorable(make(), make())
-    model = _model(args, make)
+    model = _model(args, make, train_steps)
     Agent(model)
 
     question = Question(trajectory, args.now, args.action_cost)
@@ -349,29 +379,56 @@ def _run(args: argparse.Namespace) -> None:
             model,
             make,
             n_estimates=args.bias,
-            n_steps=args.bias_steps,
+            n_steps=bias_steps,
             seed=args.seed,
             on_estimate=partial(_tell, "gradient", args.bias),
         )
         print(
-            f"\nGradients of {args.bias_steps} states, {args.bias} of each method; relative bias of PPO's halves "
+            f"\nGradients of {bias_steps} states, {args.bias} of each method; relative bias of PPO's halves "
             f"{samples.noise_floor():.3g}\n\n{format_gradients(samples, args.confidence)}"
         )
     figure = draw(args.env, estimate, question, args.confidence)
-    output = args.output or Path(args.env.replace("/", "-") + "-variance.png")
     output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(output)
     print(f"\nSaved to {output}")
 
 
-def _model(args: argparse.Namespace, make: Callable[[], gym.Env]) -> OnPolicyAlgorithm:
+def _check_picture(output: Path) -> None:
+    """
+    :raises ValueError: it is no picture that can be written
+    :raises ImportError: matplotlib is not installed
+    """
+    try:
+        from matplotlib.backend_bases import FigureCanvasBase
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            f'plots need matplotlib ({error}). Install it with: pip install "sb3_sample[plots]"'
+        ) from error
+
+    allowed = FigureCanvasBase.get_supported_filetypes()
+    if output.suffix[1:].lower() not in allowed:
+        raise ValueError(f"output must end in one of .{', .'.join(sorted(allowed))}, not be {output}")
+
+
+def _model(args: argparse.Namespace, make: Callable[[], gym.Env], train_steps: int) -> OnPolicyAlgorithm:
+    cls: Any
     if args.model is None:
-        fresh = PPO("MlpPolicy", make(), seed=args.seed, device="cpu", normalize_advantage=False)
-        return fresh.learn(args.train_steps) if args.train_steps else fresh
+        cls = ALGORITHMS[args.algo or "ppo"]
+        fresh: OnPolicyAlgorithm = cls("MlpPolicy", make(), seed=args.seed, device="cpu", normalize_advantage=False)
+        return fresh.learn(train_steps) if train_steps else fresh
     for name, path in (("model", args.model), ("vecnormalize", args.vecnormalize)):
         if path is not None and not path.is_file():
             raise ValueError(f"{name} must be a file, not {path}")
-    cls: Any = ALGORITHMS[args.algo]
+    try:
+        name = class_of(args.model)
+    except PickledFile:
+        cls = ALGORITHMS[args.algo or "ppo"]
+    else:
+        algo = next((algo for algo, kind in ALGORITHMS.items() if path_of(kind) == name), None)
+        if algo is None or args.algo not in (None, algo):
+            wanted = args.algo or f"one of {', '.join(ALGORITHMS)}"
+            raise ValueError(f"model {args.model} holds a model of {name}, but algo is {wanted}")
+        cls = ALGORITHMS[algo]
     if issubclass(cls, SafeFiles):
         model = cls.load(args.model, device="cpu", allow_pickle=args.allow_pickle)
     elif args.allow_pickle:

@@ -147,7 +147,7 @@ def estimate_components(
 
     :param model: a ``PPO`` or ``A2C``, or a subclass; nothing in it changes. The critic ends the returns and is the
         baseline
-    :param make_env: makes the environment; called ``n_envs + 1`` times, the copies have to be equal
+    :param make_env: makes the environment; called ``n_envs + 1`` times, each time for a new one, equal to the others
     :param n_steps: T, steps of a rollout
     :param n_rollouts: M, at least 3. The intervals are of these independent rollouts, so that more of them narrow
         these intervals as longer ones would not do
@@ -171,9 +171,15 @@ def estimate_components(
     """
     agent = Agent(model)
     check_arguments(n_steps, n_rollouts, n_actions, n_returns, horizon, max_lag, burn_in, n_envs)
+    check_counts({"seed": (seed, 0)})
     lags = n_steps - 1 if max_lag is None else max_lag
     env, *copies = [make_env() for _ in range(n_envs + 1)]
     try:
+        if len({id(made.unwrapped) for made in (env, *copies)}) <= n_envs:
+            raise ValueError(
+                "make_env must make a new environment each time it is called, not give the same one again: "
+                "returns are sampled in the copies while the rollout waits"
+            )
         for name in ("observation_space", "action_space"):
             ours, theirs = getattr(model, name), getattr(env, name)
             if ours != theirs:

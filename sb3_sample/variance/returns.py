@@ -1,5 +1,6 @@
 """Q-values of actions at visited states: the environment goes back to the state and the policy goes on from there."""
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,7 +21,8 @@ class Agent:
     :param model: a ``PPO`` or ``A2C``, or a subclass. The statistics of a ``VecNormalize`` around its environment are
         used as they are
     :raises TypeError: ``model`` is of another family
-    :raises ValueError: its policy is of a kind that :func:`~sb3_sample.variance.scores.check_policy` refuses
+    :raises ValueError: its policy is of a kind that :func:`~sb3_sample.variance.scores.check_policy` refuses, or it has
+        learned in a ``VecNormalize`` and is now without an environment
     """
 
     def __init__(self, model: OnPolicyAlgorithm):
@@ -31,6 +33,16 @@ class Agent:
         self.policy: Any = model.policy
         self.gamma = model.gamma
         self._normalize = model.get_vec_normalize_env()
+        # Where it learns in a VecNormalize, Stable-Baselines3 keeps, and saves, the last observation as it was before.
+        if self._normalize is None and model._last_original_obs is not None:
+            message = (
+                "model has learned in a VecNormalize, without whose statistics its policy sees other numbers than it "
+                "knows: load it with env=VecNormalize.load(...), on the command line with --vecnormalize"
+            )
+            if model.env is None:
+                raise ValueError(message)
+            # It may have been trained on in an environment without one.
+            warnings.warn(message, stacklevel=3)
 
     def normalize_observations(self, observations: np.ndarray) -> np.ndarray:
         """

@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO
+from sb3_sample.faults import TrainingDiverged
 from sb3_sample.ppo.dynamics import Dynamics, Standardizer, TransitionBuffer, Transitions
 from sb3_sample.ppo.spaces import FlatObservations, ModelActions
 from tests.ppo.common import ALGORITHMS, TrueModel, collected, linear_model, quiet, tiny
@@ -336,6 +337,52 @@ def test_the_error_is_measured_before_the_model_has_seen_the_rollout() -> None:
     model.dynamics.fit = lambda *args: (order.append("fit"), fit(*args))[1]
     quiet(model).learn(32)
     assert order == ["compare", "fit"] * 2
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_a_callback_can_train_the_models_and_simulate_at_the_end_of_a_rollout(cls: Any) -> None:
+    class Extra(BaseCallback):
+        def _on_step(self) -> bool:
+            return True
+
+        def _on_rollout_end(self) -> None:
+            model: Any = self.model
+            rollout = model.current_rollout()
+            model.fit_models()
+            sizes.append(None if cls is QMAPPO else model.transitions.size)
+            shapes.append(model.simulate(rollout.observations, rollout.values, n_simulated=2).q_values.shape)
+
+    sizes: list[Any] = []
+    shapes: list[Any] = []
+    quiet(tiny(cls)).learn(48, Extra())
+    assert shapes == [(16, 2)] * 3
+    assert sizes == [None] * 3 if cls is QMAPPO else sizes == [16, 32, 48]
+
+
+def test_the_first_losses_are_measured_by_a_scale() -> None:
+    """By the scale of the rewards, 1,000, and not in their units."""
+
+    def large(total: int, observation: Any, reward: float) -> Any:
+        return observation, 1000 * reward
+
+    model = quiet(tiny(env=Toy(poison=large))).learn(16)
+    logged = model.logger.name_to_value
+    assert logged["dynamics/heldout_reward_loss"] < 10
+    assert model.dynamics.reward_scale.std.item() > 100
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_however_it_diverges_it_is_a_divergence(seed: int) -> None:
+    with pytest.raises(TrainingDiverged):
+        tiny(learning_rate=1e12, seed=seed).learn(64)
+
+
+def test_a_standard_deviation_of_zero_is_a_divergence() -> None:
+    model = collected(tiny())
+    with torch.no_grad():
+        model.policy.log_std[1] = -1e6
+    with pytest.raises(TrainingDiverged, match="the policy's standard deviation is 0.0 at update 0"):
+        model.train()
 
 
 def test_a_callback_that_stops_the_training() -> None:

@@ -1,5 +1,7 @@
 """Arguments that are refused, and the defaults."""
 
+import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from torch import nn
 
 from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO
-from tests.ppo.common import ALGORITHMS, tiny
+from tests.ppo.common import ALGORITHMS, quiet, tiny
 from tests.sac.common import Toy, vec
 
 
@@ -28,17 +30,20 @@ class OwnBuffer(RolloutBuffer):
         ({"anneal_until": 0.0}, r"anneal_until must lie in \(0, 1\], a share of the training, or be None, not 0.0"),
         ({"anneal_until": "15%"}, "anneal_until must lie in"),
         ({"anneal_until": 1.5}, "anneal_until must lie in"),
-        ({"warm_up_until": 1.0}, "warm_up_until must be at least 0 and below 1"),
+        ({"warm_up_until": 1.1}, r"warm_up_until must lie in \[0, 1\], a share of the training, or be None, not 1.1"),
         ({"warm_up_until": 0.2, "anneal_until": 0.15}, "warm_up_until must be below anneal_until=0.15, not 0.2"),
         ({"simulation_horizon": 0}, "simulation_horizon must be an integer of at least 1, not 0"),
         ({"dynamics_buffer_size": 0}, "dynamics_buffer_size must be an integer of at least 1, not 0"),
         ({"dynamics_batch_size": 1.5}, "dynamics_batch_size must be an integer of at least 1, not 1.5"),
         ({"dynamics_kwargs": {"hidden": 8}}, r"dynamics_kwargs has 'hidden', but takes \['width', 'depth'"),
+        ({"dynamics_kwargs": "abc"}, r"dynamics_kwargs must be a dict with some of \['width', .*, or None, not 'abc'"),
+        ({"dynamics_kwargs": []}, r"dynamics_kwargs must be a dict .* not \[\]"),
         ({"dynamics_kwargs": {"width": 0}}, r"dynamics_kwargs\['width'\] must be an integer of at least 1, not 0"),
         ({"dynamics_kwargs": {"epochs": 0}}, r"dynamics_kwargs\['epochs'\] must be an integer of at least 1, not 0"),
         ({"dynamics_kwargs": {"learning_rate": -1}}, r"dynamics_kwargs\['learning_rate'\] must be at least 0"),
         ({"dynamics_kwargs": {"normalize": 1}}, r"dynamics_kwargs\['normalize'\] must be True or False, not 1"),
         ({"predict_termination": "auto"}, "predict_termination must be True, False or None, not 'auto'"),
+        ({"predict_termination": 1}, "predict_termination must be True, False or None, not 1"),
         ({"use_sde": True}, "use_sde=True draws one noise for all actions"),
         ({"rollout_buffer_class": OwnBuffer}, "rollout_buffer_class=OwnBuffer draws its minibatches itself"),
     ],
@@ -46,6 +51,56 @@ class OwnBuffer(RolloutBuffer):
 def test_what_is_refused(kwargs: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         tiny(**kwargs)
+
+
+@pytest.mark.parametrize("n_simulated", [0, 3])
+@pytest.mark.parametrize(
+    ("kwargs", "words"),
+    [
+        ({"n_steps": 0}, "n_steps must be an integer of at least 1, not 0"),
+        ({"n_steps": 1.5}, "n_steps must be an integer of at least 1, not 1.5"),
+        ({"batch_size": 0}, "batch_size must be an integer of at least 1, not 0"),
+        ({"batch_size": -1}, "batch_size must be an integer of at least 1, not -1"),
+        ({"batch_size": 1, "normalize_advantage": True}, "batch_size must be at least 2 with normalize_advantage=True"),
+        ({"n_epochs": 0}, "n_epochs must be an integer of at least 1, not 0"),
+        ({"normalize_advantage": "yes"}, "normalize_advantage must be True or False, not 'yes'"),
+        ({"learning_rate": -1}, "learning_rate must be at least 0 and finite, or a schedule, not -1"),
+        ({"learning_rate": "fast"}, "learning_rate must be .* not 'fast'"),
+        ({"gamma": 2}, r"gamma must lie in \[0, 1\], not 2"),
+        ({"gae_lambda": -1}, r"gae_lambda must lie in \[0, 1\], not -1"),
+        ({"gae_lambda": float("nan")}, r"gae_lambda must lie in \[0, 1\], not nan"),
+        ({"clip_range": -1}, "clip_range must be above 0 and finite, or a schedule, not -1"),
+        ({"clip_range": None}, "clip_range must be above 0 and finite, or a schedule, not None"),
+        ({"clip_range_vf": 0.0}, "clip_range_vf must be above 0 and finite, or a schedule, or None, not 0.0"),
+        ({"ent_coef": "a"}, "ent_coef must be a finite number, not 'a'"),
+        ({"vf_coef": -1}, "vf_coef must be at least 0 and finite, not -1"),
+        ({"max_grad_norm": None}, r"max_grad_norm must be above 0 \(float\('inf'\) for no limit\), not None"),
+        ({"target_kl": -1}, "target_kl must be above 0, or None for no limit, not -1"),
+    ],
+)
+def test_ppos_own_arguments_out_of_range(n_simulated: int, kwargs: dict[str, Any], words: str) -> None:
+    arguments = {"n_steps": 16, "batch_size": 8, "n_simulated": n_simulated, "device": "cpu", **kwargs}
+    with pytest.raises(ValueError, match=words):
+        MBMAPPO("MlpPolicy", vec(), **arguments)
+
+
+def test_numbers_of_numpy_and_schedules_will_do() -> None:
+    model = tiny(
+        n_steps=np.int64(8),
+        n_simulated=np.int32(2),
+        warm_up_until=np.float32(0.0),
+        anneal_until=1,
+        gamma=np.float32(0.9),
+        clip_range=lambda left: 0.2 * left,
+        clip_range_vf=np.float64(0.2),
+        learning_rate=lambda left: 1e-3 * left,
+        max_grad_norm=float("inf"),
+        ent_coef=-0.01,
+        dynamics_kwargs={"width": np.int64(8), "depth": 1, "learning_rate": np.float32(1e-3)},
+    )
+    model.learn(16)
+    assert model.num_timesteps == 16
+    assert tiny(warm_up_until=1.0).learn(32).num_timesteps == 32
 
 
 @pytest.mark.parametrize(
@@ -63,7 +118,7 @@ def test_what_is_refused(kwargs: dict[str, Any], words: str) -> None:
 )
 def test_without_simulated_samples_their_arguments_mean_nothing(cls: Any, argument: dict[str, Any]) -> None:
     name = next(iter(argument))
-    with pytest.raises(ValueError, match=f"{name}=.* means nothing with n_simulated=0: leave it out"):
+    with pytest.raises(ValueError, match=f"{name}=.* means nothing with n_simulated=0: leave it out, or at "):
         cls("MlpPolicy", vec(), n_simulated=0, **argument)
 
 
@@ -120,9 +175,34 @@ def test_simulating_with_nothing_to_simulate_with() -> None:
         model.simulate(None)
     with pytest.raises(ValueError, match="n_simulated=0: this model has nothing to simulate with"):
         model.current_rollout()
+    with pytest.raises(ValueError, match="n_simulated=0: this model has nothing to simulate with"):
+        model.fit_models()
     model = tiny()
     with pytest.raises(ValueError, match="n_simulated must be an integer of at least 1, not 0"):
         model.simulate(None, n_simulated=0)
+
+
+@pytest.mark.parametrize("cls", ALGORITHMS)
+def test_there_is_no_rollout_before_learning_and_after_loading(cls: Any, tmp_path: Path) -> None:
+    model = tiny(cls)
+    model.learn(16).save(tmp_path / "m")
+    for without in (tiny(cls), cls.load(tmp_path / "m", env=vec())):
+        for call in (without.current_rollout, without.fit_models):
+            with pytest.raises(ValueError, match="there is no rollout: call this after learn, or in a callback's"):
+                call()
+    assert len(model.current_rollout().values) == 16
+
+
+def test_a_training_of_one_iteration_simulates_nothing_and_says_so() -> None:
+    with pytest.warns(UserWarning, match=r"16 steps are a single iteration \(n_steps=16 times 1 env.* warm_up_until=0"):
+        model = quiet(tiny(warm_up_until=None)).learn(16)
+    assert model.logger.name_to_value["simulation/n_simulated"] == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tiny(warm_up_until=None).learn(17)
+        tiny(warm_up_until=0).learn(16)
+        tiny(anneal_until=0.5, warm_up_until=None).learn(16)
+        MBMAPPO("MlpPolicy", vec(), n_steps=16, batch_size=8, n_simulated=0, device="cpu").learn(16)
 
 
 # ---------------------------------------------------------------- defaults

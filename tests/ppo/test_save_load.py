@@ -108,19 +108,23 @@ def test_load_with_other_arguments(tmp_path: Path) -> None:
     [
         ({"n_simulatd": 3}, "n_simulatd: not an argument of MBMAPPO, so load cannot change it"),
         ({"dynamics_kwargs": {"width": 16}}, "dynamics_kwargs: with these arguments the model has other networks"),
+        ({"predict_termination": False}, "predict_termination: with these arguments the model has other networks"),
+        ({"n_simulated": 0}, "n_simulated: with these arguments the model has other networks"),
         ({"n_simulated": -1}, "n_simulated must be an integer of at least 0, not -1"),
     ],
 )
 def test_load_refuses(kwargs: dict[str, Any], words: str, tmp_path: Path) -> None:
-    tiny().save(tmp_path / "m")
+    tiny().learn(16).save(tmp_path / "m")
     with pytest.raises(ValueError, match=words):
         MBMAPPO.load(tmp_path / "m", env=vec(), **kwargs)
 
 
 def test_plain_ppo_of_a_file_with_models(tmp_path: Path) -> None:
     MBMAPPO("MlpPolicy", vec(), policy_kwargs={"net_arch": [8]}, device="cpu").save(tmp_path / "m")
-    with pytest.raises(ValueError, match="n_simulated, predict_termination: with these arguments the model has other"):
-        MBMAPPO.load(tmp_path / "m", env=vec(), n_simulated=0, predict_termination=None)
+    with pytest.raises(ValueError, match="n_simulated: with these arguments the model has other networks or parts"):
+        MBMAPPO.load(tmp_path / "m", env=vec(), n_simulated=0)
+    with pytest.raises(ValueError, match="dynamics_buffer_size=5 means nothing with n_simulated=0"):
+        MBMAPPO.load(tmp_path / "m", env=vec(), n_simulated=0, dynamics_buffer_size=5)
 
 
 def test_set_parameters_keeps_the_optimizers_settings() -> None:

@@ -108,6 +108,10 @@ def test_arguments() -> None:
         GradientSamples({"PPO": gradients}).difference("size", "PPO", "PPO")
     with pytest.raises(ValueError, match="n_estimates .* at least 4, not 3"):
         compare_gradients(agent(), make, n_estimates=3)
+    with pytest.raises(ValueError, match="n_simulated .* at least 1, not 0"):
+        compare_gradients(agent(), make, n_simulated=0)
+    with pytest.raises(ValueError, match="simulation_horizon .* at least 9, not 8"):
+        compare_gradients(agent(), make, simulation_horizon=8)
     with pytest.raises(TypeError, match="model must be a PPO or A2C"):
         compare_gradients(SAC("MlpPolicy", make(), buffer_size=1), make)  # type: ignore[arg-type]
 

@@ -9,18 +9,20 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_sample import MBMAPPO
+from sb3_sample import MBMAPPO, SAC
 from sb3_sample.cli import main
 from sb3_sample.saving import save_vec_normalize
 from sb3_sample.variance.command import Question, draw, format_choices, format_components, verdict
 from sb3_sample.variance.decomposition import Components
 from sb3_sample.variance.estimate import Estimate
+from tests.ppo.common import tiny
 
-QUICK = ["--train-steps", "0", "--n-steps", "6", "--n-rollouts", "4", "--horizon", "2", "--burn-in", "3"]
+QUICK = ["--n-steps", "6", "--n-rollouts", "4", "--horizon", "2", "--burn-in", "3"]
 
 
 def run(*arguments: str, env: str = "Pendulum-v1") -> None:
-    main(["variance", "--env", env, *QUICK, *arguments])
+    untrained = [] if {"--model", "--train-steps"} & set(arguments) else ["--train-steps", "0"]
+    main(["variance", "--env", env, *QUICK, *untrained, *arguments])
 
 
 def estimate(margin: float, noise: float = 0.01, m: int = 20) -> Estimate:
@@ -99,14 +101,34 @@ def test_a_saved_model(normalized: bool, safe: bool, tmp_path: Path, capsys: pyt
         save_vec_normalize(venv, tmp_path / "vecnormalize.pkl")
     elif normalized:
         venv.save(tmp_path / "vecnormalize.pkl")
-    if safe:
-        arguments += ["--algo", "mbma_ppo"]
-    else:
+    if not safe:
         with pytest.raises(SystemExit, match="model .*model.zip is pickled, .* pass --allow-pickle"):
             run(*arguments)
         arguments.append("--allow-pickle")
     run(*arguments)
     assert "gradient of 42 parameters" in capsys.readouterr().out
+    if normalized:
+        del arguments[4:6]
+        with pytest.raises(SystemExit, match="model has learned in a VecNormalize, .* with --vecnormalize"):
+            run(*arguments)
+
+
+def test_what_is_trained_and_what_a_file_is_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = ["-o", str(tmp_path / "picture.png")]
+    run("--algo", "a2c", "--train-steps", "10", *picture)
+    first = capsys.readouterr().out
+    run("--train-steps", "0", *picture)
+    assert capsys.readouterr().out != first
+    model = ["--model", str(tmp_path / "m.zip")]
+    tiny(env=gym.make("Pendulum-v1")).save(model[1])
+    with pytest.raises(SystemExit, match="m.zip holds a model of sb3_sample.ppo.mbma:MBMAPPO, but algo is qma_ppo"):
+        run(*model, "--algo", "qma_ppo")
+    run(*model, "--algo", "mbma_ppo", *picture)
+    SAC("MlpPolicy", "Pendulum-v1", buffer_size=10).save(model[1])
+    with pytest.raises(SystemExit, match="m.zip holds a model of .*SAC, but algo is one of ppo, a2c, mbma_ppo"):
+        run(*model)
+    with pytest.raises(SystemExit, match="train_steps=5 means nothing with --model: leave it out"):
+        run(*model, "--train-steps", "5")
 
 
 def test_bias_from_the_command_line(
@@ -137,7 +159,12 @@ def test_bias_from_the_command_line(
         (["--action-cost", "0"], "action_cost must be above 0 and finite, not 0.0"),
         (["--action-cost", "nan"], "action_cost .* not nan"),
         (["--confidence", "95"], "confidence must be between 0 and 1, not 95.0"),
-        (["--bias", "3"], "n_estimates .* at least 4, not 3"),
+        (["--bias", "3"], "bias .* at least 4, not 3"),
+        (["--bias", "4", "--bias-steps", "1"], "bias_steps .* at least 2, not 1"),
+        (["--bias-steps", "64"], "bias_steps=64 means nothing without --bias: leave it out"),
+        (["--seed", "-1"], "seed .* at least 0, not -1"),
+        (["-o", "out.xyz"], r"output must end in one of .*\.png, .*, not be out.xyz"),
+        (["-o", "out"], r"output must end in one of .*\.png, .*, not be out"),
         (["--env-kwargs", "action_repeat"], "env_kwargs must be of the form NAME=VALUE, not 'action_repeat'"),
         (["--model", "/nowhere.zip"], "model must be a file, not /nowhere.zip"),
         (["--vecnormalize", "x.pkl"], "vecnormalize must come with the model"),

@@ -241,6 +241,8 @@ def test_a_dmc_task() -> None:
 def test_arguments(kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         estimate(0, **{"n_rollouts": 3, **kwargs})
+    with pytest.raises(ValueError, match="seed .* at least 0, not -1"):
+        estimate(-1, 3)
 
 
 def test_models_and_environments_that_do_not_fit() -> None:
@@ -248,6 +250,9 @@ def test_models_and_environments_that_do_not_fit() -> None:
         estimate_components(SAC("MlpPolicy", "Pendulum-v1", buffer_size=1), tabular)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="observation_space Box.*but the model has Discrete"):
         estimate_components(tabular_model(tabular()), lambda: gym.make("CartPole-v1"))
+    shared = tabular()
+    with pytest.raises(ValueError, match="make_env must make a new environment each time it is called"):
+        estimate_components(tabular_model(tabular()), lambda: shared)
     with pytest.raises(ValueError, match="env must be an environment whose state can be saved and restored"):
         estimate_components(tabular_model(tabular()), Hidden)
 
