@@ -113,11 +113,15 @@ class GradientSamples:
         :param second: another
         :param confidence: of the interval
         :return: the first one's minus the second one's, by the jackknife
+        :raises ValueError: ``quantity`` is none of them, or M is below 5, so that too few are left without one
         """
         if quantity not in ("bias", "variance", "relative_bias", "relative_variance"):
             raise ValueError(
                 f"quantity must be 'bias', 'variance', 'relative_bias' or 'relative_variance', not {quantity!r}"
             )
+
+        if self.n_estimates < 5:
+            raise ValueError(f"difference needs at least 5 estimates of the gradients, not {self.n_estimates}")
 
         def value(samples: "GradientSamples") -> float:
             of_first, of_second = (getattr(samples, quantity)(name) for name in (first, second))

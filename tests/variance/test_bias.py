@@ -104,6 +104,10 @@ def test_arguments() -> None:
         GradientSamples({"PPO": gradients, "MBMA": gradients[:4]})
     with pytest.raises(ValueError, match="M at least 4"):
         GradientSamples({"PPO": gradients[:3]})
+    four = GradientSamples({name: np.random.default_rng(0).normal(size=(4, 3)) for name in ("PPO", "MBMA")})
+    assert np.isfinite(four.bias("MBMA")).all()
+    with pytest.raises(ValueError, match="difference needs at least 5 estimates of the gradients, not 4"):
+        four.difference("bias", "PPO", "MBMA")
     with pytest.raises(ValueError, match="quantity must be .* not 'size'"):
         GradientSamples({"PPO": gradients}).difference("size", "PPO", "PPO")
     with pytest.raises(ValueError, match="n_estimates .* at least 4, not 3"):
