@@ -3,9 +3,26 @@
 import inspect
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from numbers import Integral, Real
+from typing import Any, TypeGuard
 
 from sb3_sample.saving.checks import ParametersDoNotFit
+
+
+def is_integer(value: Any) -> TypeGuard[int]:
+    """
+    :param value: any value
+    :return: whether it is an integer, Python's or NumPy's
+    """
+    return isinstance(value, Integral) and not isinstance(value, bool)
+
+
+def is_number(value: Any) -> bool:
+    """
+    :param value: any value
+    :return: whether it is a real number, Python's or NumPy's
+    """
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def names_for_load(cls: type, base: type) -> set[str]:

@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_sample.faults import check_finite_parameters
+from sb3_sample.saving.normalization import lacks_vec_normalize
 from sb3_sample.version import __version__
 
 #: The ONNX operator set of exported files; onnxruntime has had it since 1.14.
@@ -63,7 +64,7 @@ class Exportable:
                 raise ImportError(f"export needs {package}: pip install 'sb3_sample[export]'")
         if vec_normalize is not None and not isinstance(vec_normalize, VecNormalize):
             raise ValueError(f"vec_normalize must be a VecNormalize, or None, not {vec_normalize!r}")
-        if vec_normalize is None and self.env is None and self._last_original_obs is not None:
+        if vec_normalize is None and self.env is None and lacks_vec_normalize(self):
             raise ValueError(
                 "vec_normalize must be given: this model learned from normalised observations, and was loaded without "
                 "its environment, which has their statistics"

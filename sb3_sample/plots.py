@@ -5,11 +5,12 @@ The runs of one task, mean and range over seeds, beside the curves that others h
 """
 
 import argparse
+import contextlib
 import functools
 import itertools
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -254,6 +255,21 @@ def summarize(runs: Sequence[Run]) -> pd.DataFrame:
 # ---------------------------------------------------------------- picture and table
 
 
+@contextlib.contextmanager
+def needing_matplotlib() -> Iterator[None]:
+    """
+    Around its imports.
+
+    :raises ImportError: it is not installed; says of which extra it is
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            f'plots need matplotlib ({error}). Install it with: pip install "sb3_sample[plots]"'
+        ) from error
+
+
 def draw(env_id: str, curves: Sequence[Curve], metric: str, xlim: tuple[float, float] | None = None) -> "Figure":
     """
     :param env_id: id of the environment, the title
@@ -263,14 +279,10 @@ def draw(env_id: str, curves: Sequence[Curve], metric: str, xlim: tuple[float, f
     :return: the picture: lines are means, shaded the range over seeds
     :raises ImportError: matplotlib is not installed
     """
-    try:
+    with needing_matplotlib():
         from matplotlib import colormaps
         from matplotlib.figure import Figure
         from matplotlib.ticker import EngFormatter
-    except ModuleNotFoundError as error:
-        raise ImportError(
-            f'plots need matplotlib ({error}). Install it with: pip install "sb3_sample[plots]"'
-        ) from error
 
     if xlim is None:
         own = [curve for curve in curves if not curve.published] or curves

@@ -2,14 +2,13 @@
 
 import math
 from collections.abc import Mapping
-from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 
-from sb3_sample.arguments import check_unused
+from sb3_sample.arguments import check_unused, is_integer, is_number
 
 if TYPE_CHECKING:
     from sb3_sample.ppo.simulated_ppo import SimulatedPPO
@@ -70,12 +69,13 @@ def _check_numbers(agent: "SimulatedPPO") -> None:
 
 def _check_schedule(agent: "SimulatedPPO") -> None:
     """When there are how many simulated samples."""
-    for name, low in (("anneal_until", "("), ("warm_up_until", "[")):
-        value = getattr(agent, name)
-        if value is not None and (not is_number(value) or not 0 <= value <= 1 or (value == 0 and low == "(")):
-            raise ValueError(f"{name} must lie in {low}0, 1], a share of the training, or be None, not {value!r}")
-    if agent.anneal_until is not None and (agent.warm_up_until or 0) >= agent.anneal_until:
-        raise ValueError(f"warm_up_until must be below anneal_until={agent.anneal_until}, not {agent.warm_up_until}")
+    anneal, warm_up = agent.anneal_until, agent.warm_up_until
+    if anneal is not None and (not is_number(anneal) or not 0 < anneal <= 1):
+        raise ValueError(f"anneal_until must lie in (0, 1], a share of the training, or be None, not {anneal!r}")
+    if warm_up is not None and (not is_number(warm_up) or not 0 <= warm_up <= 1):
+        raise ValueError(f"warm_up_until must lie in [0, 1], a share of the training, or be None, not {warm_up!r}")
+    if anneal is not None and (warm_up or 0) >= anneal:
+        raise ValueError(f"warm_up_until must be below anneal_until={anneal}, not {warm_up}")
 
 
 def _check_simulation(agent: "SimulatedPPO") -> None:
@@ -108,16 +108,8 @@ def check_integer(name: str, value: Any, low: int) -> None:
     :param low: the smallest allowed
     :raises ValueError: if it is no integer, or below that
     """
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < low:
+    if not is_integer(value) or value < low:
         raise ValueError(f"{name} must be an integer of at least {low}, not {value!r}")
-
-
-def is_number(value: Any) -> bool:
-    """
-    :param value: any value
-    :return: whether it is a real number, Python's or NumPy's
-    """
-    return isinstance(value, Real) and not isinstance(value, (bool, np.bool_))
 
 
 def check_network_kwargs(name: str, kwargs: dict[str, Any] | None, allowed: Mapping[str, Any]) -> dict[str, Any]:

@@ -323,12 +323,10 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         :raises ValueError: if ``kwargs`` holds something else, or values with which the file's parameters do not fit
         """
         check_known(cls, PPO, kwargs)
+        changes = dict(kwargs)
         if kwargs.get("n_simulated") == 0:
             # What the file says of simulated samples is not what the caller has asked for.
-            unused = {name: default_of(cls, name) for name in cls.simulation_arguments}
-            changes = {**unused, **kwargs}
-        else:
-            changes = kwargs
+            changes = {name: default_of(cls, name) for name in cls.simulation_arguments} | kwargs
         with naming_changes(kwargs):
             return super().load(
                 path,
@@ -398,15 +396,14 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         return self
 
     def _warn_of_one_iteration(self, total_timesteps: int) -> None:
-        if self.n_simulated > 0 and self._warm_up > 0 and self.num_timesteps == 0:
-            n = self.n_steps * self.n_envs
-            if total_timesteps <= n:
-                warnings.warn(
-                    f"{total_timesteps} steps are a single iteration (n_steps={self.n_steps} times {self.n_envs} "
-                    "environments), in which nothing is simulated: the number of simulated samples rises from 0. Train "
-                    "longer, or pass warm_up_until=0",
-                    stacklevel=3,
-                )
+        starts_at_none = self.n_simulated > 0 and self._warm_up > 0 and self.num_timesteps == 0
+        if starts_at_none and total_timesteps <= self.n_steps * self.n_envs:
+            warnings.warn(
+                f"{total_timesteps} steps are a single iteration (n_steps={self.n_steps} times {self.n_envs} "
+                "environments), in which nothing is simulated: the number of simulated samples rises from 0. Train "
+                "longer, or pass warm_up_until=0",
+                stacklevel=3,
+            )
 
     def _on_environment_reset(self) -> None:
         """The environments were reset in the midst of their episodes, of which nothing is remembered here."""
@@ -463,12 +460,10 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
             raise
         except ValueError:
             # As torch's distributions raise where a mean is not finite: say what it comes from.
-            check_finite_parameters(self)
-            self._check_standard_deviation()
+            self._check_parameters()
             raise
         self._check_losses()
-        self._check_standard_deviation()
-        check_finite_parameters(self)
+        self._check_parameters()
 
     def _check_losses(self) -> None:
         """Those that the present iteration has logged."""
@@ -482,8 +477,9 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         if bad:
             raise TrainingDiverged(bad, f"update {self._n_updates}", self.num_timesteps)
 
-    def _check_standard_deviation(self) -> None:
-        """The exponential of a finite parameter can be 0 or infinite, which no distribution takes."""
+    def _check_parameters(self) -> None:
+        """All of them, and the standard deviation: the exponential of a finite one can be 0 or infinite."""
+        check_finite_parameters(self)
         if not hasattr(self.policy, "log_std") or self.use_sde:
             return
         std = self.policy.log_std.detach().exp()

@@ -8,7 +8,6 @@ Q-learning (the minimum) and 0 the mean.
 
 import math
 from collections.abc import Sequence
-from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +15,7 @@ import torch
 from torch import nn
 from torch.optim import Optimizer
 
+from sb3_sample.arguments import is_integer, is_number
 from sb3_sample.optim import AdamW
 from sb3_sample.sac import buffers, losses
 from sb3_sample.sac.batch import Batch, CriticStep, Extra
@@ -166,16 +166,16 @@ class LearnedPessimism(Pessimism):
         sources = ("replay", "validation", "recent", "on_policy")
         if source not in sources:
             raise ValueError(f"source of the pessimism's transitions must be one of {sources}, not {source!r}")
-        if not _is_number(learning_rate) or not 0 <= learning_rate < math.inf:
+        if not is_number(learning_rate) or not 0 <= learning_rate < math.inf:
             raise ValueError(f"learning_rate of the pessimism must be at least 0 and finite, not {learning_rate!r}")
-        if not _is_integer(segment_length) or segment_length < 1:
+        if not is_integer(segment_length) or segment_length < 1:
             raise ValueError(f"segment_length must be an integer of at least 1, not {segment_length!r}")
         if source in ("recent", "on_policy") and segment_length > max(agent.buffer_size // agent.n_envs, 1):
             raise ValueError(
                 f"segment_length={segment_length} is more than a replay buffer of buffer_size={agent.buffer_size} "
                 f"holds of each of {agent.n_envs} environments"
             )
-        if not _is_number(td_lambda) or not 0 <= td_lambda <= 1:
+        if not is_number(td_lambda) or not 0 <= td_lambda <= 1:
             raise ValueError(f"td_lambda must lie in [0, 1], not {td_lambda!r}")
         if source == "validation" and agent.validation_proportion == 0:
             raise ValueError(
@@ -372,7 +372,7 @@ class TOP(Pessimism):
             raise ValueError(f"arms must be at least two values of the pessimism, not {arms!r}")
         for beta in arms:
             check_beta("each of arms", beta)
-        if not _is_number(learning_rate) or not 0 <= learning_rate < math.inf:
+        if not is_number(learning_rate) or not 0 <= learning_rate < math.inf:
             raise ValueError(f"learning_rate of the bandit must be at least 0 and finite, not {learning_rate!r}")
         super().__init__(arms[0])
         self.arms = tuple(float(beta) for beta in arms)
@@ -463,16 +463,8 @@ def check_beta(name: str, beta: Any) -> None:
     :param beta: a weight of pessimism
     :raises ValueError: if it is not a finite number of at least 0
     """
-    if not _is_number(beta) or not 0 <= beta < math.inf:
+    if not is_number(beta) or not 0 <= beta < math.inf:
         raise ValueError(f"{name} must be at least 0 and finite (0 is the mean, 1 the minimum of two), not {beta!r}")
-
-
-def _is_integer(value: Any) -> bool:
-    return isinstance(value, Integral) and not isinstance(value, bool)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def gpl(agent: "SAC", initial_pessimism: float = 1.0, learning_rate: float = 5e-5) -> LearnedPessimism:

@@ -2,12 +2,12 @@
 
 import itertools
 from collections.abc import Sequence
-from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from sb3_sample.arguments import is_integer
 from sb3_sample.networks.dormant import recycle
 from sb3_sample.sac.parts import Part
 
@@ -44,12 +44,12 @@ class Resets(Part):
         self.steps: tuple[int, ...] = ()
         self.n_done = 0
         self._reached = 0
-        if isinstance(steps, Integral) and not isinstance(steps, bool):
+        if is_integer(steps):
             self.period = int(steps)
             if self.period < 1:
                 raise ValueError(f"resets must be at least 1 environment step apart, not {steps}")
             return
-        if not isinstance(steps, (Sequence, np.ndarray)) or not all(_is_integer(step) and step >= 1 for step in steps):
+        if not isinstance(steps, (Sequence, np.ndarray)) or not all(is_integer(step) and step >= 1 for step in steps):
             raise ValueError(
                 "resets must be a sequence of environment steps, integers of at least 1, or one integer for every so "
                 f"many, not {steps!r}"
@@ -93,7 +93,7 @@ class ReDo(Part):
 
     def __init__(self, period: int = 1_000, threshold: float = 0.025):
         super().__init__()
-        if not _is_integer(period) or period < 1:
+        if not is_integer(period) or period < 1:
             raise ValueError(f"redo_period must be an integer of at least 1, or None for no recycling, not {period!r}")
         if not threshold >= 0:
             raise ValueError(f"redo_threshold must be at least 0, not {threshold}")
@@ -115,7 +115,3 @@ class ReDo(Part):
             return {
                 "plasticity/n_recycled": recycle(critic.trunk, critic.head, inputs, self.threshold, critic.optimizer)
             }
-
-
-def _is_integer(value: Any) -> bool:
-    return isinstance(value, Integral) and not isinstance(value, bool)

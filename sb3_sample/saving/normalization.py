@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
@@ -19,6 +20,15 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "training": (bool,), "norm_obs": (bool,), "norm_reward": (bool,), "norm_obs_keys": (list, type(None)),
 }  # fmt: skip
 _NUMBER = (int, float, np.floating, np.integer)
+
+
+def lacks_vec_normalize(model: BaseAlgorithm) -> bool:
+    """
+    :param model: an algorithm
+    :return: whether it has learned in a ``VecNormalize`` and has none around its environment, or no environment, now
+    """
+    # Where there is one, Stable-Baselines3 keeps, and saves, the last observation as it was before.
+    return model.get_vec_normalize_env() is None and model._last_original_obs is not None
 
 
 def save_vec_normalize(venv: VecEnv, path: str | pathlib.Path) -> None:

@@ -220,7 +220,7 @@ def compare_gradients(
     """
     Agent(model)
     check_counts({"n_estimates": (n_estimates, 4), "n_steps": (n_steps, 2), "n_fits": (n_fits, 1), "seed": (seed, 0)})
-    check_counts({"n_simulated": (n_simulated, 1)})
+    check_counts({"n_simulated": (n_simulated, 1)})  # before the horizon that has to exceed it
     check_counts({"simulation_horizon": (simulation_horizon, n_simulated + 1)})
     rng = np.random.default_rng(seed)
     env = _environment(model, make_env)

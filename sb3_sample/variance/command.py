@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_sample.envs import make_env
 from sb3_sample.envs.states import check_restorable
+from sb3_sample.plots import needing_matplotlib
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.saving import load_vec_normalize
 from sb3_sample.saving.classes import path_of
@@ -205,12 +206,8 @@ def draw(title: str, estimate: Estimate, question: Question, confidence: float =
     :return: the components, the covariances by distance, and the variance of more actions at equal cost
     :raises ImportError: matplotlib is not installed
     """
-    try:
+    with needing_matplotlib():
         from matplotlib.figure import Figure
-    except ModuleNotFoundError as error:
-        raise ImportError(
-            f'plots need matplotlib ({error}). Install it with: pip install "sb3_sample[plots]"'
-        ) from error
 
     t = question.n_steps
     figure = Figure(figsize=(12, 4), layout="constrained", dpi=150)
@@ -313,6 +310,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         _run(args)
     except (ValueError, TypeError, ImportError, OSError, NotImplementedError, gym.error.Error) as error:
+        # NotImplementedError is what Stable-Baselines3 raises for spaces that it has no policy for.
         sys.exit(f"sb3-sample variance: {error}")
 
 
@@ -398,12 +396,8 @@ def _check_picture(output: Path) -> None:
     :raises ValueError: it is no picture that can be written
     :raises ImportError: matplotlib is not installed
     """
-    try:
+    with needing_matplotlib():
         from matplotlib.backend_bases import FigureCanvasBase
-    except ModuleNotFoundError as error:
-        raise ImportError(
-            f'plots need matplotlib ({error}). Install it with: pip install "sb3_sample[plots]"'
-        ) from error
 
     allowed = FigureCanvasBase.get_supported_filetypes()
     if output.suffix[1:].lower() not in allowed:

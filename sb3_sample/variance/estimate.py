@@ -17,6 +17,7 @@ import torch
 from scipy import stats
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_sample.arguments import is_integer
 from sb3_sample.envs.states import check_restorable, save_state
 from sb3_sample.variance.decomposition import Components
 from sb3_sample.variance.returns import Agent, sample_returns
@@ -360,7 +361,7 @@ def check_counts(counts: dict[str, tuple[int, int]]) -> None:
     :raises ValueError: one of them is no whole number, or below that
     """
     for name, (value, low) in counts.items():
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < low:
+        if not is_integer(value) or value < low:
             raise ValueError(f"{name} must be a whole number of at least {low}, not {value!r}")
 
 

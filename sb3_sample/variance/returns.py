@@ -11,6 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_sample.envs.states import EnvState, restore_state
+from sb3_sample.saving.normalization import lacks_vec_normalize
 from sb3_sample.variance.scores import check_policy
 
 
@@ -33,8 +34,7 @@ class Agent:
         self.policy: Any = model.policy
         self.gamma = model.gamma
         self._normalize = model.get_vec_normalize_env()
-        # Where it learns in a VecNormalize, Stable-Baselines3 keeps, and saves, the last observation as it was before.
-        if self._normalize is None and model._last_original_obs is not None:
+        if lacks_vec_normalize(model):
             message = (
                 "model has learned in a VecNormalize, without whose statistics its policy sees other numbers than it "
                 "knows: load it with env=VecNormalize.load(...), on the command line with --vecnormalize"

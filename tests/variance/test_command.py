@@ -176,6 +176,11 @@ def test_errors_at_the_door(arguments: list[str], message: str) -> None:
         run(*arguments)
 
 
+def test_a_space_that_no_policy_takes_is_one_line() -> None:
+    with pytest.raises(SystemExit, match="sb3-sample variance: .*Tuple.* not supported"):
+        run(env="Blackjack-v1")
+
+
 def test_environments_that_do_not_fit() -> None:
     with pytest.raises(SystemExit, match="sb3-sample variance: env_id 'Nowhere-v0' is not a registered environment"):
         run(env="Nowhere-v0")

@@ -241,6 +241,9 @@ def test_a_dmc_task() -> None:
 def test_arguments(kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         estimate(0, **{"n_rollouts": 3, **kwargs})
+
+
+def test_a_negative_seed() -> None:
     with pytest.raises(ValueError, match="seed .* at least 0, not -1"):
         estimate(-1, 3)
 
