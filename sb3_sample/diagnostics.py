@@ -124,8 +124,11 @@ class DiagnosticsCallback(BaseCallback):
 
     *Overestimation* is the critics' value minus a Monte-Carlo reference, averaged over the start pairs; the critics'
     value is the mean over ensemble and quantiles. An arbitrary environment cannot be put into a state of the replay
-    buffer. Hence the start pair is a visited state and action of the rollout itself, drawn from its first half, and
-    what the rollout did from there on is the reference. ``overestimation`` compares with the discounted return (P2);
+    buffer. Hence the start pair is a visited state and action of the rollout itself: that of a step which is drawn
+    before the rollout begins, uniformly from the first half of ``rollout_length`` (of the time limit, if episodes were
+    seen to be cut earlier), and counted over the ends of episodes. So how long an episode happens to last says nothing
+    about which of its states is taken. What the episode did from there on is the reference: it is unbiased also where
+    episodes end at random. ``overestimation`` compares with the discounted return (P2);
     ``overestimation_soft`` with P4's equation 22, which also counts the entropy that a soft critic contains. The
     paper writes the entropy target for the policy's entropy; here it is the one measured in the rollout, which is
     also right where the temperature is fixed or has not reached its target. As printed in the paper, the first
@@ -149,8 +152,9 @@ class DiagnosticsCallback(BaseCallback):
         any, has to be as that of the training environment
     :param every: environment steps between two measurements, taken at the first step at or after each multiple
     :param n_start_states: rollouts a measurement, each with one start pair (5 in P4)
-    :param rollout_length: most steps of a rollout. With the default a measurement adds up to 5,000 validation
-        transitions, as in P4
+    :param rollout_length: most steps of a rollout, over several episodes if they are short. Choose it well above the
+        length of episodes that terminate, since a rollout that is cut counts as one that never ends. With the default
+        a measurement adds up to 5,000 validation transitions, as in P4
     :param soft: whether to log ``overestimation_soft``
     :param batch_size: transitions from each side, training and validation; fewer if there are not as many
     :param dormant_threshold: up to which score a neuron is called dormant
@@ -204,6 +208,8 @@ class DiagnosticsCallback(BaseCallback):
         #: What was measured last, by name, without the prefix ``diagnostics/``.
         self.last_results: dict[str, float] = {}
         self._next = every
+        # The fewest steps after which an episode was cut by a time limit.
+        self._time_limit: int | None = None
         # Transitions ever added to the store.
         self._n_stored = 0
         self._store: ReplayBuffer | None = None
@@ -290,6 +296,7 @@ class DiagnosticsCallback(BaseCallback):
         """
         return {
             "next": self._next,
+            "time_limit": self._time_limit,
             "n_stored": self._n_stored,
             "rng": self._rng,
             "last_results": self.last_results,
@@ -301,6 +308,7 @@ class DiagnosticsCallback(BaseCallback):
         :param state: from :meth:`state_dict`
         """
         self._next, self._n_stored, self._rng = state["next"], state["n_stored"], state["rng"]
+        self._time_limit = state["time_limit"]
         self.last_results = state["last_results"]
         for parameter, gradient in zip(self._measured_parameters(), state["gradients"] or (), strict=False):
             parameter.grad = None if gradient is None else gradient.to(parameter.device)
@@ -354,13 +362,20 @@ class DiagnosticsCallback(BaseCallback):
         return {name: float(value) for name, value in results.items()}
 
     def _rollout(self) -> Rollout:
-        """Follow the actor from a reset, keep the transitions, and look at the rollout from its start pair on."""
+        """
+        Follow the actor from a reset over as many episodes as the step of the start pair is away, and from there to the
+        end of the episode; keep the transitions.
+        """
         assert self._store is not None and isinstance(self.model.action_space, spaces.Box)
-        steps = []
+        # Drawn before anything is known of the episodes: what is drawn from an episode of known length is a state after
+        # which less, or more, is to come than after one that the policy happens to visit.
+        longest = min(self.rollout_length, self._time_limit or self.rollout_length)
+        start = int(self._rng.integers((longest + 1) // 2))
+        value, terminated = math.nan, False
         rewards, log_probs = [], []
-        terminated = False
+        n_steps = 0
         observation: Any = self._env.reset()
-        for _ in range(self.rollout_length):
+        for step in range(self.rollout_length):
             tensors = self._to_tensors(observation)
             action, log_prob = self.model.actor.sample(tensors, self._noise(1))
             scaled = action.cpu().numpy().reshape(1, *self.model.action_space.shape)
@@ -371,20 +386,25 @@ class DiagnosticsCallback(BaseCallback):
                 last = {k: np.asarray(v)[None] for k, v in last.items()} if isinstance(last, dict) else np.array([last])
             self._store.add(observation, last, scaled, reward, done, infos)
             self._n_stored += 1
-            steps.append((tensors, action))
-            rewards.append(reward[0])
-            log_probs.append(log_prob.item())
+            if step == start:
+                value = self.model.critic(tensors, action).mean().item()
+            if step >= start:
+                rewards.append(reward[0])
+                log_probs.append(log_prob.item())
             observation = next_observation
+            n_steps += 1
             if done[0]:
                 terminated = not infos[0].get("TimeLimit.truncated", False)
-                break
-        start = int(self._rng.integers((len(steps) + 1) // 2))
+                if not terminated:
+                    self._time_limit = min(n_steps, self._time_limit or n_steps)
+                if step >= start:
+                    break
+                n_steps, terminated = 0, False
+        following = np.array(rewards)
         normalize = self.model.get_vec_normalize_env()
-        following = np.array(rewards[start:])
         if normalize is not None:
             following = normalize.normalize_reward(following)
-        value = self.model.critic(*steps[start]).mean().item()
-        return Rollout(value, following.astype(np.float64), np.array(log_probs[start:]), terminated)
+        return Rollout(value, following.astype(np.float64), np.array(log_probs), terminated)
 
     def _overfitting(self, training: Batch) -> dict[str, float]:
         assert self._store is not None

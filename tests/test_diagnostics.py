@@ -46,6 +46,23 @@ class GlobalRandomness(Toy):
         return observation, reward, terminated, truncated, info
 
 
+class Chain(gym.Env):
+    """A reward of 1 a step in one state that is left, for the end, with some probability."""
+
+    observation_space = spaces.Box(-1, 1, (3,), np.float32)
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+
+    def __init__(self, probability: float):
+        self.probability = probability
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        return np.zeros(3, np.float32), 1.0, bool(self.np_random.random() < self.probability), False, {}
+
+
 class Written(KVWriter):
     """Keeps what is logged."""
 
@@ -155,7 +172,7 @@ def test_true_value_with_termination() -> None:
     """Of two steps the first is the start pair: 2 + 0.9 * 2."""
     model = sac(gamma=0.9, ent_coef=0.0)
     answer(model.critic, 0, 0)
-    results = ready(model, Constant(2, length=2)).measure()
+    results = ready(model, Constant(2, length=2), rollout_length=2).measure()
     assert results["overestimation"] == pytest.approx(-3.8, abs=1e-5)
     assert results["overestimation_soft"] == pytest.approx(-3.8, abs=1e-5)
 
@@ -168,23 +185,65 @@ def test_mean_over_ensemble_and_quantiles() -> None:
     assert results["overestimation"] == pytest.approx(4.5)
 
 
-def test_start_pairs_are_visited_states() -> None:
-    """They come from the first half of the episode, with the value and the return of that very step."""
-    gamma = 0.8
+def counting(gamma: float) -> SAC:
+    """A model whose value is the observation's first number, which counts the steps of the episode."""
     model = sac(gamma=gamma, ent_coef=0.0, **LINEAR)
-    with torch.no_grad():  # The value is the observation's first number, which counts the steps.
+    with torch.no_grad():
         for head in (model.critic.head, model.critic_target.head):
             head.weight.zero_()[:, 0] = 1
-    callback = ready(model, Toy(length=7), n_start_states=1, soft=False)
+    return model
+
+
+@pytest.mark.parametrize(("length", "expected"), [(7, {0, 1, 2, 3, 4}), (3, {0, 1, 2})])
+def test_start_pairs_are_visited_states(length: int, expected: set[int]) -> None:
+    """They come from the first five of ten steps, over ends of episodes, with that very step's value and return."""
+    gamma = 0.8
+    callback = ready(counting(gamma), Toy(length=length), n_start_states=1, soft=False)
     starts = []
     for _ in range(40):
         results = callback.measure()
         start = round(results["critic_value"])
         starts.append(start)
-        reference = sum(gamma**k * (start + 1 + k) for k in range(7 - start))
+        reference = sum(gamma**k * (start + 1 + k) for k in range(length - start))
         assert results["overestimation"] == pytest.approx(start - reference, abs=1e-4)
         assert "overestimation_soft" not in results
-    assert set(starts) == {0, 1, 2, 3}
+    assert set(starts) == expected
+
+
+def test_start_pairs_lie_in_the_first_half_of_a_time_limit() -> None:
+    """Once it was met; what it leaves to come is then at least half of it."""
+    callback = ready(counting(0.8), Toy(length=6, truncate=True), n_start_states=1, rollout_length=100)
+    callback.measure()
+    assert {round(callback.measure()["critic_value"]) for _ in range(40)} == {0, 1, 2}
+
+
+@pytest.mark.parametrize(
+    ("probability", "gamma", "rollout_length", "n"),
+    [(0.2, 0.9, 40, 1_500), pytest.param(0.02, 0.99, 1_000, 900, marks=pytest.mark.slow)],
+)
+def test_episodes_that_end_at_random(probability: float, gamma: float, rollout_length: int, n: int) -> None:
+    """
+    The value of the one state is 1 / (1 - gamma (1 - p)), and an exact critic overestimates by nothing. A start pair
+    chosen from an episode of known length has less ahead of it: it would seem to be worth a fifth less.
+    """
+    value = 1 / (1 - gamma * (1 - probability))
+    model = sac(vec_of(Monitor(Chain(probability))), gamma=gamma, ent_coef=0.0)
+    answer(model.critic, value, value)
+    callback = ready(model, Chain(probability), n_start_states=n, rollout_length=rollout_length, soft=False)
+    results = callback.measure()
+
+    def mean_power(discount: float) -> float:
+        """Of discount ** T for the number T of steps to come."""
+        return probability * discount / (1 - (1 - probability) * discount)
+
+    # The return is (1 - gamma ** T) / (1 - gamma).
+    variance = (mean_power(gamma**2) - mean_power(gamma) ** 2) / (1 - gamma) ** 2
+    standard_error = (variance / n) ** 0.5
+    # Half of the rollout and more is left to the start pair. Where that is not enough, it counts as endless.
+    cut = ((1 - probability) * gamma) ** (rollout_length / 2) * (1 / (1 - gamma) - value)
+    assert cut < standard_error / 4
+    assert results["critic_value"] == pytest.approx(value, rel=1e-5)
+    assert abs(results["overestimation"]) < 4 * standard_error + cut < 0.12 * value
 
 
 def test_entropy_of_the_rollout() -> None:
@@ -227,17 +286,19 @@ def test_validation_transitions(truncate: bool, dict_observations: bool) -> None
     """As they were experienced: the last observation of an episode is not the first of the next."""
     kwargs: dict[str, Any] = {"obs_space": DICT} if dict_observations else {}
     model = sac(vec(**kwargs), policy="MultiInputPolicy" if dict_observations else "MlpPolicy")
-    callback = ready(model, Toy(length=3, truncate=truncate, **kwargs), n_start_states=1)
+    callback = ready(model, Toy(length=3, truncate=truncate, **kwargs), n_start_states=6)
     callback.measure()
     store: Any = callback._store
-    assert store.size() == 3
+    # Whole episodes: that of a start pair, and those on the way there.
+    n = store.size()
+    assert n % 3 == 0 and n > 18 - 3 * truncate
     for key in ("a", "b") if dict_observations else (None,):
         now, after = (x if key is None else x[key] for x in (store.observations, store.next_observations))
-        assert now[:3, 0].reshape(3, -1)[:, 0].tolist() == [0, 1, 2]
-        assert after[:3, 0].reshape(3, -1)[:, 0].tolist() == [1, 2, 3]
-    assert store.rewards[:3, 0].tolist() == [1, 2, 3]
-    assert store.dones[:3, 0].tolist() == [0, 0, 1]
-    assert store.timeouts[:3, 0].tolist() == [0, 0, float(truncate)]
+        assert now[:n, 0].reshape(n, -1)[:, 0].tolist() == [0, 1, 2] * (n // 3)
+        assert after[:n, 0].reshape(n, -1)[:, 0].tolist() == [1, 2, 3] * (n // 3)
+    assert store.rewards[:n, 0].tolist() == [1, 2, 3] * (n // 3)
+    assert store.dones[:n, 0].tolist() == [0, 0, 1] * (n // 3)
+    assert store.timeouts[:n, 0].tolist() == [0, 0, float(truncate)] * (n // 3)
 
 
 # ---------------------------------------------------------------- overfitting
@@ -564,7 +625,7 @@ def test_the_training_environments_normalisation(wrapped: bool) -> None:
     eval_env: Any = vec_of(Constant(8, length=2))
     if wrapped:
         eval_env = VecNormalize(eval_env)
-    callback = ready(model, eval_env)
+    callback = ready(model, eval_env, rollout_length=2)
     assert model.replay_buffer is not None
     model.replay_buffer.add(
         np.full((2, 3), 4.0), np.full((2, 3), 5.0), np.zeros((2, 2)), np.full(2, 4.0), np.zeros(2), [{}, {}]
@@ -588,7 +649,7 @@ def test_subprocess() -> None:
     try:
         model = sac(gamma=0.9)
         answer(model.critic, 0, 0)
-        assert ready(model, env).measure()["overestimation"] == pytest.approx(-3.8, abs=1e-5)
+        assert ready(model, env, rollout_length=2).measure()["overestimation"] == pytest.approx(-3.8, abs=1e-5)
     finally:
         env.close()
 
