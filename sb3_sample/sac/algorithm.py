@@ -850,7 +850,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
                     metrics["train/ent_coef_loss"] = temperature_loss
 
         # Pessimism.
-        step = CriticStep(q.detach(), next_q, entropy_bonus)
+        step = CriticStep(q.detach(), next_q, entropy_bonus, noise.subset)
         metrics.update(self.pessimism_rule.update(self, batch, step, noise.pessimism, extra))
         return {name: value.detach() for name, value in metrics.items()}
 

@@ -100,12 +100,13 @@ class CriticStep(NamedTuple):
 
     ``q`` is (E, B, K), the critics' predictions; ``next_q`` (E, B, K), the target critics' of the next state and the
     actor's action there (of the drawn subset, if one is drawn); ``entropy_bonus``, ``-alpha * log pi`` of that
-    action, (B, 1).
+    action, (B, 1); ``subset``, the critics that make the step's TD target, (n,), None for all.
     """
 
     q: torch.Tensor
     next_q: torch.Tensor
     entropy_bonus: torch.Tensor
+    subset: torch.Tensor | None = None
 
 
 def draw_batches(

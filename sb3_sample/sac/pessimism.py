@@ -133,9 +133,10 @@ class LearnedPessimism(Pessimism):
       TD(0.95) return of what really followed; see :meth:`lambda_returns`.
 
     What the papers leave open: the bootstrap ``V_lb`` is that of the TD target, of the target critics and a fresh
-    action of the actor, with its entropy bonus, since that is the value whose bias beta has to mend; ``Q_mean(s, a)``
-    is of the online critics, which are trained towards it. The batch of replay is judged with the values from before
-    the step, which cost nothing more. Quantiles are averaged after the spread over critics is taken.
+    action of the actor, with its entropy bonus, since that is the value whose bias beta has to mend; with
+    ``target_subset`` it is that of the critics which make the step's own target, whatever the source. ``Q_mean(s, a)``
+    is of the online critics, all of them, which are trained towards it. The batch of replay is judged with the values
+    from before the step, which cost nothing more. Quantiles are averaged after the spread over critics is taken.
 
     At a reset beta and its optimizer start anew, as every learned number does.
 
@@ -257,19 +258,24 @@ class LearnedPessimism(Pessimism):
         elif extra is None:
             return metrics
         else:
-            error = self._error(agent, extra, noise)
+            error = self._error(agent, extra, noise, step.subset)
         loss = error.square().mean() if self.loss == "squared" else self.weight * error.detach().mean()
         agent.minimize(self.optimizer, loss)
         with torch.no_grad():
             self.weight.clamp_(min=0)
         return {**metrics, "pessimism/loss": loss, "pessimism/error": error.mean()}
 
-    def _error(self, agent: "SAC", extra: Extra, noise: torch.Tensor | None) -> torch.Tensor:
+    def _error(
+        self, agent: "SAC", extra: Extra, noise: torch.Tensor | None, subset: torch.Tensor | None
+    ) -> torch.Tensor:
         """
         :return: error of the lower bound on transitions other than the step's, (B,), its gradient through beta
         """
         batch = extra.batch
         judged = self._judge(agent, batch, noise)
+        if subset is not None:
+            # The spread of the critics that beta is applied to: that of a few of them is not that of all.
+            judged = judged._replace(next_q=judged.next_q[subset])
         if self.source != "on_policy":
             return self._td_error(batch, judged)
         assert extra.ends is not None

@@ -16,6 +16,7 @@ from sb3_sample.sac import BRO, GPLSAC, OPLSAC, SAC, TOPSAC, VPLSAC, buffers
 from sb3_sample.sac.batch import Batch, CriticStep, Noise
 from sb3_sample.sac.pessimism import TOP, LearnedPessimism, pessimistic_value
 from tests.sac.common import TINY_BRO, TINY_SAC, differing, random_batch, sac, state, vec
+from tests.sac.test_execution import captured
 from tests.sac.test_update import NoSynchronisation
 from tests.sac.test_validation_split import Written, tagged
 
@@ -325,6 +326,40 @@ def test_waits_for_a_batch_and_takes_exactly_one(
             assert split.n_validation == n and "pessimism/loss" in metrics
             assert learned.beta() != 1 and learned.optimizer.state
     assert judged == [n] * 6
+
+
+@pytest.mark.parametrize("how", ["eager", "captured", pytest.param("compiled", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["vpl", "vpl dual", "vpl recent", "opl"])
+def test_the_steps_own_subset_makes_the_lower_bound(name: str, how: str) -> None:
+    """
+    Of the target critics' answers 2, 6 and 14, the first and the last are drawn: mean 8, spread 6; the mean of all is
+    22 / 3, their spread 4.99. Rewards are 0, nothing ends, Q(s, a) is (1 + 2 + 6) / 3 = 3 and the discount 1/2.
+    """
+    # Nothing but beta moves: the critics' answers stay what they are.
+    model = make(name, vec(poison=lambda total, observation, _: (observation, 0.0), length=1_000),
+                 policy_kwargs={"net_arch": [8], "n_critics": 3}, target_subset=2, gamma=0.5, ent_coef=0.0,
+                 learning_rate=0.0, tau=1e-9, compile=how == "compiled").learn(60)  # fmt: skip
+    for critic, answers in ((model.critic, (1.0, 2.0, 6.0)), (model.critic_target, (2.0, 6.0, 14.0))):
+        with torch.no_grad():
+            critic.head.weight.zero_()
+            critic.head.bias.copy_(torch.tensor(answers).view_as(critic.head.bias))
+    if how == "captured":
+        captured(model)
+    for i, (subset, mean, spread) in enumerate([([0, 2], 8, 6), ([1, 0], 4, 2), ([2, 1], 10, 4)] * 3):
+        beta = model.pessimism_rule.beta().item()
+        metrics = model._update(random_batch(model, seed=i), Noise(subset=torch.tensor(subset)))
+        value = mean - beta * spread
+        if name == "opl":
+            # Of all segments the last step: G = V / 2; before it G = ((1 - lambda) V + lambda G) / 2. Of all critics
+            # the bound of (s, a): their spread is that of (1, 2, 6).
+            returns = [value / 2]
+            for _ in range(7):
+                returns.append((0.05 * value + 0.95 * returns[-1]) / 2)
+            error = np.mean(returns) - (3 - beta * np.std([1, 2, 6]))
+        else:
+            error = 3 - value / 2
+        assert metrics["pessimism/error"].item() == pytest.approx(error, rel=1e-4, abs=1e-4), subset
+    assert model.pessimism_rule.beta().item() != beta
 
 
 def test_recent_waits_for_eight_steps() -> None:
