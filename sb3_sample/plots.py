@@ -77,11 +77,12 @@ class Curve:
 
 def published_curves(env_id: str) -> pd.DataFrame:
     """
-    The curves published with BRO and SimbaV2 (``data/README.md`` names the sources and how they were measured).
+    The curves that others have published (``data/README.md`` names their sources, licences and how they were measured).
 
     The MuJoCo curves are of the v4 tasks and Meta-World's of the v2 tasks, whatever version ``env_id`` names.
 
-    :param env_id: id of an environment, e.g. ``"dmc/cheetah-run-v0"`` or ``"HalfCheetah-v5"``
+    :param env_id: id of an environment, e.g. ``"dmc/cheetah-run-v0"``, ``"HalfCheetah-v5"``, or HumanoidBench's
+        ``"h1-walk-v0"``
     :return: columns algorithm, metric ("return" or "success_rate") and ``COLUMNS``; no rows if nothing was published
     """
     try:
@@ -112,8 +113,9 @@ def _of_task(env_id: str) -> str:
 def select_published(env_id: str, names: Sequence[str] | None, metric: str) -> list[Curve]:
     """
     :param env_id: id of the environment
-    :param names: published algorithms, e.g. "BRO (RR=10)" or, without the bracket, "BRO"; "all"; none if empty; if None
-        those of ``PUBLISHED`` that there are
+    :param names: published algorithms, e.g. "BRO (RR=10)" or, without the bracket, "BRO", which means all of that name
+        unless one is called just so ("SAC" is one set of curves, "SAC (TD-MPC2 authors)" another); "all"; none if
+        empty; if None those of ``PUBLISHED`` that there are
     :param metric: "return" or "success_rate"
     :return: their curves
     :raises ValueError: there is no curve of that name
@@ -123,10 +125,8 @@ def select_published(env_id: str, names: Sequence[str] | None, metric: str) -> l
     available = list(data["algorithm"].unique())
     chosen: list[str] = []
     for name in PUBLISHED if names is None else names:
-        matches = [
-            algorithm
-            for algorithm in available
-            if name.lower() in ("all", algorithm.lower(), algorithm.partition(" (")[0].lower())
+        matches = [algorithm for algorithm in available if name.lower() == algorithm.lower()] or [
+            algorithm for algorithm in available if name.lower() in ("all", algorithm.partition(" (")[0].lower())
         ]
         if not matches and names is not None:
             raise ValueError(

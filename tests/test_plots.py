@@ -1,10 +1,12 @@
 """Runs beside published curves, on made-up runs."""
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from sb3_sample import plots
@@ -43,11 +45,54 @@ def test_published_curves_are_those_of_the_task() -> None:
     assert ((curves["min"] <= curves["mean"]) & (curves["mean"] <= curves["max"])).all()
     assert (plots.published_curves("metaworld/push-v3")["metric"] == "success_rate").all()
     assert len(plots.published_curves("HalfCheetah-v5"))
+    assert len(plots.published_curves("h1-balance_simple-v0"))  # HumanoidBench's own id
     assert not len(plots.published_curves("Pendulum-v1"))
 
 
 def test_the_data_file_is_small() -> None:
-    assert plots.DATA.stat().st_size < 200_000
+    assert sum(file.stat().st_size for file in plots.DATA.parent.iterdir()) < 500_000
+
+
+def test_bro_has_its_ten_seeds_where_its_authors_published_them() -> None:
+    """Their 15 + 15 + 10 tasks, and reruns of five seeds elsewhere."""
+    data = pd.read_csv(plots.DATA)
+    for algorithm in ("BRO (RR=10)", "BRO Fast (RR=2)"):
+        rows = data[data["algorithm"] == algorithm]
+        ten = rows[rows["n_seeds"] == 10].groupby("suite")["task"].nunique()
+        assert dict(ten) == {"dmc": 15, "metaworld": 15, "myosuite": 10}
+        assert set(rows["n_seeds"]) == {5, 10}
+    row = data[(data["task"] == "cheetah-run") & (data["algorithm"] == "BRO (RR=10)") & (data["env_step"] == 1_000_000)]
+    # The last evaluations of the authors' ten runs.
+    seeds = np.sort([898.55, 842.58, 852.64, 720.55, 743.99, 786.20, 871.13, 851.55, 839.18, 848.10])
+    expected = [seeds.mean(), seeds.std(ddof=1), seeds[0], seeds[-1], seeds[2:8].mean()]
+    assert row[["mean", "std", "min", "max", "iqm"]].iloc[0].tolist() == pytest.approx(expected, rel=1e-3)
+
+
+def test_rows_are_curves() -> None:
+    data = pd.read_csv(plots.DATA)
+    assert not data.duplicated(["suite", "task", "algorithm", "env_step"]).any()
+    assert not data.isna().any(axis=None) and (data["n_seeds"] >= 3).all()
+    assert (data["env_step"] <= 2_000_000).all()
+    for low, high in itertools.pairwise(("min", "iqm", "max")):
+        assert (data[low] <= data[high]).all()
+    rates = data[data["metric"] == "success_rate"]
+    assert set(rates["suite"]) == {"metaworld", "myosuite"}
+    assert (rates["min"] >= 0).all() and (rates["max"] <= 1).all()
+
+
+def test_every_curve_has_a_source_and_a_licence_that_lets_it_be_used() -> None:
+    lines = (plots.DATA.parent / "README.md").read_text().splitlines()
+    table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| ")]
+    header, *rows = [row for row in table if not set(row[0]) <= {"-", " "}]
+    assert header[:3] == ["algorithm", "source", "licence"]
+    assert {row[0] for row in rows} == set(pd.read_csv(plots.DATA)["algorithm"].unique())
+    assert {row[2] for row in rows} == {"MIT", "Apache-2.0"}
+    for licence in ("MIT", "Apache-2.0"):
+        assert (plots.DATA.parent / f"LICENSE-{licence}.txt").read_text()
+
+
+def test_curves_that_may_not_be_used_commercially_are_not_there() -> None:
+    assert not any("mr.q" in name.lower() for name in pd.read_csv(plots.DATA)["algorithm"].unique())
 
 
 @pytest.mark.parametrize(
@@ -56,7 +101,9 @@ def test_the_data_file_is_small() -> None:
         (None, ["BRO (RR=10)", "BRO Fast (RR=2)", "SAC"]),
         ([], []),
         (["bro fast"], ["BRO Fast (RR=2)"]),
-        (["SimbaV2", "SimbaV2 (RR=2)"], ["SimbaV2 (RR=2)", "SimbaV2 (RR=8)"]),
+        (["SimbaV2", "SimbaV2 (RR=2)"], [f"SimbaV2 (RR={n})" for n in (1, 2, 4, 8)]),
+        (["SAC"], ["SAC"]),
+        (["sac (td-mpc2 authors)"], ["SAC (TD-MPC2 authors)"]),
     ],
 )
 def test_published_curves_by_name(names: list[str] | None, expected: list[str]) -> None:
@@ -122,7 +169,7 @@ def test_plot_groups_runs_by_algorithm_beside_the_published(tmp_path: Path, caps
     output = capsys.readouterr().out
     assert "| 50,000 | bro | 3 | 400 | 200 | 200 | 600 | 400 |" in output
     assert "| 50,000 | sac | 1 | 20 | - | 20 | 20 | 20 |" in output
-    assert "| 50,000 | BRO (RR=10), published | 5 |" in output
+    assert "| 50,000 | BRO (RR=10), published | 10 |" in output
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
@@ -142,8 +189,8 @@ def test_picture_has_a_line_a_curve_and_the_colour_tells_the_algorithm() -> None
     curves = [plots.Curve("bro_fast", plots.summarize([run])), *plots.select_published(ENV, None, "return")]
     axes = plots.draw(ENV, curves, "return").axes[0]
     lines = {line.get_label(): line for line in axes.lines}
-    assert list(lines) == ["bro_fast, 1 seed", "BRO (RR=10), 5 seeds", "BRO Fast (RR=2), 5 seeds", "SAC, 3 seeds"]
-    assert lines["bro_fast, 1 seed"].get_color() == lines["BRO Fast (RR=2), 5 seeds"].get_color()
+    assert list(lines) == ["bro_fast, 1 seed", "BRO (RR=10), 10 seeds", "BRO Fast (RR=2), 10 seeds", "SAC, 3 seeds"]
+    assert lines["bro_fast, 1 seed"].get_color() == lines["BRO Fast (RR=2), 10 seeds"].get_color()
     assert len({line.get_color() for line in axes.lines}) == 3
     assert axes.get_xlim() == (0, 50_000)
     assert axes.get_title() == ENV

@@ -147,17 +147,19 @@ MBMA = _dmc(
 MBMA_HARD = _dmc("quadruped-walk", "quadruped-run", "humanoid-stand", "humanoid-walk")
 
 # The published curves of Gymnasium's tasks are of v4; v5 is the version of today.
-_GYMNASIUM = ("Ant", "HalfCheetah", "Hopper", "Humanoid", "Walker2d")
+_GYMNASIUM = ("Ant", "HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup", "Walker2d")
+#: How HumanoidBench's ids begin. The package has none of them; who has installed it finds the curves.
+_HUMANOIDBENCH = ("h1-", "h1hand-")
 
 
 def published_key(env_id: str) -> tuple[str, str]:
     """
     The names under which the published curves list an environment.
 
-    :param env_id: An id, e.g. ``"metaworld/push-v3"``, ``"myosuite/key-turn-v0"``, ``"dmc/cheetah-run-v0"`` or
-        ``"HalfCheetah-v5"``; the prefix ``sb3_sample:`` may stand before it.
+    :param env_id: An id, e.g. ``"metaworld/push-v3"``, ``"myosuite/key-turn-v0"``, ``"dmc/cheetah-run-v0"``,
+        ``"HalfCheetah-v5"`` or ``"h1-balance_hard-v0"``; the prefix ``sb3_sample:`` may stand before it.
     :return: Suite and task: ``("metaworld", "push")``, ``("myosuite", "myo-key-turn")``, ``("dmc", "cheetah-run")``,
-        ``("gymnasium", "HalfCheetah-v4")``. Not every task has curves.
+        ``("gymnasium", "HalfCheetah-v4")``, ``("humanoidbench", "h1-balance-hard-v0")``. Not every task has curves.
     :raises ValueError: The id is of none of these suites.
     """
     name, separator, version = env_id.removeprefix(f"{PACKAGE}:").rpartition("-v")
@@ -169,6 +171,9 @@ def published_key(env_id: str) -> tuple[str, str]:
             return suite, f"myo-{task}"
         if name in _GYMNASIUM:
             return "gymnasium", f"{name}-v4"
+        if name.startswith(_HUMANOIDBENCH):
+            return "humanoidbench", f"{name.replace('_', '-')}-v{version}"
     raise ValueError(
-        f"env_id must be a versioned id of dmc/, metaworld/ or myosuite/, or of {', '.join(_GYMNASIUM)}, got {env_id!r}"
+        "env_id must be a versioned id of dmc/, metaworld/ or myosuite/, of HumanoidBench (h1-..., h1hand-...), or of "
+        f"{', '.join(_GYMNASIUM)}, got {env_id!r}"
     )

@@ -38,6 +38,8 @@ def test_lists_hold_registered_ids_once(name: str) -> None:
         ("myosuite/key-turn-hard-v0", ("myosuite", "myo-key-turn-hard")),
         ("dmc/ball_in_cup-catch-v0", ("dmc", "ball_in_cup-catch")),
         ("HalfCheetah-v5", ("gymnasium", "HalfCheetah-v4")),
+        ("HumanoidStandup-v5", ("gymnasium", "HumanoidStandup-v4")),
+        ("h1hand-balance_hard-v0", ("humanoidbench", "h1hand-balance-hard-v0")),
     ],
 )
 def test_published_key(env_id: str, key: tuple[str, str]) -> None:
