@@ -149,7 +149,7 @@ ON_POLICY_SPACE: Space = {
     "n_simulated": _int(1, 16, log=True),
 }
 MBMA_SPACE: Space = {**ON_POLICY_SPACE, "simulation_horizon": _int(1, 24)}
-#: Its horizon lies above the number of simulated states.
+#: Its horizon lies above the number of simulated states: one rollout from each real state.
 MBPO_SPACE: Space = {**ON_POLICY_SPACE, "n_simulated": _int(1, 11, log=True), "simulation_horizon": _int(12, 24)}
 #: What each setting of a regularization belongs to, by its argument: the group, the regularization, and the range.
 REGULARIZATION_SETTINGS: dict[str, tuple[str, str, Suggest]] = {

@@ -12,10 +12,13 @@ class MBPOPPO(ModelBasedPPO):
     real state the learned model is rolled for ``simulation_horizon`` steps under the policy, and the policy gradient
     is also taken at its first ``n_simulated`` states, which makes the trajectory ``n_simulated`` + 1 times as long.
 
-    P1 has 8 states and a horizon of 12. Read here: a rollout begins with a fresh action of the policy at the real
-    state; simulated states 1 to X are the samples, each with the TD(lambda) return from it to the end of the rollout,
-    where the critic's value stands. So ``simulation_horizon`` must be above ``n_simulated``. With
-    ``predict_termination`` a sample counts as much as the rollout is likely to have come so far.
+    The many-actions paper has 8 states and a horizon of 12. Read here: a rollout begins with a fresh action of the
+    policy at the real state; simulated states 1 to X are the samples, each with the TD(lambda) return from it to the
+    end of the rollout, where the critic's value stands. A rollout of H steps so has H - 1 states with a return. Where X
+    is more than that, as in appendix D's ablation (N = 8, 16, 32, 64 at H = 12), as many rollouts branch from each real
+    state as are needed, ``ceil(X / (H - 1))``, each with actions of its own and equally many states (to one): no state
+    lies further than H - 1 steps of the model from a real one. With ``predict_termination`` a sample counts as much as
+    the rollout is likely to have come so far.
 
     :param policy: "MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes
     :param env: the environment, an id, or a vectorised environment
@@ -24,7 +27,7 @@ class MBPOPPO(ModelBasedPPO):
     :param anneal_until: share of the training from which on nothing is simulated any more; None for no decline
     :param warm_up_until: share of the training over which X rises from 0; None: 0.15, or 0 if ``anneal_until`` is
         given. Both in full: :class:`SimulatedPPO`
-    :param simulation_horizon: H, steps of a rollout of the model, above X
+    :param simulation_horizon: H, steps of a rollout of the model, at least 2
     :param dynamics_buffer_size: transitions that the model learns from
     :param dynamics_batch_size: transitions in a batch of the model
     :param dynamics_kwargs: ``width``, ``depth``, ``learning_rate``, ``epochs``, ``normalize``: :class:`ModelBasedPPO`
@@ -36,37 +39,38 @@ class MBPOPPO(ModelBasedPPO):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        self._check_horizon(self.n_simulated)
-
-    def _check_horizon(self, n_simulated: int) -> None:
-        if self.simulation_horizon <= n_simulated:
+        if self.n_simulated > 0 and self.simulation_horizon < 2:
             raise ValueError(
-                f"simulation_horizon must be above n_simulated={n_simulated}, so that the last simulated state has a "
-                f"return, not {self.simulation_horizon}"
+                "simulation_horizon must be at least 2, so that a simulated state has a return, not "
+                f"{self.simulation_horizon}"
             )
 
     def _simulate(
         self, observations: torch.Tensor, values: torch.Tensor, n_simulated: int, noise: torch.Tensor | None
     ) -> SimulatedSamples:
-        """Noise: (H, N, A), of the actions in the rollouts."""
-        self._check_horizon(n_simulated)
+        """Noise: (H, R N, A), of the actions in the R rollouts from each state, all states' first ones first."""
+        n_rollouts = -(-n_simulated // (self.simulation_horizon - 1))
+        n_kept = -(-n_simulated // n_rollouts)
         pieces, ends = [], False
-        for piece in torch.arange(len(observations), device=observations.device).split(self._rows_at_once()):
-            starts = observations[piece]
+        rows = torch.arange(n_rollouts * len(observations), device=observations.device)
+        for piece in rows.split(self._rows_at_once()):
+            starts = observations[piece % len(observations)]
             first = draw(self.distribution_at(starts), None if noise is None else noise[0, piece])
             later = None if noise is None else noise[1:, piece]
-            rolled = self.roll_out(starts, first, later, n_kept=n_simulated)
-            q_values = rolled.q_values[1 : n_simulated + 1]
-            advantages = q_values - rolled.values[:n_simulated]
+            rolled = self.roll_out(starts, first, later, n_kept=n_kept)
+            q_values = rolled.q_values[1 : n_kept + 1]
+            advantages = q_values - rolled.values[:n_kept]
             # Without terminations every state is reached.
             reached = torch.ones_like(q_values)
             if rolled.continues is not None:
-                reached = rolled.continues[:n_simulated].cumprod(dim=0)
+                reached = rolled.continues[:n_kept].cumprod(dim=0)
             ends = rolled.continues is not None
             assert rolled.observations is not None and rolled.actions is not None and rolled.log_probs is not None
             columns = (rolled.observations, rolled.actions, rolled.log_probs, q_values, advantages, reached)
             pieces.append([column.transpose(0, 1) for column in columns])
-        joined = [torch.cat(column) for column in zip(*pieces, strict=True)]
+        joined = [torch.cat(column).unflatten(0, (n_rollouts, -1)) for column in zip(*pieces, strict=True)]
+        # By state, then by step, then by rollout: what is too much are last steps.
+        joined = [column.movedim(0, 2).flatten(1, 2)[:, :n_simulated] for column in joined]
         self._check_finite(joined[3])
         samples = SimulatedSamples(*joined)
         return samples if ends else samples._replace(weights=None)

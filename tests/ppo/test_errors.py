@@ -133,10 +133,10 @@ def test_q_kwargs() -> None:
         tiny(QMAPPO, q_kwargs={"horizon": 8})
 
 
-def test_mbpo_needs_a_return_for_its_last_state() -> None:
-    with pytest.raises(ValueError, match="simulation_horizon must be above n_simulated=4, so that .* not 4"):
-        tiny(MBPOPPO, n_simulated=4, simulation_horizon=4)
-    tiny(MBPOPPO, n_simulated=4, simulation_horizon=5)
+def test_mbpo_needs_a_return_for_its_states() -> None:
+    with pytest.raises(ValueError, match="simulation_horizon must be at least 2, so that .* not 1"):
+        tiny(MBPOPPO, n_simulated=1, simulation_horizon=1)
+    tiny(MBPOPPO, n_simulated=4, simulation_horizon=2)
 
 
 @pytest.mark.parametrize("cls", ALGORITHMS)

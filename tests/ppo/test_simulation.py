@@ -173,6 +173,46 @@ def test_mbpo_weighs_a_state_by_the_chance_of_coming_there() -> None:
     )
     samples = agent.simulate(STATES)
     torch.testing.assert_close(samples.weights, torch.tensor([0.5, 0.25, 0.125]).expand(5, 3))
+    samples = agent.simulate(STATES, n_simulated=7)  # three rollouts of three, three and one states, in step
+    torch.testing.assert_close(samples.weights, torch.tensor([0.5] * 3 + [0.25] * 3 + [0.125]).expand(5, 7))
+
+
+def test_mbpo_branches_as_often_as_its_samples_need() -> None:
+    """Seven states at a horizon of four: three rollouts, each as a simulation of fewer states with its own noise."""
+    agent = linear_model(MBPOPPO, value=true_value(0.9), simulation_horizon=4, n_simulated=7)
+    noise = torch.randn(4, 3, 5, 1, generator=torch.Generator().manual_seed(3))
+    samples = agent.simulate(STATES, noise=noise.flatten(1, 2))
+    assert samples.observations.shape == (5, 7, 2) and samples.weights is None
+    rollouts = [agent.simulate(STATES, n_simulated=3, noise=noise[:, r]) for r in range(3)]
+    for j in range(7):
+        step, r = divmod(j, 3)
+        for ours, theirs in zip(samples[:5], rollouts[r][:5], strict=True):
+            torch.testing.assert_close(ours[:, j], theirs[:, step], msg=f"sample {j}")
+    agent._rows_at_once = lambda: 4
+    pieces = agent.simulate(STATES, noise=noise.flatten(1, 2))
+    torch.testing.assert_close(samples.q_values, pieces.q_values)
+
+
+@pytest.mark.parametrize(("n", "n_rollouts"), [(8, 1), (11, 1), (12, 2), (16, 2), (32, 3), (64, 6)])
+def test_mbpo_of_the_papers_ablation(n: int, n_rollouts: int) -> None:
+    """Many-actions paper, appendix D: N of 8, 16, 32 and 64 at a horizon of 12."""
+    agent = linear_model(MBPOPPO, simulation_horizon=12, n_simulated=n)
+    rolled: list[tuple[int, int]] = []
+    roll_out = agent.roll_out
+    agent.roll_out = lambda starts, *args, n_kept: (
+        rolled.append((len(starts), n_kept)), roll_out(starts, *args, n_kept=n_kept)
+    )[1]  # fmt: skip
+    samples = agent.simulate(STATES)
+    assert sum(rows for rows, _ in rolled) == 5 * n_rollouts
+    assert {kept for _, kept in rolled} == {-(-n // n_rollouts)} and max(kept for _, kept in rolled) <= 11
+    assert samples.q_values.shape == samples.advantages.shape == samples.log_probs.shape == (5, n)
+    # The rollouts from a state are not the same.
+    assert len(torch.unique(samples.observations[0], dim=0)) == n
+
+
+def test_mbpo_learns_with_more_states_than_its_horizon() -> None:
+    model = tiny(MBPOPPO, n_simulated=9, simulation_horizon=3, warm_up_until=0.0).learn(32)
+    assert model.logger.name_to_value["simulation/n_simulated"] == 9
 
 
 def test_qma_takes_the_smaller_of_two() -> None:
