@@ -150,7 +150,15 @@ def _zoo_plot(function: str) -> Callable[[list[str]], None]:
             "--allow-pickle", action="store_true", help="Read a pickled file too, which can run any code"
         )
         options, names = _own_options(parser, names)
-        with _errors(function), replaced(module, "pickle", PlottedRuns(options.allow_pickle)):
+        runs = PlottedRuns(options.allow_pickle)
+        said: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
+        if function == "plot_from_file":
+            from sb3_sample import zoo_scores
+
+            rliable, *tasks = zoo_scores.rliable_options(names)
+            if rliable:
+                runs, said = zoo_scores.NormalizedRuns(options.allow_pickle, *tasks), zoo_scores.saying_so()
+        with _errors(function), said, replaced(module, "pickle", runs):
             _zoo_function("rl_zoo3.plots", function)(names)
 
     return run

@@ -93,6 +93,89 @@ def test_train_continue_enjoy_and_plot_an_id_with_a_slash(zoo_run, capsys: pytes
     assert "| 505 |" in capsys.readouterr().out
 
 
+def write_evaluations(task: str, algorithm: str, seed: int, **arrays: np.ndarray) -> None:
+    folder = Path(f"logs/{algorithm}/{task.replace('/', '-')}_{seed}")
+    folder.mkdir(parents=True)
+    np.savez(folder / "evaluations.npz", timesteps=np.arange(1, 6) * 1_000, **arrays)
+
+
+@pytest.fixture
+def rliable(run, monkeypatch: pytest.MonkeyPatch):
+    """Runs ``plot_from_file --rliable`` on runs of some tasks; gives the scores that rliable is given."""
+    pytest.importorskip("rl_zoo3")
+    pytest.importorskip("seaborn")
+    library = pytest.importorskip("rliable.library")
+    from matplotlib import pyplot as plt
+
+    returns = np.arange(1, 6)[:, None] * [100.0, 120.0]  # the last evaluation: 500 and 600
+    for seed in (1, 2, 3):
+        for algorithm in ("bro", "sac"):
+            for task in ("dmc/cheetah-run-v0", "dmc/walker-run-v0"):
+                write_evaluations(task, algorithm, seed, results=returns + seed)
+            write_evaluations("metaworld/push-v3", algorithm, seed, results=returns * 9, successes=returns / 1_000)
+            write_evaluations("Pendulum-v1", algorithm, seed, results=-returns)
+    seen: list[dict[str, np.ndarray]] = []
+    estimates = library.get_interval_estimates
+
+    def spy(scores: dict[str, np.ndarray], *args: object, **kwargs: object):
+        seen.append(scores)
+        return estimates(scores, *args, **{**kwargs, "reps": 20})
+
+    def profile(scores: dict[str, np.ndarray], *_: object, **__: object):
+        seen.append(scores)
+        return {}, {}
+
+    monkeypatch.setattr(library, "get_interval_estimates", spy)
+    monkeypatch.setattr(library, "create_performance_profile", profile)
+
+    def draw(tasks: list[str], *arguments: str, key: str = "results") -> list[dict[str, np.ndarray]]:
+        run("all_plots", "--algos", "bro", "sac", "--env", *tasks, "-f", "logs", "-k", key, "-o", "x", "--no-display")
+        run("plot_from_file", "-i", "x", *arguments)
+        return seen
+
+    yield draw
+    plt.close("all")
+
+
+def test_rliable_plots_are_of_scores_between_0_and_1(rliable, capsys: pytest.CaptureFixture[str], recwarn) -> None:
+    aggregated, profile, versus, curve = rliable(
+        ["dmc/cheetah-run-v0", "dmc/walker-run-v0"], "--rliable", "--versus", "--iqm"
+    )
+    # Of both tasks, runs 1 to 3: the mean of 500 and 600, and the run's number.
+    expected = (550 + np.array([[1, 1], [2, 2], [3, 3]])) / 1_000
+    for scores in (aggregated, profile):
+        assert set(scores) == {"BRO-logs", "SAC-logs"}
+        for matrix in scores.values():
+            np.testing.assert_allclose(np.sort(matrix, axis=0), expected)
+    np.testing.assert_allclose(np.sort(versus["BRO-logs, SAC-logs"][0], axis=0), expected)
+    assert curve["BRO-logs"].shape == (3, 2, 2) and curve["BRO-logs"].max() == pytest.approx(0.553)
+    assert "returns of DeepMind Control over 1,000" in capsys.readouterr().out
+    assert not [w for w in recwarn if "normalizing scores" in str(w.message)]
+
+
+def test_rliable_plots_take_success_rates_as_they_are(rliable) -> None:
+    for scores in rliable(["metaworld/push-v3"], "-r", key="successes")[:2]:
+        np.testing.assert_allclose(scores["BRO-logs"], 0.55)
+
+
+def test_rliable_plots_of_raw_returns_are_refused(rliable) -> None:
+    with pytest.raises(SystemExit, match="metaworld-push-v3 are returns.* all_plots --key successes"):
+        rliable(["metaworld/push-v3"], "--rliable")
+    with pytest.raises(SystemExit, match="for Pendulum-v1 there is no score to normalise by.*--skip-envs"):
+        rliable(["dmc/cheetah-run-v0", "Pendulum-v1"], "--rliable")
+    for leaving_out in (["--skip-envs", "Pendulum-v1"], ["--keep-envs", "dmc/cheetah-run-v0"]):
+        scores = rliable(["dmc/cheetah-run-v0", "Pendulum-v1"], "--rliable", *leaving_out)[-1]
+        assert scores["BRO-logs"].shape == (3, 1) and scores["BRO-logs"].max() < 1
+
+
+def test_without_rliable_scores_are_as_they_were(rliable) -> None:
+    assert rliable(["metaworld/push-v3", "Pendulum-v1", "dmc/walker-run-v0"]) == []
+    from matplotlib import pyplot as plt
+
+    heights = [bar.get_height() for bar in plt.figure("Sensitivity plot").axes[0].patches]
+    assert max(heights) == pytest.approx(550 * 9)
+
+
 #: What runs in a few seconds and still takes gradient steps, in the cheapest of each algorithm's networks.
 SHORT = ["--env", "Pendulum-v1", "--eval-freq", "-1", "--device", "cpu"]
 QUICK = ("dac", "vpl_sac")

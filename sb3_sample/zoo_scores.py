@@ -1,0 +1,95 @@
+"""
+Normalised scores for ``plot_from_file --rliable``, which averages over tasks and draws them as "Normalized Score". The
+stock zoo has reference scores for six tasks and draws those of all others as they are, under the same name.
+"""
+
+import argparse
+import contextlib
+import warnings
+from collections.abc import Collection, Iterator, Sequence
+from typing import IO, Any
+
+import numpy as np
+
+from sb3_sample.zoo_files import PlottedRuns
+from sb3_sample.zoo_runs import RunError
+
+#: Tasks, by their names in the zoo's tables, that its command normalises itself.
+ZOO_REFERENCES = frozenset({"Half", "Ant", "Hopper", "Walker", "LunarLanderContinuous", "BipedalWalker"})
+#: The largest return of a task of DeepMind Control: at most 1 in each of 1,000 steps.
+DMC_RETURN = 1_000.0
+
+
+def rliable_options(arguments: Sequence[str]) -> tuple[bool, list[str], list[str]]:
+    """
+    :param arguments: of ``plot_from_file``
+    :return: whether it is to draw rliable's plots, the tasks to skip, the tasks to keep (all if none is named)
+    """
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("-r", "--rliable", action="store_true")
+    parser.add_argument("-skip", "--skip-envs", nargs="+", default=[])
+    parser.add_argument("--keep-envs", nargs="+", default=[])
+    options, _ = parser.parse_known_args(arguments)
+    return options.rliable, options.skip_envs, options.keep_envs
+
+
+class NormalizedRuns(PlottedRuns):
+    """
+    The same with scores between 0 and 1.
+
+    :param allow_pickle: whether pickled files are read too
+    :param skip: tasks that are not drawn
+    :param keep: the only ones that are; all if empty
+    """
+
+    def __init__(self, allow_pickle: bool, skip: Collection[str] = (), keep: Collection[str] = ()):
+        super().__init__(allow_pickle)
+        self._skip, self._keep = skip, keep
+
+    def load(self, file: IO[bytes]) -> Any:
+        """
+        :param file: file to read
+        :return: what ``all_plots`` gathered, the scores of the tasks that are drawn normalised
+        :raises BadFile: if it is damaged, or pickled and not allowed to be
+        :raises RunError: if a task has no scale to normalise by
+        """
+        results = super().load(file)
+        for task, runs_by_label in results.items():
+            if task == "results_table" or task in self._skip or (self._keep and task not in self._keep):
+                continue
+            for runs in runs_by_label.values():
+                unit = _unit(task, runs)
+                for name in runs.keys() - {"timesteps"}:
+                    runs[name] = runs[name] / unit
+        return results
+
+
+def _unit(task: str, runs: dict[str, Any]) -> float:
+    """What a task's scores are divided by."""
+    suite = task.replace("/", "-").partition("-")[0]
+    if suite == "dmc":
+        return DMC_RETURN
+    if suite in ("metaworld", "myosuite"):
+        scores = np.concatenate([np.ravel(runs["mean"]), np.ravel(runs["last_evals"])])
+        if not ((scores >= 0) & (scores <= 1)).all():
+            raise RunError(
+                f"--rliable draws scores between 0 and 1, and those of {task} are returns, which have no common scale "
+                "there: gather success rates, with all_plots --key successes"
+            )
+        return 1.0
+    if task in ZOO_REFERENCES:
+        return 1.0
+    raise RunError(
+        f"--rliable draws scores between 0 and 1, and for {task} there is no score to normalise by. There is one for "
+        "the tasks of dmc/ (returns), of metaworld/ and myosuite/ (success rates), by their whole ids, and for the "
+        f"zoo's own {', '.join(sorted(ZOO_REFERENCES))}: leave {task} out with --skip-envs, or draw without --rliable"
+    )
+
+
+@contextlib.contextmanager
+def saying_so() -> Iterator[None]:
+    """Around the zoo's command, which warns that it does not know the scale of tasks that are normalised already."""
+    print("Scores are normalised: returns of DeepMind Control over 1,000, success rates as they are")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".* not found for normalizing scores")
+        yield
