@@ -99,6 +99,8 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
     :param policy_delay: gradient steps between two of the actors' and of the temperature
     :param resets: environment steps at which all parameters start anew, counted in transitions over the model's life;
         or one integer for every so many
+    :param reset_gradient_steps: resets after every so many gradient steps of the model's life instead (SR-SAC's
+        original: 2,560,000); None for none. Not together with ``resets``
     :param reset_shrink: share of the old parameters that a reset leaves (shrink and perturb), in [0, 1)
     :param redo_period: gradient steps between two recyclings of the critics' dormant neurons (ReDo; the original:
         1,000); None for none
@@ -128,6 +130,8 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
     critic_target: CriticEnsemble
     #: beta1 of the temperature's Adam.
     temperature_beta1: ClassVar[float] = 0.9
+    #: What ``resets=None`` is without ``reset_gradient_steps``.
+    own_resets: ClassVar[Sequence[int] | int] = ()
 
     def __init__(
         self,
@@ -160,7 +164,8 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         exploration_kwargs: dict[str, Any] | None = None,
         backbone: str = "sac",
         policy_delay: int = 1,
-        resets: Sequence[int] | int = (),
+        resets: Sequence[int] | int | None = (),
+        reset_gradient_steps: int | None = None,
         reset_shrink: float = 0.0,
         redo_period: int | None = None,
         redo_threshold: float = 0.025,
@@ -220,7 +225,8 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         self.exploration_kwargs = exploration_kwargs
         self.backbone = backbone
         self.policy_delay = policy_delay
-        self.resets = resets
+        self.resets = self._resets_of(resets, reset_gradient_steps)
+        self.reset_gradient_steps = reset_gradient_steps
         self.reset_shrink = reset_shrink
         self.redo_period = redo_period
         self.redo_threshold = redo_threshold
@@ -266,7 +272,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         self.temperature = self._make_temperature()
         self.pessimism_rule = self.make_pessimism()
         self.explorer = self.make_explorer()
-        self.plasticity = Resets(self.resets, self.reset_shrink)
+        self.plasticity = Resets(self.resets, self.reset_shrink, self.reset_gradient_steps)
         self.redo = None if self.redo_period is None else ReDo(self.redo_period, self.redo_threshold)
         self.temperature_optimizer: AdamW | None = None
         if isinstance(self.temperature, LogScalar):
@@ -279,6 +285,13 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         self._batch_memory = BatchMemory()
         self._watch = MetricWatch(self.device)
         self._set_training_mode(False)
+
+    @classmethod
+    def _resets_of(cls, resets: Any, reset_gradient_steps: Any) -> Any:
+        """The argument ``resets``, with None as the class's own, which give way to resets by gradient steps."""
+        if resets is not None:
+            return resets
+        return cls.own_resets if reset_gradient_steps is None else ()
 
     def _check_arguments(self) -> None:
         """
@@ -399,6 +412,13 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
             kwargs["compiled"] = None
         if "train_freq" in kwargs or "gradient_steps" in kwargs:
             kwargs.setdefault("replay_ratio", None)
+        # One way to count resets replaces the file's other one.
+        if kwargs.get("reset_gradient_steps") is not None:
+            kwargs.setdefault("resets", ())
+        elif "resets" in kwargs:
+            kwargs["reset_gradient_steps"] = None
+        if "resets" in kwargs:
+            kwargs["resets"] = cls._resets_of(kwargs["resets"], kwargs.get("reset_gradient_steps"))
         with naming_changes(kwargs):
             return super().load(
                 path,
@@ -737,14 +757,16 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
                     group["lr"] = rate
         for part in self._parts().values():
             part.before_updates(self)
-        self._prepared_execution()
-        for first in range(0, gradient_steps, MAX_BATCHES_AT_ONCE):
-            n_batches = min(MAX_BATCHES_AT_ONCE, gradient_steps - first)
-            for i, batch in enumerate(self._draw_batches(n_batches, batch_size), first + 1):
+        taken = 0
+        while taken < gradient_steps:
+            n_batches = self.plasticity.before_gradient_steps(self, min(MAX_BATCHES_AT_ONCE, gradient_steps - taken))
+            self._prepared_execution()
+            for i, batch in enumerate(self._draw_batches(n_batches, batch_size), taken + 1):
                 self._keeps_gradients = self.keep_next_gradients and i == gradient_steps
                 metrics = self._update(batch)
                 self._watch.note(metrics, self._n_updates, self.num_timesteps)
                 self._metrics.update(metrics)
+            taken += n_batches
         self._set_training_mode(False)
         if self.device.type == "cpu":
             self._watch.check()

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import TrainFreq
 
@@ -60,7 +61,12 @@ def check(agent: "SAC") -> None:
         raise ValueError(f"{what} weighs the critics' spread, which n_critics=1 has not")
     if agent.redo_period is None:
         check_unused(agent, ["redo_threshold"], "redo_period=None")
-    if isinstance(agent.resets, Sequence) and not agent.resets:
+    if agent.reset_gradient_steps is not None and has_resets(agent.resets):
+        raise ValueError(
+            f"resets={agent.resets!r} and reset_gradient_steps={agent.reset_gradient_steps!r} are two ways to say when "
+            "everything starts anew: pass one of them"
+        )
+    if agent.reset_gradient_steps is None and not has_resets(agent.resets):
         check_unused(agent, ["reset_shrink"], "no resets")
     if agent.sam_radius is not None and not 0 < agent.sam_radius < math.inf:
         raise ValueError(f"sam_radius must be above 0 and finite, or None for no SAM, not {agent.sam_radius}")
@@ -76,6 +82,14 @@ def check(agent: "SAC") -> None:
     _check_memory_map(agent)
     _check_device_buffer(agent)
     _check_train_freq(agent)
+
+
+def has_resets(resets: Any) -> bool:
+    """
+    :param resets: the argument of that name, checked or not
+    :return: whether it asks for a reset: it is no empty sequence
+    """
+    return not (isinstance(resets, (Sequence, np.ndarray)) and len(resets) == 0)
 
 
 def _check_backbone(agent: "SAC") -> None:

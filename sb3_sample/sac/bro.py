@@ -46,8 +46,9 @@ class BRO(SAC):
     while the pessimistic one learns and is evaluated.
 
     Defaults are those of the published curves. Where the paper's text and the published code differ, the code is
-    followed: the actors have one residual block (table 5 says two), and the divergence goes from the optimistic
-    to the pessimistic actor (algorithm 2 writes the other order).
+    followed: the actors have one residual block (of table 5 it is not certain whether it says two), and the divergence
+    goes from the optimistic to the pessimistic actor (algorithm 2 writes the other order). docs/bro.md lists all
+    differences and misprints.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
@@ -88,7 +89,9 @@ class BRO(SAC):
         :class:`SAC`'s
     :param exploration_kwargs: further arguments of the exploration
     :param resets: environment steps at which all parameters start anew, counted in transitions over the model's life;
-        or one integer for every so many
+        or one integer for every so many. None: those of the published curves (``BRO_RESETS``: 15k, 50k, 250k, 500k,
+        750k, 1M, 1.5M, 2M), or none with ``reset_gradient_steps``
+    :param reset_gradient_steps: resets after every so many gradient steps of the model's life instead; None for none
     :param use_sde: not supported, refused if True
     :param stats_window_size: episodes over which the logged return is averaged
     :param tensorboard_log: folder of the TensorBoard log; none if None
@@ -102,6 +105,7 @@ class BRO(SAC):
     """
 
     temperature_beta1: ClassVar[float] = 0.5
+    own_resets: ClassVar[Sequence[int]] = BRO_RESETS
 
     def __init__(
         self,
@@ -135,7 +139,8 @@ class BRO(SAC):
         weight_decay: float = 1e-4,
         exploration: str = "optimistic_shift",
         exploration_kwargs: dict[str, Any] | None = None,
-        resets: Sequence[int] | int = BRO_RESETS,
+        resets: Sequence[int] | int | None = None,
+        reset_gradient_steps: int | None = None,
         use_sde: bool = False,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -178,6 +183,7 @@ class BRO(SAC):
             exploration=exploration,
             exploration_kwargs=exploration_kwargs,
             resets=resets,
+            reset_gradient_steps=reset_gradient_steps,
             use_sde=use_sde,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
@@ -238,9 +244,11 @@ class BROFast(BRO):
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
     :param learning_rate: a number or a function of the remaining progress (from 1 to 0)
     :param replay_ratio: gradient steps per environment transition
-    :param resets: environment steps at which all parameters start anew
+    :param resets: as in ``BRO``. None: one at 15,000 environment steps, or none with ``reset_gradient_steps``
     :param kwargs: every other argument of ``BRO``, by name
     """
+
+    own_resets: ClassVar[Sequence[int]] = BRO_FAST_RESETS
 
     def __init__(
         self,
@@ -249,7 +257,7 @@ class BROFast(BRO):
         learning_rate: float | Schedule = 3e-4,
         *,
         replay_ratio: float = 2,
-        resets: Sequence[int] = BRO_FAST_RESETS,
+        resets: Sequence[int] | int | None = None,
         **kwargs: Any,
     ):
         super().__init__(policy, env, learning_rate, replay_ratio=replay_ratio, resets=resets, **kwargs)

@@ -29,17 +29,27 @@ class Resets(Part):
     happens at the first update at or after it. The step reached is saved with the model, so that a loaded one
     does not reset again.
 
+    With ``gradient_steps`` the resets are counted in gradient steps instead, over the model's life too (D'Oro et al.
+    2022: every 2,560,000). After each such number of them the reset comes before the next one is taken, so that nobody
+    acts, or is saved, with networks that have learned nothing.
+
     :param steps: transitions at which to reset, above 0, strictly ascending; an integer for every so many; none by
         default
     :param shrink: share of the old parameters that stays, in [0, 1)
-    :raises ValueError: if the steps are not positive integers in ascending order, or ``shrink`` is out of range
+    :param gradient_steps: gradient steps between two resets; None for none
+    :raises ValueError: if the steps are not positive integers in ascending order, or another argument is out of range
     """
 
-    def __init__(self, steps: Sequence[int] | int = (), shrink: float = 0.0):
+    def __init__(self, steps: Sequence[int] | int = (), shrink: float = 0.0, gradient_steps: int | None = None):
         super().__init__()
         if not 0 <= shrink < 1:
             raise ValueError(f"reset_shrink must lie in [0, 1), not {shrink}")
-        self.shrink = shrink
+        if gradient_steps is not None and (not is_integer(gradient_steps) or gradient_steps < 1):
+            raise ValueError(
+                f"reset_gradient_steps must be an integer of at least 1, or None for no such resets, not "
+                f"{gradient_steps!r}"
+            )
+        self.shrink, self.gradient_steps = shrink, gradient_steps
         self.period: int | None = None
         self.steps: tuple[int, ...] = ()
         self.n_done = 0
@@ -66,10 +76,28 @@ class Resets(Part):
             due = now // self.period > self._reached // self.period
         self._reached = now
         if due:
-            agent.reinitialize(self.shrink)
-            self.n_done += 1
-            if agent.verbose >= 1:
-                print(f"Reset of all parameters at {now} environment steps")
+            self._reset(agent, f"at {now} environment steps")
+
+    def before_gradient_steps(self, agent: "SAC", n: int) -> int:
+        """
+        Reset now, if one is due by the gradient steps taken.
+
+        :param agent: the algorithm
+        :param n: gradient steps that are to be taken, at least 1
+        :return: how many of them may be taken before this is called again
+        """
+        if self.gradient_steps is None:
+            return n
+        taken = agent._n_updates
+        if taken > 0 and taken % self.gradient_steps == 0:
+            self._reset(agent, f"after {taken} gradient steps")
+        return min(n, self.gradient_steps - taken % self.gradient_steps)
+
+    def _reset(self, agent: "SAC", when: str) -> None:
+        agent.reinitialize(self.shrink)
+        self.n_done += 1
+        if agent.verbose >= 1:
+            print(f"Reset of all parameters {when}")
 
     def get_extra_state(self) -> dict[str, Any]:
         return {"reached": self._reached, "n_done": self.n_done}

@@ -4,10 +4,10 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_sample.networks import CReLU
+from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
 
@@ -23,12 +23,19 @@ class RegularizedSAC(SAC):
     actor-critic", https://arxiv.org/abs/2403.00514, section 3): one choice from each of three groups makes the 64
     agents of the paper, and the last two groups take any mixture, ReDo included.
 
-    All of them but the resets concern the critics only (P2, appendix B). The settings are P2's where it gives them:
-    layer norm on every hidden layer, spectral norm on the last one, weight decay on every parameter, CReLU with twice
-    the width, GPL's learning rate of 1e-5. Where it refers to the original papers, their values are taken and are
-    arguments here: SAM's radius 0.05 (Foret et al. 2021), a weight decay of 0.01 (Loshchilov and Hutter 2019, the
-    common default of AdamW), resets every 160,000 environment steps (P4), ReDo every 1,000 gradient steps at a
-    threshold of 0.025 (Sokar et al. 2023). The low replay regime is the default; ``replay_ratio=16`` is the high one.
+    The network regularizations are the critics' alone, and CReLU is the activation of actor and critics (appendix B of
+    the paper); resets are of everything; SAM and ReDo act on the critics. The settings are the paper's where it gives
+    them: layer norm on every hidden layer, spectral norm on the last one, weight decay on every parameter, CReLU with
+    twice the width, GPL's learning rate of 1e-5. Where it refers to the original papers, their values are taken and are
+    arguments here: SAM's radius 0.05 (Foret et al. 2021), resets every 160,000 environment steps (as in the
+    validation-buffer paper), ReDo every 1,000 gradient steps at a threshold of 0.025 (Sokar et al. 2023).
+
+    The coefficient of the weight decay is in no text. Here it is 0.01, the default of torch's AdamW; that of optax's,
+    the library of the authors' later code, is 1e-4, as in BRO. A gradient step takes ``learning_rate * weight_decay``
+    of a parameter: over the two million steps of the low replay regime, at a learning rate of 3e-4, 1e-4 shrinks it by
+    6 % in all, which is hardly a regularization, and 0.01 to a four-hundredth. ``weight_decay=1e-4`` is the other one.
+
+    The low replay regime is the default; ``replay_ratio=16`` is the high one.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
@@ -36,9 +43,11 @@ class RegularizedSAC(SAC):
     :param critic_regularization: "none" (the mean of the critics), "cdq" (their minimum), "gpl" or "top"
     :param network_regularization: "none", or any of "layer_norm", "spectral_norm", "weight_decay", one or several
     :param plasticity_regularization: "none", or any of "crelu", "redo", "resets", "sam", one or several
-    :param weight_decay: for "weight_decay", its coefficient; None: 0.01
+    :param weight_decay: for "weight_decay", its coefficient; None: 0.01, torch's default (optax's: 1e-4)
     :param sam_radius: for "sam"; None: 0.05
-    :param resets: for "resets", environment steps between two, or the steps of all; None: 160,000
+    :param resets: for "resets", environment steps between two, or the steps of all; None: 160,000, or none with
+        ``reset_gradient_steps``
+    :param reset_gradient_steps: for "resets", gradient steps between two instead
     :param redo_period: for "redo", gradient steps between two recyclings; None: 1,000
     :param pessimism_kwargs: for "gpl" and "top", arguments of the rule
     :param kwargs: every other argument of :class:`SAC`, by name
@@ -57,6 +66,7 @@ class RegularizedSAC(SAC):
         weight_decay: float | None = None,
         sam_radius: float | None = None,
         resets: Sequence[int] | int | None = None,
+        reset_gradient_steps: int | None = None,
         redo_period: int | None = None,
         pessimism_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
@@ -78,7 +88,9 @@ class RegularizedSAC(SAC):
 
         gpl = {"learning_rate": 1e-5} if critic_regularization == "gpl" else {}
         self.weight_decay = setting("weight_decay", weight_decay, 0.01, "weight_decay", network)
-        resets = setting("resets", resets, 160_000, "resets", chosen)
+        reset_gradient_steps = setting("reset_gradient_steps", reset_gradient_steps, None, "resets", chosen)
+        default = 160_000 if reset_gradient_steps is None else ()
+        resets = setting("resets", resets, default, "resets", chosen)
         super().__init__(
             policy,
             env,
@@ -87,6 +99,7 @@ class RegularizedSAC(SAC):
             pessimism_kwargs={**gpl, **(pessimism_kwargs or {})} or None,
             sam_radius=setting("sam_radius", sam_radius, 0.05, "sam", chosen),
             resets=() if resets is None else resets,
+            reset_gradient_steps=reset_gradient_steps,
             redo_period=setting("redo_period", redo_period, 1_000, "redo", chosen),
             **kwargs,
         )
@@ -101,7 +114,7 @@ class RegularizedSAC(SAC):
             "plasticity_regularization": (
                 (self.sam_radius is not None) == ("sam" in chosen)
                 and (self.redo_period is not None) == ("redo" in chosen)
-                and (isinstance(self.resets, int | np.integer) or len(self.resets) > 0) == ("resets" in chosen)
+                and (self.reset_gradient_steps is not None or arguments.has_resets(self.resets)) == ("resets" in chosen)
             ),
         }
         for name, agrees in in_force.items():
@@ -114,8 +127,8 @@ class RegularizedSAC(SAC):
             raise ValueError(f"weight_decay must be at least 0 and finite, not {self.weight_decay}")
         if "crelu" in chosen and "activation_fn" in self.policy_kwargs:
             raise ValueError(
-                "plasticity_regularization names 'crelu', the critics' activation, and policy_kwargs have another "
-                "activation_fn: for the actor's alone use policy_kwargs['actor_network_kwargs']"
+                "plasticity_regularization names 'crelu', the activation of actor and critics, and policy_kwargs have "
+                f"activation_fn={self.policy_kwargs['activation_fn']!r}: leave one of them out"
             )
         super()._check_arguments()
 
@@ -125,19 +138,20 @@ class RegularizedSAC(SAC):
             "plasticity_regularization", self.plasticity_regularization, PLASTICITY_REGULARIZATIONS
         )
         kwargs = super()._full_policy_kwargs()
-        critic: dict[str, Any] = {}
-        for name in ("layer_norm", "spectral_norm"):
-            if name in network:
-                critic[name] = True
-        if "crelu" in plasticity:
-            critic["activation_fn"] = CReLU
-        if critic and kwargs.get("critic_network", "mlp") != "mlp":
-            raise ValueError(
-                f"network_regularization={self.network_regularization!r} and plasticity_regularization="
-                f"{self.plasticity_regularization!r} regularize an MLP, not critic_network={kwargs['critic_network']!r}"
-            )
+        actor: dict[str, Any] = {"activation_fn": CReLU} if "crelu" in plasticity else {}
+        critic = {name: True for name in ("layer_norm", "spectral_norm") if name in network} | actor
+        for who, regularized in (("actor_network", actor), ("critic_network", critic)):
+            if regularized and kwargs.get(who, "mlp") != "mlp":
+                raise ValueError(
+                    f"network_regularization={self.network_regularization!r} and plasticity_regularization="
+                    f"{self.plasticity_regularization!r} regularize an MLP, not {who}={kwargs[who]!r}"
+                )
         optimizer = {"weight_decay": self.weight_decay} if "weight_decay" in network else {}
-        for name, own in (("critic_network_kwargs", critic), ("critic_optimizer_kwargs", optimizer)):
+        for name, own in (
+            ("actor_network_kwargs", actor),
+            ("critic_network_kwargs", critic),
+            ("critic_optimizer_kwargs", optimizer),
+        ):
             given = dict(kwargs.get(name) or {})
             for key in own.keys() & given.keys():
                 raise ValueError(f"policy_kwargs[{name!r}] has {key!r}, which the regularizations choose: leave it out")

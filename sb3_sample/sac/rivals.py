@@ -203,16 +203,20 @@ class SRSAC(SAC):
     """
     SR-SAC: soft actor-critic scaled by resetting (D'Oro et al. 2022), with the settings of P2 to P4: sixteen gradient
     steps a transition, and full-parameter resets every 160,000 environment steps. (P5 compares with
-    ``replay_ratio=32``.)
+    ``replay_ratio=32``.) The original resets every 2,560,000 gradient steps, whatever the replay ratio:
+    ``reset_gradient_steps=2_560_000``; at sixteen a transition that is as often.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
     :param learning_rate: of actor, critics and temperature
     :param replay_ratio: gradient steps per environment transition
-    :param resets: environment steps between two resets, or the steps of all of them
+    :param resets: environment steps between two resets, or the steps of all of them. None: 160,000, or none with
+        ``reset_gradient_steps``
     :param kwargs: every other argument of :class:`SAC`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
+
+    own_resets: ClassVar[int] = 160_000
 
     def __init__(
         self,
@@ -221,7 +225,7 @@ class SRSAC(SAC):
         learning_rate: float | Schedule = 3e-4,
         *,
         replay_ratio: float = 16,
-        resets: Sequence[int] | int = 160_000,
+        resets: Sequence[int] | int | None = None,
         **kwargs: Any,
     ):
         super().__init__(policy, env, learning_rate, replay_ratio=replay_ratio, resets=resets, **kwargs)

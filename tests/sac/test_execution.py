@@ -209,6 +209,19 @@ def test_captured_survives_what_happens_in_training(tmp_path: Path) -> None:
     assert largest_difference(*models) < 1e-4
 
 
+def test_captured_survives_resets_between_two_gradient_steps_of_a_turn() -> None:
+    """Moments are cleared in the midst of them, and what is captured is captured anew."""
+    models = []
+    for i in range(2):
+        models.append(model := bro(compile=False, reset_gradient_steps=30, replay_ratio=8))
+        if i == 1:
+            recorder = captured(model)
+        model.learn(20)
+    assert models[0]._n_updates == 80 and models[0].plasticity.n_done == models[1].plasticity.n_done == 2
+    assert recorder.n_recordings == 3
+    assert largest_difference(*models) < 1e-3
+
+
 def test_a_captured_step_gives_its_own_metrics_and_no_old_gradients() -> None:
     model = sac(compile=False, redo_period=5, learning_starts=60)
     model.learn(60)

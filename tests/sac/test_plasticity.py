@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from sb3_sample import DAC, SRSAC
+from sb3_sample import BRO, BROTD3, DAC, SRSAC, BROFast
+from sb3_sample.sac.bro import BRO_FAST_RESETS, BRO_RESETS
 from sb3_sample.sac.plasticity import Resets
 from tests.sac.common import MAKERS, bro, sac, vec
 
@@ -263,6 +264,134 @@ def test_another_schedule_at_loading(resets: Any, expected: list[int], tmp_path:
 def test_numbers_of_a_period() -> None:
     assert Resets(7).period == 7 and Resets(np.int64(7)).period == 7  # type: ignore[arg-type]
     assert Resets(7).steps == () and Resets((7,)).period is None
+
+
+# ---------------------------------------------------------------- every so many gradient steps
+
+
+class UpdateRecorder:
+    """Wraps ``reinitialize`` and notes the gradient steps after which it is called."""
+
+    def __init__(self, model: Any):
+        self.after: list[int] = []
+        original = model.reinitialize
+
+        def reinitialize(shrink: float = 0.0) -> None:
+            self.after.append(model._n_updates)
+            original(shrink)
+
+        model.reinitialize = reinitialize
+
+
+@pytest.mark.parametrize(
+    ("n_envs", "kwargs", "n_updates"),
+    [
+        (1, {"replay_ratio": 1}, 60),
+        (1, {"replay_ratio": 4}, 240),
+        (1, {"replay_ratio": 0.5}, 30),
+        # 80 gradient steps at once are more than are drawn at once.
+        (4, {"replay_ratio": 20}, 1_280),
+        (1, {"train_freq": (1, "episode"), "gradient_steps": -1}, 63),
+    ],
+)
+def test_resets_by_gradient_steps(n_envs: int, kwargs: dict[str, Any], n_updates: int) -> None:
+    """After every 25th, in the midst of an environment step's too, and not before there is a next one."""
+    model = sac(vec(n_envs), reset_gradient_steps=25, **kwargs)
+    recorder = UpdateRecorder(model)
+    model.learn(70)
+    assert model._n_updates == n_updates
+    assert recorder.after == list(range(25, n_updates, 25))
+    assert model.plasticity.n_done == len(recorder.after)
+
+
+def test_a_training_does_not_end_with_networks_that_have_learned_nothing() -> None:
+    model = sac(reset_gradient_steps=20)
+    recorder = UpdateRecorder(model)
+    model.learn(50)
+    assert model._n_updates == 40 and recorder.after == [20]
+    model.learn(1)
+    assert recorder.after == [20, 40]
+
+
+@pytest.mark.parametrize("maker", list(MAKERS))
+def test_every_algorithm_takes_resets_by_gradient_steps(maker: str) -> None:
+    """They replace the resets that a class has of its own; tiny ones of the makers are taken back."""
+    model = MAKERS[maker](reset_gradient_steps=15, resets=(), replay_ratio=1)
+    recorder = UpdateRecorder(model)
+    model.learn(50)
+    assert recorder.after == [15, 30]
+
+
+@pytest.mark.parametrize("cls", [BRO, BROFast, BROTD3])
+def test_a_classes_own_resets_give_way(cls: Any) -> None:
+    assert bro(cls=cls).plasticity.steps == (BRO_FAST_RESETS if cls is BROFast else BRO_RESETS)
+    model = bro(cls=cls, reset_gradient_steps=15)
+    assert model.resets == model.plasticity.steps == () and model.plasticity.period is None
+    assert bro(cls=cls, resets=None).resets == bro(cls=cls).resets
+    with pytest.raises(ValueError, match=r"resets=\(15000,\) and reset_gradient_steps=15 .* pass one of them"):
+        bro(cls=cls, resets=(15_000,), reset_gradient_steps=15)
+
+
+def test_sr_sacs_own_resets_give_way() -> None:
+    assert sac(cls=SRSAC).plasticity.period == 160_000
+    model = sac(cls=SRSAC, reset_gradient_steps=2_560_000)
+    assert model.plasticity.period is None and model.plasticity.gradient_steps == 2_560_000
+    with pytest.raises(ValueError, match="resets=160000 and reset_gradient_steps=2560000"):
+        sac(cls=SRSAC, resets=160_000, reset_gradient_steps=2_560_000)
+
+
+@pytest.mark.parametrize("resets", [(20,), [20, 30], 20, np.array([20])])
+def test_two_ways_to_count_are_refused(resets: Any) -> None:
+    with pytest.raises(ValueError, match="resets=.* and reset_gradient_steps=7 .* pass one of them"):
+        sac(resets=resets, reset_gradient_steps=7)
+    sac(resets=np.array([], int), reset_gradient_steps=7)
+
+
+@pytest.mark.parametrize("period", [0, -5, 1.5, True, "10", (10,), float("nan")])
+def test_bad_numbers_of_gradient_steps(period: Any) -> None:
+    with pytest.raises(ValueError, match="reset_gradient_steps must be an integer of at least 1, or None") as caught:
+        sac(reset_gradient_steps=period)
+    assert repr(period) in str(caught.value)
+
+
+def test_gradient_steps_are_counted_over_the_models_life(tmp_path: Path) -> None:
+    """Saved where a reset is due but not done, and loaded: it comes once."""
+    model = sac(reset_gradient_steps=15, reset_shrink=0.25).learn(40)
+    assert model._n_updates == 30 and model.plasticity.n_done == 1
+    model.save(tmp_path / "m")
+    model.save_replay_buffer(tmp_path / "b")
+    loaded = type(model).load(tmp_path / "m", env=vec())
+    loaded.load_replay_buffer(tmp_path / "b")
+    assert (loaded.plasticity.gradient_steps, loaded.plasticity.shrink, loaded.plasticity.n_done) == (15, 0.25, 1)
+    recorder = UpdateRecorder(loaded)
+    loaded.learn(20)
+    assert recorder.after == [30, 45] and loaded.plasticity.n_done == 3
+
+
+def test_one_way_to_count_replaces_the_other_at_loading(tmp_path: Path) -> None:
+    sac(cls=SRSAC).save(tmp_path / "by transitions")
+    sac(cls=SRSAC, reset_gradient_steps=9).save(tmp_path / "by gradient steps")
+
+    def loaded(name: str, **kwargs: Any) -> tuple[Any, Any]:
+        model = SRSAC.load(tmp_path / name, env=vec(), **kwargs)
+        return model.plasticity.period, model.plasticity.gradient_steps
+
+    assert loaded("by transitions") == (160_000, None)
+    assert loaded("by transitions", reset_gradient_steps=7) == (None, 7)
+    assert loaded("by transitions", resets=(), reset_gradient_steps=7) == (None, 7)
+    assert loaded("by gradient steps") == (None, 9)
+    assert loaded("by gradient steps", reset_gradient_steps=7) == (None, 7)
+    assert loaded("by gradient steps", resets=30) == (30, None)
+    assert loaded("by gradient steps", resets=None) == (160_000, None)
+    assert loaded("by gradient steps", reset_gradient_steps=None) == (None, None)
+    for name in ("by transitions", "by gradient steps"):
+        with pytest.raises(ValueError, match="resets=30 and reset_gradient_steps=7"):
+            loaded(name, resets=30, reset_gradient_steps=7)
+
+
+def test_resets_by_gradient_steps_are_told_of(capsys: pytest.CaptureFixture[str]) -> None:
+    sac(reset_gradient_steps=15, verbose=1).learn(30)
+    assert "Reset of all parameters after 15 gradient steps" in capsys.readouterr().out
 
 
 # ---------------------------------------------------------------- shrink and perturb

@@ -158,13 +158,31 @@ def test_weight_decay() -> None:
 
 
 def test_crelu() -> None:
-    """Twice the width after each hidden layer of the critics."""
+    """Twice the width after each hidden layer of critics and actor; network regularizations are the critics' alone."""
+    model = chosen(plasticity="crelu", network=("layer_norm", "spectral_norm"))
+    assert not critics_modules(model, (EnsembleLayerNorm, nn.LayerNorm, SpectralNorm))[2]
     model = chosen(plasticity="crelu")
-    assert [len(modules) for modules in critics_modules(model, CReLU)] == [2, 2, 0]
+    assert [len(modules) for modules in critics_modules(model, CReLU)] == [2, 2, 2]
     layers = model.critic.trunk.layers
     assert (layers[0].weight.shape, layers[2].weight.shape) == ((2, 5, 8), (2, 16, 8))
     assert model.critic.head.weight.shape == (2, 16, 1)
-    assert [type(m) for m in model.actor.trunk.layers] == [nn.Linear, nn.ReLU, nn.Linear, nn.ReLU]
+    layers = model.actor.trunk.layers
+    assert [type(m) for m in layers] == [nn.Linear, CReLU, nn.Linear, CReLU]
+    assert (layers[0].weight.shape, layers[2].weight.shape) == ((8, 3), (8, 16))
+    assert model.actor.mean.weight.shape == model.actor.log_std.weight.shape == (2, 16)
+    assert not any(critics_modules(chosen(), CReLU))
+
+
+def test_crelu_is_the_activation_of_both() -> None:
+    with pytest.raises(ValueError, match="'crelu', the activation of actor and critics, .* activation_fn"):
+        chosen(plasticity="crelu", policy_kwargs={"activation_fn": nn.Tanh})
+    for who in ("actor", "critic"):
+        with pytest.raises(ValueError, match=f"{who}_network_kwargs.* has 'activation_fn'"):
+            chosen(plasticity="crelu", policy_kwargs={f"{who}_network_kwargs": {"activation_fn": nn.Tanh}})
+        with pytest.raises(ValueError, match=f"regularize an MLP, not {who}_network='bronet'"):
+            chosen(plasticity="crelu", policy_kwargs={f"{who}_network": "bronet"})
+    # The network regularizations leave the actor alone, whatever it is.
+    chosen(network="layer_norm", policy_kwargs={"actor_network": "bronet"})
 
 
 def test_sam_resets_and_redo() -> None:
@@ -177,6 +195,15 @@ def test_sam_resets_and_redo() -> None:
     assert model.sam_radius is None and model.plasticity.period is None
     model = chosen(plasticity=("sam", "resets", "redo"), sam_radius=0.1, resets=(30, 40), redo_period=5)
     assert (model.sam_radius, model.plasticity.steps, model.redo.period) == (0.1, (30, 40), 5)
+
+
+def test_resets_by_gradient_steps() -> None:
+    model = chosen(plasticity="resets", reset_gradient_steps=30)
+    assert model.plasticity.gradient_steps == 30 and model.plasticity.period is None and model.resets == ()
+    assert round_trip(model).plasticity.gradient_steps == 30
+    assert round_trip(chosen(plasticity="resets"), reset_gradient_steps=7).plasticity.gradient_steps == 7
+    with pytest.raises(ValueError, match="resets=20 and reset_gradient_steps=30"):
+        chosen(plasticity="resets", reset_gradient_steps=30, resets=20)
 
 
 def test_resets_as_an_array() -> None:
@@ -245,7 +272,14 @@ def test_pessimism_is_chosen_by_name(kwargs: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("weight_decay", 0.1), ("sam_radius", 0.1), ("resets", 30), ("resets", (30,)), ("redo_period", 7)],
+    [
+        ("weight_decay", 0.1),
+        ("sam_radius", 0.1),
+        ("resets", 30),
+        ("resets", (30,)),
+        ("reset_gradient_steps", 9),
+        ("redo_period", 7),
+    ],
 )
 def test_setting_of_a_regularization_that_is_not_chosen(name: str, value: Any) -> None:
     """Not dropped without a word."""
@@ -282,6 +316,7 @@ def test_bad_weight_decay(value: float) -> None:
         {"redo_period": 7},
         {"resets": 30},
         {"resets": (30,)},
+        {"reset_gradient_steps": 30},
     ],
     ids=str,
 )
