@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -25,11 +26,18 @@ from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.envs.workers import watch_workers
 from sb3_sample.export import Exportable
 from sb3_sample.faults import MetricWatch, TrainingDiverged, check_finite_parameters, not_finite
+from sb3_sample.logged_values import LoggedValues
 from sb3_sample.networks.spectral_norm import SpectralNorm
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 from sb3_sample.sac import arguments, losses
 from sb3_sample.sac.batch import Batch, CriticStep, Extra, Noise, draw_batches
-from sb3_sample.sac.buffers import BatchMemory, ValidationDictReplayBuffer, ValidationReplayBuffer, ValidationSplit
+from sb3_sample.sac.buffers import (
+    BatchMemory,
+    ValidationDictReplayBuffer,
+    ValidationReplayBuffer,
+    ValidationSplit,
+    store_float_actions,
+)
 from sb3_sample.sac.compact_buffer import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
 from sb3_sample.sac.execution import PAYS_FROM, Execution, has_foreign_parts, why_not_compiled
 from sb3_sample.sac.exploration import EXPLORATIONS, Exploration
@@ -254,6 +262,8 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
             super()._setup_model()
         finally:
             self.policy_kwargs, self.replay_buffer_kwargs = given
+        assert self.replay_buffer is not None
+        store_float_actions(self.replay_buffer)
         if self.device.type == "cpu":
             # glibc hands freed memory back to the system above a threshold, at first below the size of one gradient,
             # and every update then pays for page faults. The threshold follows the largest block freed so far.
@@ -719,16 +729,17 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         self._updates_owed -= n_updates
         return n_updates
 
-    def train(self, gradient_steps: int, batch_size: int) -> None:
+    def train(self, gradient_steps: int, batch_size: int | None = None) -> None:
         """
-        Take gradient steps on batches from the replay buffer.
+        Take gradient steps on batches from the replay buffer, and record the metrics of the last one.
 
         :param gradient_steps: how many
-        :param batch_size: transitions a step
+        :param batch_size: transitions a step; None: the model's own ``batch_size``
         :raises TrainingDiverged: if a metric is NaN or infinite; on a GPU that may be noticed later, at the latest when
             the log is written
         """
         assert self.replay_buffer is not None
+        batch_size = self.batch_size if batch_size is None else batch_size
         self._set_training_mode(True)
         rate = self.lr_schedule(self._current_progress_remaining)
         for optimizer in self._optimizers().values():
@@ -746,8 +757,40 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
                 self._watch.note(metrics, self._n_updates, self.num_timesteps)
                 self._metrics.update(metrics)
         self._set_training_mode(False)
-        if self.device.type == "cpu":
+        if not self._metrics_wait:
             self._watch.check()
+        self._record_metrics()
+
+    @property
+    def logger(self) -> Logger:
+        """The logger. Metrics in it may be on the device until somebody reads them."""
+        LoggedValues.of(self._logger)
+        return self._logger
+
+    @property
+    def _metrics_wait(self) -> bool:
+        """Whether the host would wait for the device if it read a metric now."""
+        return self.device.type != "cpu"
+
+    def _record_metrics(self) -> None:
+        """Record the metrics of the latest gradient step: numbers on a CPU, on a GPU what becomes one when it is read."""
+        if not hasattr(self, "_logger"):
+            return  # Trained by hand: there is none before ``learn`` or ``set_logger``.
+        if self._metrics_wait:
+            LoggedValues.record_later(self.logger, self._metrics)
+        else:
+            for name, value in self._metrics.items():
+                self.logger.record(name, value.item())
+        self._record_counts()
+
+    def _record_counts(self) -> None:
+        self.logger.record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if self._execution is not None and self._execution.seconds_compiling > 0:
+            self.logger.record("time/seconds_compiling", self._execution.seconds_compiling)
+        self.logger.record("plasticity/reset", self.plasticity.n_done)
+        if isinstance(self.replay_buffer, ValidationSplit):
+            self.logger.record("validation/size", self.replay_buffer.n_validation)
 
     def _set_training_mode(self, mode: bool) -> None:
         """Dropout and power iterations: on during gradient steps, off whoever acts."""
@@ -909,18 +952,16 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
 
     def dump_logs(self) -> None:
         """
-        Write the log. Only here are the metrics fetched from the device.
+        Write the log. On a GPU the host waits here for the metrics, at the latest.
 
         :raises TrainingDiverged: if one of them was NaN or infinite since the last time
         """
         self._watch.check()
+        # Those of the latest gradient step also where there was none since the last time; a callback may have put
+        # others in the place of those that there are.
+        recorded = self.logger.name_to_excluded
         for name, value in self._metrics.items():
-            self.logger.record(name, value.item())
-        self.logger.record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        if self._execution is not None and self._execution.seconds_compiling > 0:
-            self.logger.record("time/seconds_compiling", self._execution.seconds_compiling)
-        self.logger.record("plasticity/reset", self.plasticity.n_done)
-        if isinstance(self.replay_buffer, ValidationSplit):
-            self.logger.record("validation/size", self.replay_buffer.n_validation)
+            if name not in recorded:
+                self.logger.record(name, value.item())
+        self._record_counts()
         super().dump_logs()

@@ -503,12 +503,42 @@ class SACPolicy(BasePolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
         return self(observation, deterministic)
 
+    def scale_action(self, action: np.ndarray) -> np.ndarray:
+        """
+        :param action: actions in the action space's own bounds, (B, A)
+        :return: the same in [-1, 1], (B, A)
+        """
+        bounds = self._float_bounds(np.asarray(action).dtype)
+        if bounds is None:
+            return super().scale_action(action)
+        low, high = bounds
+        return 2.0 * ((action - low) / (high - low)) - 1.0
+
     def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
         """
         :param scaled_action: actions in [-1, 1], (B, A)
-        :return: the same in the action space's own bounds, (B, A), inside them also where scaling rounds
+        :return: the same in the action space's own bounds, (B, A), inside them also where scaling rounds. As in
+            Stable-Baselines3, they are floats also where the space is one of integers
         """
-        return np.clip(super().unscale_action(scaled_action), self.action_space.low, self.action_space.high)
+        bounds = self._float_bounds(scaled_action.dtype)
+        if bounds is None:
+            return np.clip(super().unscale_action(scaled_action), self.action_space.low, self.action_space.high)
+        low, high = bounds
+        return np.clip(low + (0.5 * (scaled_action + 1.0) * (high - low)), low, high)
+
+    def _float_bounds(self, dtype: Any) -> tuple[np.ndarray, np.ndarray] | None:
+        """
+        Bounds of a space of integers as floats, since small integers cannot hold their difference.
+
+        :param dtype: of the actions
+        :return: the bounds in the type that Stable-Baselines3's arithmetic has; None where the space is one of floats
+        """
+        space = self.action_space
+        if np.issubdtype(space.dtype, np.floating):
+            return None
+        kind = np.result_type(dtype, space.dtype)
+        kind = kind if np.issubdtype(kind, np.floating) else np.dtype(np.float64)
+        return space.low.astype(kind), space.high.astype(kind)
 
     def set_training_mode(self, mode: bool) -> None:
         """
