@@ -10,8 +10,8 @@ from stable_baselines3.common.logger import Logger
 
 class LoggedValues(defaultdict[str, Any]):
     """
-    ``Logger.name_to_value``, of which some values may still be on the device. Whoever reads one of those, or all values,
-    gets floats, and only then the host waits. Whoever copies it gets a plain ``defaultdict``.
+    ``Logger.name_to_value``, of which some values may still be on the device. Whoever reads one of those, or all
+    values, gets floats, and only then the host waits. Whoever copies it gets a plain ``defaultdict``.
 
     A name that is not there reads as 0.0, as in Stable-Baselines3, but is not put there by that: at the next dump some
     of the formats would end the training, since it has no entry in ``name_to_excluded``.
@@ -68,7 +68,9 @@ class LoggedValues(defaultdict[str, Any]):
         return super().__getitem__(name)
 
     def get(self, name: str, default: Any = None) -> Any:
-        return self[name] if name in self else default
+        if name in self._waiting:
+            self._fetch()
+        return super().get(name, default)
 
     def items(self) -> ItemsView[str, Any]:  # type: ignore[override]
         return ItemsView(self)

@@ -45,6 +45,7 @@ from sb3_sample.sac.parts import ParametersDoNotFit, Part
 from sb3_sample.sac.pessimism import PESSIMISMS, Pessimism, pessimistic_value
 from sb3_sample.sac.plasticity import ReDo, Resets
 from sb3_sample.sac.policies import Actor, CnnPolicy, CriticEnsemble, MlpPolicy, ModeSwitch, MultiInputPolicy, SACPolicy
+from sb3_sample.sac.sb3_names import TemperatureNames
 from sb3_sample.sac.scalars import FixedScalar, LogScalar
 from sb3_sample.saving.checkpoint import Checkpointer
 from sb3_sample.saving.container import BadFile
@@ -57,7 +58,7 @@ Self = TypeVar("Self", bound="SAC")
 MAX_BATCHES_AT_ONCE = 64
 
 
-class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
+class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
     SAC that the papers compare with (P2-P5): tanh-Gaussian actor, two critics, clipped double Q-learning.
@@ -90,7 +91,8 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
     :param n_steps: n-step returns, as in Stable-Baselines3
     :param ent_coef: temperature: "auto" learns it, "auto_0.1" from that start, a number fixes it
     :param target_update_interval: gradient steps between two updates of the targets; None: ``policy_delay``
-    :param target_entropy: entropy that the learned temperature aims at; "auto" is -|A|/2
+    :param target_entropy: entropy that the learned temperature aims at; "auto" is -|A|/2. As in Stable-Baselines3, a
+        number once the model is made; set anew, it counts from the next ``train`` on
     :param replay_ratio: gradient steps per environment transition after the warm-up, whatever the number of
         environments; may be below 1
     :param n_quantiles: quantiles a critic; None for scalar critics
@@ -113,6 +115,8 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
     :param redo_threshold: score up to which a neuron is dormant
     :param sam_radius: radius of sharpness-aware minimisation of the critics' loss (the original: 0.05); None for none
     :param use_sde: not supported, refused if True
+    :param sde_sample_freq: as in Stable-Baselines3, without meaning where ``use_sde`` is False
+    :param use_sde_at_warmup: as in Stable-Baselines3, without meaning where ``use_sde`` is False
     :param stats_window_size: episodes over which the logged return is averaged
     :param tensorboard_log: folder of the TensorBoard log; none if None
     :param policy_kwargs: arguments of the policy
@@ -174,6 +178,8 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         redo_threshold: float = 0.025,
         sam_radius: float | None = None,
         use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        use_sde_at_warmup: bool = False,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -183,11 +189,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         compile: bool | str = "auto",
         _init_setup_model: bool = True,
     ):
-        if use_sde:
-            raise ValueError(
-                "use_sde=True is not supported by this family of algorithms: use action_noise, "
-                f"or exploration=, one of {sorted(EXPLORATIONS)}"
-            )
+        arguments.check_use_sde(use_sde)
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]  # None when a model is loaded for prediction only
@@ -210,6 +212,8 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
             verbose=verbose,
             device=device,
             seed=seed,
+            sde_sample_freq=sde_sample_freq,
+            use_sde_at_warmup=use_sde_at_warmup,
             sde_support=False,
             support_multi_env=True,
         )
@@ -269,9 +273,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
             # and every update then pays for page faults. The threshold follows the largest block freed so far.
             torch.empty(31 * 2**20, dtype=torch.uint8)
         self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
-        self._target_entropy = (
-            -self.actor.action_dim / 2 if self.target_entropy == "auto" else float(self.target_entropy)
-        )
+        self._take_target_entropy()
         self._critic_loss = losses.squared_error if self.n_quantiles is None else losses.quantile_huber
         self.temperature = self._make_temperature()
         self.pessimism_rule = self.make_pessimism()
@@ -289,6 +291,16 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         self._batch_memory = BatchMemory()
         self._watch = MetricWatch(self.device)
         self._set_training_mode(False)
+
+    def _take_target_entropy(self) -> None:
+        """Take up what ``target_entropy`` says, which is a number afterwards."""
+        arguments.check_target_entropy(self)
+        if self.target_entropy == "auto":
+            self._target_entropy = -self.actor.action_dim / 2
+        else:
+            self._target_entropy = float(self.target_entropy)
+        if self.actor.has_entropy:
+            self.target_entropy = self._target_entropy
 
     def _check_arguments(self) -> None:
         """
@@ -740,6 +752,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         """
         assert self.replay_buffer is not None
         batch_size = self.batch_size if batch_size is None else batch_size
+        self._take_target_entropy()
         self._set_training_mode(True)
         rate = self.lr_schedule(self._current_progress_remaining)
         for optimizer in self._optimizers().values():
@@ -773,9 +786,9 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         return self.device.type != "cpu"
 
     def _record_metrics(self) -> None:
-        """Record the metrics of the latest gradient step: numbers on a CPU, on a GPU what becomes one when it is read."""
+        """Record the metrics of the latest gradient step: numbers on a CPU, on a GPU what becomes them when read."""
         if not hasattr(self, "_logger"):
-            return  # Trained by hand: there is none before ``learn`` or ``set_logger``.
+            return  # There is none before ``learn`` or ``set_logger``.
         if self._metrics_wait:
             LoggedValues.record_later(self.logger, self._metrics)
         else:
@@ -852,13 +865,13 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         # Critics, towards the targets' value of the actor's next action.
         with torch.no_grad():
             next_actions, next_log_prob = self.policy.next_actions(batch.next_observations, noise.critic)
-            next_q = self.critic_target(batch.next_observations, next_actions)
+            next_q = self.critic_target.q_values(batch.next_observations, next_actions)
             if noise.subset is not None:
                 next_q = next_q[noise.subset]
             entropy_bonus = -fixed_alpha * next_log_prob
             next_values = self.pessimism_rule.value(next_q)
             target = losses.td_target(batch.rewards, batch.dones, batch.discounts, next_values, entropy_bonus)
-        q = self.critic(batch.observations, batch.actions)
+        q = self.critic.q_values(batch.observations, batch.actions)
         critic_loss = self._critic_loss(q, target)
         if self.sam_radius is None:
             self.minimize(self.critic.optimizer, critic_loss)
@@ -873,7 +886,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         if moves_actor:
             # Actor, on the new critics.
             actions, log_prob = self.actor.sample(batch.observations, noise.actor)
-            value = self._actor_value(self.critic(batch.observations, actions))
+            value = self._actor_value(self.critic.q_values(batch.observations, actions))
             actor_loss = losses.actor_loss(log_prob, value, fixed_alpha)
             self.minimize(self.actor.optimizer, actor_loss)
             metrics["train/actor_loss"] = actor_loss
@@ -920,7 +933,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         copied = {id(p) for p in self.critic.copied_parameters()}
         gradients = sharpness_aware_gradients(
             loss,
-            lambda: self._critic_loss(self.critic(batch.observations, batch.actions), target),
+            lambda: self._critic_loss(self.critic.q_values(batch.observations, batch.actions), target),
             parameters,
             self.sam_radius,
             [len(p) if id(p) in copied else None for p in parameters],

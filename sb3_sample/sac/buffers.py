@@ -315,8 +315,8 @@ def samples_as_its_class(buffer: ReplayBuffer) -> bool:
     :param buffer: a replay buffer
     :return: whether it is one of ``INDEPENDENT_BUFFERS`` whose sampling nobody has replaced, in the class or the object
     """
-    own = _OWN_SAMPLING.get(type(buffer))
-    return own == [getattr(type(buffer), name, None) for name in _SAMPLING] and vars(buffer).keys().isdisjoint(_SAMPLING)
+    present = [getattr(type(buffer), name, None) for name in _SAMPLING]
+    return _OWN_SAMPLING.get(type(buffer)) == present and vars(buffer).keys().isdisjoint(_SAMPLING)
 
 
 class BatchMemory:

@@ -29,8 +29,8 @@ def as_row(name: str, given: Any, shape: tuple[int, ...], dtype: Any = np.float3
         if len(shape) == 4 and own == (shape[0], *shape[2:], shape[1]):
             hint = ": images need their channels first, as VecNormalize(VecTransposeImage(env)) gives them"
         raise ValueError(
-            f"could not broadcast the {name} of shape {given.shape} into shape {shape} of the replay buffer, environments "
-            f"first{hint}"
+            f"could not broadcast the {name} of shape {given.shape} into shape {shape} of the replay buffer, "
+            f"environments first{hint}"
         )
     row = np.empty(shape, dtype)
     row[...] = given
@@ -70,8 +70,8 @@ def as_actions(given: Any, shape: tuple[int, int], space: spaces.Space) -> np.nd
     with_axes = (shape[0], *(space.shape or ()))
     if long(given.shape) not in (long(with_axes), long(shape)):
         raise ValueError(
-            f"could not put the action of shape {given.shape} into shape {with_axes}, environments first, or {shape} of "
-            "the replay buffer"
+            f"could not put the action of shape {given.shape} into shape {with_axes}, environments first, or {shape} "
+            "of the replay buffer"
         )
     return given.reshape(shape)
 
@@ -84,7 +84,7 @@ def as_timeouts(infos: Any, n_envs: int) -> np.ndarray:
     :return: whether a time limit ended the episode, (n_envs,)
     :raises ValueError: if there are flags of another number of environments
     """
-    flags = [info.get("TimeLimit.truncated", False) for info in infos]
+    flags: Any = [info.get("TimeLimit.truncated", False) for info in infos]
     if not all(flag is True or flag is False for flag in flags):
         flags = np.concatenate([np.ravel(flag) for flag in flags])
     return as_row("flags TimeLimit.truncated of the infos", flags, (n_envs,))
