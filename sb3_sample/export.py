@@ -111,8 +111,10 @@ class _RawPolicy(nn.Module):
             ) from error
         self.action_space, self.squashed = policy.action_space, policy.squash_output
         if isinstance(self.action_space, spaces.Box):
-            self.register_buffer("low", torch.as_tensor(self.action_space.low))
-            self.register_buffer("high", torch.as_tensor(self.action_space.high))
+            # Of integers, as floats: in the type of the actions that ``predict`` gives.
+            dtype = _action_dtype(self.action_space)
+            self.register_buffer("low", torch.as_tensor(self.action_space.low.astype(dtype)))
+            self.register_buffer("high", torch.as_tensor(self.action_space.high.astype(dtype)))
         #: Which inputs are normalised.
         self.normalized: list[str] = []
         if vec_normalize is not None and vec_normalize.norm_obs:
@@ -210,7 +212,7 @@ def _metadata(model: BaseAlgorithm, policy: _RawPolicy) -> dict[str, str]:
         "algorithm": type(model).__name__,
         "policy": type(model.policy).__name__,
         "inputs": json.dumps([_described(name, space) for name, space in policy.spaces.items()]),
-        "outputs": json.dumps([_described(OUTPUT, action)]),
+        "outputs": json.dumps([{**_described(OUTPUT, action), "dtype": str(_action_dtype(action))}]),
         "observation_space": str(model.observation_space),
         "action_space": str(action),
         "normalized_inputs": json.dumps(policy.normalized),
@@ -221,6 +223,11 @@ def _metadata(model: BaseAlgorithm, policy: _RawPolicy) -> dict[str, str]:
 def _described(name: str, space: spaces.Space) -> dict[str, Any]:
     channels = {"layout": "channels first"} if is_image_space(space) else {}
     return {"name": name, "shape": ["batch", *(space.shape or ())], "dtype": str(space.dtype), **channels}
+
+
+def _action_dtype(space: spaces.Space) -> Any:
+    """Type of the actions that ``predict`` gives: the policy's float32 numbers, scaled to the bounds of a Box."""
+    return np.result_type(np.float32, space.dtype) if isinstance(space, spaces.Box) else space.dtype
 
 
 def _as_onnx(policy: _RawPolicy, metadata: dict[str, str]) -> bytes:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -25,11 +26,18 @@ from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.envs.workers import watch_workers
 from sb3_sample.export import Exportable
 from sb3_sample.faults import MetricWatch, TrainingDiverged, check_finite_parameters, not_finite
+from sb3_sample.logged_values import LoggedValues
 from sb3_sample.networks.spectral_norm import SpectralNorm
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 from sb3_sample.sac import arguments, losses
 from sb3_sample.sac.batch import Batch, CriticStep, Extra, Noise, draw_batches
-from sb3_sample.sac.buffers import BatchMemory, ValidationDictReplayBuffer, ValidationReplayBuffer, ValidationSplit
+from sb3_sample.sac.buffers import (
+    BatchMemory,
+    ValidationDictReplayBuffer,
+    ValidationReplayBuffer,
+    ValidationSplit,
+    store_float_actions,
+)
 from sb3_sample.sac.compact_buffer import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
 from sb3_sample.sac.execution import PAYS_FROM, Execution, has_foreign_parts, why_not_compiled
 from sb3_sample.sac.exploration import EXPLORATIONS, Exploration
@@ -37,6 +45,7 @@ from sb3_sample.sac.parts import ParametersDoNotFit, Part
 from sb3_sample.sac.pessimism import PESSIMISMS, Pessimism, pessimistic_value
 from sb3_sample.sac.plasticity import ReDo, Resets
 from sb3_sample.sac.policies import Actor, CnnPolicy, CriticEnsemble, MlpPolicy, ModeSwitch, MultiInputPolicy, SACPolicy
+from sb3_sample.sac.sb3_names import TemperatureNames
 from sb3_sample.sac.scalars import FixedScalar, LogScalar
 from sb3_sample.saving.checkpoint import Checkpointer
 from sb3_sample.saving.container import BadFile
@@ -49,7 +58,7 @@ Self = TypeVar("Self", bound="SAC")
 MAX_BATCHES_AT_ONCE = 64
 
 
-class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
+class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
     SAC that the papers compare with (P2-P5): tanh-Gaussian actor, two critics, clipped double Q-learning.
@@ -82,7 +91,8 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
     :param n_steps: n-step returns, as in Stable-Baselines3
     :param ent_coef: temperature: "auto" learns it, "auto_0.1" from that start, a number fixes it
     :param target_update_interval: gradient steps between two updates of the targets; None: ``policy_delay``
-    :param target_entropy: entropy that the learned temperature aims at; "auto" is -|A|/2
+    :param target_entropy: entropy that the learned temperature aims at; "auto" is -|A|/2. As in Stable-Baselines3, a
+        number once the model is made; set anew, it counts from the next ``train`` on
     :param replay_ratio: gradient steps per environment transition after the warm-up, whatever the number of
         environments; may be below 1
     :param n_quantiles: quantiles a critic; None for scalar critics
@@ -107,6 +117,8 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
     :param redo_threshold: score up to which a neuron is dormant
     :param sam_radius: radius of sharpness-aware minimisation of the critics' loss (the original: 0.05); None for none
     :param use_sde: not supported, refused if True
+    :param sde_sample_freq: as in Stable-Baselines3, without meaning where ``use_sde`` is False
+    :param use_sde_at_warmup: as in Stable-Baselines3, without meaning where ``use_sde`` is False
     :param stats_window_size: episodes over which the logged return is averaged
     :param tensorboard_log: folder of the TensorBoard log; none if None
     :param policy_kwargs: arguments of the policy
@@ -171,6 +183,8 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         redo_threshold: float = 0.025,
         sam_radius: float | None = None,
         use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        use_sde_at_warmup: bool = False,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -180,11 +194,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         compile: bool | str = "auto",
         _init_setup_model: bool = True,
     ):
-        if use_sde:
-            raise ValueError(
-                "use_sde=True is not supported by this family of algorithms: use action_noise, "
-                f"or exploration=, one of {sorted(EXPLORATIONS)}"
-            )
+        arguments.check_use_sde(use_sde)
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]  # None when a model is loaded for prediction only
@@ -207,6 +217,8 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
             verbose=verbose,
             device=device,
             seed=seed,
+            sde_sample_freq=sde_sample_freq,
+            use_sde_at_warmup=use_sde_at_warmup,
             sde_support=False,
             support_multi_env=True,
         )
@@ -260,14 +272,14 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
             super()._setup_model()
         finally:
             self.policy_kwargs, self.replay_buffer_kwargs = given
+        assert self.replay_buffer is not None
+        store_float_actions(self.replay_buffer)
         if self.device.type == "cpu":
             # glibc hands freed memory back to the system above a threshold, at first below the size of one gradient,
             # and every update then pays for page faults. The threshold follows the largest block freed so far.
             torch.empty(31 * 2**20, dtype=torch.uint8)
         self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
-        self._target_entropy = (
-            -self.actor.action_dim / 2 if self.target_entropy == "auto" else float(self.target_entropy)
-        )
+        self._take_target_entropy()
         self._critic_loss = losses.squared_error if self.n_quantiles is None else losses.quantile_huber
         self.temperature = self._make_temperature()
         self.pessimism_rule = self.make_pessimism()
@@ -292,6 +304,16 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         if resets is not None:
             return resets
         return cls.own_resets if reset_gradient_steps is None else ()
+
+    def _take_target_entropy(self) -> None:
+        """Take up what ``target_entropy`` says, which is a number afterwards."""
+        arguments.check_target_entropy(self)
+        if self.target_entropy == "auto":
+            self._target_entropy = -self.actor.action_dim / 2
+        else:
+            self._target_entropy = float(self.target_entropy)
+        if self.actor.has_entropy:
+            self.target_entropy = self._target_entropy
 
     def _check_arguments(self) -> None:
         """
@@ -739,16 +761,18 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         self._updates_owed -= n_updates
         return n_updates
 
-    def train(self, gradient_steps: int, batch_size: int) -> None:
+    def train(self, gradient_steps: int, batch_size: int | None = None) -> None:
         """
-        Take gradient steps on batches from the replay buffer.
+        Take gradient steps on batches from the replay buffer, and record the metrics of the last one.
 
         :param gradient_steps: how many
-        :param batch_size: transitions a step
+        :param batch_size: transitions a step; None: the model's own ``batch_size``
         :raises TrainingDiverged: if a metric is NaN or infinite; on a GPU that may be noticed later, at the latest when
             the log is written
         """
         assert self.replay_buffer is not None
+        batch_size = self.batch_size if batch_size is None else batch_size
+        self._take_target_entropy()
         self._set_training_mode(True)
         rate = self.lr_schedule(self._current_progress_remaining)
         for optimizer in self._optimizers().values():
@@ -768,8 +792,40 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
                 self._metrics.update(metrics)
             taken += n_batches
         self._set_training_mode(False)
-        if self.device.type == "cpu":
+        if not self._metrics_wait:
             self._watch.check()
+        self._record_metrics()
+
+    @property
+    def logger(self) -> Logger:
+        """The logger. Metrics in it may be on the device until somebody reads them."""
+        LoggedValues.of(self._logger)
+        return self._logger
+
+    @property
+    def _metrics_wait(self) -> bool:
+        """Whether the host would wait for the device if it read a metric now."""
+        return self.device.type != "cpu"
+
+    def _record_metrics(self) -> None:
+        """Record the metrics of the latest gradient step: numbers on a CPU, on a GPU what becomes them when read."""
+        if not hasattr(self, "_logger"):
+            return  # There is none before ``learn`` or ``set_logger``.
+        if self._metrics_wait:
+            LoggedValues.record_later(self.logger, self._metrics)
+        else:
+            for name, value in self._metrics.items():
+                self.logger.record(name, value.item())
+        self._record_counts()
+
+    def _record_counts(self) -> None:
+        self.logger.record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if self._execution is not None and self._execution.seconds_compiling > 0:
+            self.logger.record("time/seconds_compiling", self._execution.seconds_compiling)
+        self.logger.record("plasticity/reset", self.plasticity.n_done)
+        if isinstance(self.replay_buffer, ValidationSplit):
+            self.logger.record("validation/size", self.replay_buffer.n_validation)
 
     def _set_training_mode(self, mode: bool) -> None:
         """Dropout and power iterations: on during gradient steps, off whoever acts."""
@@ -831,13 +887,13 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         # Critics, towards the targets' value of the actor's next action.
         with torch.no_grad():
             next_actions, next_log_prob = self.policy.next_actions(batch.next_observations, noise.critic)
-            next_q = self.critic_target(batch.next_observations, next_actions)
+            next_q = self.critic_target.q_values(batch.next_observations, next_actions)
             if noise.subset is not None:
                 next_q = next_q[noise.subset]
             entropy_bonus = -fixed_alpha * next_log_prob
             next_values = self.pessimism_rule.value(next_q)
             target = losses.td_target(batch.rewards, batch.dones, batch.discounts, next_values, entropy_bonus)
-        q = self.critic(batch.observations, batch.actions)
+        q = self.critic.q_values(batch.observations, batch.actions)
         critic_loss = self._critic_loss(q, target)
         if self.sam_radius is None:
             self.minimize(self.critic.optimizer, critic_loss)
@@ -852,7 +908,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         if moves_actor:
             # Actor, on the new critics.
             actions, log_prob = self.actor.sample(batch.observations, noise.actor)
-            value = self._actor_value(self.critic(batch.observations, actions))
+            value = self._actor_value(self.critic.q_values(batch.observations, actions))
             actor_loss = losses.actor_loss(log_prob, value, fixed_alpha)
             self.minimize(self.actor.optimizer, actor_loss)
             metrics["train/actor_loss"] = actor_loss
@@ -899,7 +955,7 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
         copied = {id(p) for p in self.critic.copied_parameters()}
         gradients = sharpness_aware_gradients(
             loss,
-            lambda: self._critic_loss(self.critic(batch.observations, batch.actions), target),
+            lambda: self._critic_loss(self.critic.q_values(batch.observations, batch.actions), target),
             parameters,
             self.sam_radius,
             [len(p) if id(p) in copied else None for p in parameters],
@@ -931,18 +987,16 @@ class SAC(Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
 
     def dump_logs(self) -> None:
         """
-        Write the log. Only here are the metrics fetched from the device.
+        Write the log. On a GPU the host waits here for the metrics, at the latest.
 
         :raises TrainingDiverged: if one of them was NaN or infinite since the last time
         """
         self._watch.check()
+        # Those of the latest gradient step also where there was none since the last time; a callback may have put
+        # others in the place of those that there are.
+        recorded = self.logger.name_to_excluded
         for name, value in self._metrics.items():
-            self.logger.record(name, value.item())
-        self.logger.record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        if self._execution is not None and self._execution.seconds_compiling > 0:
-            self.logger.record("time/seconds_compiling", self._execution.seconds_compiling)
-        self.logger.record("plasticity/reset", self.plasticity.n_done)
-        if isinstance(self.replay_buffer, ValidationSplit):
-            self.logger.record("validation/size", self.replay_buffer.n_validation)
+            if name not in recorded:
+                self.logger.record(name, value.item())
+        self._record_counts()
         super().dump_logs()

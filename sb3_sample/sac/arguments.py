@@ -51,8 +51,8 @@ def check(agent: "SAC") -> None:
         raise ValueError(f"tau must lie in (0, 1], not {agent.tau}")
     if not 0 <= agent.gamma <= 1:
         raise ValueError(f"gamma must lie in [0, 1], not {agent.gamma}")
-    if agent.target_entropy != "auto" and not math.isfinite(number("target_entropy", agent.target_entropy, "'auto'")):
-        raise ValueError(f"target_entropy must be finite, or 'auto', not {agent.target_entropy}")
+    check_target_entropy(agent)
+    check_use_sde(agent.use_sde)
     if agent.exploration not in EXPLORATIONS:
         raise ValueError(f"exploration must be one of {sorted(EXPLORATIONS)}, not {agent.exploration!r}")
     n_critics = agent.policy_kwargs.get("n_critics", 2)
@@ -90,6 +90,28 @@ def has_resets(resets: Any) -> bool:
     :return: whether it asks for a reset: it is no empty sequence
     """
     return not (isinstance(resets, (Sequence, np.ndarray)) and len(resets) == 0)
+
+
+def check_target_entropy(agent: "SAC") -> None:
+    """
+    :param agent: an algorithm
+    :raises ValueError: if its ``target_entropy`` is no number that is finite, nor "auto"
+    """
+    value = agent.target_entropy
+    if value != "auto" and not math.isfinite(number("target_entropy", value, "'auto'")):
+        raise ValueError(f"target_entropy must be finite, or 'auto', not {value}")
+
+
+def check_use_sde(use_sde: bool) -> None:
+    """
+    :param use_sde: the argument
+    :raises ValueError: if it is asked for
+    """
+    if use_sde:
+        raise ValueError(
+            "use_sde=True is not supported by this family of algorithms: use action_noise, "
+            f"or exploration=, one of {sorted(EXPLORATIONS)}"
+        )
 
 
 def _check_backbone(agent: "SAC") -> None:

@@ -3,14 +3,10 @@
 from typing import Any, NamedTuple
 
 import torch
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_sample.sac.buffers import PLAIN_BUFFERS, BatchMemory, DeviceReplayBuffer
-
-# Buffers whose every transition is drawn independently, so that one large draw can be cut into batches. Others compose
-# each batch (HerReplayBuffer: so many real, so many relabelled transitions) and are asked once a gradient step.
-INDEPENDENT_BUFFERS = (*PLAIN_BUFFERS, NStepReplayBuffer, DeviceReplayBuffer)
+from sb3_sample.sac.buffers import BatchMemory, samples_as_its_class
 
 
 class Batch(NamedTuple):
@@ -130,7 +126,7 @@ def draw_batches(
     """
     if memory is not None and memory.serves(buffer, vec_normalize):
         return _cut(Batch.of(memory.gather(buffer, n_batches * batch_size), gamma), n_batches, batch_size)
-    if n_batches > 1 and type(buffer) not in INDEPENDENT_BUFFERS:
+    if n_batches > 1 and not samples_as_its_class(buffer):
         return [draw_batches(buffer, 1, batch_size, gamma, vec_normalize)[0] for _ in range(n_batches)]
     return _cut(Batch.of(buffer.sample(n_batches * batch_size, env=vec_normalize), gamma), n_batches, batch_size)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -17,6 +17,7 @@ from sb3_sample.sac.compact_buffer import (
     CompactReplayBuffer,
 )
 from sb3_sample.sac.next_observations import NextObservations
+from sb3_sample.sac.rows import action_dtype, as_actions, as_observation, as_row, as_timeouts
 
 
 def samples_at(
@@ -95,15 +96,14 @@ class ValidationSplit(CompactReplay):
         """Transitions to train on."""
         return (self.buffer_size if self.full else self.pos) * self.n_envs - self.n_validation
 
-    def add(self, *args: Any, **kwargs: Any) -> None:
-        """Store one transition of each environment, as in Stable-Baselines3, and draw its side."""
+    def _replacing(self, row: int) -> None:
+        """Draw the sides of a step's transitions."""
         held_out = np.random.random(self.n_envs) < self.validation_proportion
-        self._first += int(self.held_out[self.pos].sum())
-        self.held_out[self.pos] = held_out
-        new = self.pos * self.n_envs + np.flatnonzero(held_out)
+        self._first += int(self.held_out[row].sum())
+        self.held_out[row] = held_out
+        new = row * self.n_envs + np.flatnonzero(held_out)
         self._ring[(self._last + np.arange(len(new))) % len(self._ring)] = new
         self._last += len(new)
-        super().add(*args, **kwargs)
 
     def reset(self) -> None:
         """Empty the buffer."""
@@ -213,6 +213,7 @@ class DeviceReplayBuffer(ReplayBuffer):
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
+        store_float_actions(self)
         for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
             # The host's array was never written to, so that it took no memory.
             setattr(
@@ -230,18 +231,24 @@ class DeviceReplayBuffer(ReplayBuffer):
         done: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """Store one transition of each environment, as in Stable-Baselines3."""
-        timeouts = [info.get("TimeLimit.truncated", False) for info in infos]
-        for store, row in (
-            (self.observations, obs),
-            (self.next_observations, next_obs),
-            (self.actions, action),
-            (self.rewards, reward),
-            (self.dones, done),
-            (self.timeouts, timeouts if self.handle_timeout_termination else np.zeros(self.n_envs)),
-        ):
+        """
+        Store one transition of each environment, as in Stable-Baselines3.
+
+        :raises ValueError: if something has another shape than its space; nothing is stored then
+        """
+        timeouts = as_timeouts(infos, self.n_envs) if self.handle_timeout_termination else np.zeros(self.n_envs)
+        shape = (self.n_envs, *self.obs_shape)
+        rows = [
+            (self.observations, as_observation("observation", obs, shape, self.observation_space)),
+            (self.next_observations, as_observation("next observation", next_obs, shape, self.observation_space)),
+            (self.actions, as_actions(action, (self.n_envs, self.action_dim), self.action_space)),
+            (self.rewards, as_row("reward", reward, (self.n_envs,))),
+            (self.dones, as_row("done", done, (self.n_envs,))),
+            (self.timeouts, timeouts),
+        ]
+        for store, row in rows:
             target: Any = store[self.pos]
-            target.copy_(torch.as_tensor(np.asarray(row)).reshape(target.shape))
+            target.copy_(torch.as_tensor(row))
         self.pos += 1
         if self.pos == self.buffer_size:
             self.full, self.pos = True, 0
@@ -275,6 +282,17 @@ class DeviceReplayBuffer(ReplayBuffer):
         return super().to_torch(array, copy)
 
 
+def store_float_actions(buffer: ReplayBuffer) -> None:
+    """
+    Have an empty buffer store actions as floats where Stable-Baselines3's cuts what lies in [-1, 1] to integers.
+
+    :param buffer: the buffer
+    """
+    dtype = action_dtype(buffer.action_space)
+    if isinstance(buffer.actions, np.ndarray) and buffer.actions.dtype != dtype:
+        buffer.actions = np.zeros(buffer.actions.shape, dtype)
+
+
 #: Buffers that hold one transition a place, each of which can be drawn by itself.
 PLAIN_BUFFERS = (
     CompactReplayBuffer,
@@ -284,6 +302,21 @@ PLAIN_BUFFERS = (
     ReplayBuffer,
     DictReplayBuffer,
 )
+#: Buffers whose every transition is drawn independently, so that one large draw can be cut into batches. Others compose
+#: each batch (HerReplayBuffer: so many real, so many relabelled transitions) and are asked once a gradient step.
+INDEPENDENT_BUFFERS = (*PLAIN_BUFFERS, NStepReplayBuffer, DeviceReplayBuffer)
+#: What a buffer's samples are made by.
+_SAMPLING = ("sample", "_get_samples", "_at", "training_places", "to_torch", "_normalize_obs", "_normalize_reward")
+_OWN_SAMPLING = {cls: [getattr(cls, name, None) for name in _SAMPLING] for cls in INDEPENDENT_BUFFERS}
+
+
+def samples_as_its_class(buffer: ReplayBuffer) -> bool:
+    """
+    :param buffer: a replay buffer
+    :return: whether it is one of ``INDEPENDENT_BUFFERS`` whose sampling nobody has replaced, in the class or the object
+    """
+    present = [getattr(type(buffer), name, None) for name in _SAMPLING]
+    return _OWN_SAMPLING.get(type(buffer)) == present and vars(buffer).keys().isdisjoint(_SAMPLING)
 
 
 class BatchMemory:
@@ -303,7 +336,8 @@ class BatchMemory:
         :param vec_normalize: what normalises the samples
         :return: whether transitions can be gathered from the buffer without asking it
         """
-        return type(buffer) in PLAIN_BUFFERS and not buffer.optimize_memory_usage and vec_normalize is None
+        is_plain = type(buffer) in PLAIN_BUFFERS and samples_as_its_class(buffer)
+        return is_plain and not buffer.optimize_memory_usage and vec_normalize is None
 
     def gather(self, buffer: ReplayBuffer, n: int) -> ReplayBufferSamples | DictReplayBufferSamples:
         """

@@ -16,6 +16,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 
 from sb3_sample.sac import memory_map as files
 from sb3_sample.sac.next_observations import NEXT_ROW, ONLY, NextObservations, SideStore
+from sb3_sample.sac.rows import action_dtype, as_actions, as_observation, as_row, as_timeouts
 
 try:  # As in Stable-Baselines3: without it nobody looks at the memory.
     import psutil
@@ -53,6 +54,7 @@ class CompactReplay:
     pos: int
     full: bool
     observations: Any
+    observation_space: Any
     memory_map: str | None
     slot: np.ndarray
     aside: SideStore
@@ -82,7 +84,7 @@ class CompactReplay:
             shapes: Any = self.obs_shape
             one = {key: (shapes[key], space.dtype) for key, space in observation_space.spaces.items()}
         layout = {key: ((*rows, *shape), dtype) for key, (shape, dtype) in one.items()}
-        actions = ((*rows, self.action_dim), self._maybe_cast_dtype(action_space.dtype))
+        actions = ((*rows, self.action_dim), action_dtype(action_space))
         needed = sum(files.n_bytes(*array) for array in [*layout.values(), actions, *[(rows, np.float32)] * 4])
         #: The folder that holds the arrays; None if the memory does.
         self.memory_map = None if memory_map is None else files.check_folder(memory_map, needed)
@@ -141,13 +143,20 @@ class CompactReplay:
         done: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """Store one transition of each environment, as in Stable-Baselines3."""
+        """
+        Store one transition of each environment, as in Stable-Baselines3.
+
+        :raises ValueError: if something has another shape than its space; nothing is stored then
+        """
         assert isinstance(self, ReplayBuffer)
-        now, after = self._as_stored(obs), self._as_stored(next_obs)
-        action = np.asarray(action).reshape((self.n_envs, self.action_dim))
+        now, after = self._as_stored("observation", obs), self._as_stored("next observation", next_obs)
+        action = as_actions(action, (self.n_envs, self.action_dim), self.action_space)
+        reward, done = (as_row(name, row, (self.n_envs,)) for name, row in (("reward", reward), ("done", done)))
+        timeouts = as_timeouts(infos, self.n_envs) if self.handle_timeout_termination else None
         pos = self.pos
         if self.size() > 0 and self.buffer_size > 1:
             self._settle((pos - 1) % self.buffer_size, now)
+        self._replacing(pos)
         if self.full:
             self.aside.free(self.slot[pos])
         for key, array in self.stored().items():
@@ -156,19 +165,23 @@ class CompactReplay:
         self.actions[pos] = action
         self.rewards[pos] = reward
         self.dones[pos] = done
-        if self.handle_timeout_termination:
-            self.timeouts[pos] = [info.get("TimeLimit.truncated", False) for info in infos]
+        if timeouts is not None:
+            self.timeouts[pos] = timeouts
         self.pos = pos + 1
         if self.pos == self.buffer_size:
             self.full, self.pos = True, 0
 
-    def _as_stored(self, given: Any) -> dict[str, np.ndarray]:
+    def _as_stored(self, name: str, given: Any) -> dict[str, np.ndarray]:
         """Observations of all environments in the form in which they are stored, (n_envs, O) each."""
-        by_key = given if isinstance(self.observations, dict) else {ONLY: given}
+        if not isinstance(self.observations, dict):
+            return {ONLY: as_observation(name, given, self.observations.shape[1:], self.observation_space)}
         return {
-            key: np.ascontiguousarray(by_key[key], dtype=array.dtype).reshape(array.shape[1:])
-            for key, array in self.stored().items()
+            key: as_observation(f"{name} {key!r}", given[key], array.shape[1:], self.observation_space[key])
+            for key, array in self.observations.items()
         }
+
+    def _replacing(self, row: int) -> None:
+        """A step is about to be stored in a row."""
 
     def _set_newest(self, row: int, following: dict[str, np.ndarray]) -> None:
         for key, array in self.aside.newest().items():

@@ -175,7 +175,7 @@ class OptimisticExploration(Exploration):
 
         optimistic_mean, optimistic_std = self._gaussian(batch.observations, features, mean, std)
         action = agent.actor.learned_action(optimistic_mean, self.std_multiplier * optimistic_std, noise)
-        q = agent.critic(batch.observations, action)
+        q = agent.critic.q_values(batch.observations, action)
         q_mean, q_std = q.mean(dim=0), spread(q, self.uncertainty)
         kl = self._kl(agent, (optimistic_mean, optimistic_std), (mean, std))
         upper_value = q_mean + optimism.detach() * q_std
@@ -419,7 +419,7 @@ class OptimisticGradient(Exploration):
         # Acting runs in inference mode, which knows no gradients.
         with torch.inference_mode(False), torch.enable_grad():
             at = mean.clone().requires_grad_()
-            q = agent.critic(_cloned(observations), torch.tanh(at))
+            q = agent.critic.q_values(_cloned(observations), torch.tanh(at))
             upper_value = q.mean(dim=(0, 2)) + self.optimism * epistemic_std(q).mean(dim=1)
             (gradient,) = torch.autograd.grad(upper_value.sum(), at)
         scaled = std.square() * gradient

@@ -296,8 +296,9 @@ class LearnedPessimism(Pessimism):
         """What the critics' step computes, of other transitions."""
         with torch.no_grad():
             actions, log_prob = agent.policy.next_actions(batch.next_observations, noise)
-            next_q = agent.critic_target(batch.next_observations, actions)
-            return CriticStep(agent.critic(batch.observations, batch.actions), next_q, -agent.temperature() * log_prob)
+            next_q = agent.critic_target.q_values(batch.next_observations, actions)
+            q = agent.critic.q_values(batch.observations, batch.actions)
+            return CriticStep(q, next_q, -agent.temperature() * log_prob)
 
     def _td_error(self, batch: Batch, step: CriticStep) -> torch.Tensor:
         """``Q_mean(s, a) - r - gamma V_lb(s')``, (B,)."""

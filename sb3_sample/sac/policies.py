@@ -1,14 +1,16 @@
 """Actor, critic ensemble and target ensemble of the off-policy family, as Stable-Baselines3 policies."""
 
 import copy
+import functools
 import inspect
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from gymnasium import spaces
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.policies import BaseModel, BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import (
@@ -24,6 +26,7 @@ from torch import nn
 from sb3_sample.networks import NETWORKS, Network, linear
 from sb3_sample.optim import AdamW
 from sb3_sample.sac.losses import gaussian_kl, tanh_gaussian_log_prob
+from sb3_sample.sac.q_values import QValues
 
 # The log standard deviation is squashed into this interval by a tanh.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
@@ -90,11 +93,23 @@ class Actor(BasePolicy):
             normalize_images=normalize_images,
             squash_output=True,
         )
+        self._network_args = {"network": network, "network_kwargs": network_kwargs}
         self.features_dim = features_extractor.features_dim
         self.action_dim = get_action_dim(action_space)
         self.trunk = network(self.features_dim, **network_kwargs)
         self.mean = linear(self.trunk.out_features, self.action_dim, None)
         self.log_std = linear(self.trunk.out_features, self.action_dim, None, gain=1.0)
+        #: Stable-Baselines3's distribution of the actions, for its own use: nothing here reads it.
+        self.action_dist = SquashedDiagGaussianDistribution(self.action_dim)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = {**self._network_args, "features_extractor": self.features_extractor}
+        return {**super()._get_constructor_parameters(), **own}
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The last actions that somebody asked the distribution for go with no copy: they may have a gradient.
+        fresh = SquashedDiagGaussianDistribution(self.action_dim)
+        return {name: fresh if name == "action_dist" else value for name, value in vars(self).items()}
 
     def features(self, obs: PyTorchObs) -> torch.Tensor:
         """
@@ -125,6 +140,29 @@ class Actor(BasePolicy):
         noise = torch.randn_like(mean) if noise is None else noise
         x = mean + log_std.exp() * noise
         return torch.tanh(x), tanh_gaussian_log_prob(x, noise, log_std)
+
+    def get_action_dist_params(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        """
+        As in Stable-Baselines3.
+
+        :param obs: observations, (B, O), or a dict of them
+        :return: mean and log standard deviation of the pre-tanh Gaussian, (B, A) each, and no other arguments
+        """
+        mean, log_std = self.gaussian(self.features(obs))
+        return mean, log_std, {}
+
+    def action_log_prob(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        :meth:`sample` as Stable-Baselines3 has it; sets ``action_dist``.
+
+        :param obs: observations, (B, O), or a dict of them
+        :return: sampled actions in [-1, 1], (B, A), and their log-probability, (B,)
+        """
+        mean, log_std, _ = self.get_action_dist_params(obs)
+        noise = torch.randn_like(mean)
+        x = mean + log_std.exp() * noise
+        self.action_dist.proba_distribution(mean, log_std).gaussian_actions = x
+        return torch.tanh(x), tanh_gaussian_log_prob(x, noise, log_std).squeeze(1)
 
     def act(self, mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """
@@ -204,7 +242,27 @@ class DeterministicActor(Actor):
                 raise ValueError(f"{name} must be at least 0 and finite, not {value}")
         self.log_exploration_noise = math.log(exploration_noise)
         self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
-        del self.log_std
+        self._noise_args = {
+            "exploration_noise": exploration_noise,
+            "target_noise": target_noise,
+            "target_noise_clip": target_noise_clip,
+        }
+        del self.log_std, self.action_dist
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), **self._noise_args}
+
+    def get_action_dist_params(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        """
+        :raises AttributeError: always; as with Stable-Baselines3's TD3, there is no distribution
+        """
+        raise AttributeError("a deterministic actor (backbone='td3') has no distribution of its actions")
+
+    def action_log_prob(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        :raises AttributeError: always; as with Stable-Baselines3's TD3, there is no distribution
+        """
+        raise AttributeError("a deterministic actor (backbone='td3') has no distribution of its actions")
 
     def gaussian(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         mean = self.mean(self.trunk(features))
@@ -293,6 +351,7 @@ class CriticEnsemble(BaseModel):
         super().__init__(
             observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
         )
+        self._network_args = {"network": network, "network_kwargs": network_kwargs, "n_outputs": n_outputs}
         self.n_critics = n_critics
         in_features = features_extractor.features_dim + get_action_dim(action_space)
         self.trunk = network(in_features, n_copies=n_critics, **network_kwargs)
@@ -307,13 +366,49 @@ class CriticEnsemble(BaseModel):
         assert isinstance(self.features_extractor, BaseFeaturesExtractor)
         return torch.cat((self.extract_features(obs, self.features_extractor), actions), dim=1)
 
-    def forward(self, obs: PyTorchObs, actions: torch.Tensor) -> torch.Tensor:
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = {**self._network_args, "features_extractor": self.features_extractor, "n_critics": self.n_critics}
+        return {**super()._get_constructor_parameters(), **own}
+
+    def q_values(self, obs: PyTorchObs, actions: torch.Tensor) -> torch.Tensor:
         """
         :param obs: observations, (B, O), or a dict of them
         :param actions: actions in [-1, 1], (B, A)
         :return: (E, B, K)
         """
         return self.head(self.trunk(self.inputs(obs, actions)))
+
+    def forward(self, obs: PyTorchObs, actions: torch.Tensor) -> QValues | torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them
+        :param actions: actions in [-1, 1], (B, A)
+        :return: Stable-Baselines3's tuple of E tensors, (B, K) each, that is a tensor (E, B, K) too; where it is being
+            compiled, the tensor alone
+        """
+        q = self.q_values(obs, actions)
+        return q if torch.compiler.is_compiling() else QValues(q)
+
+    def q1_forward(self, obs: PyTorchObs, actions: torch.Tensor) -> torch.Tensor:
+        """
+        As in Stable-Baselines3, but that all critics are evaluated.
+
+        :param obs: observations, (B, O), or a dict of them
+        :param actions: actions in [-1, 1], (B, A)
+        :return: the first critic's value, the mean of its quantiles if it has some, (B, 1)
+        """
+        return self.q_values(obs, actions)[0].mean(dim=1, keepdim=True)
+
+    @property
+    def q_networks(self) -> list[Callable[[torch.Tensor], torch.Tensor]]:
+        """
+        Each critic as a function of features and actions, (B, F + A) to (B, K). They are no modules as in
+        Stable-Baselines3: the parameters of all lie together, (E, ...).
+        """
+
+        def network(index: int, inputs: torch.Tensor) -> torch.Tensor:
+            return self.head(self.trunk(inputs))[index]
+
+        return [functools.partial(network, index) for index in range(self.n_critics)]
 
     def copied_parameters(self) -> list[nn.Parameter]:
         """
@@ -348,6 +443,7 @@ class SACPolicy(BasePolicy):
     :param optimizer_class: optimizer of actor and critics
     :param optimizer_kwargs: its arguments, but for the learning rate
     :param critic_optimizer_kwargs: arguments of the critics' optimizer alone, over ``optimizer_kwargs``
+    :param share_features_extractor: False, as in Stable-Baselines3 by default; True is refused
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
@@ -377,7 +473,13 @@ class SACPolicy(BasePolicy):
         optimizer_class: type[torch.optim.Optimizer] = AdamW,
         optimizer_kwargs: dict[str, Any] | None = None,
         critic_optimizer_kwargs: dict[str, Any] | None = None,
+        share_features_extractor: bool = False,
     ):
+        if share_features_extractor:
+            raise ValueError(
+                "share_features_extractor must be False: actor and critics have a features extractor each, trained by "
+                "their own losses"
+            )
         super().__init__(
             observation_space,
             action_space,
@@ -503,12 +605,42 @@ class SACPolicy(BasePolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
         return self(observation, deterministic)
 
+    def scale_action(self, action: np.ndarray) -> np.ndarray:
+        """
+        :param action: actions in the action space's own bounds, (B, A)
+        :return: the same in [-1, 1], (B, A)
+        """
+        bounds = self._float_bounds(np.asarray(action).dtype)
+        if bounds is None:
+            return super().scale_action(action)
+        low, high = bounds
+        return 2.0 * ((action - low) / (high - low)) - 1.0
+
     def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
         """
         :param scaled_action: actions in [-1, 1], (B, A)
-        :return: the same in the action space's own bounds, (B, A), inside them also where scaling rounds
+        :return: the same in the action space's own bounds, (B, A), inside them also where scaling rounds. As in
+            Stable-Baselines3, they are floats also where the space is one of integers
         """
-        return np.clip(super().unscale_action(scaled_action), self.action_space.low, self.action_space.high)
+        bounds = self._float_bounds(scaled_action.dtype)
+        if bounds is None:
+            return np.clip(super().unscale_action(scaled_action), self.action_space.low, self.action_space.high)
+        low, high = bounds
+        return np.clip(low + (0.5 * (scaled_action + 1.0) * (high - low)), low, high)
+
+    def _float_bounds(self, dtype: Any) -> tuple[np.ndarray, np.ndarray] | None:
+        """
+        Bounds of a space of integers as floats, since small integers cannot hold their difference.
+
+        :param dtype: of the actions
+        :return: the bounds in the type that Stable-Baselines3's arithmetic has; None where the space is one of floats
+        """
+        space = self.action_space
+        if np.issubdtype(space.dtype, np.floating):
+            return None
+        kind = np.result_type(dtype, space.dtype)
+        kind = kind if np.issubdtype(kind, np.floating) else np.dtype(np.float64)
+        return space.low.astype(kind), space.high.astype(kind)
 
     def set_training_mode(self, mode: bool) -> None:
         """

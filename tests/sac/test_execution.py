@@ -321,7 +321,7 @@ def test_settings_changed_on_the_way_count_in_a_compiled_step() -> None:
     model, compiled = pair("SAC", compile=True, learning_rate=1e-3)
     for m in (model, compiled):
         updates(m, 5)
-        m.tau, m.gamma, m._target_entropy = 0.7, 0.3, 5.0
+        m.tau, m.gamma, m.target_entropy = 0.7, 0.3, 5.0
         updates(m, 5, seed=1)
     assert largest_difference(model, compiled) < TOLERANCE
 

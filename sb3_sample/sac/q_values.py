@@ -1,0 +1,70 @@
+"""What critics answer, for Stable-Baselines3's code and for this package's."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+
+class QValues(tuple[torch.Tensor, ...]):
+    """
+    The values of E critics: Stable-Baselines3's tuple of E tensors, (B, K) each (K = 1 if they are scalar), and,
+    wherever a tensor is wanted, the one tensor (E, B, K). ``torch.cat(q, dim=1)``, ``q1, q2 = q`` and loops over it see
+    the tuple; arithmetic, torch's other functions, tensors' methods and indices the tensor.
+
+    :param tensor: (E, B, K)
+    """
+
+    #: The values as one tensor, (E, B, K).
+    tensor: torch.Tensor
+
+    def __new__(cls, tensor: torch.Tensor) -> "QValues":
+        self = super().__new__(cls, tensor.unbind())
+        self.tensor = tensor
+        return self
+
+    def __reduce__(self) -> Any:
+        return QValues, (self.tensor,)
+
+    def __getattr__(self, name: str) -> Any:
+        # How it is copied and printed is no business of the tensor.
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self.tensor, name)
+
+    def __getitem__(self, index: Any) -> Any:
+        found = self.tensor[index]
+        return QValues(found) if isinstance(index, slice) else found
+
+    @classmethod
+    def __torch_function__(cls, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return function(*_with_tensors(args), **_with_tensors(kwargs or {}))
+
+    def __repr__(self) -> str:
+        return f"QValues({self.tensor!r})"
+
+    def __hash__(self) -> int:
+        return id(self)
+
+
+def _with_tensors(values: Any) -> Any:
+    """The same nested lists, tuples and dicts, with tensors for the values of critics."""
+    if isinstance(values, QValues):
+        return values.tensor
+    if isinstance(values, dict):
+        return {key: _with_tensors(value) for key, value in values.items()}
+    return type(values)(map(_with_tensors, values)) if type(values) in (list, tuple) else values
+
+
+def _of_the_tensor(name: str) -> Callable[..., Any]:
+    def operator(self: QValues, *others: Any) -> Any:
+        return getattr(self.tensor, name)(*_with_tensors(others))
+
+    return operator
+
+
+for _name in (
+    *("add", "radd", "sub", "rsub", "mul", "rmul", "truediv", "rtruediv", "floordiv", "mod", "pow", "rpow", "matmul"),
+    *("neg", "pos", "abs", "eq", "ne", "lt", "le", "gt", "ge"),
+):
+    setattr(QValues, f"__{_name}__", _of_the_tensor(f"__{_name}__"))

@@ -1,0 +1,54 @@
+"""Stable-Baselines3's names for what ``SAC`` here has under others; docs/sac.md has the table."""
+
+import math
+from typing import Any
+
+import torch
+
+from sb3_sample.optim import AdamW
+from sb3_sample.sac.policies import Actor
+from sb3_sample.sac.scalars import FixedScalar, LogScalar
+
+
+class TemperatureNames:
+    """
+    The temperature as ``stable_baselines3.SAC`` has it. A number that is set is put in the place of the old one, so
+    that it counts from the next gradient step on, however that is run.
+    """
+
+    actor: Actor
+    temperature: LogScalar | FixedScalar
+    temperature_optimizer: AdamW | None
+
+    @property
+    def log_ent_coef(self) -> torch.Tensor | None:
+        """Logarithm of the temperature, a scalar that is learned; None if the temperature is fixed."""
+        return self.temperature.log_value if isinstance(self.temperature, LogScalar) else None
+
+    @log_ent_coef.setter
+    def log_ent_coef(self, value: Any) -> None:
+        if not isinstance(self.temperature, LogScalar):
+            raise ValueError(f"log_ent_coef cannot be set to {value}: the temperature is not learned")
+        if not math.isfinite(float(value)):
+            raise ValueError(f"log_ent_coef must be finite, not {value}")
+        self.temperature.log_value.data.fill_(float(value))
+
+    @property
+    def ent_coef_tensor(self) -> torch.Tensor:
+        """The temperature, a scalar without gradient, learned or not; 0 for a deterministic actor."""
+        return self.temperature().detach()
+
+    @ent_coef_tensor.setter
+    def ent_coef_tensor(self, value: Any) -> None:
+        if isinstance(self.temperature, LogScalar):
+            raise ValueError(f"ent_coef_tensor cannot be set to {value}: the temperature is learned, set log_ent_coef")
+        if not self.actor.has_entropy:
+            raise ValueError(f"ent_coef_tensor cannot be set to {value}: a deterministic actor has no temperature")
+        if not 0 <= float(value) < math.inf:
+            raise ValueError(f"ent_coef_tensor must be at least 0 and finite, not {value}")
+        self.temperature.value.fill_(float(value))
+
+    @property
+    def ent_coef_optimizer(self) -> AdamW | None:
+        """Optimizer of the temperature; None if it is fixed."""
+        return self.temperature_optimizer
