@@ -29,26 +29,32 @@ else
 DM_CONTROL = @:
 endif
 
-.PHONY: demo demo-imports test test-all lint lock check-python clean
+ifneq (,$(filter-out clean lock,$(or $(MAKECMDGOALS),demo)))
+ifeq (,$(filter $(VERSION),$(PYTHONS)))
+$(error $(PYTHON) is Python $(or $(VERSION),?), and there are lock files for $(PYTHONS): make PYTHON=python3.12 ..., say)
+endif
+ifneq (,$(wildcard $(BIN)/python))
+ifneq ($(VERSION),$(call version,$(BIN)/python))
+$(error $(PYTHON) is Python $(VERSION), and $(VENV) was made with $(call version,$(BIN)/python): make clean, then again)
+endif
+endif
+endif
 
-check-python:
-	$(if $(filter $(VERSION),$(PYTHONS)),,$(error There are lock files for Python $(PYTHONS), and $(PYTHON) is \
-	    "$(VERSION)": make PYTHON=python3.12 ..., say))
-	$(if $(wildcard $(BIN)/python),$(if $(filter $(VERSION),$(call version,$(BIN)/python)),,$(error $(VENV) is of \
-	    Python $(call version,$(BIN)/python), and $(PYTHON) is $(VERSION): make clean first, or name the other)))
+.PHONY: demo demo-imports test test-all lint lock clean
 
-$(BIN)/python: | check-python
+
+$(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) --upgrade pip setuptools wheel
 
-$(VENV)/.demo: setup.cfg $(LOCK) | check-python $(BIN)/python
+$(VENV)/.demo: setup.cfg $(LOCK) | $(BIN)/python
 	@echo "Installing what the demo needs into $(VENV) (Python $(VERSION)) ..."
 	$(PIP) torch
 	$(PIP) -e ".[dmc,plots,progress]"
 	$(DM_CONTROL)
 	@touch $@
 
-$(VENV)/.all: setup.cfg $(LOCK) | check-python $(BIN)/python
+$(VENV)/.all: setup.cfg $(LOCK) | $(BIN)/python
 	@echo "Installing everything into $(VENV) (Python $(VERSION), some minutes) ..."
 	$(PIP) torch
 	$(PIP) -e ".[all,tests]"
@@ -67,7 +73,7 @@ test: lint
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -m "not slow" -n 2
 
 # The demo has to run with the extras that it installs, not with what a full environment happens to hold.
-demo-imports: setup.cfg $(LOCK) | check-python
+demo-imports: setup.cfg $(LOCK)
 	rm -rf .venv-demo
 	$(MAKE) --no-print-directory VENV=.venv-demo .venv-demo/.demo
 	.venv-demo/bin/python examples/demo.py --help > /dev/null
