@@ -10,12 +10,13 @@ import numpy as np
 from gymnasium import spaces
 
 
-def import_library(module: str, extra: str) -> ModuleType:
+def import_library(module: str, extra: str, then: str = "") -> ModuleType:
     """
     Import an optional library when an environment of it is made.
 
     :param module: Name of the module, e.g. ``"dm_control.suite"``.
     :param extra: The extra of this package that installs it, e.g. ``"dmc"``.
+    :param then: What is to be typed after that, if the extra alone is not enough.
     :return: The module.
     :raises ImportError: The library, or something that it needs, is not installed.
     """
@@ -24,7 +25,7 @@ def import_library(module: str, extra: str) -> ModuleType:
     except ModuleNotFoundError as error:
         raise ImportError(
             f"The {extra}/ environments need {module.split('.')[0]} ({error}). "
-            f'Install it with: pip install "sb3_sample[{extra}]"'
+            f'Install it with: pip install "sb3_sample[{extra}]"{then and f", then: {then}"}'
         ) from error
 
 
