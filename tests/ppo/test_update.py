@@ -242,4 +242,4 @@ def test_the_critic_learns_from_the_real_samples_alone() -> None:
         model.train()
         return model.policy.value_net.weight
 
-    torch.testing.assert_close(critic(1), critic(5), rtol=0, atol=1e-7)
+    torch.testing.assert_close(critic(1), critic(5), rtol=1e-5, atol=1e-6)
