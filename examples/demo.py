@@ -24,7 +24,7 @@ from sb3_sample import BRO, make_env
 from sb3_sample.plots import Curve, Run, draw, summarize
 
 ENV, ENV_ARGUMENTS = "dmc/ball_in_cup-catch-v0", {"action_repeat": 4}  # an episode is 250 decisions
-STEPS, EVERY = 8_000, 500  # decisions at most, and between two evaluations
+STEPS, EVERY = 12_000, 500  # decisions at most, and between two evaluations
 SOLVED = 900  # mean return, of at most 1,000
 # The smallest critics and no resets: enough for this task, and quick on a laptop.
 AGENT: dict[str, Any] = dict(model_size="0.55M", replay_ratio=4, learning_starts=1_000, resets=())

@@ -26,8 +26,8 @@ from sb3_sample.envs.base import (
 )
 
 EPISODE_STEPS = 1000
-#: dm-control asks for labmaze, which has no wheel after Python 3.12 and which the suite never imports, so that there the
-#: extra has everything but dm-control itself (setup.cfg).
+#: dm-control asks for labmaze, which has no wheel after Python 3.12 and which the suite never imports. There the extra
+#: has everything but dm-control itself (setup.cfg).
 _THEN = "pip install --no-deps dm-control" if sys.version_info >= (3, 13) else ""
 
 
