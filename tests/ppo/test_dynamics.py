@@ -96,13 +96,13 @@ def test_transitions_are_normalised_when_they_are_used() -> None:
     t = np.repeat(np.arange(32) % 7, 2)
     np.testing.assert_allclose(kept.observations[:64], np.repeat(t[:, None], 3, axis=1), rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(kept.next_observations[:64], np.repeat(t[:, None] + 1, 3, axis=1), rtol=1e-5, atol=1e-4)
-    np.testing.assert_allclose(kept.rewards[:64], t + 1)
+    np.testing.assert_allclose(kept.rewards[:64], t + 1, rtol=1e-6)
     # A second learn goes on in the midst of an episode.
     np.testing.assert_allclose(kept.observations[64:66], kept.next_observations[62:64], rtol=1e-5, atol=1e-4)
     used = model._as_tensors(kept)
     np.testing.assert_allclose(used.observations, env.normalize_obs(kept.observations), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(used.next_observations, env.normalize_obs(kept.next_observations), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(used.rewards, env.normalize_reward(kept.rewards))
+    np.testing.assert_allclose(used.rewards, env.normalize_reward(kept.rewards), rtol=1e-6)
 
 
 def test_dict_observations() -> None:
