@@ -2,32 +2,63 @@
 # make test      set up, lint, types, tests (what CI runs)
 # make test-all  the same with the long tests
 # make clean     remove the virtual environment
+#
+# make PYTHON=python3.13 ...  sets up with another Python than python3, one of those below
+
+# The Pythons that there is a lock file for: constraints/3.11.txt and so on.
+PYTHONS := 3.11 3.12 3.13 3.14
+# Those that labmaze has wheels for.
+LABMAZE_PYTHONS := 3.11 3.12
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+version = $(shell $(1) -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+VERSION := $(call version,$(PYTHON))
+LOCK := constraints/$(VERSION).txt
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(LOCK)
+# rliable asks for a release of arch that has no wheel for Python 3.14. Built from source without its compiled parts it
+# needs no compiler; wheels, where there are some, are the same as ever.
+export ARCH_NO_BINARY := 1
 
-.PHONY: demo demo-imports test test-all lint check-python clean
+# dm-control asks for labmaze, which has no wheel after Python 3.12 and which its suite never imports. There the extra
+# [dmc] is everything else that dm-control asks for.
+ifeq (,$(filter $(VERSION),$(LABMAZE_PYTHONS)))
+DM_CONTROL = $(PIP) --no-deps dm-control
+else
+DM_CONTROL = @:
+endif
 
-check-python:
-	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; \
-	    sys.exit(0 if v == (3, 11) else "The lock file is for Python 3.11, and %s is %d.%d: make PYTHON=python3.11 ..." % ("$(PYTHON)", *v))'
+ifneq (,$(filter-out clean lock,$(or $(MAKECMDGOALS),demo)))
+ifeq (,$(filter $(VERSION),$(PYTHONS)))
+$(error $(PYTHON) is Python $(or $(VERSION),?), and there are lock files for $(PYTHONS): make PYTHON=python3.12 ..., say)
+endif
+ifneq (,$(wildcard $(BIN)/python))
+ifneq ($(VERSION),$(call version,$(BIN)/python))
+$(error $(PYTHON) is Python $(VERSION), and $(VENV) was made with $(call version,$(BIN)/python): make clean, then again)
+endif
+endif
+endif
 
-$(BIN)/python: | check-python
+.PHONY: demo demo-imports test test-all lint lock clean
+
+
+$(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) --upgrade pip setuptools wheel
 
-$(VENV)/.demo: setup.cfg constraints.txt | $(BIN)/python
-	@echo "Installing what the demo needs into $(VENV) ..."
+$(VENV)/.demo: setup.cfg $(LOCK) | $(BIN)/python
+	@echo "Installing what the demo needs into $(VENV) (Python $(VERSION)) ..."
 	$(PIP) torch
 	$(PIP) -e ".[dmc,plots,progress]"
+	$(DM_CONTROL)
 	@touch $@
 
-$(VENV)/.all: setup.cfg constraints.txt | $(BIN)/python
-	@echo "Installing everything into $(VENV) (some minutes) ..."
+$(VENV)/.all: setup.cfg $(LOCK) | $(BIN)/python
+	@echo "Installing everything into $(VENV) (Python $(VERSION), some minutes) ..."
 	$(PIP) torch
 	$(PIP) -e ".[all,tests]"
+	$(DM_CONTROL)
 	@touch $@
 
 demo: $(VENV)/.demo
@@ -42,7 +73,7 @@ test: lint
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -m "not slow" -n 2
 
 # The demo has to run with the extras that it installs, not with what a full environment happens to hold.
-demo-imports: setup.cfg constraints.txt | check-python
+demo-imports: setup.cfg $(LOCK)
 	rm -rf .venv-demo
 	$(MAKE) --no-print-directory VENV=.venv-demo .venv-demo/.demo
 	.venv-demo/bin/python examples/demo.py --help > /dev/null
@@ -50,6 +81,19 @@ demo-imports: setup.cfg constraints.txt | check-python
 
 test-all: lint demo-imports
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -n 2
+
+# Resolves the lock files anew, for maintainers: needs uv (pip install uv), installs nothing. A version stays where it
+# still fits; empty a file to have its Python's newest ones. Nothing is built but this package's own metadata (first, for
+# uv's cache) and what has no wheel at all, pure Python but for arch.
+lock: $(PYTHONS:%=constraints/%.lock)
+
+constraints/%.lock:
+	uv pip compile setup.cfg --python-version $* --no-deps --quiet > /dev/null
+	uv pip compile setup.cfg constraints/pins.txt --python-version $* --all-extras --quiet \
+	    --no-annotate --custom-compile-command "make lock" \
+	    $(if $(filter $*,$(LABMAZE_PYTHONS)),,--excludes constraints/no_wheel.txt) \
+	    --only-binary :all: $(foreach p,rliable moviepy proglog $(if $(filter $*,3.14),arch),--no-binary $(p)) \
+	    -o constraints/$*.txt
 
 clean:
 	rm -rf $(VENV)

@@ -1,5 +1,6 @@
 """What the suites share: the check of their arguments, the missing library's message and the choice of an OpenGL."""
 
+import contextlib
 import ctypes
 import importlib
 import os
@@ -10,12 +11,13 @@ import numpy as np
 from gymnasium import spaces
 
 
-def import_library(module: str, extra: str) -> ModuleType:
+def import_library(module: str, extra: str, then: str = "") -> ModuleType:
     """
     Import an optional library when an environment of it is made.
 
     :param module: Name of the module, e.g. ``"dm_control.suite"``.
     :param extra: The extra of this package that installs it, e.g. ``"dmc"``.
+    :param then: What is to be typed after that, if the extra alone is not enough.
     :return: The module.
     :raises ImportError: The library, or something that it needs, is not installed.
     """
@@ -24,7 +26,7 @@ def import_library(module: str, extra: str) -> ModuleType:
     except ModuleNotFoundError as error:
         raise ImportError(
             f"The {extra}/ environments need {module.split('.')[0]} ({error}). "
-            f'Install it with: pip install "sb3_sample[{extra}]"'
+            f'Install it with: pip install "sb3_sample[{extra}]"{then and f", then: {then}"}'
         ) from error
 
 
@@ -35,7 +37,14 @@ def select_gl_backend() -> None:
     MuJoCo's libraries read the variable when they are imported and otherwise take GLFW, which cannot draw without a
     screen. A value that the user has set stays; where neither library is found nothing is set, and everything but
     ``render`` works.
+
+    To be called before a library that opens its OpenGL when it is imported. Mesa's OpenGL and the Triton of PyTorch's
+    CUDA builds each bring an LLVM, and with Mesa's loaded first (PyOpenGL loads it for all to see) Triton ends the
+    process with a segmentation fault when PyTorch's optimizers import it. The other way round both work, so Triton is
+    imported here.
     """
+    with contextlib.suppress(ImportError):  # PyTorch's CPU builds come without it
+        importlib.import_module("triton")
     has_screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if not sys.platform.startswith("linux") or has_screen or "MUJOCO_GL" in os.environ:
         return

@@ -10,6 +10,7 @@ period in milliseconds, written to an attribute that all instances share; and ev
 """
 
 import os
+import sys
 from types import ModuleType
 from typing import Any
 
@@ -25,6 +26,9 @@ from sb3_sample.envs.base import (
 )
 
 EPISODE_STEPS = 1000
+#: dm-control asks for labmaze, which has no wheel after Python 3.12 and which the suite never imports. There the extra
+#: has everything but dm-control itself (setup.cfg).
+_THEN = "pip install --no-deps dm-control" if sys.version_info >= (3, 13) else ""
 
 
 class DMCEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -156,7 +160,7 @@ def _flatten(observation: dict[str, np.ndarray]) -> np.ndarray:
 def _import_suite() -> ModuleType:
     select_gl_backend()
     try:
-        return import_library("dm_control.suite", "dmc")
+        return import_library("dm_control.suite", "dmc", _THEN)
     except (ImportError, AttributeError, OSError) as error:
         if isinstance(error.__cause__, ModuleNotFoundError):
             raise
@@ -164,7 +168,7 @@ def _import_suite() -> ModuleType:
         chosen = os.environ.get("MUJOCO_GL")
         os.environ["MUJOCO_GL"] = "disable"
         try:
-            suite = import_library("dm_control.suite", "dmc")
+            suite = import_library("dm_control.suite", "dmc", _THEN)
         finally:
             if chosen is None:
                 del os.environ["MUJOCO_GL"]

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -112,6 +113,28 @@ def test_seeds_beyond_32_bits() -> None:
     first, _ = env.reset(seed=2**40 + 5)
     second, _ = env.reset(seed=2**40 + 5)
     np.testing.assert_array_equal(first, second)
+
+
+def test_triton_is_loaded_before_an_opengl(tmp_path: Path) -> None:
+    """Their two LLVMs in the other order are a segmentation fault (``select_gl_backend``)."""
+    (tmp_path / "triton.py").write_text("import sys\nprint('dm_control' in sys.modules)\n")
+    program = (
+        "import sb3_sample; env = sb3_sample.make_env('dmc/pendulum-swingup-v0'); print(type(env.unwrapped).__name__)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(tmp_path)}
+    )
+    assert result.stdout.split() == ["False", "DMCEnv"], result.stderr
+
+
+def test_an_opengl_and_then_an_optimizer() -> None:
+    program = (
+        "import sb3_sample\n"
+        "env = sb3_sample.make_env('dmc/pendulum-swingup-v0')\n"
+        "print(type(sb3_sample.SAC('MlpPolicy', env)).__name__)"
+    )
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert result.stdout.split() == ["SAC"], (result.returncode, result.stderr)
 
 
 def test_an_unusable_opengl_does_not_stop_the_simulation() -> None:

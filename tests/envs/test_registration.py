@@ -72,7 +72,8 @@ def test_a_missing_library_names_its_extra(
     env_id: str, module: str, extra: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(ImportError, match=rf'pip install "sb3_sample\[{extra}\]"'):
+    then = ", then: pip install --no-deps dm-control" if extra == "dmc" and sys.version_info >= (3, 13) else ""
+    with pytest.raises(ImportError, match=rf'pip install "sb3_sample\[{extra}\]"{then}$'):
         gym.make(env_id)
 
 

@@ -84,7 +84,7 @@ def test_transitions_are_the_environments(truncate: bool) -> None:
     np.testing.assert_array_equal(kept.terminations, (t == 6) & (not truncate))
     taken = np.concatenate(remember.actions)
     assert np.abs(taken).max() > 1
-    np.testing.assert_allclose(kept.actions, (np.clip(taken, -0.5, 0.25) + 0.125) / 0.375, atol=1e-6)
+    np.testing.assert_allclose(kept.actions, (np.clip(taken, -0.5, 0.25) + 0.125) / 0.375, rtol=1e-5, atol=1e-6)
 
 
 def test_transitions_are_normalised_when_they_are_used() -> None:
@@ -94,15 +94,15 @@ def test_transitions_are_normalised_when_they_are_used() -> None:
     model.learn(32, reset_num_timesteps=False)
     kept = model.transitions.recent(1000)
     t = np.repeat(np.arange(32) % 7, 2)
-    np.testing.assert_allclose(kept.observations[:64], np.repeat(t[:, None], 3, axis=1), atol=1e-5)
-    np.testing.assert_allclose(kept.next_observations[:64], np.repeat(t[:, None] + 1, 3, axis=1), atol=1e-4)
-    np.testing.assert_allclose(kept.rewards[:64], t + 1)
+    np.testing.assert_allclose(kept.observations[:64], np.repeat(t[:, None], 3, axis=1), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(kept.next_observations[:64], np.repeat(t[:, None] + 1, 3, axis=1), rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(kept.rewards[:64], t + 1, rtol=1e-6)
     # A second learn goes on in the midst of an episode.
-    np.testing.assert_allclose(kept.observations[64:66], kept.next_observations[62:64], atol=1e-4)
+    np.testing.assert_allclose(kept.observations[64:66], kept.next_observations[62:64], rtol=1e-5, atol=1e-4)
     used = model._as_tensors(kept)
-    np.testing.assert_allclose(used.observations, env.normalize_obs(kept.observations), atol=1e-6)
-    np.testing.assert_allclose(used.next_observations, env.normalize_obs(kept.next_observations), atol=1e-6)
-    np.testing.assert_allclose(used.rewards, env.normalize_reward(kept.rewards))
+    np.testing.assert_allclose(used.observations, env.normalize_obs(kept.observations), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(used.next_observations, env.normalize_obs(kept.next_observations), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(used.rewards, env.normalize_reward(kept.rewards), rtol=1e-6)
 
 
 def test_dict_observations() -> None:
@@ -318,7 +318,7 @@ def test_the_error_of_the_return_is_zero_with_the_true_model_and_what_it_should_
         agent.dynamics = model
         agent._compare_returns()
         got = [agent.logger.name_to_value[f"simulation/return_error_{h}"] for h in (1, 2, 4)]
-        np.testing.assert_allclose(got, expected, atol=1e-4)
+        np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-4)
 
 
 @pytest.mark.parametrize("length", [1, 2, 3])

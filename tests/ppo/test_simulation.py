@@ -71,9 +71,11 @@ def test_mbma_has_the_analytic_q_with_the_true_model_and_critic(horizon: int, ga
     got = samples.q_values.view(2, 5, 3).mean(dim=0)
     actions = samples.actions[:5].numpy()
     expected = [true_q(STATES.numpy(), actions[:, x], 0.9) for x in range(3)]
-    np.testing.assert_allclose(got, np.stack(expected, axis=1), atol=1e-5)
+    np.testing.assert_allclose(got, np.stack(expected, axis=1), rtol=1e-5, atol=1e-5)
     values = STATES.numpy() @ true_value(0.9)[0] + true_value(0.9)[1]
-    np.testing.assert_allclose(samples.advantages, samples.q_values.numpy() - np.tile(values, 2)[:, None], atol=1e-5)
+    np.testing.assert_allclose(
+        samples.advantages, samples.q_values.numpy() - np.tile(values, 2)[:, None], rtol=1e-5, atol=1e-5
+    )
 
 
 def test_without_a_critic_a_long_horizon_has_the_analytic_q_of_a_quadratic_cost() -> None:
@@ -127,7 +129,7 @@ def test_the_model_gets_clipped_actions_in_its_own_units() -> None:
     assert samples.actions.abs().max() > 10  # the policy's own
     for x in range(3):
         clipped = samples.actions[:, x].clamp(-bound, bound).numpy()
-        np.testing.assert_allclose(samples.q_values[:, x], true_q(STATES.numpy(), clipped, 0.9), atol=1e-5)
+        np.testing.assert_allclose(samples.q_values[:, x], true_q(STATES.numpy(), clipped, 0.9), rtol=1e-5, atol=1e-5)
 
 
 def test_termination_cuts_the_return() -> None:
@@ -157,13 +159,15 @@ def test_mbpo_samples_the_states_of_its_rollouts() -> None:
         for i in reversed(range(k, horizon)):
             next_value = states[i + 1] @ v + v_0
             following = rewards[i] + 0.9 * ((1 - 0.95) * next_value + 0.95 * following)
-        np.testing.assert_allclose(samples.observations[:, k - 1], states[k], atol=1e-5)
-        np.testing.assert_allclose(samples.actions[:, k - 1], actions[k], atol=1e-5)
-        np.testing.assert_allclose(samples.q_values[:, k - 1], following, atol=1e-5)
-        np.testing.assert_allclose(samples.advantages[:, k - 1], following - (states[k] @ v + v_0), atol=1e-5)
+        np.testing.assert_allclose(samples.observations[:, k - 1], states[k], rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(samples.actions[:, k - 1], actions[k], rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(samples.q_values[:, k - 1], following, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(
+            samples.advantages[:, k - 1], following - (states[k] @ v + v_0), rtol=1e-5, atol=1e-5
+        )
         density = torch.distributions.Normal(torch.as_tensor(states[k] @ GAIN.T + OFFSET), std)
         log_prob = density.log_prob(torch.as_tensor(actions[k])).sum(dim=1)
-        np.testing.assert_allclose(samples.log_probs[:, k - 1], log_prob, atol=1e-5)
+        np.testing.assert_allclose(samples.log_probs[:, k - 1], log_prob, rtol=1e-5, atol=1e-5)
     assert samples.weights is None
 
 

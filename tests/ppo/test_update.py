@@ -116,10 +116,12 @@ def test_samples_of_weight_zero_change_nothing(arguments: dict[str, Any]) -> Non
         model.set_random_seed(5)
         quiet(model).learn(64)
     assert ours._n_updates == theirs._n_updates
-    same_parameters(ours, theirs, atol=1e-6)
-    for name, value in theirs.logger.name_to_value.items():
-        if name.startswith("train/"):
-            assert ours.logger.name_to_value[name] == pytest.approx(value, abs=1e-5), name
+    moved = theirs._n_updates * theirs.lr_schedule(1.0)  # at most, in Adam
+    same_parameters(ours, theirs, rtol=1e-6, atol=1e-3 * moved)
+    logged = {name: value for name, value in theirs.logger.name_to_value.items() if name.startswith("train/")}
+    assert logged["train/value_loss"] > 100, "not of order one, as the simulated advantages are not"
+    for name, value in logged.items():
+        assert ours.logger.name_to_value[name] == pytest.approx(value, rel=1e-5, abs=1e-6), name
 
 
 # ---------------------------------------------------------------- the loss
@@ -240,4 +242,4 @@ def test_the_critic_learns_from_the_real_samples_alone() -> None:
         model.train()
         return model.policy.value_net.weight
 
-    torch.testing.assert_close(critic(1), critic(5), rtol=0, atol=1e-7)
+    torch.testing.assert_close(critic(1), critic(5), rtol=1e-5, atol=1e-6)

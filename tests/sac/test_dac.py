@@ -76,9 +76,9 @@ def test_barrier_by_hand(distance: float, loss: float, gradient: float) -> None:
     model = dac()
     optimism = torch.tensor(distance - 1.0, requires_grad=True)
     value = model.explorer._optimism_loss(model, optimism, torch.tensor(0.2))
-    assert value.item() == pytest.approx(loss, abs=1e-6)
+    assert value.item() == pytest.approx(loss, rel=1e-5, abs=1e-6)
     value.backward()
-    assert optimism.grad is not None and optimism.grad.item() == pytest.approx(gradient, abs=1e-6)
+    assert optimism.grad is not None and optimism.grad.item() == pytest.approx(gradient, rel=1e-5, abs=1e-6)
 
 
 def test_weight_of_the_divergence_is_clipped_in_the_actors_loss_alone() -> None:
@@ -155,7 +155,7 @@ def test_evaluation_is_the_pessimistic_actors() -> None:
     observations = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
     with torch.no_grad():
         expected = torch.tanh(model.actor.gaussian(model.actor.features(torch.as_tensor(observations)))[0])
-    np.testing.assert_allclose(model.predict(observations, deterministic=True)[0], expected, atol=1e-6)
+    np.testing.assert_allclose(model.predict(observations, deterministic=True)[0], expected, rtol=1e-5, atol=1e-6)
     assert (np.abs(model.predict(observations, deterministic=False)[0]) < 0.999).any()
     model.learn(15)
     taken = model.replay_buffer.actions[:15].reshape(15, 2)

@@ -84,11 +84,12 @@ def test_losses_of_stable_baselines3(gamma: float, monkeypatch: pytest.MonkeyPat
     assert not drawn
     metrics = ours._update(batch, Noise(critic=of_critic, actor=of_actor))
     assert metrics["train/critic_loss"].item() == pytest.approx(2 * logger.name_to_value["train/critic_loss"], rel=1e-5)
-    assert metrics["train/actor_loss"].item() == pytest.approx(logger.name_to_value["train/actor_loss"], rel=1e-5)
+    assert metrics["train/actor_loss"].item() == pytest.approx(logger.name_to_value["train/actor_loss"], rel=1e-4)
     observations = batch.observations.numpy()
     np.testing.assert_allclose(
         ours.predict(observations, deterministic=True)[0],
         theirs.predict(observations, deterministic=True)[0],
+        rtol=1e-5,
         atol=1e-6,
     )
 
@@ -139,7 +140,7 @@ def test_redq_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not torch.allclose(torch.minimum(q[1], q[3]), q.min(dim=0).values)
     metrics = model._update(batch, noise)
     assert metrics["train/critic_loss"].item() == pytest.approx(critic_loss.item(), rel=1e-5)
-    assert metrics["train/actor_loss"].item() == pytest.approx(actor_loss.item(), rel=1e-5)
+    assert metrics["train/actor_loss"].item() == pytest.approx(actor_loss.item(), rel=1e-4)
 
 
 def test_every_pair_is_drawn() -> None:

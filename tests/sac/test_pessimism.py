@@ -119,7 +119,7 @@ def test_one_is_the_minimum_and_zero_the_mean_in_both_losses(beta: float, n_quan
         actor_loss = (0.3 * log_prob.flatten() - value(model.critic(batch.observations, action)).mean(dim=1)).mean()
     metrics = model._update(batch, noise)
     assert metrics["train/critic_loss"].item() == pytest.approx(critic_loss.item(), rel=1e-5)
-    assert metrics["train/actor_loss"].item() == pytest.approx(actor_loss.item(), rel=1e-5)
+    assert metrics["train/actor_loss"].item() == pytest.approx(actor_loss.item(), rel=1e-4)
 
 
 @pytest.mark.parametrize("beta", [0.0, 0.5, 1.0])

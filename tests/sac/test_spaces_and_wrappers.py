@@ -128,7 +128,7 @@ def test_actions_within_bounds(maker: str, space: spaces.Box, bias: float) -> No
     # The random warm-up uses the whole range.
     assert np.ptp(stored[:10]) > 0.5
     rescaled = 2 * (received - space.low) / (space.high - space.low) - 1
-    np.testing.assert_allclose(stored, rescaled, atol=1e-5)
+    np.testing.assert_allclose(stored, rescaled, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("bias", [40, -40, 0])

@@ -1,0 +1,63 @@
+"""The files that say what is installed agree with each other."""
+
+import configparser
+import importlib.metadata
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PYTHONS = ["3.11", "3.12", "3.13", "3.14"]
+
+
+def setup_cfg() -> configparser.ConfigParser:
+    config = configparser.ConfigParser()
+    config.read(ROOT / "setup.cfg")
+    return config
+
+
+def name_of(requirement: str) -> str:
+    """Normalized name: ``"PyOpenGL>=3.1.4"`` is ``"pyopengl"``."""
+    return re.sub("[-_.]+", "-", re.match(r"[\w.-]+", requirement.strip())[0]).lower()  # type: ignore[index]
+
+
+def pins(python: str) -> dict[str, str]:
+    lines = (ROOT / "constraints" / f"{python}.txt").read_text().splitlines()
+    return dict(line.split("==") for line in lines if line and not line.startswith("#"))
+
+
+def test_each_python_has_its_lock_file() -> None:
+    assert sorted(path.stem for path in (ROOT / "constraints").glob("3.*.txt")) == PYTHONS
+    assert f"PYTHONS := {' '.join(PYTHONS)}\n" in (ROOT / "Makefile").read_text()
+    classifiers = setup_cfg()["metadata"]["classifiers"]
+    assert re.findall(r"Python :: (3\.\d+)", classifiers) == PYTHONS
+    assert setup_cfg()["options"]["python_requires"] == f">={PYTHONS[0]}"
+
+
+@pytest.mark.parametrize("python", PYTHONS)
+def test_the_lock_has_everything_that_setup_asks_for(python: str) -> None:
+    config = setup_cfg()
+    asked = config["options"]["install_requires"].splitlines()
+    for extra in config["options.extras_require"].values():
+        asked += extra.splitlines()
+    names = {name_of(line) for line in asked if line.strip() and not line.startswith("#")} - {"sb3-sample"}
+    assert names - pins(python).keys() == set()
+    assert ("labmaze" in pins(python)) == (python in ("3.11", "3.12"))
+
+
+@pytest.mark.parametrize("python", PYTHONS[1:])
+def test_the_pythons_have_the_same_versions_of_what_runs(python: str) -> None:
+    first, other = pins(PYTHONS[0]), pins(python)
+    different = {name for name in first.keys() & other.keys() if first[name] != other[name]}
+    # MyoSuite asks for an old one before Python 3.14, and 3.14 needs a newer one.
+    assert different == ({"onnxruntime"} if python == "3.14" else set())
+
+
+def test_without_labmaze_the_extra_is_all_that_dm_control_asks_for() -> None:
+    pytest.importorskip("dm_control")
+    requires = importlib.metadata.requires("dm-control") or []
+    asked = {name_of(line) for line in requires if "extra ==" not in line} - {"labmaze"}
+    later = [line for line in setup_cfg()["options.extras_require"]["dmc"].splitlines() if '>= "3.13"' in line]
+    installed = setup_cfg()["options"]["install_requires"].splitlines()
+    assert {name_of(line) for line in later} == asked - {name_of(line) for line in installed if line}
