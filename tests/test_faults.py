@@ -15,7 +15,7 @@ from sb3_sample import SAC, TrainingDiverged
 from sb3_sample.faults import HoldBack, MetricWatch, check_finite_parameters
 from sb3_sample.sac import algorithm
 from tests.ppo.common import ALGORITHMS, TINY, tiny
-from tests.sac.common import MAKERS, Toy, random_batch, sac, vec
+from tests.sac.common import COMPILES, MAKERS, Toy, random_batch, sac, vec
 from tests.sac.test_execution import captured
 
 NAN, INF = float("nan"), float("inf")
@@ -87,7 +87,7 @@ def test_the_first_of_several_gradient_steps_is_named(monkeypatch: pytest.Monkey
     assert model._n_updates == 20
 
 
-@pytest.mark.parametrize("compile", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("compile", [False, pytest.param(True, marks=[COMPILES, pytest.mark.slow])])
 def test_it_changes_nothing(compile: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     from tests.sac.common import differing, state
 
@@ -127,6 +127,7 @@ def test_captured_steps_are_watched() -> None:
     assert len(seen) == 8 and recorder.n_repetitions > 5
 
 
+@COMPILES
 @pytest.mark.slow
 def test_compiled_steps_are_watched() -> None:
     with pytest.raises(TrainingDiverged, match=r"train/critic_loss is nan.* at gradient step 20 "):

@@ -21,7 +21,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from sb3_sample.arguments import check_known, naming_changes
+from sb3_sample.arguments import check_known, default_of, naming_changes
 from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.envs.workers import watch_workers
 from sb3_sample.export import Exportable
@@ -39,7 +39,14 @@ from sb3_sample.sac.buffers import (
     store_float_actions,
 )
 from sb3_sample.sac.compact_buffer import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
-from sb3_sample.sac.execution import PAYS_FROM, Execution, has_foreign_parts, why_not_compiled
+from sb3_sample.sac.execution import (
+    PAYS_FROM,
+    Execution,
+    has_foreign_parts,
+    old_torch,
+    warn_not_compiled,
+    why_not_compiled,
+)
 from sb3_sample.sac.exploration import EXPLORATIONS, Exploration
 from sb3_sample.sac.parts import ParametersDoNotFit, Part
 from sb3_sample.sac.pessimism import PESSIMISMS, Pessimism, pessimistic_value
@@ -142,8 +149,6 @@ class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyA
     critic_target: CriticEnsemble
     #: beta1 of the temperature's Adam.
     temperature_beta1: ClassVar[float] = 0.9
-    #: What ``resets=None`` is without ``reset_gradient_steps``.
-    own_resets: ClassVar[Sequence[int] | int] = ()
 
     def __init__(
         self,
@@ -176,7 +181,7 @@ class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyA
         exploration_kwargs: dict[str, Any] | None = None,
         backbone: str = "sac",
         policy_delay: int = 1,
-        resets: Sequence[int] | int | None = (),
+        resets: Sequence[int] | int = (),
         reset_gradient_steps: int | None = None,
         reset_shrink: float = 0.0,
         redo_period: int | None = None,
@@ -237,7 +242,10 @@ class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyA
         self.exploration_kwargs = exploration_kwargs
         self.backbone = backbone
         self.policy_delay = policy_delay
-        self.resets = self._resets_of(resets, reset_gradient_steps)
+        if reset_gradient_steps is not None and resets is default_of(type(self), "resets"):
+            # Those that a class has of its own give way. By identity: equal ones that are passed are another object.
+            resets = ()
+        self.resets = resets
         self.reset_gradient_steps = reset_gradient_steps
         self.reset_shrink = reset_shrink
         self.redo_period = redo_period
@@ -297,13 +305,6 @@ class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyA
         self._batch_memory = BatchMemory()
         self._watch = MetricWatch(self.device)
         self._set_training_mode(False)
-
-    @classmethod
-    def _resets_of(cls, resets: Any, reset_gradient_steps: Any) -> Any:
-        """The argument ``resets``, with None as the class's own, which give way to resets by gradient steps."""
-        if resets is not None:
-            return resets
-        return cls.own_resets if reset_gradient_steps is None else ()
 
     def _take_target_entropy(self) -> None:
         """Take up what ``target_entropy`` says, which is a number afterwards."""
@@ -439,8 +440,6 @@ class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyA
             kwargs.setdefault("resets", ())
         elif "resets" in kwargs:
             kwargs["reset_gradient_steps"] = None
-        if "resets" in kwargs:
-            kwargs["resets"] = cls._resets_of(kwargs["resets"], kwargs.get("reset_gradient_steps"))
         with naming_changes(kwargs):
             return super().load(
                 path,
@@ -734,9 +733,13 @@ class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyA
             if self.train_freq.unit is TrainFrequencyUnit.EPISODE:
                 n_calls = 0  # How long episodes are is not known.
             n_updates = n_steps if self.gradient_steps < 0 else self.gradient_steps * n_calls
-        # What keeps the step from being compiled is worth a warning only where it was asked for.
+        # What keeps the step from being compiled is worth a warning only where it was asked for, but for an old torch,
+        # which is easily renewed.
         pays = n_updates >= PAYS_FROM and not has_foreign_parts(self)
-        self.compiled = pays and why_not_compiled(self) is None
+        reason = why_not_compiled(self) if pays else None
+        self.compiled = pays and reason is None
+        if reason is not None and reason == old_torch():
+            warn_not_compiled(self, reason)
         self._execution = None
 
     def _updates_due(self, n_collected: int) -> int:

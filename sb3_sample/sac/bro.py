@@ -89,9 +89,9 @@ class BRO(SAC):
         :class:`SAC`'s
     :param exploration_kwargs: further arguments of the exploration
     :param resets: environment steps at which all parameters start anew, counted in transitions over the model's life;
-        or one integer for every so many. None: those of the published curves (``BRO_RESETS``: 15k, 50k, 250k, 500k,
-        750k, 1M, 1.5M, 2M), or none with ``reset_gradient_steps``
-    :param reset_gradient_steps: resets after every so many gradient steps of the model's life instead; None for none
+        or one integer for every so many
+    :param reset_gradient_steps: resets after every so many gradient steps of the model's life instead, in the place of
+        the default of ``resets``; None for none
     :param use_sde: not supported, refused if True
     :param stats_window_size: episodes over which the logged return is averaged
     :param tensorboard_log: folder of the TensorBoard log; none if None
@@ -105,7 +105,6 @@ class BRO(SAC):
     """
 
     temperature_beta1: ClassVar[float] = 0.5
-    own_resets: ClassVar[Sequence[int]] = BRO_RESETS
 
     def __init__(
         self,
@@ -139,7 +138,7 @@ class BRO(SAC):
         weight_decay: float = 1e-4,
         exploration: str = "optimistic_shift",
         exploration_kwargs: dict[str, Any] | None = None,
-        resets: Sequence[int] | int | None = None,
+        resets: Sequence[int] | int = BRO_RESETS,
         reset_gradient_steps: int | None = None,
         use_sde: bool = False,
         stats_window_size: int = 100,
@@ -244,11 +243,9 @@ class BROFast(BRO):
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
     :param learning_rate: a number or a function of the remaining progress (from 1 to 0)
     :param replay_ratio: gradient steps per environment transition
-    :param resets: as in ``BRO``. None: one at 15,000 environment steps, or none with ``reset_gradient_steps``
+    :param resets: environment steps at which all parameters start anew
     :param kwargs: every other argument of ``BRO``, by name
     """
-
-    own_resets: ClassVar[Sequence[int]] = BRO_FAST_RESETS
 
     def __init__(
         self,
@@ -257,7 +254,7 @@ class BROFast(BRO):
         learning_rate: float | Schedule = 3e-4,
         *,
         replay_ratio: float = 2,
-        resets: Sequence[int] | int | None = None,
+        resets: Sequence[int] | int = BRO_FAST_RESETS,
         **kwargs: Any,
     ):
         super().__init__(policy, env, learning_rate, replay_ratio=replay_ratio, resets=resets, **kwargs)

@@ -7,6 +7,7 @@ noise as tensors, chooses nothing by the value of a tensor, and counts nothing o
 
 import functools
 import inspect
+import re
 import time
 import types
 import warnings
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 #: With ``compile="auto"``, gradient steps in one ``learn`` from which on compiling pays: it takes the time of some
 #: thousand steps (docs/performance.md). A number of steps, not a measurement, so that a seed fixes the whole run.
 PAYS_FROM = 20_000
+#: The first torch that a gradient step is compiled with.
+COMPILES_FROM = (2, 13)
 
 Metrics = dict[str, torch.Tensor]
 #: Runs a function without its effects taking place, and gives back what repeats them, and its result, whose tensors
@@ -42,6 +45,35 @@ def _compilation_errors() -> tuple[type[Exception], ...]:
     return Unsupported, TorchDynamoException, InductorError, FailOnRecompileLimitHit
 
 
+def old_torch() -> str | None:
+    """
+    :return: that this torch is too old to compile a whole gradient step, in words; None if it is not
+    """
+    if tuple(int(number) for number in re.findall(r"\d+", str(torch.__version__))[:2]) >= COMPILES_FROM:
+        return None
+    needed = ".".join(map(str, COMPILES_FROM))
+    return f"that needs torch {needed} or newer, and this is {torch.__version__}. It is run eagerly, on a GPU captured"
+
+
+#: Ways to ask for compiling (values of ``compile``) that have been answered with a torch that is too old.
+_told: set[bool | str] = set()
+
+
+def warn_not_compiled(agent: "SAC", reason: str) -> None:
+    """
+    Warn that the gradient step is not compiled; of a torch that is too old once a process and way of asking, since that
+    holds for every model.
+
+    :param agent: the algorithm
+    :param reason: what keeps it from being compiled
+    """
+    if reason == old_torch():
+        if agent.compile in _told:
+            return
+        _told.add(agent.compile)
+    warnings.warn(f"The gradient step is not compiled: {reason}", stacklevel=3)
+
+
 def why_not_compiled(agent: "SAC") -> str | None:
     """
     :param agent: the algorithm
@@ -52,11 +84,9 @@ def why_not_compiled(agent: "SAC") -> str | None:
         return f"it knows the steps of sb3_sample.optim.AdamW only, not of {foreign}"
     if agent.device.type not in ("cpu", "cuda"):
         return f"it is not supported on the device {str(agent.device)!r}"
-    # Present from the first version on that compiles a whole step, gradients included.
-    import torch._dynamo
-
-    if not hasattr(torch._dynamo.config, "trace_autograd_ops") or not hasattr(torch.compiler, "skip_all_guards_unsafe"):
-        return f"torch {torch.__version__} is too old for it"
+    old = old_torch()
+    if old is not None:
+        return old
     if agent.device.type == "cpu":
         from torch._inductor.cpp_builder import get_cpp_compiler
         from torch._inductor.exc import InvalidCxxCompiler
@@ -131,7 +161,7 @@ class Execution:
         if agent.compiled:
             reason = why_not_compiled(agent)
             if reason is not None:
-                warnings.warn(f"The gradient step is not compiled: {reason}", stacklevel=2)
+                warn_not_compiled(agent, reason)
                 agent.compiled = False
         # Parts of one's own may look at values on the host: captured only when asked for.
         asked = agent.compile is True or (agent.compile == "auto" and not has_foreign_parts(agent))

@@ -10,6 +10,9 @@ from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
 
+#: SR-SAC's environment steps between two resets. An object of its own, which no 160_000 in a program is.
+SR_SAC_RESETS = int("160_000")
+
 
 class _RuleSAC(SAC):
     """SAC with one rule that moves pessimism, by the name that ``pessimism`` would take."""
@@ -210,13 +213,11 @@ class SRSAC(SAC):
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
     :param learning_rate: of actor, critics and temperature
     :param replay_ratio: gradient steps per environment transition
-    :param resets: environment steps between two resets, or the steps of all of them. None: 160,000, or none with
+    :param resets: environment steps between two resets, or the steps of all of them; the default gives way to
         ``reset_gradient_steps``
     :param kwargs: every other argument of :class:`SAC`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
-
-    own_resets: ClassVar[int] = 160_000
 
     def __init__(
         self,
@@ -225,7 +226,7 @@ class SRSAC(SAC):
         learning_rate: float | Schedule = 3e-4,
         *,
         replay_ratio: float = 16,
-        resets: Sequence[int] | int | None = None,
+        resets: Sequence[int] | int = SR_SAC_RESETS,
         **kwargs: Any,
     ):
         super().__init__(policy, env, learning_rate, replay_ratio=replay_ratio, resets=resets, **kwargs)

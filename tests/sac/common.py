@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
@@ -25,7 +26,10 @@ from sb3_sample.sac import (
     BROFast,
     RegularizedSAC,
 )
+from sb3_sample.sac.execution import old_torch
 
+#: Of tests whose gradient step is compiled.
+COMPILES = pytest.mark.skipif(old_torch() is not None, reason="compiling needs a newer torch")
 #: Arguments that make a model small and quick.
 TINY_BRO: dict[str, Any] = dict(
     model_size=(1, 8),

@@ -1,6 +1,7 @@
 """The three ways to run the gradient step give the same numbers: eager, compiled, captured."""
 
 import copy
+import io
 import json
 import warnings
 import zipfile
@@ -22,9 +23,9 @@ from sb3_sample import BRO, DiagnosticsCallback
 from sb3_sample.sac import SAC, algorithm, execution
 from sb3_sample.sac.batch import draw_batches
 from sb3_sample.sac.buffers import PLAIN_BUFFERS, BatchMemory, DeviceReplayBuffer
-from sb3_sample.sac.execution import Execution, why_not_compiled
+from sb3_sample.sac.execution import Execution, old_torch, why_not_compiled
 from sb3_sample.sac.pessimism import PESSIMISMS, Pessimism
-from tests.sac.common import MAKERS, Toy, bro, differing, sac, state, vec
+from tests.sac.common import COMPILES, MAKERS, Toy, bro, differing, sac, state, vec
 
 #: Largest difference of a parameter after 50 updates, each of which moves it by up to 3e-4. The same arithmetic in
 #: another order differs by rounding; Adam makes much of it where a gradient is nearly zero.
@@ -129,6 +130,7 @@ def updates(model: SAC, n: int, seed: int = 0, each: Callable[[int], None] = lam
 FAST = ["BRO", "VPLSAC"]
 
 
+@COMPILES
 @pytest.mark.parametrize(
     "maker", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in MAKERS]
 )
@@ -243,7 +245,7 @@ def test_a_captured_step_gives_its_own_metrics_and_no_old_gradients() -> None:
     assert model.gradients_are_stale
 
 
-@pytest.mark.parametrize("how", ["compiled", "captured"])
+@pytest.mark.parametrize("how", [pytest.param("compiled", marks=COMPILES), "captured"])
 @pytest.mark.parametrize(
     "change",
     [
@@ -267,6 +269,7 @@ def test_changes_on_the_way_are_noticed(how: str, change: Callable[[SAC], None])
     assert largest_difference(model, other) < TOLERANCE
 
 
+@COMPILES
 def test_moments_are_found_in_any_order_of_the_file() -> None:
     model, compiled = pair("SAC", compile=True, learning_rate=1e-3)
     for m in (model, compiled):
@@ -287,6 +290,7 @@ def test_diagnostics_do_not_have_steps_captured_anew() -> None:
     assert recorder.n_recordings == 1
 
 
+@COMPILES
 def test_a_gradient_step_of_ones_own() -> None:
     class Own(SAC):
         def _gradient_step(self, *args: Any) -> dict[str, torch.Tensor]:
@@ -307,6 +311,7 @@ def test_a_copied_model_trains_on_and_a_file_holds_no_transitions(tmp_path: Path
     assert sizes["data.json"] + sizes["tensors.safetensors"] < 30_000
 
 
+@COMPILES
 def test_learning_rates_of_a_schedule_compile_once() -> None:
     model, compiled = pair("SAC", compile=True)
     calls = torch._dynamo.utils.counters["stats"]["unique_graphs"]
@@ -317,6 +322,7 @@ def test_learning_rates_of_a_schedule_compile_once() -> None:
     assert largest_difference(model, compiled) < 1e-3
 
 
+@COMPILES
 def test_settings_changed_on_the_way_count_in_a_compiled_step() -> None:
     model, compiled = pair("SAC", compile=True, learning_rate=1e-3)
     for m in (model, compiled):
@@ -326,6 +332,7 @@ def test_settings_changed_on_the_way_count_in_a_compiled_step() -> None:
     assert largest_difference(model, compiled) < TOLERANCE
 
 
+@COMPILES
 def test_compiled_models_do_not_share() -> None:
     """Two models of one class and one shape, which differ in a number that the compiled code holds."""
     eager = [sac(tau=tau, learning_starts=60, compile=False).learn(60) for tau in (0.1, 0.9)]
@@ -340,6 +347,7 @@ def test_compiled_models_do_not_share() -> None:
 # ---------------------------------------------------------------- when
 
 
+@COMPILES
 def test_auto_compiles_where_it_pays_and_the_file_remembers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(algorithm, "PAYS_FROM", 50)
     model = sac(learning_starts=20, replay_ratio=1)
@@ -354,6 +362,7 @@ def test_auto_compiles_where_it_pays_and_the_file_remembers(tmp_path: Path, monk
     assert undecided.compiled is None and undecided.learn(10).compiled is False
 
 
+@COMPILES
 @pytest.mark.parametrize(
     ("kwargs", "n_updates"),
     [
@@ -383,6 +392,7 @@ def test_episodes_of_unknown_length_stay_uncompiled(monkeypatch: pytest.MonkeyPa
     assert model.compiled is False
 
 
+@COMPILES
 @pytest.mark.parametrize("compile", [True, "auto"])
 def test_without_a_compiler_training_goes_on_uncompiled(compile: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(algorithm, "PAYS_FROM", 5)
@@ -397,6 +407,43 @@ def test_without_a_compiler_training_goes_on_uncompiled(compile: Any, monkeypatc
     assert model.compiled is False and model._n_updates == 20
 
 
+@pytest.mark.parametrize("compile", [True, "auto"])
+@pytest.mark.parametrize("version", ["2.11.0+cu130", "2.4.1", "1.13.1"])
+def test_an_old_torch_is_told_of_once(compile: Any, version: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over several models, calls of ``learn`` and a file that says to go on compiled; and the numbers are eager's."""
+    monkeypatch.setattr(algorithm, "PAYS_FROM", 5)
+    eager = sac(compile=False).learn(30)
+    monkeypatch.setattr(torch, "__version__", version)
+    monkeypatch.setattr(execution, "_told", set())
+    file = io.BytesIO()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert sac(compile="auto").learn(12).compiled is False  # too short to pay
+        assert not caught
+        models = [sac(compile=compile).learn(30) for _ in range(3)]
+        models[1].learn(30)
+        elsewhere = sac(compile=compile)
+        elsewhere.compiled = True
+        elsewhere.save(file)
+        file.seek(0)
+        models.append(SAC.load(file, env=vec()))
+        models[3].learn(30)
+    said = [str(w.message) for w in caught if "not compiled" in str(w.message)]
+    assert said == [
+        f"The gradient step is not compiled: that needs torch 2.13 or newer, and this is {version}. It is run eagerly, "
+        "on a GPU captured"
+    ]
+    assert not any(model.compiled or model._execution.compiled for model in models)
+    assert not differing(state(models[0]), state(eager))
+
+
+@pytest.mark.parametrize(("version", "old"), [("2.13.0", False), ("2.13.0a0+git1234", False), ("2.14.1+cpu", False),
+                                              ("3.0.0", False), ("2.12.1", True), ("2.4", True)])  # fmt: skip
+def test_which_torch_is_old(version: str, old: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "__version__", version)
+    assert (old_torch() is not None) is old
+
+
 class Peeking(BaseFeaturesExtractor):
     """Looks at a value on the host, which cannot be compiled."""
 
@@ -409,6 +456,7 @@ class Peeking(BaseFeaturesExtractor):
         return y if y.sum().item() > 1e9 else y + 1
 
 
+@COMPILES
 def test_what_cannot_be_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(algorithm, "PAYS_FROM", 5)
     kwargs = {"policy_kwargs": {"net_arch": [8], "features_extractor_class": Peeking}}
@@ -422,6 +470,7 @@ def test_what_cannot_be_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
         sac(compile=True, **kwargs).learn(30)
 
 
+@COMPILES
 def test_parts_of_ones_own_are_compiled_when_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     class Own(Pessimism):
         def __init__(self, agent: SAC):
@@ -453,6 +502,7 @@ def test_foreign_optimizers_stay_uncompiled(monkeypatch: pytest.MonkeyPatch) -> 
         assert sac(compile=True, **kwargs).learn(30).compiled is False
 
 
+@COMPILES
 def test_says_how_long_it_takes(capsys: pytest.CaptureFixture[str]) -> None:
     model = sac(compile=True, verbose=1)
     model.learn(30)
@@ -461,6 +511,7 @@ def test_says_how_long_it_takes(capsys: pytest.CaptureFixture[str]) -> None:
     assert out.count("Compiled in") == 1
 
 
+@COMPILES
 @pytest.mark.parametrize("replay_ratio", [0.5, 1, 3])
 def test_diagnostics_find_gradients_of_a_compiled_model(replay_ratio: float) -> None:
     model = sac(compile=True, learning_starts=10, replay_ratio=replay_ratio)

@@ -22,6 +22,7 @@ from sb3_sample.networks import MLP, BroNet
 from sb3_sample.networks.ensemble import EnsembleLayerNorm, EnsembleLinear
 from sb3_sample.sac import SAC
 from sb3_sample.sac.batch import Batch, Noise
+from tests.sac.common import COMPILES
 from tests.sac.test_execution import captured
 
 OWN_FOLDER = Path(__file__).parents[1] / "golden"
@@ -284,7 +285,11 @@ COMPILED_IN_SHORT = {"bro_quantile_public", "dac_edge"}
             path,
             execution,
             id=f"{path.stem}-{execution}",
-            marks=[pytest.mark.slow] if execution == "compiled" and path.stem not in COMPILED_IN_SHORT else [],
+            marks=[]
+            if execution != "compiled"
+            else [COMPILES]
+            if path.stem in COMPILED_IN_SHORT
+            else [COMPILES, pytest.mark.slow],
         )
         for path in FILES
         for execution in EXECUTIONS

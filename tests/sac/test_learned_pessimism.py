@@ -15,7 +15,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from sb3_sample.sac import BRO, GPLSAC, OPLSAC, SAC, TOPSAC, VPLSAC, buffers
 from sb3_sample.sac.batch import Batch, CriticStep, Noise
 from sb3_sample.sac.pessimism import TOP, LearnedPessimism, pessimistic_value
-from tests.sac.common import TINY_BRO, TINY_SAC, differing, random_batch, sac, state, vec
+from tests.sac.common import COMPILES, TINY_BRO, TINY_SAC, differing, random_batch, sac, state, vec
 from tests.sac.test_execution import captured
 from tests.sac.test_update import NoSynchronisation
 from tests.sac.test_validation_split import Written, tagged
@@ -328,7 +328,7 @@ def test_waits_for_a_batch_and_takes_exactly_one(
     assert judged == [n] * 6
 
 
-@pytest.mark.parametrize("how", ["eager", "captured", pytest.param("compiled", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("how", ["eager", "captured", pytest.param("compiled", marks=[COMPILES, pytest.mark.slow])])
 @pytest.mark.parametrize("name", ["vpl", "vpl dual", "vpl recent", "opl"])
 def test_the_steps_own_subset_makes_the_lower_bound(name: str, how: str) -> None:
     """

@@ -11,6 +11,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from sb3_sample import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SRSAC, TOPSAC, VPLSAC, RegularizedSAC
 from sb3_sample.sac import SAC
+from tests.sac.common import COMPILES
 
 #: Mean return over ten episodes: a random policy has about -1200, a good one about -150.
 GOOD = -300
@@ -55,6 +56,7 @@ def test_bro_learns_pendulum() -> None:
     assert score(small_bro(0).learn(2_500)) > GOOD
 
 
+@COMPILES
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [small_sac, small_bro])
 def test_compiled_step_learns_pendulum(make: Callable[..., SAC]) -> None:
