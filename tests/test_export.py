@@ -57,7 +57,7 @@ def check(model: Any, tmp_path: Path, vec_normalize: VecNormalize | None = None,
     session, script = onnxruntime.InferenceSession(onnx_path), torch.jit.load(script_path)
     space, seen = model.action_space, []
     # Actions in [-1, 1], and up to half the range where that is larger than 1, as float32 rounds.
-    scale = np.maximum((space.high - space.low) / 2, 1) if isinstance(space, spaces.Box) else 1
+    scale = np.maximum((space.high.astype(float) - space.low) / 2, 1) if isinstance(space, spaces.Box) else 1
     for n in (1, 2, 3, 17):
         raw = observations(model.observation_space, n, seed=n)
         expected, _ = model.predict(
@@ -121,6 +121,16 @@ def test_action_spaces(action_space: spaces.Space, tmp_path: Path) -> None:
     proto = check(shake(ppo(vec(action_space=action_space))), tmp_path)
     (output,) = json.loads(next(entry.value for entry in proto.metadata_props if entry.key == "outputs"))
     assert output["shape"] == ["batch", *action_space.shape]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [sac, ppo])
+@pytest.mark.parametrize("dtype", [np.int64, np.int8])
+def test_actions_of_integers(dtype: Any, make: Any, tmp_path: Path) -> None:
+    """The numbers are floats, as those of ``predict`` are."""
+    proto = check(shake(make(vec(action_space=spaces.Box(-100, 100, (2,), dtype)))), tmp_path)
+    (output,) = json.loads(next(entry.value for entry in proto.metadata_props if entry.key == "outputs"))
+    assert output["dtype"] == ("float64" if dtype is np.int64 else "float32")
 
 
 @pytest.mark.slow

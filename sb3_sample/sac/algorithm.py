@@ -818,7 +818,7 @@ class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyA
             LoggedValues.record_later(self.logger, self._metrics)
         else:
             for name, value in self._metrics.items():
-                self.logger.record(name, value.item())
+                self.logger.record(name, float(value))
         self._record_counts()
 
     def _record_counts(self) -> None:
@@ -1000,6 +1000,6 @@ class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyA
         recorded = self.logger.name_to_excluded
         for name, value in self._metrics.items():
             if name not in recorded:
-                self.logger.record(name, value.item())
+                self.logger.record(name, float(value))
         self._record_counts()
         super().dump_logs()

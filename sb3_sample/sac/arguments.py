@@ -75,7 +75,8 @@ def check(agent: "SAC") -> None:
     for name in ("n_quantiles", "backbone"):
         if name in agent.policy_kwargs:
             raise ValueError(f"{name} is an argument of the algorithm, not of policy_kwargs")
-    _check_backbone(agent)
+    if agent.backbone == "td3":
+        _check_no_entropy(agent, "ent_coef")
     _check_pessimism(agent)
     _check_replay(agent)
     _check_n_steps(agent)
@@ -95,8 +96,10 @@ def has_resets(resets: Any) -> bool:
 def check_target_entropy(agent: "SAC") -> None:
     """
     :param agent: an algorithm
-    :raises ValueError: if its ``target_entropy`` is no number that is finite, nor "auto"
+    :raises ValueError: if its ``target_entropy`` is neither finite nor "auto", or a number where there is no entropy
     """
+    if agent.backbone == "td3":
+        _check_no_entropy(agent, "target_entropy")
     value = agent.target_entropy
     if value != "auto" and not math.isfinite(number("target_entropy", value, "'auto'")):
         raise ValueError(f"target_entropy must be finite, or 'auto', not {value}")
@@ -114,14 +117,12 @@ def check_use_sde(use_sde: bool) -> None:
         )
 
 
-def _check_backbone(agent: "SAC") -> None:
-    if agent.backbone == "td3":
-        for name in ("ent_coef", "target_entropy"):
-            if getattr(agent, name) != "auto":
-                raise ValueError(
-                    f"{name}={getattr(agent, name)!r} asks for an entropy, which a deterministic actor "
-                    f"(backbone='td3') has not: leave {name} out"
-                )
+def _check_no_entropy(agent: "SAC", name: str) -> None:
+    if getattr(agent, name) != "auto":
+        raise ValueError(
+            f"{name}={getattr(agent, name)!r} asks for an entropy, which a deterministic actor (backbone='td3') has "
+            f"not: leave {name} out"
+        )
 
 
 def _check_pessimism(agent: "SAC") -> None:
