@@ -106,7 +106,8 @@ def test_two_steps_of_adam(loss: str) -> None:
         betas.append(learned.beta().item())
     g1, g2 = gradients
     m, v = (0.09 * g1 + 0.1 * g2) / (1 - 0.81), (0.000999 * g1**2 + 0.001 * g2**2) / (1 - 0.999**2)
-    assert betas[1] - betas[0] == pytest.approx(-0.01 * m / v**0.5, rel=1e-4)
+    # A difference of two float32 numbers near 1.
+    assert betas[1] - betas[0] == pytest.approx(-0.01 * m / v**0.5, rel=1e-3)
     if loss == "dual":
         # At beta = 1.01 the errors are (1.76, -0.995).
         assert g1 == pytest.approx(-0.625) and g2 == pytest.approx((1.76 - 0.995) / 2, rel=1e-5)
