@@ -67,6 +67,6 @@ class MBPOPPO(ModelBasedPPO):
             columns = (rolled.observations, rolled.actions, rolled.log_probs, q_values, advantages, reached)
             pieces.append([column.transpose(0, 1) for column in columns])
         joined = [torch.cat(column) for column in zip(*pieces, strict=True)]
-        self._check_finite(joined[3])
+        self._check_finite("returns", joined[3])
         samples = SimulatedSamples(*joined)
         return samples if ends else samples._replace(weights=None)
