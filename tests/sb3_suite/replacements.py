@@ -13,7 +13,7 @@ SAC = sb3_sample.SAC
 
 
 class BRO(sb3_sample.BRO):
-    """BRO with the smallest of networks where a test asks for small ones: ``net_arch`` describes an MLP, not a BroNet."""
+    """BRO, with small networks where a test asks for some by ``net_arch``, which describes an MLP and no BroNet."""
 
     def __init__(self, *args: Any, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any):
         policy_kwargs = dict(policy_kwargs or {})

@@ -125,11 +125,11 @@ def replace_class(text: str, suite: Suite) -> str | None:
     :return: the module with our class under the name of theirs; None if it does not import theirs
     """
     for node in ast.parse(text).body:
-        if isinstance(node, ast.ImportFrom) and node.module == suite.distribution:
-            if any(alias.name == suite.replaced for alias in node.names):
-                lines = text.splitlines(keepends=True)
-                ours = f"from {__package__}.replacements import {suite.replacement} as {suite.replaced}\n"
-                return "".join([*lines[: node.end_lineno], ours, *lines[node.end_lineno :]])
+        imports = node.names if isinstance(node, ast.ImportFrom) and node.module == suite.distribution else []
+        if suite.replaced in [alias.name for alias in imports]:
+            lines = text.splitlines(keepends=True)
+            ours = f"from {__package__}.replacements import {suite.replacement} as {suite.replaced}\n"
+            return "".join([*lines[: node.end_lineno], ours, *lines[node.end_lineno :]])
     return None
 
 
