@@ -48,5 +48,5 @@ class MBMAPPO(ModelBasedPPO):
             starts = observations[torch.div(piece, n_columns, rounding_mode="floor")]
             returns.append(self.roll_out(starts, flat_actions[piece], piece_noise).q_values[0])
         q_values = torch.cat(returns).view(-1, n_columns)
-        self._check_finite(q_values)
+        self._check_finite("returns", q_values)
         return SimulatedSamples(None, actions, log_probs, q_values, q_values - values[:, None], weights)

@@ -71,6 +71,6 @@ class MBPOPPO(ModelBasedPPO):
         joined = [torch.cat(column).unflatten(0, (n_rollouts, -1)) for column in zip(*pieces, strict=True)]
         # By state, then by step, then by rollout: what is too much are last steps.
         joined = [column.movedim(0, 2).flatten(1, 2)[:, :n_simulated] for column in joined]
-        self._check_finite(joined[3])
+        self._check_finite("returns", joined[3])
         samples = SimulatedSamples(*joined)
         return samples if ends else samples._replace(weights=None)

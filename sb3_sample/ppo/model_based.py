@@ -297,7 +297,12 @@ class ModelBasedPPO(SimulatedPPO):
             if prediction.continues is not None:
                 continues.append(prediction.continues)
             if k + 1 < self.simulation_horizon:
-                distribution = self.distribution_at(observations)
+                try:
+                    distribution = self.distribution_at(observations)
+                except ValueError:
+                    # torch's distributions refuse NaN, and do not say where it comes from.
+                    self._check_finite("states", observations)
+                    raise
                 actions = draw(distribution, None if noise is None else noise[k])
                 if k < n_kept:
                     kept.append((observations, actions, distribution.log_prob(actions)))
@@ -313,10 +318,10 @@ class ModelBasedPPO(SimulatedPPO):
         return max(1, floats // self._model_kwargs["width"])
 
     @staticmethod
-    def _check_finite(q_values: torch.Tensor) -> None:
-        if not torch.isfinite(q_values).all():
+    def _check_finite(name: str, simulated: torch.Tensor) -> None:
+        if not torch.isfinite(simulated).all():
             raise ValueError(
-                "simulated returns are not finite: the model has diverged. Allowed are finite numbers; try a smaller "
+                f"simulated {name} are not finite: the model has diverged. Allowed are finite numbers; try a smaller "
                 "dynamics_kwargs['learning_rate'] or simulation_horizon"
             )
 

@@ -271,12 +271,13 @@ def test_a_simulation_of_the_present_rollout() -> None:
     torch.testing.assert_close(samples.advantages, samples.q_values - rollout.values[:, None])
 
 
-def test_a_diverged_model_is_an_error() -> None:
+@pytest.mark.parametrize(("network", "what"), [("reward", "returns"), ("transition", "states")])
+def test_a_diverged_model_is_an_error(network: str, what: str) -> None:
     for cls in (MBMAPPO, MBPOPPO):
         agent = tiny(cls)
         with torch.no_grad():
-            agent.dynamics.reward[-1].bias.fill_(torch.inf)
-        with pytest.raises(ValueError, match="simulated returns are not finite: the model has diverged"):
+            getattr(agent.dynamics, network)[-1].bias.fill_(torch.inf)
+        with pytest.raises(ValueError, match=f"simulated {what} are not finite: the model has diverged"):
             agent.simulate(torch.randn(6, 3))
 
 

@@ -21,6 +21,7 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
@@ -93,6 +94,47 @@ def test_images(maker: str) -> None:
     assert model.replay_buffer.observations.dtype == np.uint8
     for name, value in model.policy.state_dict().items():
         assert not torch.equal(value, before[name]), f"{name} does not learn"
+
+
+class BatchNormExtractor(FlattenExtractor):
+    """A features extractor with running statistics."""
+
+    def __init__(self, observation_space: spaces.Space):
+        super().__init__(observation_space)
+        self.norm = torch.nn.BatchNorm1d(self.features_dim)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        return self.norm(super().forward(observations))
+
+
+@pytest.mark.parametrize("maker", ["SAC", "BRO"])
+def test_running_statistics_of_an_extractor(maker: str) -> None:
+    """Only gradient steps change them, and the targets get the critics' own, however small tau is."""
+    kwargs: dict[str, Any] = {"features_extractor_class": BatchNormExtractor}
+    if maker == "SAC":
+        kwargs["net_arch"] = [8]
+    # The actor's step comes after the targets', and passes through the critics again: the last step shall have none.
+    every = dict(policy_delay=2, target_update_interval=1, replay_ratio=1)
+    model = MAKERS[maker](tau=1e-30, policy_kwargs=kwargs, **every)
+
+    def norms() -> list[torch.nn.BatchNorm1d]:
+        return [m.features_extractor.norm for m in (model.actor, model.critic, model.critic_target)]
+
+    def running() -> list[torch.Tensor]:
+        return [statistic.clone() for norm in norms() for statistic in (norm.running_mean, norm.running_var)]
+
+    first, weight = running(), norms()[2].weight.clone()
+    model.learn(10)  # All of it warm-up.
+    model.predict(np.ones((5, 3), np.float32))
+    assert all(map(torch.equal, running(), first))
+    model.learn(41)
+    assert model._n_updates == 41
+    last = running()
+    assert not any(map(torch.equal, last, first))
+    assert all(map(torch.equal, last[2:4], last[4:6]))
+    assert torch.equal(norms()[2].weight, weight) and not torch.equal(norms()[1].weight, weight)
+    model.predict(np.ones((5, 3), np.float32))
+    assert all(map(torch.equal, running(), last))
 
 
 # ---------------------------------------------------------------- action spaces

@@ -1,0 +1,49 @@
+"""
+The classes that Stable-Baselines3's and SB3-contrib's tests get in the place of their own.
+
+Each takes the arguments that those tests pass, where ours have another name or another meaning by design, and is small
+enough for them. Nothing else is changed.
+"""
+
+from typing import Any
+
+import sb3_sample
+
+SAC = sb3_sample.SAC
+
+
+class BRO(sb3_sample.BRO):
+    """BRO, with small networks where a test asks for some by ``net_arch``, which describes an MLP and no BroNet."""
+
+    def __init__(self, *args: Any, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any):
+        policy_kwargs = dict(policy_kwargs or {})
+        if policy_kwargs.pop("net_arch", None) is not None:
+            policy_kwargs["actor_network_kwargs"] = {"n_blocks": 1, "width": 16}
+            kwargs.setdefault("model_size", (1, 16))
+        super().__init__(*args, policy_kwargs=policy_kwargs, **kwargs)
+
+
+class QuantileSAC(sb3_sample.SAC):
+    """SAC with quantile critics, as TQC has. Their number is an argument of the algorithm here, not of the policy."""
+
+    def __init__(self, *args: Any, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any):
+        policy_kwargs = dict(policy_kwargs or {})
+        kwargs.setdefault("n_quantiles", policy_kwargs.pop("n_quantiles", 25))
+        super().__init__(*args, policy_kwargs=policy_kwargs, **kwargs)
+
+
+class MBMAPPO(sb3_sample.MBMAPPO):
+    """MBMA that simulates from the first iteration on, a little, with a small model of the environment."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        small: dict[str, Any] = dict(
+            n_simulated=2, warm_up_until=0.0, simulation_horizon=3, dynamics_kwargs={"width": 16, "depth": 1}
+        )
+        super().__init__(*args, **{**small, **kwargs})
+
+
+class PlainMBMAPPO(sb3_sample.MBMAPPO):
+    """MBMA without simulated actions, which is PPO."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"n_simulated": 0, **kwargs})
