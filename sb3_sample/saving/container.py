@@ -169,13 +169,14 @@ def sync_folder(folder: pathlib.Path) -> None:
 
 
 def _say_not_synced(folder: pathlib.Path, error: OSError) -> None:
-    if any(folder == other or folder in other.parents or other in folder.parents for other in _not_synced):
-        return
+    known = any(folder == other or folder in other.parents or other in folder.parents for other in _not_synced)
     _not_synced.add(folder)
-    warnings.warn(
-        f"{folder} cannot be synced ({error.strerror}): files in it are complete, but a power cut can cost the newest",
-        stacklevel=4,
-    )
+    if not known:
+        warnings.warn(
+            f"{folder} cannot be synced ({error.strerror}): files in it are complete, but a power cut can cost the "
+            "newest",
+            stacklevel=4,
+        )
 
 
 def _max_json(kind: str) -> int:
