@@ -154,7 +154,7 @@ class Encoder:
         try:
             table = ScheduleTable.of(value)
         except ValueError as error:
-            raise NotPortable(f"{name}: no table can be made of the schedule {value!r}: {error}") from error
+            raise NotPortable(f"{name}: no table can be made of the schedule, since {error}") from error
         return self.encode(table, name, depth)
 
     def _encode(self, value: Any, name: str, depth: int) -> Any:

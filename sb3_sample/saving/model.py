@@ -107,6 +107,8 @@ class SafeFiles(BaseAlgorithm):
         trusted, custom_objects = check_trusted(trusted_modules), custom_objects or {}
         if "policy" in kwargs:
             kwargs["policy_class"] = cls._policy_class(kwargs.pop("policy"))
+        if "policy_kwargs" in kwargs:
+            kwargs["policy_kwargs"] = kwargs["policy_kwargs"] or {}
         try:
             with paths.opened(path, "zip") as file:
                 content = Content(file, cls, SafeFiles, trusted)

@@ -1,6 +1,7 @@
 """Replay buffers in files that run no code."""
 
 import io
+import json
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -159,6 +160,10 @@ def _encode_attribute(buffer: ReplayBuffer, value: Any, name: str, encoder: Leni
         while infos and not any(infos[-1]):
             infos.pop()
         first = [[_encode_info(info, name, encoder) for info in row] for row in infos]
+        if infos and (size := len(json.dumps(first))) > container.MAX_JSON // 2:
+            # More than a reader takes: the transitions are worth more than what was said of them.
+            encoder.leave_out(name, f"they take {size} bytes of JSON")
+            first = []
         return {"infos": list(value.shape), "first": first}
     filled = _filled(buffer, len(value))
     if filled < len(value) and not value[filled:].any():
