@@ -29,10 +29,11 @@ def names_for_load(cls: type, base: type) -> set[str]:
     """
     :param cls: class of an algorithm
     :param base: its family's first class
-    :return: the arguments that ``load`` may change: those of the class and of its bases in the family
+    :return: the arguments that ``load`` may change: those of the class and of its bases in the family, and
+        ``policy_class``, Stable-Baselines3's name for what the policy is of
     """
     names = {name for c in cls.__mro__ if issubclass(c, base) for name in inspect.signature(c).parameters}
-    return names - {"policy", "env", "kwargs", "_init_setup_model"}
+    return (names | {"policy_class"}) - {"env", "kwargs", "_init_setup_model"}
 
 
 def check_known(cls: type, base: type, kwargs: dict[str, Any]) -> None:

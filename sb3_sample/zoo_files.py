@@ -11,7 +11,6 @@ import contextlib
 import functools
 import importlib
 import inspect
-import io
 import pickle
 import sys
 import types
@@ -137,17 +136,10 @@ def adapt(module: types.ModuleType, algorithms: Sequence[str]) -> None:
     """
     manager: Any = module.ExperimentManager
     callback: Any = module.SaveVecNormalizeCallback
-    setup, normalize = manager.setup_experiment, manager._maybe_normalize
+    normalize = manager._maybe_normalize
     save_model, on_step = manager.save_trained_model, callback._on_step
     for each in (module, rl_zoo3.utils):
         each.VecNormalize = _VecNormalize()  # type: ignore[attr-defined]
-
-    def setup_experiment(self: Any) -> Any:
-        result = setup(self)
-        if result is not None and self.algo in algorithms:
-            # What cannot be saved is known before the training, not after it.
-            result[0].save(io.BytesIO())
-        return result
 
     def maybe_normalize(self: Any, env: VecEnv, eval_env: bool) -> VecEnv:
         # A program that uses the manager has not said anything about pickles: they are refused then.
@@ -163,7 +155,6 @@ def adapt(module: types.ModuleType, algorithms: Sequence[str]) -> None:
         with _safe_statistics(isinstance(self.model, SafeFiles)):
             return on_step(self)  # type: ignore[no-any-return]
 
-    manager.setup_experiment = setup_experiment
     manager._maybe_normalize = maybe_normalize
     manager.save_trained_model = save_trained_model
     callback._on_step = save_statistics

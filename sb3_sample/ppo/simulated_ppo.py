@@ -36,6 +36,8 @@ from sb3_sample.ppo.dynamics import minibatches
 from sb3_sample.ppo.spaces import FlatObservations, ModelActions
 from sb3_sample.saving.checkpoint import Checkpointer
 from sb3_sample.saving.model import SafeFiles
+from sb3_sample.saving.model_tree import Description
+from sb3_sample.saving.notice import say_once
 
 Self = TypeVar("Self", bound="SimulatedPPO")
 
@@ -316,8 +318,9 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         :param force_reset: whether the environment is reset before training goes on
         :param allow_pickle: whether a file in Stable-Baselines3's own, pickled format is loaded too, which can run any
             code that its author wanted
-        :param trusted_modules: modules, or packages of modules, whose classes and functions the file may name
-        :param kwargs: arguments of the constructor that shall differ from the saved ones
+        :param trusted_modules: modules, or packages of modules, whose classes and functions the file, and what the
+            model reads later, may name
+        :param kwargs: arguments of the constructor that take the place of the file's, which is not asked for them
         :return: the model
         :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
         :raises ValueError: if ``kwargs`` holds something else, or values with which the file's parameters do not fit
@@ -376,6 +379,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         )
         self._iteration = 0
         self._warn_of_one_iteration(total_timesteps)
+        say_once(self, Description(self).encoder)
         with Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
             checkpointer.resume()
             callback.on_training_start(locals(), globals())

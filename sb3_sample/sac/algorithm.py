@@ -57,7 +57,9 @@ from sb3_sample.sac.scalars import FixedScalar, LogScalar
 from sb3_sample.saving.checkpoint import Checkpointer
 from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.model import SafeFiles
-from sb3_sample.saving.replay import SafeReplayBuffers
+from sb3_sample.saving.model_tree import Description
+from sb3_sample.saving.notice import say_once
+from sb3_sample.saving.replay import SafeReplayBuffers, encode_buffer
 
 Self = TypeVar("Self", bound="SAC")
 
@@ -423,9 +425,11 @@ class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyA
         :param force_reset: whether the environment is reset before training goes on
         :param allow_pickle: whether a file in Stable-Baselines3's own, pickled format is loaded too, which can run any
             code that its author wanted
-        :param trusted_modules: modules, or packages of modules, whose classes and functions the file may name
-        :param kwargs: arguments of the constructor that shall differ from the saved ones. What a learned number starts
-            from (``initial_...``, ``ent_coef="auto_..."``) counts from the next reset on: the file has its value
+        :param trusted_modules: modules, or packages of modules, whose classes and functions the file, and what the
+            model reads later, may name
+        :param kwargs: arguments of the constructor that take the place of the file's, which is not asked for them. What
+            a learned number starts from (``initial_...``, ``ent_coef="auto_..."``) counts from the next reset on: the
+            file has its value
         :return: the model
         :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
         :raises ValueError: if ``kwargs`` holds something else, or values that are not allowed
@@ -639,10 +643,10 @@ class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyA
         :param allow_pickle: see ``load``
         :param trusted_modules: see ``load``
         :raises BadFile: (a ``ValueError``) if the file is damaged, hostile or pickled
-        :raises ValueError: if it is the buffer of other spaces, or holds out another share of its transitions than
-            ``validation_proportion``
+        :raises ValueError: if it is the buffer of other spaces or of another number of environments, or holds out
+            another share of its transitions than ``validation_proportion``
         """
-        before = self.replay_buffer
+        before = getattr(self, "replay_buffer", None)
         super().load_replay_buffer(path, truncate_last_traj, allow_pickle=allow_pickle, trusted_modules=trusted_modules)
         share = self.replay_buffer.validation_proportion if isinstance(self.replay_buffer, ValidationSplit) else 0.0
         if share != self.validation_proportion:
@@ -689,6 +693,10 @@ class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyA
         )
         if resets_environment:
             self._on_environment_reset()
+        encoder = Description(self).encoder
+        if self.replay_buffer is not None:
+            encode_buffer(self.replay_buffer, encoder, only_small=True)
+        say_once(self, encoder)
         with Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
             checkpointer.resume()
             self._decide_compilation(total_timesteps - self.num_timesteps)

@@ -7,7 +7,6 @@ moment when everything agrees: between the environment's step and ``train`` a tr
 update yet.
 """
 
-import json
 import os
 import signal
 import sys
@@ -16,7 +15,6 @@ import time
 import types
 import warnings
 from collections.abc import Callable, Iterator
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +29,7 @@ from sb3_sample.saving import container, training_state, vec_envs
 from sb3_sample.saving.attributes import DoesNotFit
 from sb3_sample.saving.callbacks import CallbackStates, environments, walk, without_progress_bar
 from sb3_sample.saving.encoding import NotPortable, decode, encode
+from sb3_sample.saving.identity import identity_of
 from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.progress import ProgressFile
 from sb3_sample.saving.rings import Ring
@@ -101,7 +100,7 @@ class Checkpointer:
         for path, each in self._callbacks():
             for name, ring in getattr(each, "checkpoint_rings", dict)().items():
                 self._rings[f"{path}.{name}"] = ring
-        self._identity = _identity(model)
+        self._identity = identity_of(model)
         found = self._folder.newest_good()
         if found is not None:
             folder, self._manifest = found
@@ -332,7 +331,7 @@ class Checkpointer:
             "generators": training_state.save_generators(model.device),
         }
         files: dict[str, Callable[[Path], None]] = {
-            MODEL: lambda path: model.save(path, trusted_modules=_own_modules()),
+            MODEL: model.save,
             STATE: lambda path: _write(path, KIND, state),
         }
         about = {"circumstances": training_state.circumstances(model.device)}
@@ -372,30 +371,8 @@ def _write(path: Path, kind: str, value: Any) -> None:
 
 
 def _own_modules() -> tuple[str, ...]:
-    """
-    Whose classes may be named in what is written: those of this program. Who reads the model's file decides anew whom
-    to trust, and what is restored here never makes an object by its name.
-    """
+    """Whose classes a checkpoint's parameters may name: those of this program, which wrote them."""
     return tuple(sorted({name.split(".")[0] for name in sys.modules}))
-
-
-def _identity(model: SafeFiles) -> dict[str, list[str]]:
-    """
-    What tells a run from another, by the argument's name: a digest to compare, and the value to show.
-
-    :raises ValueError: an argument is nothing that can be saved
-    """
-    assert model.env is not None
-    values = {**training_state.arguments_of(model), "env": vec_envs.fingerprint(model.env)}
-    identity = {}
-    for name, value in values.items():
-        tensors: dict[str, Any] = {}
-        digest = sha256(json.dumps(encode(value, name, tensors, _own_modules()), sort_keys=True).encode())
-        for key in sorted(tensors):
-            digest.update(key.encode())
-            digest.update(np.ascontiguousarray(torch.as_tensor(tensors[key]).cpu().numpy()).tobytes())
-        identity[name] = [digest.hexdigest(), repr(value)]
-    return identity
 
 
 class _Interrupts:

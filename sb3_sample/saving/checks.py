@@ -1,17 +1,20 @@
 """What of a model's file is looked at before torch and the algorithms see it, who take much on trust."""
 
 import collections.abc
+import functools
 import inspect
 import numbers
+import pathlib
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any
 
 import numpy as np
 import torch
 from stable_baselines3.her import HerReplayBuffer
 
+from sb3_sample.saving.classes import PACKAGES, may_be_set, within
 from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.replay import MAX_HER_TRANSITIONS, MAX_TRANSITIONS
 
@@ -19,6 +22,11 @@ from sb3_sample.saving.replay import MAX_HER_TRANSITIONS, MAX_TRANSITIONS
 MAX_ENVS = 100_000
 #: The largest width, depth or number of networks that a file can ask for. Python makes lists of such lengths.
 MAX_WIDTH = 1_000_000
+#: What belongs to the program in which a model is, and to no file.
+NEVER = (
+    "policy", "env", "replay_buffer", "rollout_buffer", "_vec_normalize_env", "_logger", "_custom_logger",
+    "_trusted_modules", "_told",
+)  # fmt: skip
 #: What the common optimizers keep of each parameter, in its shape. torch's fused kernels do not check it.
 _MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq", "momentum_buffer", "square_avg", "grad_avg")
 
@@ -81,68 +89,87 @@ def check_moments(optimizer: torch.optim.Optimizer, state: Any, name: str) -> No
             raise BadFile(f"{name} keeps {sorted(map(str, kept))} of parameter {index}, but others of other parameters")
 
 
+def library_class(cls: type) -> type:
+    """
+    :param cls: class of an algorithm
+    :return: the nearest class above it that is of a library, itself perhaps
+    """
+    return next(base for base in cls.__mro__ if within(base.__module__, PACKAGES))
+
+
 def check_names(model: Any, attributes: dict[str, Any], name: str) -> None:
-    """A file sets attributes, but never in the place of a method or of what belongs to the class."""
-    own, left_out = vars(model), model._excluded_save_params()
+    """A file sets attributes, but never in the place of a method or of what belongs to the class or the program."""
+    left_out = model._excluded_save_params()
     for key, value in attributes.items():
-        if key in left_out and value is not None:
+        own = vars(model).get(key)
+        if key in NEVER or (key in left_out and type(own) is not type(value) and own is not None):
             raise BadFile(f"{name} is damaged or hostile: it sets {key!r:.100}, which is not in a model's file")
-        if not key.isidentifier() or key.startswith("__") or (hasattr(type(model), key) and key not in own):
+        if not may_be_set(type(model), key):
             raise BadFile(f"{name} is damaged or hostile: it sets {key!r:.100}, which is no attribute of a model")
 
 
-def check_sizes(model: Any, name: str, own_buffer: bool) -> None:
+def check_sizes(model: Any, name: str, given: Collection[str]) -> None:
     """
-    What is allocated without torch, or object by object, and so out of the budget's sight. With ``own_buffer`` the size
-    of the replay buffer is the caller's.
+    What is allocated without torch, or object by object, and so out of the budget's sight, as far as it is not
+    ``given`` by the caller.
     """
     if type(model.n_envs) is not int or not 1 <= model.n_envs <= MAX_ENVS:
         raise BadFile(f"{name}: n_envs must lie in [1, {MAX_ENVS}], not be {model.n_envs!r:.100}")
     for key, value in vars(model).items():
-        if key.endswith("_kwargs") and key not in ("replay_buffer_kwargs", "rollout_buffer_kwargs"):
-            _check_widths(value, f"{name}: {key}")
+        if key.endswith("_kwargs") and key not in ("replay_buffer_kwargs", "rollout_buffer_kwargs", *given):
+            _check_widths(value, key, f"{name}: {key}")
     buffer_class, size = getattr(model, "replay_buffer_class", None), getattr(model, "buffer_size", 1)
     most = MAX_TRANSITIONS
     if isinstance(buffer_class, type) and issubclass(buffer_class, HerReplayBuffer):
         most = MAX_HER_TRANSITIONS
-    if not own_buffer and (type(size) is not int or not 1 <= size <= most):
+    if "buffer_size" not in given and (type(size) is not int or not 1 <= size <= most):
         raise BadFile(f"{name}: buffer_size must lie in [1, {most}], not be {size!r:.100}: pass another one to load")
 
 
-def _check_widths(value: Any, name: str) -> None:
+def _check_widths(value: Any, argument: str, name: str) -> None:
     if isinstance(value, int) and abs(value) > MAX_WIDTH:
-        raise BadFile(f"{name} holds {value!r:.100}, but sizes of networks are at most {MAX_WIDTH}")
+        raise BadFile(
+            f"{name} holds {value!r:.100}, but sizes of networks are at most {MAX_WIDTH}: pass {argument}= to load"
+        )
     if isinstance(value, dict):
         for key, item in value.items():
-            _check_widths(item, f"{name}.{key}")
+            _check_widths(item, argument, f"{name}.{key}")
     elif isinstance(value, (list, tuple)):
         for item in value:
-            _check_widths(item, name)
+            _check_widths(item, argument, name)
 
 
 def check_kinds(model: Any, attributes: dict[str, Any], name: str) -> None:
     """
-    :param model: a model that is not set up
+    :param model: a model of a library's class that is not set up: what a class of the user's own adds can be anything
     :param attributes: what a file sets
     :param name: the file, for messages
     :raises BadFile: if a value is of another kind than the constructor or its present value say: a text for a number
     """
-    hints = _hints(type(model))
+    cls: Any = type(model)
+    hints = hints_of(cls)
     for key, value in attributes.items():
-        own = vars(model).get(key)
+        own = getattr(model, key, None)
         # Some arguments are None once they are replaced by others.
         if value is None:
             fits = True
         elif key in hints:
             fits = _fits(value, hints[key])
+        elif isinstance(own, numbers.Real):
+            fits = isinstance(value, numbers.Real)
         else:
-            fits = isinstance(value, numbers.Real) if isinstance(own, numbers.Real) else True
+            # A default of the class, as no instance has one.
+            fits = key in vars(model) or own is None or isinstance(value, type(own))
         if not fits:
             raise BadFile(f"{name} is damaged: {key} cannot be {value!r:.100}")
 
 
-def _hints(cls: type) -> dict[str, Any]:
-    """What the constructors of a class and of those above it take."""
+@functools.cache
+def hints_of(cls: type) -> dict[str, Any]:
+    """
+    :param cls: class of an algorithm
+    :return: what its constructor and those of the classes above it take, by the argument's name
+    """
     hints: dict[str, Any] = {}
     for base in reversed(cls.__mro__):
         init = vars(base).get("__init__")
@@ -168,6 +195,8 @@ def _fits(value: Any, hint: Any) -> bool:
         return callable(value)
     if kind in (tuple, list, collections.abc.Sequence, collections.abc.Iterable):
         return isinstance(value, (tuple, list, np.ndarray))
+    if kind is str:
+        return isinstance(value, (str, pathlib.PurePath))
     if kind in (bool, int, float):
         return isinstance(value, (numbers.Real, np.bool_))
     return isinstance(value, kind) if isinstance(kind, type) else True

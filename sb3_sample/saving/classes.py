@@ -5,6 +5,7 @@ import importlib
 import inspect
 import re
 import sys
+import types
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -33,13 +34,6 @@ IMPORTED = ("sb3_contrib", "stable_baselines3.common.sb2_compat")
 #: What can be an argument of an algorithm: networks, policies, features extractors, activations; optimizers; buffers.
 KINDS = (nn.Module, torch.optim.Optimizer, BaseBuffer)
 
-HOW = (
-    "What can be: numbers, texts, arrays and what holds them; for a schedule a number, or LinearSchedule or "
-    "ConstantSchedule of stable_baselines3.common.utils; classes of torch.nn, torch.optim, stable_baselines3, "
-    "sb3_contrib and sb3_sample; functions and classes at the top of a module that is named in trusted_modules=[...], "
-    "when saving and when loading. allow_pickle=True writes Stable-Baselines3's own format instead, which runs code"
-)
-
 
 class NotPortable(ValueError):
     """A value that cannot stand in a file that runs no code."""
@@ -56,7 +50,12 @@ def check_trusted(trusted: Sequence[str]) -> tuple[str, ...]:
     return tuple(trusted)
 
 
-def _within(module: str, packages: Sequence[str]) -> bool:
+def within(module: str, packages: Sequence[str]) -> bool:
+    """
+    :param module: name of a module
+    :param packages: names of modules or packages
+    :return: whether it is one of them, or in one of them
+    """
     return any(module == package or module.startswith(f"{package}.") for package in packages)
 
 
@@ -68,6 +67,22 @@ def path_of(value: Any) -> str:
     return f"{value.__module__}:{value.__qualname__}"
 
 
+def is_importable(value: Any) -> bool:
+    """
+    :param value: a class or a function
+    :return: whether its path leads to it, in this program: not to what is made inside of a function
+    """
+    found: Any = sys.modules.get(value.__module__ or "")
+    return _at(found, value.__qualname__.split(".")) is value
+
+
+def _at(module: Any, names: Sequence[str]) -> Any:
+    found = module
+    for name in names:
+        found = vars(found).get(name) if isinstance(found, (types.ModuleType, type)) else None
+    return found
+
+
 def resolve(path: str, trusted: Sequence[str]) -> Any:
     """
     :param path: what ``path_of`` gave
@@ -76,45 +91,50 @@ def resolve(path: str, trusted: Sequence[str]) -> Any:
     :raises ValueError: if it may not be named, or is not there
     """
     module, _, name = path.partition(":")
-    parts = module.split(".")
-    if not (name.isidentifier() and all(part.isidentifier() for part in parts)) or name.startswith("_"):
-        raise ValueError(f"{path!r} is no public name at the top of a module")
-    is_trusted = _within(module, trusted)
-    is_known = _within(module, PACKAGES) and not any(part.startswith("_") for part in parts)
-    if not (is_trusted or is_known):
-        raise ValueError(f"{path!r} is of a module that is not trusted")
-    if not is_trusted and module not in sys.modules and not _within(module, IMPORTED):
-        raise ValueError(f"{path!r} is of a module that is not there, or not imported")
+    names = name.split(".")
+    if "<locals>" in names:
+        raise ValueError(f"{path!r:.300} was made inside of a function, where no import finds it")
+    if not all(part.isidentifier() for part in (*module.split("."), *names)) or any(n.startswith("__") for n in names):
+        raise ValueError(f"{path!r:.300} is no name in a module")
+    is_trusted = within(module, trusted)
+    if not is_trusted:
+        _check_known(path, module, names)
     try:
-        value = vars(importlib.import_module(module)).get(name)
+        value = _at(importlib.import_module(module), names)
     except ImportError as error:
-        raise ValueError(f"{path!r} cannot be imported: {error}") from error
+        raise ValueError(f"{path!r:.300} cannot be imported: {error}") from error
     # Names that a module has imported from elsewhere are not its own.
     is_own = isinstance(value, type) or inspect.isroutine(value)
     if not is_own or getattr(value, "__module__", None) != module or getattr(value, "__qualname__", None) != name:
-        raise ValueError(f"{path!r} is no class or function of this module")
+        raise ValueError(f"{path!r:.300} is no class or function of this module")
     if not is_trusted and not (isinstance(value, type) and issubclass(value, KINDS)):
-        raise ValueError(f"{path!r} is no network, policy, optimizer or buffer")
+        raise ValueError(f"{path!r:.300} is no network, policy, optimizer or buffer")
     return value
 
 
-def checked_path(value: Any, name: str, trusted: Sequence[str]) -> str:
+def _check_known(path: str, module: str, names: Sequence[str]) -> None:
+    """Of modules that nobody vouches for: public classes at the top of those that a file may name anyway."""
+    if not within(module, PACKAGES) or any(part.startswith("_") for part in module.split(".")):
+        raise ValueError(f"{path!r:.300} is of a module that is not trusted")
+    if len(names) > 1 or names[0].startswith("_"):
+        raise ValueError(f"{path!r:.300} is no public name at the top of a module")
+    if module not in sys.modules and not within(module, IMPORTED):
+        raise ValueError(f"{path!r:.300} is of a module that is not there, or not imported")
+
+
+def may_be_set(cls: type, name: str) -> bool:
     """
-    :param value: a class or a function
-    :param name: what it is the value of, for messages
-    :param trusted: see ``resolve``
-    :return: its import path, with which ``resolve`` gives the same
-    :raises NotPortable: if a file may not name it
+    What a file may set on an object, and so what is written of one: never what its class does.
+
+    :param cls: the object's class
+    :param name: name of an attribute
+    :return: whether the name is a plain one, under which the class has nothing, or a default that is plain data: no
+        method, property, class or function
     """
-    what = "class" if isinstance(value, type) else "function"
-    try:
-        path = path_of(value)
-        if resolve(path, trusted) is value:
-            return path
-        reason = f"{path!r} is another one by now"
-    except (ValueError, AttributeError) as error:
-        reason = str(error)
-    raise NotPortable(f"{name}: the {what} {value!r} cannot be written to a file that runs no code ({reason}). {HOW}")
+    if not name.isidentifier() or name.startswith("__"):
+        return False
+    found = next((vars(base)[name] for base in cls.__mro__ if name in vars(base)), None)
+    return not callable(found) and not any(hasattr(type(found), f"__{word}__") for word in ("get", "set", "delete"))
 
 
 def _is_number(value: Any) -> bool:
@@ -141,6 +161,11 @@ def _are_noises(value: Any) -> bool:
     return isinstance(value, list) and all(map(_is_noise, value))
 
 
+def _is_table(value: Any) -> bool:
+    is_table = isinstance(value, np.ndarray) and value.ndim == 2 and len(value) == 2 and value.dtype == np.float64
+    return is_table and value.size > 0 and bool(np.isfinite(value).all() and (np.diff(value[0]) > 0).all())
+
+
 #: Attributes of the classes whose objects a file may hold, and what their values must be.
 OBJECTS: dict[str, dict[str, Callable[[Any], bool]]] = {
     "stable_baselines3.common.utils:ConstantSchedule": {"val": _is_number},
@@ -149,6 +174,7 @@ OBJECTS: dict[str, dict[str, Callable[[Any], bool]]] = {
     },
     "stable_baselines3.common.utils:FloatSchedule": {"value_schedule": callable},
     "rl_zoo3.utils:SimpleLinearSchedule": {"initial_value": _is_number},
+    "sb3_sample.saving.schedules:ScheduleTable": {"table": _is_table},
     "stable_baselines3.common.running_mean_std:RunningMeanStd": {
         "mean": _is_array, "var": _is_array, "count": _is_number,
     },

@@ -7,6 +7,7 @@ else is refused before it is read.
 """
 
 import contextlib
+import errno
 import gc
 import hashlib
 import io
@@ -18,6 +19,7 @@ import platform
 import re
 import secrets
 import struct
+import warnings
 import zipfile
 from collections.abc import Iterator
 from typing import IO, Any
@@ -54,6 +56,12 @@ _PICKLED = (
     "is pickled, and reading it can run any code that its author wanted. If you trust its author, "
     "read it with allow_pickle=True, and save it again without to have a safe file"
 )
+#: How systems say that a folder cannot be opened to be synced, or not synced, though files in it are written.
+_NOT_OFFERED = (
+    errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF, errno.EACCES, errno.EPERM, errno.EISDIR,
+)  # fmt: skip
+#: Folders of which it was said.
+_not_synced: set[pathlib.Path] = set()
 PathOrFile = str | pathlib.Path | IO[bytes]
 
 
@@ -140,17 +148,35 @@ def replacing(path: pathlib.Path) -> Iterator[IO[bytes]]:
 
 def sync_folder(folder: pathlib.Path) -> None:
     """
-    Make sure that the names of a folder's files are on the disk, where the system offers it.
+    Make sure that the names of a folder's files are on the disk, where the system offers it. Where it does not, as on
+    network shares, that is said once.
 
     :param folder: the folder
+    :raises OSError: if the disk is at fault
     """
     if os.name != "posix":
         return
-    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        if error.errno not in _NOT_OFFERED:
+            raise
+        _say_not_synced(pathlib.Path(os.path.abspath(folder)), error)
+
+
+def _say_not_synced(folder: pathlib.Path, error: OSError) -> None:
+    known = any(folder == other or folder in other.parents or other in folder.parents for other in _not_synced)
+    _not_synced.add(folder)
+    if not known:
+        warnings.warn(
+            f"{folder} cannot be synced ({error.strerror}): files in it are complete, but a power cut can cost the "
+            "newest",
+            stacklevel=4,
+        )
 
 
 def _max_json(kind: str) -> int:

@@ -3,7 +3,9 @@
 import base64
 import binascii
 import collections
+import enum
 import math
+import pathlib
 import random
 import sys
 from collections.abc import Callable, Sequence
@@ -25,13 +27,28 @@ from sb3_sample.saving.classes import (
     check_attribute,
     check_trusted,
     class_of,
+    may_be_set,
     resolve,
     torch_has,
+    within,
 )
 from sb3_sample.saving.container import BadFile
 
 #: What the library's constructors raise where a file holds nonsense.
 _NONSENSE = (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError, AssertionError, RuntimeError)
+
+
+class NotTrusted(BadFile):
+    """
+    A file names a class or function that nobody vouches for, or that is not there.
+
+    :param message: where, and which
+    :param path: its import path, from the file
+    """
+
+    def __init__(self, message: str, path: str):
+        super().__init__(message)
+        self.path = path
 
 
 def decode(tree: Any, tensors: dict[str, torch.Tensor], name: str, trusted: Sequence[str] = ()) -> Any:
@@ -44,6 +61,7 @@ def decode(tree: Any, tensors: dict[str, torch.Tensor], name: str, trusted: Sequ
     :param name: what it is, for messages
     :param trusted: modules, or packages of modules, whose classes and functions it may name
     :return: the value
+    :raises NotTrusted: (a ``BadFile``) if it names others
     :raises BadFile: if the tree is not one that ``encode`` makes
     """
     return _Decoder(tensors, check_trusted(trusted)).decode(tree, name, 0)
@@ -78,11 +96,20 @@ class _Decoder:
             raise BadFile(f"{name} refers to the tensor {key!r}, which is not in the file, or refers to it again")
         return self.tensors.pop(key)
 
+    def _left_out(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
+        raise BadFile(f"{name} was left out when the file was written ({tree!r:.200})")
+
     def _list(self, tree: Any, name: str, depth: int) -> list[Any]:
         if not isinstance(tree, list):
             raise BadFile(f"{name} must be a list in the file, not {type(tree).__name__}")
         decoded: list[Any] = self.decode(tree, name, depth)
         return decoded
+
+    def _numbers(self, tree: Any, whole: Any, name: str, depth: int) -> list[Any]:
+        tensor = self.take(tree, name)
+        if tensor.dtype not in (torch.float64, torch.int64) or tensor.dim() != 1:
+            raise BadFile(f"{name} must be a list of numbers in the file, not a tensor of {tensor.dtype}")
+        return tensor.tolist()
 
     def _complex(self, tree: Any, whole: Any, name: str, depth: int) -> complex:
         real, imaginary = self._list(tree, name, depth)
@@ -138,7 +165,10 @@ class _Decoder:
         return self.take(tree, name).requires_grad_(bool(whole.get("requires_grad", False)))
 
     def _enum(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
-        cls: Any = class_of(tree, ENUMERATIONS, name)
+        known = isinstance(tree, str) and tree in ENUMERATIONS
+        cls: Any = class_of(tree, ENUMERATIONS, name) if known else self._import(tree, whole, name, depth)
+        if not issubclass(cls, enum.Enum):
+            raise BadFile(f"{name}: {tree!r:.100} is no enumeration")
         return cls[whole["member"]]
 
     def _named_tuple(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
@@ -148,6 +178,27 @@ class _Decoder:
         if len(items) != len(wanted) or not all(map(isinstance, items, wanted)):
             raise BadFile(f"{name}: {items} are no items of {tree}")
         return cls(*items)
+
+    def _import(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
+        if not isinstance(tree, str):
+            raise BadFile(f"{name}: {tree!r:.100} is no name of a class or function")
+        try:
+            return resolve(tree, self.trusted)
+        except ValueError as error:
+            raise NotTrusted(f"{name}: {error}", tree) from error
+
+    def _instance(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
+        cls = self._import(tree, whole, name, depth)
+        module = tree.partition(":")[0]
+        if not isinstance(cls, type) or not within(module, self.trusted):
+            raise NotTrusted(f"{name}: {tree!r:.300} is no class of a module that is trusted", tree)
+        attributes = whole["attributes"]
+        made: Any = object.__new__(cls)
+        for key, item in attributes.items():
+            if not may_be_set(cls, key):
+                raise BadFile(f"{name}: an object of {tree} must not have its {key!r:.100} set")
+            vars(made)[key] = self.decode(item, f"{name}.{key}", depth + 1)
+        return made
 
     def _object(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
         cls: Any = class_of(tree, OBJECTS, name)
@@ -255,9 +306,11 @@ def _from_bytes(data: bytes, dtype_text: Any, shape: Any, name: str) -> np.ndarr
 
 #: Readers by tag: of what stands behind the tag, the whole object, its name and its depth.
 _READERS: dict[str, Callable[[_Decoder, Any, Any, str, int], Any]] = {
+    "left_out": _Decoder._left_out,
     "int": lambda d, tree, whole, name, depth: int(tree, 16),
     "float": lambda d, tree, whole, name, depth: {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}[tree],
     "complex": _Decoder._complex,
+    "numbers": _Decoder._numbers,
     "bytes": lambda d, tree, whole, name, depth: base64.b64decode(tree, validate=True),
     "tuple": lambda d, tree, whole, name, depth: tuple(d._list(tree, name, depth)),
     "set": lambda d, tree, whole, name, depth: set(d._list(tree, name, depth)),
@@ -276,10 +329,12 @@ _READERS: dict[str, Callable[[_Decoder, Any, Any, str, int], Any]] = {
     "numpy_type": lambda d, tree, whole, name, depth: _read_dtype(tree, name).type,
     "torch_dtype": lambda d, tree, whole, name, depth: _read_torch_dtype(tree, name),
     "device": lambda d, tree, whole, name, depth: _read_device(tree, name),
-    "import": lambda d, tree, whole, name, depth: resolve(tree, d.trusted),
+    "path": lambda d, tree, whole, name, depth: pathlib.Path(tree),
+    "import": _Decoder._import,
     "enum": _Decoder._enum,
     "named_tuple": _Decoder._named_tuple,
     "object": _Decoder._object,
+    "instance": _Decoder._instance,
     "space": _Decoder._space,
     "numpy_random": _Decoder._numpy_random,
     "random": _Decoder._random,
@@ -293,6 +348,7 @@ _FURTHER: dict[str, tuple[str, ...]] = {
     "enum": ("member",),
     "named_tuple": ("items",),
     "object": ("attributes",),
+    "instance": ("attributes",),
     "space": ("arguments", "np_random"),
     "numpy_random": ("state",),
     "torch_generator": ("device",),

@@ -8,58 +8,96 @@ this file and the tables of ``classes.py`` name, whatever stands in the tree.
 
 import base64
 import collections
+import contextlib
 import enum
 import math
+import pathlib
 import random
 import types
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import BaseBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.saving.classes import (
     BIT_GENERATORS,
     DTYPE_TEXT,
     ENUMERATIONS,
-    HOW,
     INT_MAX,
     MAX_DEPTH,
     NAMED_TUPLES,
     OBJECTS,
+    PACKAGES,
     SPACES,
     NotPortable,
     check_attribute,
-    check_trusted,
-    checked_path,
+    is_importable,
+    may_be_set,
     object_path,
+    path_of,
+    resolve,
     torch_has,
+    within,
 )
 from sb3_sample.saving.container import DTYPES
 from sb3_sample.saving.decoding import decode
+from sb3_sample.saving.schedules import ScheduleTable
 
-__all__ = ["NotPortable", "decode", "encode"]
+__all__ = ["Encoder", "Lenient", "NotPortable", "decode", "encode", "is_left_out"]
+
+#: In the place of a value that is left out, with the reason.
+LEFT_OUT = "left_out"
+#: Lists of numbers that are longer are arrays in the file.
+LONG = 16
+#: What trains, or is trained in, is more than its attributes.
+_OF_TRAINING = (BaseAlgorithm, BaseBuffer, BaseCallback, VecEnv, gym.Env, gym.Space)
+#: What draws, and is written by its state.
+GENERATORS = (np.random.Generator, np.random.RandomState, random.Random, torch.Generator)
+#: What is written by its name.
+NAMED = (type, types.FunctionType, types.BuiltinFunctionType)
 
 
-def encode(value: Any, name: str, tensors: dict[str, torch.Tensor], trusted: Sequence[str] = ()) -> Any:
+class _Plain:
+    """A class of whose objects the attributes are all there is."""
+
+
+def encode(value: Any, name: str, tensors: dict[str, torch.Tensor], schedule: bool = False) -> Any:
     """
     A value as a tree of JSON. Tensors on other devices are copied to the CPU, where :func:`decode` leaves them. A value
     that occurs twice is two values afterwards, and a generator can draw on, but not spawn as before.
 
+    Classes and functions are written by their names, whosever they are, and objects of a class by their attributes:
+    whether they may be named is asked by who reads them.
+
     :param value: the value
     :param name: what it is, for messages and for the names of its arrays
     :param tensors: takes its arrays and tensors, without copying what is on the CPU already
-    :param trusted: modules, or packages of modules, whose classes and functions it may name
+    :param schedule: whether it is a schedule, of which a table is as good as its name where it has none
     :return: the tree
     :raises NotPortable: if it holds what has no place in such a file; the message says what and where
     """
-    return _Encoder(tensors, check_trusted(trusted)).encode(value, name, 0)
+    return Encoder(tensors).encode(value, name, schedule=schedule)
 
 
-class _Encoder:
-    def __init__(self, tensors: dict[str, torch.Tensor], trusted: tuple[str, ...]):
-        self.tensors, self.trusted = tensors, trusted
+class Encoder:
+    """
+    Makes trees of several values.
+
+    :param tensors: takes their arrays and tensors
+    """
+
+    def __init__(self, tensors: dict[str, torch.Tensor]):
+        self.tensors = tensors
+        #: Paths of classes and functions that whoever reads the file has to vouch for, by what they are the value of.
+        self.foreign: dict[str, str] = {}
+        self._inside: set[int] = set()
 
     def put(self, tensor: torch.Tensor, name: str) -> str:
         unique, n = name, 1
@@ -69,10 +107,30 @@ class _Encoder:
         self.tensors[unique] = tensor
         return unique
 
-    def encode(self, value: Any, name: str, depth: int) -> Any:
-        if depth > MAX_DEPTH:
-            raise NotPortable(f"{name} is nested more than {MAX_DEPTH} times, or holds itself")
+    @contextlib.contextmanager
+    def all_or_nothing(self) -> Iterator[None]:
+        """What is refused leaves nothing of what was written of it before."""
+        before = [(kept, len(kept)) for kept in (self.tensors, self.foreign)]
+        try:
+            yield
+        except NotPortable:
+            for kept, n in before:
+                for key in list(kept)[n:]:
+                    del kept[key]  # type: ignore[attr-defined]
+            raise
+
+    def encode(self, value: Any, name: str, depth: int = 0, schedule: bool = False) -> Any:
+        """
+        :param value: the value
+        :param name: what it is
+        :param depth: how deep it lies in another
+        :param schedule: whether it is a schedule
+        :return: its tree
+        :raises NotPortable: as :func:`encode`
+        """
         cls = type(value)
+        if depth > MAX_DEPTH or id(value) in self._inside:
+            raise NotPortable(f"{name} is nested more than {MAX_DEPTH} times, or holds itself")
         if value is None or cls is bool or cls is str:
             return value
         if cls is int:
@@ -80,15 +138,40 @@ class _Encoder:
             return value if -INT_MAX <= value < INT_MAX else {"int": hex(value)}
         if cls is float:
             return value if math.isfinite(value) else {"float": repr(value)}
+        if schedule and callable(value):
+            return self._schedule(value, name, depth)
+        self._inside.add(id(value))
+        try:
+            return self._encode(value, name, depth)
+        finally:
+            self._inside.discard(id(value))
+
+    def _schedule(self, value: Any, name: str, depth: int) -> Any:
+        """By its name, or an object by its attributes; where no name leads to it, or they are not plain, by a table."""
+        if is_importable(value if isinstance(value, NAMED) else type(value)):
+            with contextlib.suppress(NotPortable), self.all_or_nothing():
+                return Encoder.encode(self, value, name, depth)
+        try:
+            table = ScheduleTable.of(value)
+        except ValueError as error:
+            raise NotPortable(f"{name}: no table can be made of the schedule, since {error}") from error
+        return self.encode(table, name, depth)
+
+    def _encode(self, value: Any, name: str, depth: int) -> Any:
+        cls = type(value)
         if cls is list:
-            return self._items(value, name, depth)
+            return self._list(value, name, depth)
         tagged = self._plain(value, name, depth) or self._numbers(value, name) or self._objects(value, name, depth)
         if tagged is None:
-            raise NotPortable(
-                f"{name}: an object of {cls.__module__}.{cls.__qualname__} cannot be written to a file that runs no "
-                f"code. {HOW}"
-            )
+            kind = f"{cls.__module__}.{cls.__qualname__}"
+            raise NotPortable(f"{name}: an object of {kind} cannot be written to a file that runs no code")
         return tagged
+
+    def _list(self, values: list[Any], name: str, depth: int) -> Any:
+        for number, dtype in ((float, torch.float64), (int, torch.int64)):
+            if len(values) > LONG and all(type(item) is number and not abs(item) >= INT_MAX for item in values):
+                return {"numbers": self.put(torch.tensor(values, dtype=dtype), name)}
+        return self._items(values, name, depth)
 
     def _items(self, values: Any, name: str, depth: int) -> list[Any]:
         return [self.encode(value, f"{name}[{i}]", depth + 1) for i, value in enumerate(values)]
@@ -110,6 +193,8 @@ class _Encoder:
             return {"bytes": base64.b64encode(value).decode()}
         if cls is complex:
             return {"complex": [self.encode(part, name, depth) for part in (value.real, value.imag)]}
+        if isinstance(value, pathlib.PurePath):
+            return {"path": str(value)}
         return None
 
     def _numbers(self, value: Any, name: str) -> dict[str, Any] | None:
@@ -151,24 +236,60 @@ class _Encoder:
     def _objects(self, value: Any, name: str, depth: int) -> dict[str, Any] | None:
         if isinstance(value, type) and issubclass(value, np.generic):
             return {"numpy_type": np.dtype(value).str}
-        if isinstance(value, (type, types.FunctionType, types.BuiltinFunctionType)):
-            return {"import": checked_path(value, name, self.trusted)}
-        if isinstance(value, enum.Enum) and (path := object_path(value, ENUMERATIONS)):
-            return {"enum": path, "member": value.name}
+        if isinstance(value, NAMED):
+            return {"import": self._path(value, name)}
+        if isinstance(value, enum.Enum):
+            if object_path(value, ENUMERATIONS) is None:
+                self.foreign[name] = path_of(type(value))
+            return {"enum": path_of(type(value)), "member": value.name}
         if path := object_path(value, NAMED_TUPLES):
             return {"named_tuple": path, "items": self._items(value, name, depth)}
         if path := object_path(value, OBJECTS):
-            if vars(value).keys() != OBJECTS[path].keys():
-                raise NotPortable(f"{name}: an object of {path} with other attributes than {sorted(OBJECTS[path])}")
-            state = {}
-            for key, item in vars(value).items():
-                # An argument is known to the user by its own name, not by that of what Stable-Baselines3 wraps it in.
-                state[key] = self.encode(item, name if key == "value_schedule" else f"{name}.{key}", depth + 1)
-                check_attribute(path, key, item, name, NotPortable)
-            return {"object": path, "attributes": state}
+            return self._known_object(value, path, name, depth)
         if type(value) in SPACES:
             return self._space(value, name, depth)
-        return self._generator(value, name, depth)
+        return self._generator(value, name, depth) or self._instance(value, name, depth)
+
+    def _path(self, value: Any, name: str) -> str:
+        """The path of a class or function; noted where it is not known to everybody who reads the file."""
+        path = path_of(value)
+        if not isinstance(value, type) and not is_importable(value):
+            raise NotPortable(
+                f"{name}: the function {value!r} has no name that a file can hold: it is not that of a module"
+            )
+        try:
+            if resolve(path, ()) is value:
+                return path
+        except ValueError:
+            self.foreign[name] = path
+            return path
+        raise NotPortable(f"{name}: {value!r} is not what {path!r} names")
+
+    def _known_object(self, value: Any, path: str, name: str, depth: int) -> dict[str, Any]:
+        if vars(value).keys() != OBJECTS[path].keys():
+            raise NotPortable(f"{name}: an object of {path} with other attributes than {sorted(OBJECTS[path])}")
+        state = {}
+        for key, item in vars(value).items():
+            # An argument is known to the user by its own name, not by that of what Stable-Baselines3 wraps it in.
+            wraps = key == "value_schedule"
+            state[key] = self.encode(item, name if wraps else f"{name}.{key}", depth + 1, schedule=wraps)
+            check_attribute(path, key, item, name, NotPortable)
+        return {"object": path, "attributes": state}
+
+    def _instance(self, value: Any, name: str, depth: int) -> dict[str, Any] | None:
+        """An object of a class of the user's own by its attributes, if it consists of nothing else."""
+        cls = type(value)
+        is_plain = cls.__basicsize__ == _Plain.__basicsize__ and cls.__dictoffset__ != 0
+        has_more = issubclass(cls, _OF_TRAINING) or hasattr(cls, "state_dict") or within(cls.__module__, PACKAGES)
+        if not is_plain or has_more:
+            return None
+        attributes = {}
+        path = self.foreign[name] = path_of(cls)
+        for key, item in vars(value).items():
+            if not may_be_set(cls, key):
+                raise NotPortable(f"{name}: its {key!r} takes the place of what {path} does")
+            attributes[key] = self.encode(item, f"{name}.{key}", depth + 1)
+        return {"instance": path, "attributes": attributes}
 
     def _space(self, space: Any, name: str, depth: int) -> dict[str, Any]:
         arguments: dict[str, Any]
@@ -203,6 +324,49 @@ class _Encoder:
             state = self.encode(value.get_state(), name, depth + 1)
             return {"torch_generator": state, "device": str(value.device)}
         return None
+
+
+class Lenient(Encoder):
+    """
+    An encoder that goes on without what no file can hold.
+
+    :param tensors: takes the values' arrays and tensors
+    """
+
+    def __init__(self, tensors: dict[str, torch.Tensor]):
+        super().__init__(tensors)
+        #: What is left out, by its name, with the reason.
+        self.left_out: dict[str, str] = {}
+
+    def attempt(self, value: Any, name: str, schedule: bool = False) -> Any:
+        """
+        :param value: the value
+        :param name: what it is
+        :param schedule: whether it is a schedule
+        :return: its tree; or, if a part of it has no place in a file, what stands for it (:func:`is_left_out`)
+        """
+        try:
+            with self.all_or_nothing():
+                return self.encode(value, name, schedule=schedule)
+        except NotPortable as error:
+            return self.leave_out(name, str(error).removeprefix(f"{name}: "))
+
+    def leave_out(self, name: str, reason: str) -> dict[str, str]:
+        """
+        :param name: a value that shall not be in the file
+        :param reason: why
+        :return: what stands for it
+        """
+        self.left_out[name] = reason
+        return {LEFT_OUT: reason}
+
+
+def is_left_out(tree: Any) -> bool:
+    """
+    :param tree: of a value, perhaps from a file
+    :return: whether it stands for one that was left out
+    """
+    return isinstance(tree, dict) and tree.keys() == {LEFT_OUT} and isinstance(tree[LEFT_OUT], str)
 
 
 def _checked(dtype: np.dtype, name: str) -> np.dtype:

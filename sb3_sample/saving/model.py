@@ -3,7 +3,6 @@
 import io
 import pathlib
 import warnings
-from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
@@ -13,23 +12,13 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 
-from sb3_sample.saving import container, paths
+from sb3_sample.saving import container, notice, paths
 from sb3_sample.saving.budget import Budget
-from sb3_sample.saving.checks import (
-    ParametersDoNotFit,
-    check_extra,
-    check_finite,
-    check_kinds,
-    check_metadata,
-    check_moments,
-    check_names,
-    check_sizes,
-)
-from sb3_sample.saving.classes import check_trusted, path_of
+from sb3_sample.saving.checks import ParametersDoNotFit, check_kinds, check_names, check_sizes, library_class
+from sb3_sample.saving.classes import check_trusted
 from sb3_sample.saving.container import BadFile, PickledFile
-from sb3_sample.saving.encoding import decode, encode
+from sb3_sample.saving.model_tree import KIND, Content, Description
 
-KIND = "model"
 Self = TypeVar("Self", bound="SafeFiles")
 
 
@@ -38,6 +27,14 @@ class SafeFiles(BaseAlgorithm):
     What an algorithm's class gains that stands before Stable-Baselines3's among its bases: ``save``, ``load`` and
     ``set_parameters`` with files that hold JSON and tensors, and run no code. See docs/saving.md.
     """
+
+    #: Modules that whoever loaded the model vouches for. A file never says so.
+    _trusted_modules: tuple[str, ...] = ()
+    #: What was said of the model's files.
+    _told: frozenset[str] = frozenset()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_trusted_modules", "_told", "lr_schedule"]
 
     def save(
         self,
@@ -52,13 +49,15 @@ class SafeFiles(BaseAlgorithm):
         Save the model, as in Stable-Baselines3, but to a file that runs no code when it is loaded. What is there is
         replaced at once, and only when the new file is complete.
 
+        Classes and functions are written by their names, and a schedule that has none as a table. What no file can hold
+        is left out, with one warning for a model (``learn`` gives it when the training starts).
+
         :param path: path, to which ".zip" is added if it has no suffix, or a binary file open for writing
         :param exclude: attributes to leave out, besides those that always are
         :param include: attributes to save that would be left out
         :param allow_pickle: whether to write Stable-Baselines3's own, pickled format instead, which can hold anything
-        :param trusted_modules: modules, or packages of modules, whose classes and functions the file may name; to be
-            named again when it is loaded
-        :raises NotPortable: (a ``ValueError``) if an attribute cannot be in such a file; nothing is written then
+        :param trusted_modules: modules, or packages of modules, that will be named when it is loaded, so that it needs
+            no warning
         :raises ValueError: if a parameter is not finite
         :raises OSError: if the file cannot be written
         """
@@ -66,30 +65,10 @@ class SafeFiles(BaseAlgorithm):
         if allow_pickle:
             super().save(path, exclude, include)
             return
-        names, variables = self._get_torch_save_params()
-        if variables:
-            raise ValueError(
-                f"{type(self).__name__} holds tensors of its own, {variables}: allow_pickle=True saves them"
-            )
-        left_out = {*self._excluded_save_params(), *(exclude or ())} - set(include or ())
-        left_out |= {name.split(".")[0] for name in names}
-        tensors: dict[str, torch.Tensor] = {}
-        attributes = {
-            name: encode(value, name, tensors, trusted) for name, value in vars(self).items() if name not in left_out
-        }
-        parameters = self.get_parameters()
-        for name, state in parameters.items():
-            check_finite(recursive_getattr(self, name), state, name, "cannot be saved, since it", ValueError)
-        metadata = {name: getattr(state, "_metadata", None) for name, state in parameters.items()}
-        classes = [path_of(cls) for cls in type(self).__mro__ if issubclass(cls, SafeFiles)]
-        tree = {
-            "classes": classes,
-            "attributes": attributes,
-            "parameters": {name: encode(state, name, tensors, trusted) for name, state in parameters.items()},
-            # What torch's modules know of the version of their own parameters.
-            "metadata": {name: encode(value, name, tensors, trusted) for name, value in metadata.items()},
-        }
-        container.write(paths.to_write(path, "zip"), KIND, tree, tensors)
+        described = Description(self, exclude or (), include or ())
+        tree = described.tree(SafeFiles)
+        notice.say_once(self, described.encoder, trusted)
+        container.write(paths.to_write(path, "zip"), KIND, tree, described.encoder.tensors)
 
     @classmethod
     def load(
@@ -116,72 +95,116 @@ class SafeFiles(BaseAlgorithm):
         :param force_reset: whether the environment is reset before training goes on
         :param allow_pickle: whether a file in Stable-Baselines3's own, pickled format is loaded too, which can run any
             code that its author wanted
-        :param trusted_modules: modules, or packages of modules, whose classes and functions the file may name
-        :param kwargs: arguments of the constructor that shall differ from the saved ones
+        :param trusted_modules: modules, or packages of modules, whose classes and functions the file, and what the
+            model reads later, may name
+        :param kwargs: arguments of the constructor that take the place of the file's, which is not asked for them:
+            ``policy`` (a class), ``policy_kwargs``, ``action_noise``, ``learning_rate``, ...
         :return: the model
-        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
+        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, of another class, or names what is
+            not trusted; or lacks what must be given
         :raises ParametersDoNotFit: (a ``ValueError``) if its parameters are not those of the model that it describes
         """
-        trusted = check_trusted(trusted_modules)
+        trusted, custom_objects = check_trusted(trusted_modules), custom_objects or {}
+        if "policy" in kwargs:
+            kwargs["policy_class"] = cls._policy_class(kwargs.pop("policy"))
+        if "policy_kwargs" in kwargs:
+            kwargs["policy_kwargs"] = kwargs["policy_kwargs"] or {}
         try:
             with paths.opened(path, "zip") as file:
-                content = _Content(file, cls, trusted)
+                content = Content(file, cls, SafeFiles, trusted)
         except PickledFile:
             if not allow_pickle:
                 raise
             try:
                 made = None if env is None else maybe_make_env(env, 0)
-                return super().load(path, made, device, custom_objects, print_system_info, force_reset, **kwargs)
+                model = super().load(path, made, device, custom_objects, print_system_info, force_reset, **kwargs)
             except TypeError as error:
                 raise ValueError(
                     f"{path} holds no model of {cls.__name__} ({error}): a model of one of Stable-Baselines3's own "
                     "algorithms has other networks, and is loaded by its own class"
                 ) from error
+            model._trusted_modules = trusted
+            return model
         if print_system_info:
             print("== CURRENT SYSTEM INFO ==")
             get_system_info()
             print("== SAVED MODEL SYSTEM INFO ==")
             print("\n".join(f"- {name}: {version}" for name, version in content.versions.items()))
-        attributes = content.attributes(custom_objects or {})
-        if "replay_buffer_kwargs" not in kwargs:
-            _forget_folder(attributes, warn=env is not None)
-        given = kwargs.get("policy_kwargs")
-        if "policy_kwargs" in kwargs and given != attributes["policy_kwargs"]:
-            raise ValueError(
-                f"policy_kwargs must be those of the file, {attributes['policy_kwargs']}, or be left out, not {given}"
-            )
+        attributes = content.attributes(kwargs.keys(), custom_objects)
+        if "policy_kwargs" in kwargs:
+            content.check_policy_kwargs(kwargs["policy_kwargs"])
+        _forget_folder(attributes, warn=env is not None)
+        model = cls._made(content, attributes, kwargs, custom_objects, env, device, force_reset)
+        model._trusted_modules = trusted
+        if content.left_out:
+            shown = ", ".join(f"{name} ({reason:.200})" for name, reason in content.left_out.items())
+            warnings.warn(f"{content.name} was saved without {shown}: the model has its defaults there", stacklevel=3)
+        return model
+
+    @classmethod
+    def _made(
+        cls: type[Self],
+        content: Content,
+        attributes: dict[str, Any],
+        kwargs: dict[str, Any],
+        custom_objects: dict[str, Any],
+        env: GymEnv | str | None,
+        device: torch.device | str,
+        force_reset: bool,
+    ) -> Self:
+        """The model of a file: ``attributes`` are the file's, ``kwargs`` the caller's, the rest as in ``load``."""
+        policy_class = kwargs.get("policy_class", attributes.get("policy_class"))
+        if policy_class is None:
+            raise BadFile(f"{content.name} lacks policy_class: pass policy= to load")
+        given, lacks = {*kwargs, *custom_objects}, ""
         if env is not None:
-            env = cls._wrap_env(maybe_make_env(env, attributes["verbose"]), attributes["verbose"])
-            check_for_correct_spaces(env, attributes["observation_space"], attributes["action_space"])
+            verbose = kwargs.get("verbose", attributes.get("verbose", 0))
+            env = cls._wrap_env(maybe_make_env(env, verbose), verbose)
+            spaces = [attributes.get(name, getattr(env, name)) for name in ("observation_space", "action_space")]
+            check_for_correct_spaces(env, *spaces)
             attributes["n_envs"] = env.num_envs
             if force_reset:
                 attributes["_last_obs"] = None
+        elif missing := [name for name in ("observation_space", "action_space") if name not in attributes]:
+            raise BadFile(f"{content.name} lacks {' and '.join(missing)}: pass env= to load")
         try:
             with Budget(content.tensors, content.name):
-                model = cls(policy=attributes["policy_class"], env=env, device=device, _init_setup_model=False)  # type: ignore[call-arg]
+                model = cls(policy=policy_class, env=env, device=device, _init_setup_model=False)  # type: ignore[call-arg]
+                lacks = content.lacking(model, given)
                 check_names(model, attributes, content.name)
-                given = {*kwargs, *(custom_objects or ())}
-                check_kinds(model, {k: v for k, v in attributes.items() if k not in given}, content.name)
-                vars(model).update(attributes)
-                vars(model).update(kwargs)
-                check_sizes(model, content.name, "buffer_size" in kwargs)
+                library: Any = library_class(cls)
+                plain = model if library is cls else library(policy_class, None, device=device, _init_setup_model=False)
+                check_kinds(plain, {k: v for k, v in attributes.items() if k not in given}, content.name)
+                vars(model).update({"n_envs": 1, **attributes, **kwargs})
+                check_sizes(model, content.name, given)
                 model._setup_model()
             if kwargs:
                 content.check_shapes(model)
             content.check_parameters(model)
-            model.set_parameters(content.parameters(), exact_match=True, device=device)
+            model.set_parameters(content.parameters(model), exact_match=True, device=device)
+            content.set_variables(model)
             if model.use_sde:
                 model.policy.reset_noise()  # type: ignore[operator]
-        except (BadFile, ParametersDoNotFit):
-            raise
+        except (BadFile, ParametersDoNotFit) as error:
+            if not lacks:
+                raise
+            kind = BadFile if isinstance(error, BadFile) else ParametersDoNotFit
+            raise kind(f"{lacks}{error}") from error
         except Exception as error:
             # With arguments that the file does not have, its content need not be to blame.
-            if kwargs or custom_objects:
+            if given:
                 raise
-            raise BadFile(
-                f"{content.name}: no {cls.__name__} can be made of what it holds: {type(error).__name__}: {error}"
-            ) from error
+            why = f"{type(error).__name__}: {error}"
+            raise BadFile(f"{lacks}{content.name}: no {cls.__name__} can be made of what it holds: {why}") from error
         return model
+
+    @classmethod
+    def _policy_class(cls, policy: Any) -> Any:
+        if isinstance(policy, str) and policy in cls.policy_aliases:
+            return cls.policy_aliases[policy]
+        if not isinstance(policy, type):
+            raise ValueError(f"policy must be one of {list(cls.policy_aliases)} or a policy class, not {policy!r}")
+        return policy
 
     def set_parameters(
         self,
@@ -200,7 +223,7 @@ class SafeFiles(BaseAlgorithm):
         :param exact_match: whether parameters for every module must be there, and no others
         :param device: "auto", "cpu", "cuda", ...
         :param allow_pickle: see ``load``
-        :param trusted_modules: see ``load``
+        :param trusted_modules: see ``load``; besides those that the model was loaded with
         :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
         :raises ParametersDoNotFit: (a ``ValueError``) if the file's parameters are not those of this model
         """
@@ -208,10 +231,11 @@ class SafeFiles(BaseAlgorithm):
         content = None
         if not isinstance(load_path_or_dict, dict):
             try:
+                trusted = (*self._trusted_modules, *check_trusted(trusted_modules))
                 with paths.opened(load_path_or_dict, "zip") as file:
-                    content = _Content(file, type(self), check_trusted(trusted_modules))
+                    content = Content(file, type(self), SafeFiles, trusted)
                 content.check_parameters(self)
-                parameters = content.parameters()
+                parameters = content.parameters(self)
             except PickledFile:
                 if not allow_pickle:
                     raise
@@ -232,6 +256,8 @@ class SafeFiles(BaseAlgorithm):
                 for key in group.keys() - own.keys() - {"params"}:
                     del group[key]
                 group.update(own)
+        if content is not None:
+            content.set_variables(self)
 
 
 def class_of(path: str | pathlib.Path) -> str:
@@ -243,112 +269,7 @@ def class_of(path: str | pathlib.Path) -> str:
     """
     anything: Any = SafeFiles
     with paths.opened(path, "zip") as file:
-        return _Content(file, anything, ()).tree["classes"][0]
-
-
-class _Content:
-    """
-    What a model's file holds.
-
-    :param file: the file
-    :param cls: the class that is to be loaded
-    :param trusted: modules that the file may name
-    :raises BadFile: if it is no such file
-    """
-
-    def __init__(self, file: Any, cls: type[SafeFiles], trusted: tuple[str, ...]):
-        self.name = str(getattr(file, "name", "the file"))
-        self.trusted = trusted
-        self.tree, self._stored, self.versions = container.read_with_versions(file, KIND)
-        #: Of which the budget is made.
-        self.tensors = dict(self._stored)
-        tree = self.tree
-        if not isinstance(tree, dict) or tree.keys() != {"classes", "attributes", "parameters", "metadata"}:
-            raise BadFile(f"{self.name} is damaged: it does not hold what a model consists of")
-        classes = tree["classes"]
-        if not isinstance(classes, list) or not classes or not all(isinstance(path, str) for path in classes):
-            raise BadFile(f"{self.name} is damaged: it does not say of which class the model is")
-        if not all(isinstance(tree[key], dict) for key in ("attributes", "parameters", "metadata")):
-            raise BadFile(f"{self.name} is damaged: it does not hold what a model consists of")
-        if path_of(cls) not in classes and classes[0] not in map(path_of, cls.__mro__):
-            raise BadFile(
-                f"{self.name} holds a model of {classes[0]}, which is neither {cls.__name__} nor above or below it: "
-                "load it with its own class"
-            )
-        self._parameters: dict[str, Any] | None = None
-
-    def attributes(self, custom_objects: dict[str, Any]) -> dict[str, Any]:
-        """
-        :param custom_objects: what replaces the file's
-        :return: the values of the attributes
-        """
-        described = self.tree["attributes"]
-        attributes = {
-            name: custom_objects[name] if name in custom_objects else self._decoded(tree, name)
-            for name, tree in described.items()
-        }
-        for name, kind in (("policy_kwargs", dict), ("verbose", int), ("policy_class", type)):
-            if not isinstance(attributes.get(name), kind):
-                raise BadFile(f"{self.name} is damaged: {name} is {attributes.get(name)!r:.100}")
-        for name in ("observation_space", "action_space"):
-            if name not in attributes:
-                raise BadFile(f"{self.name} is damaged: it has no {name}")
-        attributes["policy_kwargs"].pop("device", None)
-        # Where the model is to be says the one who loads it.
-        attributes.pop("device", None)
-        return attributes
-
-    def _decoded(self, tree: Any, name: str) -> Any:
-        try:
-            return decode(tree, self._stored, name, self.trusted)
-        except BadFile as error:
-            raise BadFile(f"{self.name}: {error}") from error
-
-    def parameters(self) -> dict[str, Any]:
-        """
-        :return: what ``get_parameters`` gave, once
-        """
-        if self._parameters is None:
-            self._parameters = {name: self._decoded(tree, name) for name, tree in self.tree["parameters"].items()}
-            for name, tree in self.tree["metadata"].items():
-                if isinstance(state := self._parameters.get(name), OrderedDict):
-                    metadata = vars(state)["_metadata"] = self._decoded(tree, name)
-                    check_metadata(metadata, f"{self.name}: {name}")
-        return self._parameters
-
-    def check_shapes(self, model: SafeFiles) -> None:
-        """
-        Before the file is asked whether it fits in every other respect: with arguments of the caller's own it is not to
-        blame if it does not.
-
-        :param model: for which the parameters are
-        :raises ParametersDoNotFit: if a tensor has another shape there
-        """
-        for name in model._get_torch_save_params()[0]:
-            owner, state = recursive_getattr(model, name), self.parameters().get(name)
-            if not isinstance(owner, torch.nn.Module) or not isinstance(state, dict):
-                continue
-            for key, own in owner.state_dict().items():
-                theirs = state.get(key)
-                if isinstance(own, torch.Tensor) and isinstance(theirs, torch.Tensor) and own.shape != theirs.shape:
-                    raise ParametersDoNotFit(
-                        f"{name}.{key} has the shape {tuple(theirs.shape)} in the file and {tuple(own.shape)} here"
-                    )
-
-    def check_parameters(self, model: SafeFiles) -> None:
-        """
-        :param model: for which they are
-        :raises BadFile: if one is not finite, or what an optimizer keeps of one is not of its shape
-        """
-        known = model._get_torch_save_params()[0]
-        for name, state in self.parameters().items():
-            # Others are refused by ``set_parameters``.
-            owner = recursive_getattr(model, name) if name in known else None
-            check_finite(owner, state, f"{self.name}: {name}", "", BadFile)
-            if isinstance(owner, torch.nn.Module):
-                check_extra(owner, state, f"{self.name}: {name}")
-            if isinstance(owner, torch.optim.Optimizer):
-                check_moments(owner, state, f"{self.name}: {name}")
+        return Content(file, anything, SafeFiles, ()).tree["classes"][0]
 
 
 def _forget_folder(attributes: dict[str, Any], warn: bool) -> None:

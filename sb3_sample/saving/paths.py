@@ -1,7 +1,9 @@
 """Where files are, by Stable-Baselines3's rules, and whether they are pickled."""
 
 import contextlib
+import errno
 import io
+import os
 import pathlib
 import warnings
 from collections.abc import Iterator
@@ -32,17 +34,35 @@ def to_write(path: PathOrFile, suffix: str) -> Any:
     return path
 
 
-@contextlib.contextmanager
-def opened(path: PathOrFile, suffix: str) -> Iterator[IO[bytes]]:
+def find(path: PathOrFile, *suffixes: str) -> Any:
     """
-    :param path: a path, with or without the suffix, or a binary file open for reading
-    :param suffix: without its dot
+    :param path: a path, with or without a suffix, or a binary file open for reading
+    :param suffixes: those that may have been added to it, without their dots, the likeliest first
+    :return: the path of the file that is there, or the file
+    :raises FileNotFoundError: if there is none
+    :raises ValueError: if a file is not open for reading
+    """
+    if not isinstance(path, (str, pathlib.Path)):
+        return open_path(path, "r")
+    candidates = [pathlib.Path(path), *(pathlib.Path(f"{path}.{suffix}") for suffix in suffixes)]
+    for candidate in candidates:
+        if candidate.exists() and not candidate.is_dir():
+            return candidate
+    tried = " and ".join(str(candidate) for candidate in candidates)
+    raise FileNotFoundError(errno.ENOENT, f"{os.strerror(errno.ENOENT)} (looked for {tried})", str(path))
+
+
+@contextlib.contextmanager
+def opened(path: PathOrFile, *suffixes: str) -> Iterator[IO[bytes]]:
+    """
+    :param path: as of :func:`find`
+    :param suffixes: as of :func:`find`
     :return: the file, which is closed afterwards if it was opened here
     :raises FileNotFoundError: if there is none
     """
-    file: Any = open_path(path, "r", suffix=suffix)
-    try:
-        yield file
-    finally:
-        if isinstance(path, (str, pathlib.Path)):
-            file.close()
+    found = find(path, *suffixes)
+    if isinstance(found, pathlib.Path):
+        with found.open("rb") as file:
+            yield file
+    else:
+        yield found

@@ -1,6 +1,7 @@
 """Replay buffers in files that run no code."""
 
 import io
+import json
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -11,13 +12,15 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_sample.saving import container, paths
-from sb3_sample.saving.classes import NotPortable, check_trusted, checked_path
+from sb3_sample.saving import container, notice, paths
+from sb3_sample.saving.classes import PACKAGES, check_trusted, may_be_set, within
 from sb3_sample.saving.container import MAX_MESSAGE, BadFile, PickledFile
-from sb3_sample.saving.encoding import decode, encode
+from sb3_sample.saving.decoding import NotTrusted
+from sb3_sample.saving.encoding import Lenient, decode, is_left_out
 
 KIND = "replay buffer"
-SUFFIX = "buffer.zip"
+#: What is added to a path that is written, and what else may have been, by those who expect a pickle.
+SUFFIX, PICKLES_SUFFIX = "buffer.zip", "pkl"
 #: Transitions that a model's file can ask memory for, which is not touched before they come; and of a HerReplayBuffer,
 #: which makes an object for each.
 MAX_TRANSITIONS, MAX_HER_TRANSITIONS = 100_000_000, 5_000_000
@@ -45,25 +48,26 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
     ) -> None:
         """
         Save the replay buffer, as in Stable-Baselines3, but to a file that runs no code when it is loaded. The rows
-        that were never filled take no space.
+        that were never filled take no space. What no file can hold is left out, with a warning.
 
         :param path: path, to which ".buffer.zip" is added if it has no suffix, or a binary file open for writing
         :param allow_pickle: whether to write Stable-Baselines3's own, pickled format instead (".pkl")
-        :param trusted_modules: modules, or packages of modules, whose classes the file may name; to be named again when
-            it is loaded
-        :raises NotPortable: (a ``ValueError``) if the buffer cannot be in such a file; nothing is written then
+        :param trusted_modules: modules, or packages of modules, that will be named when it is loaded, so that it needs
+            no warning
         :raises ValueError: if there is no replay buffer
         :raises OSError: if the file cannot be written
         """
         trusted = check_trusted(trusted_modules)
-        if self.replay_buffer is None:
+        buffer = getattr(self, "replay_buffer", None)
+        if buffer is None:
             raise ValueError("there is no replay buffer to save")
         if allow_pickle:
             super().save_replay_buffer(path)
             return
-        tensors: dict[str, torch.Tensor] = {}
-        tree = encode_buffer(self.replay_buffer, tensors, trusted)
-        container.write(paths.to_write(path, SUFFIX), KIND, tree, tensors)
+        encoder = Lenient({})
+        tree = encode_buffer(buffer, encoder)
+        notice.say_once(self, encoder, trusted)
+        container.write(paths.to_write(path, SUFFIX), KIND, tree, encoder.tensors)
 
     def load_replay_buffer(
         self,
@@ -76,28 +80,26 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
         """
         Load a replay buffer, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it.
 
-        :param path: file, or where ``save_replay_buffer`` wrote it
+        :param path: file, or where ``save_replay_buffer`` wrote it; what it holds, and not its name, says what it is
         :param truncate_last_traj: with ``HerReplayBuffer``, whether the last episode counts as ended
         :param allow_pickle: whether a file in Stable-Baselines3's own, pickled format is loaded too, which can run any
             code that its author wanted
-        :param trusted_modules: modules, or packages of modules, whose classes the file may name
-        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile or pickled
-        :raises ValueError: if it is the buffer of other spaces
+        :param trusted_modules: modules, or packages of modules, whose classes the file may name, besides those that the
+            model was loaded with
+        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile or pickled, or names what is not trusted
+        :raises ValueError: if it is the buffer of other spaces, or of another number of environments
         """
-        trusted = check_trusted(trusted_modules)
+        trusted = (*self._trusted_modules, *check_trusted(trusted_modules))  # type: ignore[attr-defined]
+        found = paths.find(path, SUFFIX, PICKLES_SUFFIX)
+        name = str(getattr(found, "name", "the file")) if not isinstance(found, pathlib.Path) else str(found)
         try:
-            with paths.opened(path, SUFFIX) as file:
+            with paths.opened(found) as file:
                 tree, tensors = container.read(file, KIND)
-                name = str(getattr(file, "name", "the file"))
-        except (PickledFile, FileNotFoundError):
-            if allow_pickle:
-                super().load_replay_buffer(path, truncate_last_traj)
-                return
-            if isinstance(path, (str, pathlib.Path)) and pathlib.Path(f"{path}.pkl").is_file():
-                raise PickledFile(
-                    f"{path}.pkl is pickled: allow_pickle=True reads it, and runs what is in it"
-                ) from None
-            raise
+        except PickledFile:
+            if not allow_pickle:
+                raise
+            self._load_pickled(found, name, truncate_last_traj)
+            return
         buffer = decode_buffer(tree, tensors, self, name, trusted)
         if isinstance(buffer, HerReplayBuffer):
             if self.env is None:
@@ -107,54 +109,72 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
                 buffer.truncate_last_trajectory()
         self.replay_buffer = buffer
 
+    def _load_pickled(self, path: Any, name: str, truncate_last_traj: bool) -> None:
+        before = getattr(self, "replay_buffer", None)
+        super().load_replay_buffer(path, truncate_last_traj)
+        loaded: Any = self.replay_buffer
+        try:
+            _check_n_envs(loaded.n_envs, self)
+            _check_spaces(loaded, self)
+        except ValueError as error:
+            self.replay_buffer = before
+            raise ValueError(f"{name}: {error}") from error
+
 
 def _has_state(buffer: Any) -> bool:
     return hasattr(buffer, "state_dict") and hasattr(buffer, "load_state_dict")
 
 
-def encode_buffer(buffer: ReplayBuffer, tensors: dict[str, torch.Tensor], trusted: Sequence[str] = ()) -> Any:
+def encode_buffer(buffer: ReplayBuffer, encoder: Lenient, only_small: bool = False) -> Any:
     """
     :param buffer: a replay buffer
-    :param tensors: takes its arrays, without copying them
-    :param trusted: modules whose classes it may be of
+    :param encoder: takes its arrays, without copying them
+    :param only_small: whether to go without the rows, as if there were none
     :return: its tree of JSON
-    :raises NotPortable: if it has no place in such a file
     """
-    path = checked_path(type(buffer), "replay_buffer", trusted)
+    tree: dict[str, Any] = {"class": encoder.attempt(type(buffer), "replay_buffer").get("import")}
     if _has_state(buffer):
-        arguments = {name: getattr(buffer, name) for name in _ARGUMENTS if hasattr(buffer, name)}
-        state: Any = buffer.state_dict()  # type: ignore[attr-defined]
-        return {"class": path, "arguments": arguments, "state": encode(state, "replay_buffer", tensors, trusted)}
-    attributes = {}
+        tree["arguments"] = {name: getattr(buffer, name) for name in _ARGUMENTS if hasattr(buffer, name)}
+        state: Any = {} if only_small else buffer.state_dict()  # type: ignore[attr-defined]
+        tree["state"] = {"dict": {key: encoder.attempt(value, f"replay_buffer.{key}") for key, value in state.items()}}
+        return tree
+    tree["attributes"] = {}
     for name, value in vars(buffer).items():
-        if name not in _NOT_SAVED:
-            attributes[name] = _encode_attribute(buffer, value, f"replay_buffer.{name}", tensors, trusted)
-    return {"class": path, "attributes": attributes}
+        if name in _NOT_SAVED or (only_small and isinstance(value, (np.ndarray, torch.Tensor, dict))):
+            continue
+        if may_be_set(type(buffer), name):
+            tree["attributes"][name] = _encode_attribute(buffer, value, f"replay_buffer.{name}", encoder)
+        else:
+            encoder.leave_out(f"replay_buffer.{name}", "it takes the place of what the class does")
+    return tree
 
 
-def _encode_attribute(
-    buffer: ReplayBuffer, value: Any, name: str, tensors: dict[str, torch.Tensor], trusted: Sequence[str]
-) -> dict[str, Any]:
+def _encode_attribute(buffer: ReplayBuffer, value: Any, name: str, encoder: Lenient) -> dict[str, Any]:
     if isinstance(value, dict) and value and all(isinstance(item, np.ndarray) for item in value.values()):
-        return {
-            "dict": {
-                key: _encode_attribute(buffer, item, f"{name}.{key}", tensors, trusted) for key, item in value.items()
-            }
-        }
+        return {"dict": {k: _encode_attribute(buffer, item, f"{name}.{k}", encoder) for k, item in value.items()}}
     if not isinstance(value, (np.ndarray, torch.Tensor)) or value.ndim == 0:
-        return {"whole": encode(value, name, tensors, trusted)}
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        # HerReplayBuffer's infos: of the environments if copy_info_dict, else empty.
-        if value.ndim != 2 or not all(isinstance(info, dict) for info in value.flat):
-            raise NotPortable(f"{name}: an array of other objects than dicts cannot be written to the file")
+        return {"whole": encoder.attempt(value, name)}
+    if isinstance(value, np.ndarray) and value.dtype == object and all(isinstance(info, dict) for info in value.flat):
+        # HerReplayBuffer's: of the environments if copy_info_dict, else empty.
         infos = [list(row) for row in value]
         while infos and not any(infos[-1]):
             infos.pop()
-        return {"infos": list(value.shape), "first": encode(infos, name, tensors, trusted)}
+        first = [[_encode_info(info, name, encoder) for info in row] for row in infos]
+        if infos and (size := len(json.dumps(first))) > container.MAX_JSON // 2:
+            # More than a reader takes: the transitions are worth more than what was said of them.
+            encoder.leave_out(name, f"they take {size} bytes of JSON")
+            first = []
+        return {"infos": list(value.shape), "first": first}
     filled = _filled(buffer, len(value))
     if filled < len(value) and not value[filled:].any():
-        return {"rows": len(value), "first": encode(value[:filled], name, tensors, trusted)}
-    return {"whole": encode(value, name, tensors, trusted)}
+        return {"rows": len(value), "first": encoder.attempt(value[:filled], name)}
+    return {"whole": encoder.attempt(value, name)}
+
+
+def _encode_info(info: dict[Any, Any], name: str, encoder: Lenient) -> Any:
+    """What an environment said of a step, without what no file can hold."""
+    pairs = [(key, encoder.attempt(item, f"{name}.{key}")) for key, item in info.items() if type(key) is str]
+    return {"dict": {key: tree for key, tree in pairs if not is_left_out(tree)}}
 
 
 def _filled(buffer: ReplayBuffer, n_rows: int) -> int:
@@ -189,6 +209,8 @@ def decode_buffer(
         raise BadFile(
             f"{name}: no replay buffer can be made of what it holds: {type(error).__name__}: {error}"
         ) from error
+    except NotTrusted as error:
+        raise BadFile(f"{name}: {error}: {notice.need(type(model), 'replay_buffer', error.path)}") from error
     except BadFile as error:
         raise BadFile(f"{name}: {error}") from error
     except ValueError as error:
@@ -204,7 +226,7 @@ def _with_state(
     size, n_envs = arguments["buffer_size"], arguments["n_envs"]
     _check_size(size, n_envs, cls, model)
     state = decode(tree["state"], tensors, "replay_buffer", trusted)
-    own: Any = model.replay_buffer
+    own: Any = getattr(model, "replay_buffer", None)
     buffer = own
     if type(own) is not cls or any(getattr(own, name, None) != value for name, value in arguments.items()):
         same_class = {} if type(own) is not cls else dict(model.replay_buffer_kwargs)
@@ -224,13 +246,17 @@ def _with_attributes(
     described = tree["attributes"]
     size, n_envs = described["buffer_size"]["whole"], described["n_envs"]["whole"]
     _check_size(size, n_envs, cls, model)
+    own = getattr(model, "replay_buffer", None)
     buffer: Any = cls.__new__(cls)
     for name, value in described.items():
-        if not name.isidentifier() or name.startswith("__") or name in _NOT_SAVED or hasattr(cls, name):
+        if name in _NOT_SAVED or not may_be_set(cls, name):
             raise BadFile(f"it sets {name!r:.100}, which is no attribute of a {cls.__name__}")
-        vars(buffer)[name] = _decode_attribute(value, (size, n_envs), f"replay_buffer.{name}", tensors, trusted)
-    if type(model.replay_buffer) is cls:
-        _check_alike(buffer, model.replay_buffer)
+        if is_left_out(value.get("whole")) and type(own) is cls and name in vars(own):
+            vars(buffer)[name] = vars(own)[name]
+        else:
+            vars(buffer)[name] = _decode_attribute(value, (size, n_envs), f"replay_buffer.{name}", tensors, trusted)
+    if type(own) is cls:
+        _check_alike(buffer, own)
     buffer.device = model.device
     if issubclass(cls, HerReplayBuffer):
         buffer.env = None
@@ -252,7 +278,7 @@ def _with_attributes(
 def _check_size(size: Any, n_envs: Any, cls: type, model: OffPolicyAlgorithm) -> None:
     if type(size) is not int or type(n_envs) is not int or size < 1 or n_envs < 1:
         raise BadFile(f"its size is {size!r:.50} rows of {n_envs!r:.50} environments")
-    own = model.replay_buffer
+    own = getattr(model, "replay_buffer", None)
     most = max(
         MAX_OTHER_HER if issubclass(cls, HerReplayBuffer) else MAX_OTHER,
         model.buffer_size if own is None else own.buffer_size * own.n_envs,
@@ -262,12 +288,25 @@ def _check_size(size: Any, n_envs: Any, cls: type, model: OffPolicyAlgorithm) ->
             f"its size is {size} rows of {n_envs} environments, at most {most} transitions in all: load the model with "
             "a buffer_size as large first"
         )
+    _check_n_envs(n_envs, model)
+
+
+def _check_n_envs(n_envs: int, model: OffPolicyAlgorithm) -> None:
+    if n_envs != model.n_envs:
+        raise ValueError(
+            f"it is the buffer of {n_envs} environments (n_envs), but the model has {model.n_envs}: load the model "
+            "with as many (env=), or go on without the buffer"
+        )
 
 
 def _check_alike(buffer: Any, own: Any) -> None:
-    """A class that does not look at its state itself: a buffer must have what another has, of the same kinds."""
+    """
+    A class that does not look at its state itself: a buffer must have what another has, of the same kinds; what a class
+    of the user's own adds can be anything.
+    """
+    is_known = within(type(own).__module__, PACKAGES)
     for name, value in vars(own).items():
-        if name in _NOT_SAVED:
+        if name in _NOT_SAVED or not (is_known or isinstance(value, np.ndarray)):
             continue
         if name not in vars(buffer):
             raise BadFile(f"it has no {name}")

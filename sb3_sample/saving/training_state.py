@@ -18,6 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 
 from sb3_sample.saving.attributes import Describer, Node, Opaque, Restorer, without_generators
+from sb3_sample.saving.classes import NotPortable
 from sb3_sample.version import __version__
 
 #: Attributes of an algorithm that its file leaves out and that the future of the run depends on nevertheless.
@@ -33,12 +34,12 @@ DERIVED = (
 HARMLESS = ("verbose", "device", "tensorboard_log", "compile", "_init_setup_model")
 
 
-def argument_names(model: BaseAlgorithm) -> set[str]:
+def argument_names(cls: type) -> set[str]:
     """
-    :param model: the algorithm
+    :param cls: class of an algorithm
     :return: the arguments of its constructor and of those of its bases
     """
-    signatures = (inspect.signature(cls).parameters for cls in type(model).__mro__ if issubclass(cls, BaseAlgorithm))
+    signatures = (inspect.signature(base).parameters for base in cls.__mro__ if issubclass(base, BaseAlgorithm))
     return {name for parameters in signatures for name in parameters} - {"args", "kwargs", "_init_setup_model"}
 
 
@@ -51,12 +52,12 @@ def save_attributes(model: BaseAlgorithm) -> dict[str, Node]:
     """
     :param model: the algorithm, at the end of a turn of its loop
     :return: everything that its turns change and that is not saved elsewhere
-    :raises ValueError: an attribute of a subclass is nothing that can be saved
+    :raises NotPortable: (a ``ValueError``) the action noise, or an attribute of a subclass, cannot be described
     """
-    skip = (_saved_elsewhere(model) | argument_names(model)) - set(KEPT)
+    skip = (_saved_elsewhere(model) | argument_names(type(model))) - set(KEPT)
     described, opaque = Describer().attributes(model, skip)
     if opaque:
-        raise ValueError(f"{type(model).__name__} has attributes that a checkpoint cannot hold: {', '.join(opaque)}")
+        raise NotPortable(f"{type(model).__name__} has attributes that a checkpoint cannot hold: {', '.join(opaque)}")
     return described
 
 
@@ -145,7 +146,7 @@ def arguments_of(model: BaseAlgorithm) -> dict[str, Any]:
     values["policy"] = model.policy_class
     for name in ("observation_space", "action_space"):
         values[name] = without_generators(getattr(model, name))
-    for name in sorted(argument_names(model) - {"env", "policy", *HARMLESS}):
+    for name in sorted(argument_names(type(model)) - {"env", "policy", *HARMLESS}):
         if name in own:
             values[name] = own[name]
     return values

@@ -1,9 +1,11 @@
 """What a checkpoint holds, what it refuses, and what happens when it cannot be written or read."""
 
+import errno
 import json
 import os
 import resource
 import signal
+import stat
 import subprocess
 import warnings
 import zipfile
@@ -230,13 +232,6 @@ def test_buffers_that_no_checkpoint_can_hold(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="copy_info_dict=True"):
         model.learn(10, checkpoint=tmp_path)
     assert model.num_timesteps == 0 and not steps_of(tmp_path)
-
-
-def test_a_schedule_that_no_file_can_hold_is_refused_before_training(tmp_path: Path) -> None:
-    model = sac(learning_rate=lambda progress: 1e-3 * progress)
-    with pytest.raises(ValueError, match="learning_rate: .*<lambda>"):
-        model.learn(20, checkpoint=tmp_path)
-    assert model._n_updates == 0 and not steps_of(tmp_path)
 
 
 class OwnPolicy(MlpPolicy):
@@ -626,3 +621,21 @@ def test_callback_states_notice_changes_in_place() -> None:
     assert states.save()["callback"]["attributes"] == {}
     callback.best["step"] = 3.0
     assert set(states.save()["callback"]["attributes"]) == {"best"}
+
+
+def test_a_folder_that_cannot_be_synced(tmp_path: Path, monkeypatch: Any) -> None:
+    """Checkpoints are kept there, which is said once, and the run goes on from them."""
+    fsync = os.fsync
+
+    def not_of_folders(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", not_of_folders)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sac().learn(30, checkpoint=tmp_path / "run", **STEPS)
+        again = sac().learn(50, checkpoint=tmp_path / "run", **STEPS)
+    assert ["cannot be synced" in str(w.message) for w in caught] == [True]
+    assert steps_of(tmp_path / "run") == [40, 50] and not differing(state(sac().learn(50)), state(again))

@@ -13,6 +13,7 @@ import struct
 import subprocess
 import sys
 import textwrap
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -161,6 +162,59 @@ def test_data_and_name_are_on_the_disk_before_the_call_returns(tmp_path: Path, m
     monkeypatch.setattr(os, "replace", logged_replace)
     write(tmp_path / "m", "model", TREE, {})
     assert events == ["file", "replace", "folder"]
+
+
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EPERM])
+def test_a_folder_that_cannot_be_synced(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As network shares and some FUSE mounts answer: what is complete is written, which is said once a folder."""
+    fsync = os.fsync
+
+    def not_of_folders(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(number, os.strerror(number))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", not_of_folders)
+    (tmp_path / "inside").mkdir()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for name in ("a", "b", "a", "inside/c"):
+            write(tmp_path / name, "model", TREE, some_tensors())
+    assert [str(w.message) for w in caught] == [
+        f"{tmp_path} cannot be synced ({os.strerror(number)}): files in it are complete, but a power cut can cost the "
+        "newest"
+    ]
+    assert read(tmp_path / "b", "model")[0] == TREE
+
+
+def test_a_folder_that_cannot_be_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = os.open
+
+    def denied(path: Any, flags: int, *args: Any) -> int:
+        if os.path.isdir(path):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return opened(path, flags, *args)
+
+    monkeypatch.setattr(os, "open", denied)
+    with pytest.warns(UserWarning, match="cannot be synced .Permission denied"):
+        write(tmp_path / "m", "model", TREE, some_tensors())
+    assert [p.name for p in tmp_path.iterdir()] == ["m"]
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC, errno.EROFS])
+def test_a_disk_that_fails_is_no_folder_that_cannot_be_synced(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fsync = os.fsync
+
+    def fails(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(number, os.strerror(number))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fails)
+    with pytest.raises(OSError, match="could not be written"):
+        write(tmp_path / "m", "model", TREE, some_tensors())
 
 
 def test_no_space_left(tmp_path: Path) -> None:

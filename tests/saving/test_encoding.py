@@ -1,6 +1,8 @@
 """Values in files that run no code: what comes back is what was given, and nothing else gets in."""
 
 import collections
+import enum
+import functools
 import json
 import math
 import random
@@ -25,14 +27,16 @@ from sb3_sample.sac.policies import SACPolicy
 from sb3_sample.saving import container
 from sb3_sample.saving.classes import MAX_DEPTH
 from sb3_sample.saving.container import BadFile
-from sb3_sample.saving.encoding import NotPortable, decode, encode
+from sb3_sample.saving.decoding import NotTrusted
+from sb3_sample.saving.encoding import Encoder, Lenient, NotPortable, decode, encode, is_left_out
+from sb3_sample.saving.schedules import ScheduleTable
 
 G = np.random.default_rng(0)
 
 
 def through_a_file(value: Any, tmp_path: Path, trusted: tuple[str, ...] = ()) -> Any:
     tensors: dict[str, torch.Tensor] = {}
-    tree = encode(value, "value", tensors, trusted)
+    tree = encode(value, "value", tensors)
     container.write(tmp_path / "f", "test", tree, tensors)
     read_tree, read = container.read(tmp_path / "f", "test")
     decoded = decode(read_tree, read, "value", trusted)
@@ -107,7 +111,8 @@ VALUES: list[Any] = [
     OrnsteinUhlenbeckActionNoise(np.zeros(2), np.ones(2)),
     VectorizedActionNoise(OrnsteinUhlenbeckActionNoise(np.zeros(2), np.ones(2), initial_noise=np.ones(2)), 3),
     RunningMeanStd(shape=(3,)), nn.ReLU, nn.Tanh, nn.LayerNorm, torch.optim.Adam, torch.optim.AdamW, ReplayBuffer,
-    SACPolicy,
+    SACPolicy, Path("a/b"), [*range(17)], [0.5, -math.inf, math.nan] * 6, [*range(16), 2**70], [True] * 20,
+    ScheduleTable.of(lambda progress: progress**2), FloatSchedule(ScheduleTable.of(lambda progress: 1.0)),
 ]  # fmt: skip
 ARRAYS: list[np.ndarray] = [
     *(G.normal(size=(3, 2)).astype(t) for t in ("f2", "f4", "f8", "c8", "c16", ">f8", "longdouble")),
@@ -208,6 +213,50 @@ class Outer:
         pass
 
 
+class _Private(nn.ReLU):
+    pass
+
+
+class Own:
+    """An object that consists of its attributes."""
+
+    count = 0
+
+    def __init__(self, n: int):
+        self.n, self.count, self.array = n, n + 1, np.arange(3)
+
+
+class Slotted:
+    __slots__ = ("n",)
+
+
+class Overriding:
+    def __init__(self) -> None:
+        self.method = 3  # type: ignore[method-assign, assignment]
+
+    def method(self) -> None:
+        pass
+
+    @property
+    def number(self) -> int:
+        return 3
+
+
+class OwnSpace(spaces.Box):
+    pass
+
+
+class Phase(enum.Enum):
+    FIRST, LAST = 1, 2
+
+
+def local_class() -> Any:
+    class Local:
+        pass
+
+    return Local
+
+
 LOOP: list[Any] = []
 LOOP.append(LOOP)
 
@@ -215,27 +264,24 @@ LOOP.append(LOOP)
 @pytest.mark.parametrize(
     ("value", "words"),
     [
-        (lambda progress: progress, "learning_rate: the function .*LinearSchedule.*trusted_modules"),
-        (a_function, f"learning_rate: the function .*{__name__}:a_function' is of a module that is not trusted"),
-        (FloatSchedule(lambda progress: 1e-3), "learning_rate: the function .*trusted_modules"),
-        (OwnActivation, "learning_rate: the class .*OwnActivation"),
-        ({"activation_fn": OwnActivation}, "learning_rate.activation_fn: the class .*OwnActivation"),
+        (lambda progress: progress, "learning_rate: the function .*lambda.* has no name that a file can hold"),
+        (FloatSchedule(lambda progress: math.nan), "learning_rate: no table .*its value at 0 is nan"),
+        ({"activation_fn": functools.partial(nn.ELU)}, "learning_rate.activation_fn: an object of functools.partial"),
+        (Slotted(), f"learning_rate: an object of {__name__}.Slotted"),
+        (Overriding(), "learning_rate: its 'method' takes the place of what"),
+        ([].append, "learning_rate: the function"),
+        (OwnSpace(0, 1), f"learning_rate: an object of {__name__}.OwnSpace"),
         ([1, {"x": (object(),)}], r"learning_rate\[1\].x\[0\]: an object of builtins.object"),
         (OwnDict(), f"learning_rate: an object of {__name__}.OwnDict"),
         (nn.ReLU(), "learning_rate: an object of torch.nn.modules.activation.ReLU"),
-        (Outer.Inner, "no public name at the top of a module"),
         (np.array([object()]), "learning_rate: an array of object"),
         (np.zeros(2, [("a", "f4")]), "learning_rate: an array of"),
         (np.ma.array([1.0]), "learning_rate: an object of numpy.ma"),
         (torch.sparse_coo_tensor([[0]], [1.0], (2,)), "learning_rate: a Tensor of torch.float32 and torch.sparse_coo"),
         (nn.Parameter(torch.zeros(1)), "learning_rate: a Parameter"),
         (torch.zeros(2, dtype=torch.complex128), "learning_rate: a Tensor of torch.complex128"),
-        (len, "learning_rate: the function"), (int, "learning_rate: the class"),
-        (Path("a"), "learning_rate: an object"),
-        (torch.load, "learning_rate: the function"), (subprocess.Popen, "learning_rate: the class"),
         (random.SystemRandom(), "learning_rate: an object of random.SystemRandom"), (LOOP, "nested more than"),
         (spaces.Text(3), "learning_rate: an object of gymnasium.spaces.text.Text"),
-        (nn.functional.relu, "learning_rate: the function"),
     ],
 )  # fmt: skip
 def test_what_has_no_place_in_a_file_is_refused_by_name(value: Any, words: str) -> None:
@@ -243,16 +289,53 @@ def test_what_has_no_place_in_a_file_is_refused_by_name(value: Any, words: str) 
         encode(value, "learning_rate", {})
 
 
-@pytest.mark.parametrize("value", [a_function, OwnActivation, FloatSchedule(a_function)])
+@pytest.mark.parametrize(
+    "value", [a_function, OwnActivation, FloatSchedule(a_function), Outer.Inner, _Private, Own(3), Phase.LAST]
+)
 def test_trusted_modules(value: Any, tmp_path: Path) -> None:
+    """Anything can be written; what is read is what somebody vouches for."""
     assert same(through_a_file(value, tmp_path, (__name__,)), value)
     assert same(through_a_file(value, tmp_path, ("tests",)), value)
-    tree = json.loads(json.dumps(encode(value, "value", {}, (__name__,))))
+    tree = json.loads(json.dumps(encode(value, "value", {})))
     for trusted in ((), ("test",), (f"{__name__}.x",)):
         with pytest.raises(BadFile, match="value.*not trusted"):
             decode(tree, {}, "value", trusted)
     with pytest.raises(ValueError, match="trusted_modules must be a list of names of modules, not 'tests'"):
-        encode(value, "value", {}, "tests")
+        decode(tree, {}, "value", "tests")
+
+
+@pytest.mark.parametrize(
+    "value", [len, int, torch.load, subprocess.Popen, nn.functional.relu, OwnActivation, local_class(), local_class()()]
+)
+def test_writing_a_name_is_harmless_and_reading_it_is_refused(value: Any) -> None:
+    encoder = Encoder({})
+    tree = encoder.encode({"a": value}, "value")
+    assert list(encoder.foreign) == ["value.a"]
+    with pytest.raises(NotTrusted, match="value.a"):
+        decode(tree, {}, "value")
+
+
+def test_classes_of_a_function_are_never_found() -> None:
+    for value in (local_class(), local_class()()):
+        with pytest.raises(NotTrusted, match="was made inside of a function"):
+            decode(encode(value, "value", {}), {}, "value", (__name__,))
+
+
+@pytest.mark.parametrize("key", ["method", "number", "__class__", "a.b", "__dict__"])
+def test_a_file_sets_no_method_of_an_object(key: str) -> None:
+    tree = {"instance": f"{__name__}:Overriding", "attributes": {key: 3}}
+    with pytest.raises(BadFile, match=f"must not have its {key!r} set"):
+        decode(tree, {}, "value", (__name__,))
+
+
+def test_what_is_refused_leaves_nothing(tmp_path: Path) -> None:
+    encoder = Lenient({})
+    tree = encoder.attempt([np.zeros(3), Own(1), object()], "value")
+    assert is_left_out(tree) and not encoder.tensors and not encoder.foreign
+    assert encoder.left_out == {"value": "value[2]: an object of builtins.object cannot be written to a file that runs "
+                                "no code"}  # fmt: skip
+    with pytest.raises(BadFile, match="value was left out when the file was written"):
+        decode(tree, {}, "value")
 
 
 def test_a_trusted_module_stands_for_its_own_names_only() -> None:
@@ -306,6 +389,12 @@ HOSTILE: list[Any] = [
     {"numpy_random": "Generator", "state": 3}, {"random": [3, 4, None]}, {"random": 3},
     {"random": [3, {"array": "ints"}, None]}, {"torch_generator": {"tensor": "bytes"}, "device": "cpu"},
     {"torch_generator": 3, "device": "cpu"},
+    {"path": 3}, {"path": []}, {"numbers": "t"}, {"numbers": "nothing"}, {"numbers": 3}, {"left_out": "x"},
+    {"left_out": 3}, {"instance": "subprocess:Popen", "attributes": {}}, {"instance": 3, "attributes": {}},
+    {"instance": "torch.nn.modules.activation:ReLU", "attributes": {}}, {"instance": "x"},
+    {"enum": "signal:Signals", "member": 1},
+    {"object": "sb3_sample.saving.schedules:ScheduleTable", "attributes": {"table": {"array": "t"}}},
+    {"object": "sb3_sample.saving.schedules:ScheduleTable", "attributes": {"table": [[0, 1], [1, 0]]}},
 ]  # fmt: skip
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.monitor import Monitor
@@ -18,8 +17,10 @@ from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.sac import SAC
 from sb3_sample.sac.buffers import DeviceReplayBuffer
-from sb3_sample.saving import BadFile, NotPortable, container
+from sb3_sample.saving import BadFile, container
 from sb3_sample.saving.container import PickledFile
+from sb3_sample.saving.encoding import Lenient
+from sb3_sample.saving.replay import encode_buffer
 from tests.sac.common import sac, vec
 
 DICT = spaces.Dict({"a": spaces.Box(-10, 10, (2,)), "n": spaces.Discrete(9)})
@@ -163,11 +164,77 @@ def test_names_pickles_and_other_kinds(tmp_path: Path) -> None:
         model.load_replay_buffer(tmp_path / "nowhere")
 
 
-def test_classes_and_spaces(tmp_path: Path) -> None:
-    model = sac(replay_buffer_class=OwnBuffer).learn(12)
-    with pytest.raises(NotPortable, match="replay_buffer: the class .*OwnBuffer.*trusted_modules"):
+def test_what_a_file_holds_says_what_it_is_and_not_its_name(tmp_path: Path) -> None:
+    model = sac().learn(12)
+    model.save_replay_buffer(tmp_path / "b.pkl")  # by CheckpointCallback's name
+    for name in ("b", "b.pkl"):
+        model.load_replay_buffer(tmp_path / name)
+        model.load_replay_buffer(str(tmp_path / name), allow_pickle=True)
+    model.save_replay_buffer(tmp_path / "pickled.buffer.zip", allow_pickle=True)
+    for name in ("pickled", "pickled.buffer.zip"):
+        with pytest.raises(PickledFile, match="pickled.buffer.zip.*allow_pickle=True"):
+            model.load_replay_buffer(tmp_path / name)
+        model.load_replay_buffer(tmp_path / name, allow_pickle=True)
+    # The name that save_replay_buffer gives comes first, and a folder is no file.
+    sac().save_replay_buffer(tmp_path / "b")
+    (tmp_path / "b").mkdir()
+    model.load_replay_buffer(tmp_path / "b")
+    assert model.replay_buffer.size() == 0
+    with pytest.raises(FileNotFoundError, match=r"looked for .*/c and .*/c.buffer.zip and .*/c.pkl"):
+        model.load_replay_buffer(tmp_path / "c")
+
+
+@pytest.mark.parametrize("kind", ["plain", "compact", "her"])
+def test_a_model_that_was_freed_of_its_buffer(kind: str, tmp_path: Path) -> None:
+    model = make(kind, 1, 50).learn(24)
+    model.save_replay_buffer(tmp_path / "b")
+    model.save_replay_buffer(tmp_path / "pickled", allow_pickle=True)
+    rows = samples(model.replay_buffer)
+    for name in ("b", "pickled"):
+        del model.replay_buffer
+        with pytest.raises(ValueError, match="no replay buffer to save"):
+            model.save_replay_buffer(tmp_path / "c")
+        model.load_replay_buffer(tmp_path / name, truncate_last_traj=False, allow_pickle=True)
+        for a, b in zip(rows, samples(model.replay_buffer), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("kind", ["plain", "dict", "device", "compact", "her"])
+def test_a_buffer_of_another_number_of_environments(kind: str, tmp_path: Path) -> None:
+    one, three = make(kind, 1, 50).learn(24), make(kind, 3, 50).learn(24)
+    one.save_replay_buffer(tmp_path / "b")
+    three.save_replay_buffer(tmp_path / "pickled", allow_pickle=True)
+    for model, name, words in (
+        (three, "b", r"b.buffer.zip: it is the buffer of 1 environments \(n_envs\), but the model has 3"),
+        (one, "pickled", r"pickled.pkl: it is the buffer of 3 environments \(n_envs\), but the model has 1"),
+    ):
+        before = model.replay_buffer
+        with pytest.raises(ValueError, match=words):
+            model.load_replay_buffer(tmp_path / name, allow_pickle=True)
+        assert model.replay_buffer is before
+    one.load_replay_buffer(tmp_path / "b")
+
+
+def test_what_environments_say_and_no_file_holds(tmp_path: Path) -> None:
+    model = make("her_infos", 1, 50).learn(24)
+    for row in model.replay_buffer.infos[:24]:
+        row[0]["thing"] = object()
+    with pytest.warns(UserWarning, match="replay_buffer.infos.thing is left out .an object of builtins.object"):
         model.save_replay_buffer(tmp_path / "b")
-    model.save_replay_buffer(tmp_path / "b", trusted_modules=[__name__])
+    other = make("her_infos", 1, 50)
+    other.load_replay_buffer(tmp_path / "b")
+    infos = other.replay_buffer.infos[:24, 0]
+    assert [info["place"] for info in infos] == [info["place"] for info in model.replay_buffer.infos[:24, 0]]
+    assert not any("thing" in info for info in infos)
+
+
+def test_classes_and_spaces(tmp_path: Path) -> None:
+    model = sac(replay_buffer_class=OwnBuffer)
+    with pytest.warns(
+        UserWarning, match="replay_buffer is .*OwnBuffer, for which load_replay_buffer needs trusted_modules="
+    ):
+        model.learn(12)
+    model.save_replay_buffer(tmp_path / "b")
     with pytest.raises(BadFile, match="b.buffer.zip: .*not trusted"):
         model.load_replay_buffer(tmp_path / "b")
     model.load_replay_buffer(tmp_path / "b", trusted_modules=[__name__])
@@ -251,12 +318,10 @@ def test_hostile_files(kind: str, change: Any, files: Path) -> None:
 
 def test_a_large_buffer_is_not_copied(tmp_path: Path) -> None:
     """What is written is the buffer's own memory."""
-    from sb3_sample.saving.replay import encode_buffer
-
     model = make("plain", 1, 50).learn(24)
-    tensors: dict[str, torch.Tensor] = {}
-    encode_buffer(model.replay_buffer, tensors)
-    assert tensors["replay_buffer.observations"].data_ptr() == model.replay_buffer.observations.ctypes.data
+    encoder = Lenient({})
+    encode_buffer(model.replay_buffer, encoder)
+    assert encoder.tensors["replay_buffer.observations"].data_ptr() == model.replay_buffer.observations.ctypes.data
 
 
 def test_a_buffer_far_larger_than_the_models_own(tmp_path: Path) -> None:

@@ -1,0 +1,60 @@
+"""What tells a run from another: its arguments, as far as two programs can be compared by them."""
+
+import json
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_sample.saving import training_state, vec_envs
+from sb3_sample.saving.checks import library_class
+from sb3_sample.saving.classes import path_of
+from sb3_sample.saving.encoding import GENERATORS, NAMED, Encoder, NotPortable
+from sb3_sample.saving.model_tree import schedule_names
+from sb3_sample.saving.schedules import ScheduleTable
+
+
+class _Comparable(Encoder):
+    """
+    Describes what a program passes anew whenever it is started. Of what no file can hold, the import path is compared;
+    of generators, whose states a checkpoint holds, the kind.
+    """
+
+    def encode(self, value: Any, name: str, depth: int = 0, schedule: bool = False) -> Any:
+        try:
+            return super().encode(value, name, depth, schedule)
+        except NotPortable:
+            return {"of": path_of(value if isinstance(value, NAMED) else type(value))}
+
+    def _generator(self, value: Any, name: str, depth: int) -> dict[str, Any] | None:
+        return {"generator": path_of(type(value))} if isinstance(value, GENERATORS) else None
+
+
+def identity_of(model: BaseAlgorithm) -> dict[str, list[str]]:
+    """
+    :param model: the algorithm, before its training
+    :return: by the argument's name: a digest to compare, and the value to show
+    """
+    assert model.env is not None
+    values = {**training_state.arguments_of(model), "env": vec_envs.fingerprint(model.env)}
+    schedules = schedule_names(library_class(type(model)))
+    identity = {}
+    for name, value in values.items():
+        tensors: dict[str, torch.Tensor] = {}
+        tree = _Comparable(tensors).encode(value, name, schedule=name in schedules)
+        digest = sha256(json.dumps(tree, sort_keys=True).encode())
+        for key in sorted(tensors):
+            digest.update(key.encode())
+            digest.update(np.ascontiguousarray(tensors[key].cpu().numpy()).tobytes())
+        identity[name] = [digest.hexdigest(), _shown(value, name in schedules)]
+    return identity
+
+
+def _shown(value: Any, is_schedule: bool) -> str:
+    """A value in words: a schedule by its values, since the names of two closures say nothing."""
+    try:
+        return repr(ScheduleTable.of(value)) if is_schedule and callable(value) else repr(value)
+    except ValueError:
+        return repr(value)

@@ -1,0 +1,328 @@
+"""The tree of a model's file: what is written of a model, and what is read for one."""
+
+import collections.abc
+import functools
+import json
+import typing
+from collections import OrderedDict
+from collections.abc import Collection, Iterable
+from typing import Any
+
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
+
+from sb3_sample.saving import container, notice
+from sb3_sample.saving.checks import (
+    NEVER,
+    ParametersDoNotFit,
+    check_extra,
+    check_finite,
+    check_metadata,
+    check_moments,
+    hints_of,
+    library_class,
+)
+from sb3_sample.saving.classes import PACKAGES, NotPortable, may_be_set, path_of, within
+from sb3_sample.saving.container import BadFile
+from sb3_sample.saving.decoding import NotTrusted, decode
+from sb3_sample.saving.encoding import LEFT_OUT, Encoder, Lenient, is_left_out
+from sb3_sample.saving.training_state import argument_names
+
+KIND = "model"
+#: What follows from the rest, or says who loads.
+_NOT_READ = ("device", "lr_schedule")
+_SECTIONS = ("classes", "attributes", "parameters", "metadata")
+
+
+class Description:
+    """
+    What is written of a model.
+
+    :param model: the algorithm
+    :param exclude: attributes to leave out, besides those that always are
+    :param include: attributes to write that would be left out
+    """
+
+    def __init__(self, model: BaseAlgorithm, exclude: Iterable[str] = (), include: Iterable[str] = ()):
+        self._model = model
+        #: Has the tensors, and what is to be said of the file.
+        self.encoder = Lenient({})
+        included, always = set(include), set(model._excluded_save_params())
+        modules = {name.split(".")[0] for names in model._get_torch_save_params() for name in names}
+        skipped = (always | set(exclude)) - included | modules
+        schedules = schedule_names(library_class(type(model)))
+        self.attributes = {
+            name: self._attribute(value, name, name in schedules, name in always)
+            for name, value in vars(model).items()
+            if name not in skipped
+        }
+        self._keep_small()
+
+    def _attribute(self, value: Any, name: str, is_schedule: bool, is_derived: bool) -> Any:
+        if name in NEVER:
+            return self.encoder.leave_out(name, "it belongs to the program that trains")
+        if not may_be_set(type(self._model), name):
+            return self.encoder.leave_out(name, "it takes the place of what the class does")
+        if is_derived and not isinstance(value, (bool, int, float, str, list, dict)):
+            return self.encoder.leave_out(name, "it follows from the rest")
+        return self.encoder.attempt(value, name, is_schedule)
+
+    def _keep_small(self) -> None:
+        """Leave out the largest attributes of a model that would be more than a reader takes."""
+        sizes = {name: len(json.dumps(tree)) for name, tree in self.attributes.items()}
+        for name in sorted(sizes, key=lambda name: -sizes[name]):
+            if sum(sizes.values()) <= container.MAX_JSON_OF[KIND] // 2:
+                return
+            self.attributes[name] = self.encoder.leave_out(name, f"it takes {sizes.pop(name)} bytes of JSON")
+
+    def tree(self, family: type) -> dict[str, Any]:
+        """
+        :param family: base of the algorithms whose files this class reads
+        :return: the whole tree, with the parameters
+        :raises ValueError: if a parameter is not finite
+        """
+        model, parameters = self._model, self._model.get_parameters()
+        variables = {name: recursive_getattr(model, name) for name in model._get_torch_save_params()[1]}
+        variables = {name: value.detach() for name, value in variables.items() if isinstance(value, torch.Tensor)}
+        for name, state in {**parameters, **variables}.items():
+            owner = recursive_getattr(model, name)
+            check_finite(getattr(owner, "_orig_mod", owner), state, name, "cannot be saved, since it", ValueError)
+        metadata = {name: getattr(state, "_metadata", None) for name, state in parameters.items()}
+        return {
+            "classes": [path_of(cls) for cls in type(model).__mro__ if issubclass(cls, family)],
+            "attributes": self.attributes,
+            "parameters": {name: self._state(state, name) for name, state in parameters.items()},
+            "variables": {name: self.encoder.attempt(value, name) for name, value in variables.items()},
+            # What torch's modules know of the version of their own parameters.
+            "metadata": {name: self.encoder.attempt(value, name) for name, value in metadata.items()},
+        }
+
+    def _state(self, state: Any, name: str) -> Any:
+        """A state entry by entry, so that what cannot be written costs nothing of the rest."""
+        if type(state) not in (dict, OrderedDict) or not all(type(key) is str for key in state):
+            return self.encoder.attempt(state, name)
+        entries = {key: self.encoder.attempt(value, f"{name}.{key}") for key, value in state.items()}
+        return {"dict" if type(state) is dict else "ordered_dict": entries}
+
+
+class Content:
+    """
+    What a model's file holds.
+
+    :param file: the file
+    :param cls: the class that is to be loaded
+    :param family: base of the algorithms whose files it reads
+    :param trusted: modules that the file may name
+    :raises BadFile: if it is no such file
+    """
+
+    def __init__(self, file: Any, cls: type, family: type, trusted: tuple[str, ...]):
+        self.name = str(getattr(file, "name", "the file"))
+        self._cls, self._trusted = cls, trusted
+        self.tree, self._stored, self.versions = container.read_with_versions(file, KIND)
+        #: Of which the budget is made.
+        self.tensors = dict(self._stored)
+        tree = self.tree
+        if not isinstance(tree, dict) or tree.keys() - {"variables"} != set(_SECTIONS):
+            raise BadFile(f"{self.name} is damaged: it does not hold what a model consists of")
+        classes = tree["classes"]
+        if not isinstance(classes, list) or not classes or not all(isinstance(path, str) for path in classes):
+            raise BadFile(f"{self.name} is damaged: it does not say of which class the model is")
+        if not all(
+            isinstance(tree.get(key, {}), dict) for key in ("attributes", "parameters", "variables", "metadata")
+        ):
+            raise BadFile(f"{self.name} is damaged: it does not hold what a model consists of")
+        self._check_class([path_of(base) for base in cls.__mro__ if issubclass(base, family)])
+        #: What the file was written without, and nobody has given, with the reason.
+        self.left_out: dict[str, str] = {}
+        self._parameters: dict[str, Any] | None = None
+
+    def _check_class(self, ours: list[str]) -> None:
+        """The class, or what it is of this package where a program has moved its own."""
+        theirs = self.tree["classes"]
+        starts = {classes[0] for classes in (ours, theirs)}
+        starts |= {next((path for path in classes if within(path, PACKAGES)), classes[0]) for classes in (ours, theirs)}
+        if not starts & set(ours) & set(theirs):
+            raise BadFile(
+                f"{self.name} holds a model of {theirs[0]}, which is neither {self._cls.__name__} nor above or below "
+                "it: load it with its own class"
+            )
+
+    def attributes(self, given: Collection[str], custom_objects: dict[str, Any]) -> dict[str, Any]:
+        """
+        :param given: attributes that the caller has for it, so that the file's are not read
+        :param custom_objects: what replaces the file's
+        :return: the values of the others
+        :raises BadFile: if one is damaged, names what is not trusted, or is left out and needed
+        """
+        attributes, refused = {}, []
+        for name, tree in self.tree["attributes"].items():
+            if name in given or name in _NOT_READ:
+                continue
+            if name in custom_objects:
+                attributes[name] = custom_objects[name]
+            elif is_left_out(tree):
+                self.left_out[name] = reason = tree[LEFT_OUT]
+                if name.endswith("_kwargs"):
+                    refused.append(f"{name} was left out ({reason:.200}), so that load needs {name}=")
+            else:
+                try:
+                    attributes[name] = self._decoded(tree, name)
+                except NotTrusted as error:
+                    refused.append(f"{error}: {notice.need(self._cls, name, error.path)}")
+        if refused:
+            raise BadFile(f"{self.name}: {'; '.join(refused)}")
+        for name, kind in (("policy_kwargs", dict), ("verbose", int), ("policy_class", type)):
+            if name in attributes and not isinstance(attributes[name], kind):
+                raise BadFile(f"{self.name} is damaged: {name} is {attributes[name]!r:.100}")
+        attributes.get("policy_kwargs", {}).pop("device", None)
+        return attributes
+
+    def _decoded(self, tree: Any, name: str) -> Any:
+        try:
+            return decode(tree, self._stored, name, self._trusted)
+        except NotTrusted:
+            raise
+        except BadFile as error:
+            raise BadFile(f"{self.name}: {error}") from error
+
+    def check_policy_kwargs(self, given: Any) -> None:
+        """
+        :param given: policy_kwargs that take the place of the file's
+        :raises ValueError: if they are others, as far as that can be said without asking for trust
+        """
+        theirs = self.tree["attributes"].get("policy_kwargs")
+        if theirs is not None and not is_left_out(theirs) and not _agree(theirs, given, "policy_kwargs"):
+            raise ValueError(f"policy_kwargs must be those of the file, {theirs}, or be left out, not {given}")
+
+    def parameters(self, model: BaseAlgorithm) -> dict[str, Any]:
+        """
+        :param model: for which they are, and whose own stand for what the file was written without
+        :return: what ``get_parameters`` gave, once
+        :raises BadFile: if they are damaged
+        """
+        if self._parameters is None:
+            try:
+                self._parameters = {name: self._state(model, name) for name in self.tree["parameters"]}
+                for name, tree in self.tree["metadata"].items():
+                    if isinstance(state := self._parameters.get(name), OrderedDict) and not is_left_out(tree):
+                        metadata = vars(state)["_metadata"] = self._decoded(tree, name)
+                        check_metadata(metadata, f"{self.name}: {name}")
+            except NotTrusted as error:
+                raise BadFile(f"{self.name}: {error}: trusted_modules=[...] takes it") from error
+        return self._parameters
+
+    def _state(self, model: BaseAlgorithm, name: str) -> Any:
+        tree = self.tree["parameters"][name]
+        entries: Any = next(iter(tree.values()), None) if isinstance(tree, dict) else None
+        lacking = [key for key, entry in entries.items() if is_left_out(entry)] if isinstance(entries, dict) else []
+        if not (is_left_out(tree) or lacking):
+            return self._decoded(tree, name)
+        self._check_known(model, name)
+        own = recursive_getattr(model, name).state_dict()
+        if is_left_out(tree):
+            self.left_out[name] = tree[LEFT_OUT]
+            return own
+        self.left_out.update({f"{name}.{key}": entries[key][LEFT_OUT] for key in lacking})
+        kept = {key: entry for key, entry in entries.items() if key not in lacking}
+        return self._decoded({next(iter(tree)): kept}, name) | {key: own[key] for key in lacking if key in own}
+
+    def _check_known(self, model: BaseAlgorithm, name: str) -> None:
+        if name not in model._get_torch_save_params()[0]:
+            raise BadFile(f"{self.name} has parameters of {name!r:.100}, which a {self._cls.__name__} has not")
+
+    def check_shapes(self, model: BaseAlgorithm) -> None:
+        """
+        Before the file is asked whether it fits in every other respect: with arguments of the caller's own it is not to
+        blame if it does not.
+
+        :param model: for which the parameters are
+        :raises ParametersDoNotFit: if a tensor has another shape there
+        """
+        for name in model._get_torch_save_params()[0]:
+            owner, state = recursive_getattr(model, name), self.parameters(model).get(name)
+            if not isinstance(owner, torch.nn.Module) or not isinstance(state, dict):
+                continue
+            for key, own in owner.state_dict().items():
+                theirs = state.get(key)
+                if isinstance(own, torch.Tensor) and isinstance(theirs, torch.Tensor) and own.shape != theirs.shape:
+                    raise ParametersDoNotFit(
+                        f"{name}.{key} has the shape {tuple(theirs.shape)} in the file and {tuple(own.shape)} here"
+                    )
+
+    def check_parameters(self, model: BaseAlgorithm) -> None:
+        """
+        :param model: for which they are
+        :raises BadFile: if one is not finite, or what an optimizer keeps of one is not of its shape
+        """
+        known = model._get_torch_save_params()[0]
+        for name, state in self.parameters(model).items():
+            # Others are refused by ``set_parameters``.
+            owner = recursive_getattr(model, name) if name in known else None
+            check_finite(owner, state, f"{self.name}: {name}", "", BadFile)
+            if isinstance(owner, torch.nn.Module):
+                check_extra(owner, state, f"{self.name}: {name}")
+            if isinstance(owner, torch.optim.Optimizer):
+                check_moments(owner, state, f"{self.name}: {name}")
+
+    def set_variables(self, model: BaseAlgorithm) -> None:
+        """
+        Give a model the tensors that are parameters without a module, as Stable-Baselines3's ``load`` does.
+
+        :param model: the model
+        :raises BadFile: if they are not those of the model, or not finite
+        """
+        for name, tree in self.tree.get("variables", {}).items():
+            if is_left_out(tree):
+                self.left_out[name] = tree[LEFT_OUT]
+                continue
+            own = recursive_getattr(model, name) if name in model._get_torch_save_params()[1] else None
+            value = self._decoded(tree, name)
+            if not isinstance(own, torch.Tensor) or not isinstance(value, torch.Tensor) or own.shape != value.shape:
+                raise BadFile(f"{self.name}: {name!r:.100} is no tensor of the shape that the model has there")
+            check_finite(own, value, f"{self.name}: {name}", "", BadFile)
+            recursive_setattr(model, f"{name}.data", value.to(own))
+
+    def lacking(self, model: BaseAlgorithm, given: Collection[str]) -> str:
+        """
+        :param model: an algorithm with the defaults of its constructor
+        :param given: what the caller has for it
+        :return: what to say if the file turns out not to fit: the arguments that it does not have, if any
+        """
+        names = (argument_names(type(model)) & vars(model).keys()) - self.tree["attributes"].keys()
+        names -= {"env", "device", *given}
+        if not names:
+            return ""
+        wanted = " or ".join(f"{name}=" for name in sorted(names))
+        return f"{self.name} lacks {', '.join(sorted(names))}, for which the defaults stand (load takes {wanted}): "
+
+
+def _agree(theirs: Any, given: Any, name: str) -> bool:
+    """Whether a value can be what a file describes: of what asks for trust, anything can."""
+    tag, inside = next(iter(theirs.items())) if isinstance(theirs, dict) and theirs else ("", theirs)
+    if tag == "dict":
+        alike = isinstance(inside, dict) and isinstance(given, dict) and inside.keys() == given.keys()
+        return alike and all(_agree(entry, given[key], f"{name}.{key}") for key, entry in inside.items())
+    if tag in ("instance", "enum") or (tag == "import" and not within(str(inside), PACKAGES)):
+        return True
+    if isinstance(theirs, list) and isinstance(given, list):
+        pairs = enumerate(zip(theirs, given, strict=False))
+        return len(theirs) == len(given) and all(_agree(entry, item, f"{name}[{i}]") for i, (entry, item) in pairs)
+    try:
+        return bool(Encoder({}).encode(given, name) == theirs)
+    except NotPortable:
+        return False
+
+
+@functools.cache
+def schedule_names(cls: type) -> frozenset[str]:
+    """
+    :param cls: class of an algorithm
+    :return: the arguments of its constructor, and of those of its bases, that take a schedule
+    """
+    kinds = {
+        name: {typing.get_origin(part) for part in (hint, *typing.get_args(hint))}
+        for name, hint in hints_of(cls).items()
+    }
+    return frozenset(name for name, origins in kinds.items() if collections.abc.Callable in origins)

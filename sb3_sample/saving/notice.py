@@ -1,0 +1,59 @@
+"""What is said, once, of what a model's files lack and of what reading them needs."""
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+from sb3_sample.saving.classes import within
+from sb3_sample.saving.encoding import Lenient
+from sb3_sample.saving.training_state import argument_names
+
+
+def argument_for(cls: type, name: str) -> str | None:
+    """
+    :param cls: class of an algorithm
+    :param name: an attribute, or something in one: ``policy_kwargs.activation_fn``
+    :return: the argument of ``load`` that stands for what a file has there; None of what is in the replay buffer's file
+    """
+    attribute = name.split(".")[0].split("[")[0]
+    others = {"policy_class": "policy=", "observation_space": "env=", "action_space": "env=", "replay_buffer": None}
+    if attribute in others:
+        return others[attribute]
+    return f"{attribute}=" if attribute in argument_names(cls) else f"custom_objects={{{attribute!r}: ...}}"
+
+
+def need(cls: type, name: str, path: str) -> str:
+    """
+    :param cls: class of an algorithm
+    :param name: what of it is a class or function, or an object of one, that not everybody knows
+    :param path: of the class or function
+    :return: what reading its file needs for that
+    """
+    argument = argument_for(cls, name)
+    module = path.partition(":")[0]
+    wanted = [] if "<locals>" in path else [f"trusted_modules=[{module!r:.200}]"]
+    wanted += [] if argument is None else [argument]
+    return f"{'load_replay_buffer' if argument is None else 'load'} needs {' or '.join(wanted) or 'another class'}"
+
+
+def say_once(model: Any, encoder: Lenient, trusted: Sequence[str] = ()) -> None:
+    """
+    Warn of what was not named before.
+
+    :param model: an algorithm
+    :param encoder: by which its file is written, or would be
+    :param trusted: modules that the caller vouches for anyway
+    """
+    cls, vouched = type(model), (*model._trusted_modules, *trusted)
+    said: dict[str, str] = {}
+    for name, path in encoder.foreign.items():
+        if "<locals>" in path or not within(path.partition(":")[0], vouched):
+            said[f"{name} {path}"] = f"{name} is {path}, for which {need(cls, name, path)}"
+    for name, reason in encoder.left_out.items():
+        argument = argument_for(cls, name)
+        wanted = "" if argument is None or argument.startswith("custom_objects") else f", and load needs {argument}"
+        said[name] = f"{name} is left out ({reason}){wanted}"
+    new = "; ".join(text for key, text in said.items() if key not in model._told)
+    model._told = frozenset({*model._told, *said})
+    if new:
+        warnings.warn(f"What is saved of this {cls.__name__} (docs/saving.md): {new}", stacklevel=3)
