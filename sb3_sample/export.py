@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import importlib.util
+import inspect
 import io
 import json
 import logging
@@ -53,7 +54,7 @@ class Exportable:
         :param vec_normalize: whose normalisation of the observations is put inside; None: that of the model's own
             environment, if there is one
         :return: the two files
-        :raises ImportError: if the extra is missing
+        :raises ImportError: if the extra is missing, or torch is too old
         :raises TrainingDiverged: if a parameter is not finite
         :raises ValueError: if the observation space is not supported, the normalisation is not this model's or missing,
             or a policy of the user's own computes differently for another length of the batch
@@ -62,6 +63,10 @@ class Exportable:
         for package in ("onnx", "onnxscript"):
             if importlib.util.find_spec(package) is None:
                 raise ImportError(f"export needs {package}: pip install 'sb3_sample[export]'")
+        if "dynamic_shapes" not in inspect.signature(torch.onnx.export).parameters:
+            raise ImportError(
+                f"export needs a newer torch than {torch.__version__}, one whose torch.onnx.export has dynamic_shapes"
+            )
         if vec_normalize is not None and not isinstance(vec_normalize, VecNormalize):
             raise ValueError(f"vec_normalize must be a VecNormalize, or None, not {vec_normalize!r}")
         if vec_normalize is None and self.env is None and lacks_vec_normalize(self):

@@ -263,6 +263,13 @@ def test_the_extra_is_named(package: str, tmp_path: Path, monkeypatch: pytest.Mo
     assert not list(tmp_path.iterdir())
 
 
+def test_a_torch_that_is_too_old(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(torch.onnx, "export", lambda model, args, f=None, dynamo=False: None)
+    with pytest.raises(ImportError, match="export needs a newer torch than .*, one whose .* has dynamic_shapes"):
+        sac().export(tmp_path / "policy")
+    assert not list(tmp_path.iterdir())
+
+
 class Counted(nn.Module):
     """A layer whose result depends on how many rows Python sees."""
 
