@@ -96,7 +96,6 @@ _BRO = (
 )
 _PPO = (
     *_excluded("Errors", "ValueError: clip_range_vf must be above 0", "test_run::test_ppo[-0.2-*]"),
-    *_excluded("Advantages", "DID NOT RAISE AssertionError", "test_run::test_ppo_warnings"),
     *_excluded("The test", "is truncated, or no file of sb3_sample", "test_save_load::test_load_bad_zip"),
     *_excluded("The test", "There is no item named 'data'", "test_save_load::test_load_invalid_object"),
     *_excluded("The test", "PPO_1", "test_tensorboard::test_tensorboard[ppo]"),
@@ -124,7 +123,8 @@ _MBMA = (
         "test_save_load::test_save_load_policy[True-MlpPolicy-*]",
         "test_sde::test_state_dependent_noise[*]",
     ),
-    *_excluded("The test", "the model has diverged", "test_save_load::test_save_load[*]"),
+    *_excluded("Defaults", "Mean reward below threshold", "test_identity::test_continuous[*]", by_chance=True),
+    *_excluded("Advantages", "DID NOT RAISE AssertionError", "test_run::test_ppo_warnings"),
 )
 _TQC = (
     *_excluded("State-dependent exploration", "use_sde=True is not supported", "test_run::test_sde[*]"),
@@ -137,6 +137,7 @@ _TQC = (
     *_excluded("The test", "IndexError: list index out of range", "test_save_load::test_save_load[*]"),
 )
 _CROSSQ = (
+    *_excluded("The test", "unexpected keyword argument 'renorm_warmup_steps'", "test_run::test_crossq"),
     *_excluded("State-dependent exploration", "use_sde=True is not supported", "test_run::test_sde[*]"),
     *_excluded("The test", "IndexError: list index out of range", "test_save_load::test_save_load[*]"),
 )

@@ -43,7 +43,10 @@ class MBMAPPO(sb3_sample.MBMAPPO):
 
 
 class PlainMBMAPPO(sb3_sample.MBMAPPO):
-    """MBMA without simulated actions, which is PPO."""
+    """MBMA without simulated actions, with PPO's networks and normalised advantages, which is PPO."""
 
-    def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, **{"n_simulated": 0, **kwargs})
+    def __init__(self, *args: Any, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any):
+        if args[:1] == ("MlpPolicy",):
+            policy_kwargs = {"net_arch": {"pi": [64, 64], "vf": [64, 64]}, **(policy_kwargs or {})}
+        defaults = {"n_simulated": 0, "normalize_advantage": True}
+        super().__init__(*args, policy_kwargs=policy_kwargs, **{**defaults, **kwargs})
