@@ -13,14 +13,14 @@ SAC = sb3_sample.SAC
 
 
 class BRO(sb3_sample.BRO):
-    """BRO, with small networks where a test asks for some by ``net_arch``, which describes an MLP and no BroNet."""
+    """BRO with small networks. ``net_arch``, by which tests ask for some, describes an MLP and no BroNet."""
 
     def __init__(self, *args: Any, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any):
-        policy_kwargs = dict(policy_kwargs or {})
-        if policy_kwargs.pop("net_arch", None) is not None:
-            policy_kwargs["actor_network_kwargs"] = {"n_blocks": 1, "width": 16}
-            kwargs.setdefault("model_size", (1, 16))
-        super().__init__(*args, policy_kwargs=policy_kwargs, **kwargs)
+        small = {"n_blocks": 1, "width": 16}
+        policy_kwargs = {"actor_network_kwargs": small, **(policy_kwargs or {})}
+        policy_kwargs.pop("net_arch", None)
+        defaults: dict[str, Any] = {"model_size": (1, 16), "exploration_kwargs": {"network_kwargs": small}}
+        super().__init__(*args, policy_kwargs=policy_kwargs, **{**defaults, **kwargs})
 
 
 class QuantileSAC(sb3_sample.SAC):
@@ -43,7 +43,10 @@ class MBMAPPO(sb3_sample.MBMAPPO):
 
 
 class PlainMBMAPPO(sb3_sample.MBMAPPO):
-    """MBMA without simulated actions, which is PPO."""
+    """MBMA without simulated actions, with PPO's networks and normalised advantages, which is PPO."""
 
-    def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, **{"n_simulated": 0, **kwargs})
+    def __init__(self, *args: Any, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any):
+        if args[:1] == ("MlpPolicy",):
+            policy_kwargs = {"net_arch": {"pi": [64, 64], "vf": [64, 64]}, **(policy_kwargs or {})}
+        defaults = {"n_simulated": 0, "normalize_advantage": True}
+        super().__init__(*args, policy_kwargs=policy_kwargs, **{**defaults, **kwargs})
