@@ -826,7 +826,7 @@ class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyA
             LoggedValues.record_later(self.logger, self._metrics)
         else:
             for name, value in self._metrics.items():
-                self.logger.record(name, float(value))
+                self.logger.record(name, float(value.numpy()))
         self._record_counts()
 
     def _record_counts(self) -> None:

@@ -10,6 +10,8 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 
+from sb3_sample.sac.q_values import QValues
+
 
 def td_target(
     rewards: torch.Tensor,
@@ -134,6 +136,8 @@ def quantile_huber(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     :param target: target quantiles in any order, (B, K'), without gradient
     :return: scalar
     """
+    if isinstance(q, QValues):
+        q = q.tensor  # A Function takes it for no tensor, and gives no gradient.
     return (_QuantileHuberPairs if torch.compiler.is_compiling() else _QuantileHuber).apply(q, target)
 
 
