@@ -576,6 +576,46 @@ def test_tensors_that_are_parameters_without_a_module(tmp_path: Path) -> None:
         model.save(tmp_path / "m")
 
 
+class WithNetwork(SAC):
+    """Learns a network that it names nowhere."""
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.extra = nn.Sequential(nn.Linear(3, 2), nn.BatchNorm1d(2))
+        self.extra_optimizer = torch.optim.Adam(self.extra.parameters(), lr=1e-2)
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        super().train(gradient_steps, batch_size)
+        self.extra_optimizer.zero_grad()
+        self.extra(torch.randn(8, 3)).square().sum().backward()
+        self.extra_optimizer.step()
+
+
+def test_networks_and_optimizers_of_a_subclass(tmp_path: Path) -> None:
+    model = sac(cls=WithNetwork)
+    assert train(model, tmp_path) == []
+    loaded = WithNetwork.load(tmp_path / "m", env=vec())
+    for name in ("extra", "extra_optimizer"):
+        own, other = getattr(model, name).state_dict(), getattr(loaded, name).state_dict()
+        assert repr(own) == repr(other) and len(own) > 1
+    assert loaded.extra_optimizer.param_groups[0]["params"][0] is loaded.extra[0].weight
+    loaded.learn(20)
+    with pytest.warns(
+        UserWarning, match="without extra .a state of something that this model has not.*extra_optimizer"
+    ):
+        SAC.load(tmp_path / "m")
+    # And with checkpoints, bit by bit.
+    whole = sac(cls=WithNetwork).learn(96)
+    again = interrupted(lambda: sac(cls=WithNetwork), tmp_path / "run")
+    assert not differing(state(whole), state(again))
+    assert repr(whole.extra_optimizer.state_dict()) == repr(again.extra_optimizer.state_dict())
+    model.extra[0].weight.data[0, 0] = np.nan
+    with pytest.raises(
+        ValueError, match=r"extra.0.weight cannot be saved, since it holds 1 numbers that are not finite"
+    ):
+        model.save(tmp_path / "m")
+
+
 # ---------------------------------------------------------------- what save accepts, load takes
 
 
