@@ -322,6 +322,20 @@ def test_a_replay_buffer_of_ones_own(maker: str, tmp_path: Path) -> None:
         loaded.learn(5)
 
 
+def test_a_replay_buffer_class_of_a_function(tmp_path: Path) -> None:
+    class Local(OwnBuffer):
+        pass
+
+    model = sac(replay_buffer_class=Local)
+    (message,) = train(model, tmp_path)
+    assert "load_replay_buffer needs a model that has it as its replay_buffer_class" in message
+    with pytest.raises(BadFile, match="was made inside of a function.*load_replay_buffer needs a model that has it"):
+        sac().load_replay_buffer(tmp_path / "b", **TRUST)
+    loaded = SAC.load(tmp_path / "m", env=vec(), replay_buffer_class=Local)
+    loaded.load_replay_buffer(tmp_path / "b")
+    assert type(loaded.replay_buffer) is Local and loaded.replay_buffer.added == 64
+
+
 def test_what_a_replay_buffer_cannot_hold(tmp_path: Path) -> None:
     model = sac(replay_buffer_class=OwnBuffer).learn(12)
     model.replay_buffer.lock = threading.Lock()
