@@ -224,7 +224,8 @@ class Encoder:
         return {"raw_array": self.put(torch.from_numpy(raw), name), "dtype": dtype.str, "shape": list(array.shape)}
 
     def _tensor(self, tensor: torch.Tensor, name: str) -> dict[str, Any]:
-        if type(tensor) is not torch.Tensor or tensor.layout != torch.strided or tensor.dtype not in DTYPES.values():
+        has_numbers = type(tensor) is torch.Tensor and tensor.layout == torch.strided and not tensor.is_meta
+        if not has_numbers or tensor.dtype not in DTYPES.values():
             raise NotPortable(
                 f"{name}: a {type(tensor).__name__} of {tensor.dtype} and {tensor.layout} cannot be written to the file"
             )

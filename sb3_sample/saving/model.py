@@ -105,8 +105,8 @@ class SafeFiles(BaseAlgorithm):
         :raises ParametersDoNotFit: (a ``ValueError``) if its parameters are not those of the model that it describes
         """
         trusted, custom_objects = check_trusted(trusted_modules), custom_objects or {}
-        if "policy" in kwargs:
-            kwargs["policy_class"] = cls._policy_class(kwargs.pop("policy"))
+        for name in {"policy", "policy_class"} & kwargs.keys():
+            kwargs["policy_class"] = cls._policy_class(kwargs.pop(name))
         if "policy_kwargs" in kwargs:
             kwargs["policy_kwargs"] = kwargs["policy_kwargs"] or {}
         try:
@@ -182,7 +182,7 @@ class SafeFiles(BaseAlgorithm):
                 content.check_shapes(model)
             content.check_parameters(model)
             model.set_parameters(content.parameters(model), exact_match=True, device=device)
-            content.set_variables(model)
+            content.set_own(model, given)
             if model.use_sde:
                 model.policy.reset_noise()  # type: ignore[operator]
         except (BadFile, ParametersDoNotFit) as error:
@@ -257,7 +257,7 @@ class SafeFiles(BaseAlgorithm):
                     del group[key]
                 group.update(own)
         if content is not None:
-            content.set_variables(self)
+            content.set_own(self, only_variables=True)
 
 
 def class_of(path: str | pathlib.Path) -> str:

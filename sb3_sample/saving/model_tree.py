@@ -52,10 +52,13 @@ class Description:
         modules = {name.split(".")[0] for names in model._get_torch_save_params() for name in names}
         skipped = (always | set(exclude)) - included | modules
         schedules = schedule_names(library_class(type(model)))
+        values = {name: value for name, value in vars(model).items() if name not in skipped}
+        #: Modules and the like of a subclass's own, which are written by their states.
+        self._own = {name: value for name, value in values.items() if name not in always and _has_state(value)}
         self.attributes = {
             name: self._attribute(value, name, name in schedules, name in always)
-            for name, value in vars(model).items()
-            if name not in skipped
+            for name, value in values.items()
+            if name not in self._own
         }
         self._keep_small()
 
@@ -84,19 +87,21 @@ class Description:
         """
         model, parameters = self._model, self._model.get_parameters()
         variables = {name: recursive_getattr(model, name) for name in model._get_torch_save_params()[1]}
-        variables = {name: value.detach() for name, value in variables.items() if isinstance(value, torch.Tensor)}
-        for name, state in {**parameters, **variables}.items():
+        own = {name: value.detach() for name, value in variables.items() if isinstance(value, torch.Tensor)}
+        own |= {name: value.state_dict() for name, value in self._own.items()}
+        for name, state in {**parameters, **own}.items():
             owner = recursive_getattr(model, name)
             check_finite(getattr(owner, "_orig_mod", owner), state, name, "cannot be saved, since it", ValueError)
         metadata = {name: getattr(state, "_metadata", None) for name, state in parameters.items()}
-        return {
+        tree = {
             "classes": [path_of(cls) for cls in type(model).__mro__ if issubclass(cls, family)],
             "attributes": self.attributes,
             "parameters": {name: self._state(state, name) for name, state in parameters.items()},
-            "variables": {name: self.encoder.attempt(value, name) for name, value in variables.items()},
             # What torch's modules know of the version of their own parameters.
             "metadata": {name: self.encoder.attempt(value, name) for name, value in metadata.items()},
         }
+        # What a subclass has besides: files of this package's own classes have no such section.
+        return tree | ({"own": {name: self.encoder.attempt(state, name) for name, state in own.items()}} if own else {})
 
     def _state(self, state: Any, name: str) -> Any:
         """A state entry by entry, so that what cannot be written costs nothing of the rest."""
@@ -124,14 +129,12 @@ class Content:
         #: Of which the budget is made.
         self.tensors = dict(self._stored)
         tree = self.tree
-        if not isinstance(tree, dict) or tree.keys() - {"variables"} != set(_SECTIONS):
+        if not isinstance(tree, dict) or tree.keys() - {"own"} != set(_SECTIONS):
             raise BadFile(f"{self.name} is damaged: it does not hold what a model consists of")
         classes = tree["classes"]
         if not isinstance(classes, list) or not classes or not all(isinstance(path, str) for path in classes):
             raise BadFile(f"{self.name} is damaged: it does not say of which class the model is")
-        if not all(
-            isinstance(tree.get(key, {}), dict) for key in ("attributes", "parameters", "variables", "metadata")
-        ):
+        if not all(isinstance(tree.get(key, {}), dict) for key in ("attributes", "parameters", "metadata", "own")):
             raise BadFile(f"{self.name} is damaged: it does not hold what a model consists of")
         self._check_class([path_of(base) for base in cls.__mro__ if issubclass(base, family)])
         #: What the file was written without, and nobody has given, with the reason.
@@ -266,23 +269,40 @@ class Content:
             if isinstance(owner, torch.optim.Optimizer):
                 check_moments(owner, state, f"{self.name}: {name}")
 
-    def set_variables(self, model: BaseAlgorithm) -> None:
+    def set_own(self, model: BaseAlgorithm, given: Collection[str] = (), only_variables: bool = False) -> None:
         """
-        Give a model the tensors that are parameters without a module, as Stable-Baselines3's ``load`` does.
+        Give a model what its subclass has besides parameters: tensors without a module, as Stable-Baselines3's ``load``
+        does, and the states of modules and the like that nobody names as parameters.
 
-        :param model: the model
-        :raises BadFile: if they are not those of the model, or not finite
+        :param model: the model, set up
+        :param given: what the caller has for it
+        :param only_variables: whether to leave the latter alone
+        :raises BadFile: if something is not of the model, or not finite
         """
-        for name, tree in self.tree.get("variables", {}).items():
+        names, variables = model._get_torch_save_params()
+        taken = {name.split(".")[0] for name in names} | set(model._excluded_save_params())
+        for name, tree in self.tree.get("own", {}).items():
+            if name in given or (only_variables and name not in variables):
+                continue
             if is_left_out(tree):
                 self.left_out[name] = tree[LEFT_OUT]
                 continue
-            own = recursive_getattr(model, name) if name in model._get_torch_save_params()[1] else None
+            own = recursive_getattr(model, name, None) if name in variables else vars(model).get(name)
+            if name not in variables and (name in taken or not may_be_set(type(model), name)):
+                raise BadFile(f"{self.name} is damaged or hostile: {name!r:.100} is nothing of a subclass's own")
+            if own is None:
+                self.left_out[name] = "a state of something that this model has not"
+                continue
             value = self._decoded(tree, name)
-            if not isinstance(own, torch.Tensor) or not isinstance(value, torch.Tensor) or own.shape != value.shape:
-                raise BadFile(f"{self.name}: {name!r:.100} is no tensor of the shape that the model has there")
             check_finite(own, value, f"{self.name}: {name}", "", BadFile)
-            recursive_setattr(model, f"{name}.data", value.to(own))
+            if isinstance(own, torch.Tensor) and isinstance(value, torch.Tensor) and own.shape == value.shape:
+                recursive_setattr(model, f"{name}.data", value.to(own))
+            elif _has_state(own) and isinstance(value, dict):
+                if isinstance(own, torch.optim.Optimizer):
+                    check_moments(own, value, f"{self.name}: {name}")
+                own.load_state_dict(value)
+            else:
+                raise BadFile(f"{self.name}: {name!r:.100} is no state of what the model has there")
 
     def lacking(self, model: BaseAlgorithm, given: Collection[str]) -> str:
         """
@@ -296,6 +316,10 @@ class Content:
             return ""
         wanted = " or ".join(f"{name}=" for name in sorted(names))
         return f"{self.name} lacks {', '.join(sorted(names))}, for which the defaults stand (load takes {wanted}): "
+
+
+def _has_state(value: Any) -> bool:
+    return all(hasattr(type(value), name) for name in ("state_dict", "load_state_dict"))
 
 
 def _agree(theirs: Any, given: Any, name: str) -> bool:

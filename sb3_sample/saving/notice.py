@@ -32,8 +32,9 @@ def need(cls: type, name: str, path: str) -> str:
     argument = argument_for(cls, name)
     module = path.partition(":")[0]
     wanted = [] if "<locals>" in path else [f"trusted_modules=[{module!r:.200}]"]
-    wanted += [] if argument is None else [argument]
-    return f"{'load_replay_buffer' if argument is None else 'load'} needs {' or '.join(wanted) or 'another class'}"
+    if argument is None:
+        return f"load_replay_buffer needs {wanted[0] if wanted else 'a model that has it as its replay_buffer_class'}"
+    return f"load needs {' or '.join([*wanted, argument])}"
 
 
 def say_once(model: Any, encoder: Lenient, trusted: Sequence[str] = ()) -> None:

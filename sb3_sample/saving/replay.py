@@ -13,7 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.saving import container, notice, paths
-from sb3_sample.saving.classes import PACKAGES, check_trusted, may_be_set, within
+from sb3_sample.saving.classes import PACKAGES, check_trusted, may_be_set, path_of, within
 from sb3_sample.saving.container import MAX_MESSAGE, BadFile, PickledFile
 from sb3_sample.saving.decoding import NotTrusted
 from sb3_sample.saving.encoding import Lenient, decode, is_left_out
@@ -199,7 +199,10 @@ def decode_buffer(
     :raises ValueError: if it is the buffer of other spaces
     """
     try:
-        cls = decode({"import": tree["class"]}, {}, "replay_buffer", trusted)
+        own, path = type(getattr(model, "replay_buffer", None)), tree["class"]
+        # What was made inside of a function is found nowhere, but the model may have it.
+        is_own = isinstance(path, str) and "<locals>" in path and path == path_of(own)
+        cls = own if is_own else decode({"import": path}, {}, "replay_buffer", trusted)
         if not (isinstance(cls, type) and issubclass(cls, ReplayBuffer)):
             raise BadFile(f"it holds a {cls.__name__}, which is no replay buffer")
         if _has_state(cls):

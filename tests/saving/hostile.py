@@ -160,6 +160,10 @@ def hostile_value(rng: random.Random, original: Original) -> Any:
             "stable_baselines3.common.utils:ConstantSchedule", "os:system", "subprocess:Popen", 3,
             "stable_baselines3.common.noise:VectorizedActionNoise"]), "attributes": rng.choice([{}, 3, {"val": "x"}, {
                 "n_envs": 10**9, "_base_noise": None, "_noises": []}])},
+        lambda: {"instance": rng.choice([*DANGEROUS, 3, "sb3_sample.sac.plasticity:ReDo", "threading:Thread"]),
+                 "attributes": rng.choice([{}, 3, {"run": 1}, {"__class__": 1}])},
+        lambda: {"left_out": rng.choice(["", "x" * 5000, 3, None, {}])}, lambda: {"path": rng.choice(["", "../x", 3])},
+        lambda: {"numbers": tensor}, lambda: {"own": {"critic": {"dict": {}}}},
         lambda: {"enum": rng.choice(["signal:Signals", "stable_baselines3.common.type_aliases:TrainFrequencyUnit"]),
                  "member": rng.choice(["STEP", "__class__", "mro", 3])},
         lambda: {"named_tuple": rng.choice(["os:stat_result", "stable_baselines3.common.type_aliases:TrainFreq"]),
@@ -386,7 +390,23 @@ def tree(rng: random.Random, original: Original) -> Case:
             value = parent[path[-1]] = json.loads(json.dumps(at(root, rng.choice(options))))
         case _ if isinstance(parent, dict):
             key = rng.choice(
-                ["__class__", "predict", "_setup_model", "env", "x", "a.b", "", "__dict__", "policy", "device"]
+                [
+                    "__class__",
+                    "predict",
+                    "_setup_model",
+                    "env",
+                    "x",
+                    "a.b",
+                    "",
+                    "__dict__",
+                    "policy",
+                    "device",
+                    "own",
+                    "temperature_beta1",
+                    "policy_aliases",
+                    "_trusted_modules",
+                    "_metrics",
+                ]
             )
             value = parent[key] = hostile_value(rng, original)
         case _:

@@ -279,6 +279,7 @@ LOOP.append(LOOP)
         (np.ma.array([1.0]), "learning_rate: an object of numpy.ma"),
         (torch.sparse_coo_tensor([[0]], [1.0], (2,)), "learning_rate: a Tensor of torch.float32 and torch.sparse_coo"),
         (nn.Parameter(torch.zeros(1)), "learning_rate: a Parameter"),
+        (torch.zeros(2, device="meta"), "learning_rate: a Tensor"),
         (torch.zeros(2, dtype=torch.complex128), "learning_rate: a Tensor of torch.complex128"),
         (random.SystemRandom(), "learning_rate: an object of random.SystemRandom"), (LOOP, "nested more than"),
         (spaces.Text(3), "learning_rate: an object of gymnasium.spaces.text.Text"),

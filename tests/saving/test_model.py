@@ -341,8 +341,9 @@ HUGE = 10**9
         ("SAC", attribute("_logger", {"left_out": 3})),
         ("SAC", attribute("policy_kwargs", {"left_out": "x"})), ("SAC", attribute("policy_class", {"left_out": "x"})),
         ("SAC", attribute("action_noise", {"instance": "os:_Environ", "attributes": {}})),
-        ("SAC", lambda tree, tensors: tree.update(variables={"gamma": {"tensor": "x"}})),
-        ("SAC", lambda tree, tensors: tree.update(variables=3)), ("SAC", lambda tree, tensors: tree.update(more={})),
+        ("SAC", lambda tree, tensors: tree.update(own=3)), ("SAC", lambda tree, tensors: tree.update(more={})),
+        *(("SAC", lambda tree, tensors, name=name: tree.update(own={name: {"dict": {}}}))
+          for name in ("gamma", "critic", "policy", "actor.optimizer", "train", "replay_buffer", "lr_schedule")),
         ("SAC", lambda tree, tensors: tree["parameters"].update({"x": {"left_out": "x"}})),
         ("SAC", attribute("learning_rate", {"import": "os:system"})), ("SAC", attribute("env", "cpu")),
         ("SAC", lambda tree, tensors: tree["attributes"].clear()),

@@ -322,6 +322,20 @@ def test_a_replay_buffer_of_ones_own(maker: str, tmp_path: Path) -> None:
         loaded.learn(5)
 
 
+def test_a_replay_buffer_class_of_a_function(tmp_path: Path) -> None:
+    class Local(OwnBuffer):
+        pass
+
+    model = sac(replay_buffer_class=Local)
+    (message,) = train(model, tmp_path)
+    assert "load_replay_buffer needs a model that has it as its replay_buffer_class" in message
+    with pytest.raises(BadFile, match="was made inside of a function.*load_replay_buffer needs a model that has it"):
+        sac().load_replay_buffer(tmp_path / "b", **TRUST)
+    loaded = SAC.load(tmp_path / "m", env=vec(), replay_buffer_class=Local)
+    loaded.load_replay_buffer(tmp_path / "b")
+    assert type(loaded.replay_buffer) is Local and loaded.replay_buffer.added == 64
+
+
 def test_what_a_replay_buffer_cannot_hold(tmp_path: Path) -> None:
     model = sac(replay_buffer_class=OwnBuffer).learn(12)
     model.replay_buffer.lock = threading.Lock()
@@ -573,6 +587,46 @@ def test_tensors_that_are_parameters_without_a_module(tmp_path: Path) -> None:
     assert loaded.log_x.tolist() == [3, 3] and loaded.log_x.requires_grad
     model.log_x.data[0] = np.nan
     with pytest.raises(ValueError, match="log_x cannot be saved, since it holds 1 numbers that are not finite"):
+        model.save(tmp_path / "m")
+
+
+class WithNetwork(SAC):
+    """Learns a network that it names nowhere."""
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.extra = nn.Sequential(nn.Linear(3, 2), nn.BatchNorm1d(2))
+        self.extra_optimizer = torch.optim.Adam(self.extra.parameters(), lr=1e-2)
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        super().train(gradient_steps, batch_size)
+        self.extra_optimizer.zero_grad()
+        self.extra(torch.randn(8, 3)).square().sum().backward()
+        self.extra_optimizer.step()
+
+
+def test_networks_and_optimizers_of_a_subclass(tmp_path: Path) -> None:
+    model = sac(cls=WithNetwork)
+    assert train(model, tmp_path) == []
+    loaded = WithNetwork.load(tmp_path / "m", env=vec())
+    for name in ("extra", "extra_optimizer"):
+        own, other = getattr(model, name).state_dict(), getattr(loaded, name).state_dict()
+        assert repr(own) == repr(other) and len(own) > 1
+    assert loaded.extra_optimizer.param_groups[0]["params"][0] is loaded.extra[0].weight
+    loaded.learn(20)
+    with pytest.warns(
+        UserWarning, match="without extra .a state of something that this model has not.*extra_optimizer"
+    ):
+        SAC.load(tmp_path / "m")
+    # And with checkpoints, bit by bit.
+    whole = sac(cls=WithNetwork).learn(96)
+    again = interrupted(lambda: sac(cls=WithNetwork), tmp_path / "run")
+    assert not differing(state(whole), state(again))
+    assert repr(whole.extra_optimizer.state_dict()) == repr(again.extra_optimizer.state_dict())
+    model.extra[0].weight.data[0, 0] = np.nan
+    with pytest.raises(
+        ValueError, match=r"extra.0.weight cannot be saved, since it holds 1 numbers that are not finite"
+    ):
         model.save(tmp_path / "m")
 
 
