@@ -32,7 +32,7 @@ class Suite(NamedTuple):
     files: tuple[str, ...]
 
     def __str__(self) -> str:
-        return f"{self.distribution}.{self.replaced}->{self.replacement}"
+        return f"{self.distribution}-{self.replaced}-{self.replacement}"
 
 
 class Exclusion(NamedTuple):
