@@ -52,7 +52,7 @@ from sb3_sample.sac.parts import ParametersDoNotFit, Part
 from sb3_sample.sac.pessimism import PESSIMISMS, Pessimism, pessimistic_value
 from sb3_sample.sac.plasticity import ReDo, Resets
 from sb3_sample.sac.policies import Actor, CnnPolicy, CriticEnsemble, MlpPolicy, ModeSwitch, MultiInputPolicy, SACPolicy
-from sb3_sample.sac.sb3_names import TemperatureNames
+from sb3_sample.sac.sb3_names import SB3Names
 from sb3_sample.sac.scalars import FixedScalar, LogScalar
 from sb3_sample.saving.checkpoint import Checkpointer
 from sb3_sample.saving.container import BadFile
@@ -67,7 +67,7 @@ Self = TypeVar("Self", bound="SAC")
 MAX_BATCHES_AT_ONCE = 64
 
 
-class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
+class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
     SAC that the papers compare with (P2-P5): tanh-Gaussian actor, two critics, clipped double Q-learning.
@@ -810,7 +810,8 @@ class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyA
     @property
     def logger(self) -> Logger:
         """The logger. Metrics in it may be on the device until somebody reads them."""
-        LoggedValues.of(self._logger)
+        if isinstance(self._logger, Logger):
+            LoggedValues.of(self._logger)
         return self._logger
 
     @property
@@ -1005,7 +1006,7 @@ class SAC(TemperatureNames, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyA
         self._watch.check()
         # Those of the latest gradient step also where there was none since the last time; a callback may have put
         # others in the place of those that there are.
-        recorded = self.logger.name_to_excluded
+        recorded = getattr(self.logger, "name_to_excluded", ())
         for name, value in self._metrics.items():
             if name not in recorded:
                 self.logger.record(name, float(value))

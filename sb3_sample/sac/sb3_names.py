@@ -4,19 +4,22 @@ import math
 from typing import Any
 
 import torch
+from stable_baselines3.common.utils import get_parameters_by_name
 
 from sb3_sample.optim import AdamW
-from sb3_sample.sac.policies import Actor
+from sb3_sample.sac.policies import Actor, CriticEnsemble
 from sb3_sample.sac.scalars import FixedScalar, LogScalar
 
 
-class TemperatureNames:
+class SB3Names:
     """
-    The temperature as ``stable_baselines3.SAC`` has it. A number that is set is put in the place of the old one, so
+    Attributes as ``stable_baselines3.SAC`` has them. A temperature that is set is put in the place of the old one, so
     that it counts from the next gradient step on, however that is run.
     """
 
     actor: Actor
+    critic: CriticEnsemble
+    critic_target: CriticEnsemble
     temperature: LogScalar | FixedScalar
     temperature_optimizer: AdamW | None
 
@@ -52,3 +55,13 @@ class TemperatureNames:
     def ent_coef_optimizer(self) -> AdamW | None:
         """Optimizer of the temperature; None if it is fixed."""
         return self.temperature_optimizer
+
+    @property
+    def batch_norm_stats(self) -> list[torch.Tensor]:
+        """Running statistics in the critics' network; ``train`` copies the features extractor's to the targets."""
+        return get_parameters_by_name(self.critic, ["running_"])
+
+    @property
+    def batch_norm_stats_target(self) -> list[torch.Tensor]:
+        """The same of the target critics."""
+        return get_parameters_by_name(self.critic_target, ["running_"])

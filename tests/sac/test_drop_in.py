@@ -160,6 +160,27 @@ def test_values_held_by_a_callback_stay_the_loggers() -> None:
         assert holds.values["train/critic_loss"] > 0
 
 
+def test_a_logger_that_is_none_of_stable_baselines3(fetched: str) -> None:
+    """It calls ``record`` and ``dump``, and asks for nothing else."""
+
+    class Own:
+        def __init__(self) -> None:
+            self.lines, self.now = [], {}
+
+        def record(self, name: str, value: Any, exclude: Any = None) -> None:
+            assert type(value) in (int, float)
+            self.now[name] = value
+
+        def dump(self, step: int) -> None:
+            self.lines.append(self.now)
+            self.now = {}
+
+    model, own = sac(learning_starts=20), Own()
+    model.set_logger(own)
+    model.learn(42, log_interval=1)
+    assert ["train/critic_loss" in line for line in own.lines] == [False] * 3 + [True] * 3
+
+
 def test_a_diverged_loss_is_not_recorded(fetched: str) -> None:
     model = sac(learning_starts=20, compile=False).learn(25, log_interval=None)
     with torch.no_grad():
@@ -296,6 +317,20 @@ def test_names_without_a_temperature() -> None:
     assert model.log_ent_coef is None and model.ent_coef_optimizer is None and model.ent_coef_tensor.item() == 0
     with pytest.raises(ValueError, match="deterministic"):
         model.ent_coef_tensor = 0.5
+
+
+def test_stable_baselines3s_own_update_runs_on_the_model() -> None:
+    """Its ``SAC.train``, which knows nothing of this package, finds all that it needs."""
+    model = sac(learning_starts=20).learn(25, log_interval=None)
+    before, n_updates = state(model), model._n_updates
+    stable_baselines3.SAC.train(model, gradient_steps=3, batch_size=8)
+    assert model._n_updates == n_updates + 3
+    values = model.logger.name_to_value
+    assert all(np.isfinite(values[f"train/{name}_loss"]) for name in ("critic", "actor", "ent_coef"))
+    after = state(model)
+    for name, value in before.items():
+        if name.startswith(("policy", "temperature/")):
+            assert not torch.equal(value, after[name]), name
 
 
 # ---------------------------------------------------------------- actor
