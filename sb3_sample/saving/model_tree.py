@@ -173,7 +173,7 @@ class Content:
                 try:
                     attributes[name] = self._decoded(tree, name)
                 except NotTrusted as error:
-                    refused.append(f"{error}: {notice.need(self._cls, name, error.path)}")
+                    refused.append(f"{error}: {notice.need(self._cls, name, error.path, self._trusted)}")
         if refused:
             raise BadFile(f"{self.name}: {'; '.join(refused)}")
         for name, kind in (("policy_kwargs", dict), ("verbose", int), ("policy_class", type)):

@@ -22,16 +22,17 @@ def argument_for(cls: type, name: str) -> str | None:
     return f"{attribute}=" if attribute in argument_names(cls) else f"custom_objects={{{attribute!r}: ...}}"
 
 
-def need(cls: type, name: str, path: str) -> str:
+def need(cls: type, name: str, path: str, trusted: Sequence[str] = ()) -> str:
     """
     :param cls: class of an algorithm
     :param name: what of it is a class or function, or an object of one, that not everybody knows
     :param path: of the class or function
+    :param trusted: modules that somebody vouches for, so that it is not trust that is missing
     :return: what reading its file needs for that
     """
     argument = argument_for(cls, name)
     module = path.partition(":")[0]
-    wanted = [] if "<locals>" in path else [f"trusted_modules=[{module!r:.200}]"]
+    wanted = [] if "<locals>" in path or within(module, trusted) else [f"trusted_modules=[{module!r:.200}]"]
     if argument is None:
         return f"load_replay_buffer needs {wanted[0] if wanted else 'a model that has it as its replay_buffer_class'}"
     return f"load needs {' or '.join([*wanted, argument])}"

@@ -213,7 +213,8 @@ def decode_buffer(
             f"{name}: no replay buffer can be made of what it holds: {type(error).__name__}: {error}"
         ) from error
     except NotTrusted as error:
-        raise BadFile(f"{name}: {error}: {notice.need(type(model), 'replay_buffer', error.path)}") from error
+        wanted = notice.need(type(model), "replay_buffer", error.path, trusted)
+        raise BadFile(f"{name}: {error}: {wanted}") from error
     except BadFile as error:
         raise BadFile(f"{name}: {error}") from error
     except ValueError as error:
