@@ -25,6 +25,7 @@ from sb3_sample.sac import SAC, losses
 from sb3_sample.sac.batch import Batch
 from sb3_sample.sac.buffers import samples_at
 from sb3_sample.sac.pessimism import epistemic_std
+from sb3_sample.sac.q_values import evaluate
 from sb3_sample.saving.rings import Ring
 
 
@@ -387,7 +388,7 @@ class DiagnosticsCallback(BaseCallback):
             self._store.add(observation, last, scaled, reward, done, infos)
             self._n_stored += 1
             if step == start:
-                value = self.model.critic.q_values(tensors, action).mean().item()
+                value = evaluate(self.model.critic, tensors, action).mean().item()
             if step >= start:
                 rewards.append(reward[0])
                 log_probs.append(log_prob.item())
@@ -421,20 +422,20 @@ class DiagnosticsCallback(BaseCallback):
         """Mean squared TD error of the critics' mean."""
         model = self.model
         actions, log_prob = model.policy.next_actions(batch.next_observations, self._noise(len(batch.actions)))
-        next_q = model.critic_target.q_values(batch.next_observations, actions)
+        next_q = evaluate(model.critic_target, batch.next_observations, actions)
         if model.target_subset is not None:
             next_q = next_q[self._rng.permutation(len(next_q))[: model.target_subset]]
         next_values = model.pessimism_rule.value(next_q)
         entropy_bonus = -model.temperature() * log_prob
         target = losses.td_target(batch.rewards, batch.dones, batch.discounts, next_values, entropy_bonus)
-        q = model.critic.q_values(batch.observations, batch.actions)
+        q = evaluate(model.critic, batch.observations, batch.actions)
         return (q.mean(dim=(0, 2)) - target.mean(dim=1)).square().mean().item()
 
     def _networks(self, batch: Batch) -> dict[str, float]:
         """Disagreement, dormant neurons and rank, on a batch of the replay buffer."""
         actor, critic = self.model.actor, self.model.critic
         results: dict[str, float] = {}
-        q = critic.q_values(batch.observations, batch.actions)
+        q = evaluate(critic, batch.observations, batch.actions)
         if len(q) > 1:
             results["critic_disagreement"] = epistemic_std(q).mean().item()
         extractor: Any = critic.features_extractor

@@ -52,6 +52,7 @@ from sb3_sample.sac.parts import ParametersDoNotFit, Part
 from sb3_sample.sac.pessimism import PESSIMISMS, Pessimism, pessimistic_value
 from sb3_sample.sac.plasticity import ReDo, Resets
 from sb3_sample.sac.policies import Actor, CnnPolicy, CriticEnsemble, MlpPolicy, ModeSwitch, MultiInputPolicy, SACPolicy
+from sb3_sample.sac.q_values import evaluate
 from sb3_sample.sac.sb3_names import SB3Names
 from sb3_sample.sac.scalars import FixedScalar, LogScalar
 from sb3_sample.saving.checkpoint import Checkpointer
@@ -899,13 +900,13 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         # Critics, towards the targets' value of the actor's next action.
         with torch.no_grad():
             next_actions, next_log_prob = self.policy.next_actions(batch.next_observations, noise.critic)
-            next_q = self.critic_target.q_values(batch.next_observations, next_actions)
+            next_q = evaluate(self.critic_target, batch.next_observations, next_actions)
             if noise.subset is not None:
                 next_q = next_q[noise.subset]
             entropy_bonus = -fixed_alpha * next_log_prob
             next_values = self.pessimism_rule.value(next_q)
             target = losses.td_target(batch.rewards, batch.dones, batch.discounts, next_values, entropy_bonus)
-        q = self.critic.q_values(batch.observations, batch.actions)
+        q = evaluate(self.critic, batch.observations, batch.actions)
         critic_loss = self._critic_loss(q, target)
         if self.sam_radius is None:
             self.minimize(self.critic.optimizer, critic_loss)
@@ -920,7 +921,7 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         if moves_actor:
             # Actor, on the new critics.
             actions, log_prob = self.actor.sample(batch.observations, noise.actor)
-            value = self._actor_value(self.critic.q_values(batch.observations, actions))
+            value = self._actor_value(evaluate(self.critic, batch.observations, actions))
             actor_loss = losses.actor_loss(log_prob, value, fixed_alpha)
             self.minimize(self.actor.optimizer, actor_loss)
             metrics["train/actor_loss"] = actor_loss
@@ -967,7 +968,7 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         copied = {id(p) for p in self.critic.copied_parameters()}
         gradients = sharpness_aware_gradients(
             loss,
-            lambda: self._critic_loss(self.critic.q_values(batch.observations, batch.actions), target),
+            lambda: self._critic_loss(evaluate(self.critic, batch.observations, batch.actions), target),
             parameters,
             self.sam_radius,
             [len(p) if id(p) in copied else None for p in parameters],

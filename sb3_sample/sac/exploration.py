@@ -13,6 +13,7 @@ from sb3_sample.optim import AdamW
 from sb3_sample.sac import losses
 from sb3_sample.sac.parts import Part
 from sb3_sample.sac.pessimism import epistemic_std
+from sb3_sample.sac.q_values import evaluate
 from sb3_sample.sac.scalars import BoundedLogScalar, LogScalar
 
 if TYPE_CHECKING:
@@ -175,7 +176,7 @@ class OptimisticExploration(Exploration):
 
         optimistic_mean, optimistic_std = self._gaussian(batch.observations, features, mean, std)
         action = agent.actor.learned_action(optimistic_mean, self.std_multiplier * optimistic_std, noise)
-        q = agent.critic.q_values(batch.observations, action)
+        q = evaluate(agent.critic, batch.observations, action)
         q_mean, q_std = q.mean(dim=0), spread(q, self.uncertainty)
         kl = self._kl(agent, (optimistic_mean, optimistic_std), (mean, std))
         upper_value = q_mean + optimism.detach() * q_std
@@ -419,7 +420,7 @@ class OptimisticGradient(Exploration):
         # Acting runs in inference mode, which knows no gradients.
         with torch.inference_mode(False), torch.enable_grad():
             at = mean.clone().requires_grad_()
-            q = agent.critic.q_values(_cloned(observations), torch.tanh(at))
+            q = evaluate(agent.critic, _cloned(observations), torch.tanh(at))
             upper_value = q.mean(dim=(0, 2)) + self.optimism * epistemic_std(q).mean(dim=1)
             (gradient,) = torch.autograd.grad(upper_value.sum(), at)
         scaled = std.square() * gradient

@@ -20,6 +20,7 @@ from sb3_sample.optim import AdamW
 from sb3_sample.sac import buffers, losses
 from sb3_sample.sac.batch import Batch, CriticStep, Extra
 from sb3_sample.sac.parts import ParametersDoNotFit, Part
+from sb3_sample.sac.q_values import evaluate
 
 if TYPE_CHECKING:
     from sb3_sample.sac.algorithm import SAC
@@ -296,8 +297,8 @@ class LearnedPessimism(Pessimism):
         """What the critics' step computes, of other transitions."""
         with torch.no_grad():
             actions, log_prob = agent.policy.next_actions(batch.next_observations, noise)
-            next_q = agent.critic_target.q_values(batch.next_observations, actions)
-            q = agent.critic.q_values(batch.observations, batch.actions)
+            next_q = evaluate(agent.critic_target, batch.next_observations, actions)
+            q = evaluate(agent.critic, batch.observations, batch.actions)
             return CriticStep(q, next_q, -agent.temperature() * log_prob)
 
     def _td_error(self, batch: Batch, step: CriticStep) -> torch.Tensor:

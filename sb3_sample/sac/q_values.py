@@ -47,6 +47,20 @@ class QValues(tuple[torch.Tensor, ...]):
         return id(self)
 
 
+def evaluate(critics: Callable[..., Any], observations: Any, actions: torch.Tensor) -> torch.Tensor:
+    """
+    Values of critics as one tensor, whether they answer as this package's or with a tensor: stand-ins, hooks on the
+    module and networks of one's own are asked like any other.
+
+    :param critics: (B, O) and (B, A) to values
+    :param observations: (B, O), or a dict of them
+    :param actions: actions in [-1, 1], (B, A)
+    :return: (E, B, K)
+    """
+    q = critics(observations, actions)
+    return q.tensor if isinstance(q, QValues) else q  # type: ignore[no-any-return]
+
+
 def _with_tensors(values: Any) -> Any:
     """The same nested lists, tuples and dicts, with tensors for the values of critics."""
     if isinstance(values, QValues):
