@@ -71,6 +71,25 @@ def test_no_pickle_is_touched(maker: str, tmp_path: Path, no_pickle: None) -> No
             assert not differing(state(model), state(loaded))
 
 
+@pytest.mark.parametrize("maker", MAKE)
+def test_nothing_of_this_packages_own_is_left_out_or_apart(maker: str, tmp_path: Path) -> None:
+    """What has a state is named among the parameters, and what is no parameter is plain."""
+    model = MAKE[maker]()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.save(tmp_path / "m")
+    tree, _ = container.read(tmp_path / "m.zip", "model")
+    assert tree.keys() == {"classes", "attributes", "parameters", "metadata"}
+    assert "left_out" not in json.dumps(tree)
+
+
+def test_a_file_of_before_is_read(files: dict[str, Path]) -> None:
+    """It has the schedule that follows from the learning rate."""
+    schedule = {"object": "stable_baselines3.common.utils:FloatSchedule", "attributes": {"value_schedule": {
+        "object": "stable_baselines3.common.utils:ConstantSchedule", "attributes": {"val": 0.5}}}}  # fmt: skip
+    assert SAC.load(changed(files["SAC"], attribute("lr_schedule", schedule))).lr_schedule(0.5) == 3e-4
+
+
 def test_the_fixture_catches_pickles(tmp_path: Path, no_pickle: None) -> None:
     with pytest.raises(AssertionError, match="was called"):
         sac().save(tmp_path / "m", allow_pickle=True)
