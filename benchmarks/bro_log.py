@@ -5,8 +5,8 @@ logs and the seeds of the authors' code.
     OMP_NUM_THREADS=1 python benchmarks/bro_log.py --task cheetah-run --seed 0 --steps 50000
 
 A line of JSON every ``--every`` steps goes to ``OUTPUT/TASK/rr<replay ratio>_seed<seed>.jsonl``: means of the metrics
-since the line before, norms of all parameters of actor, optimistic actor and critics, and at multiples of ``--eval-freq``
-the return of 5 episodes of the mean action.
+since the line before, norms of all parameters of actor, optimistic actor and critics, and at multiples of
+``--eval-freq`` the return of 5 episodes of the mean action.
 """
 
 import argparse
