@@ -44,6 +44,7 @@ REASONS = (
     "Errors",
     "`n_steps` with a buffer of one's own",
     "Memory of the replay buffer",
+    "Schedules in files",
     "Features extractors",
     "`tau=0`",
     "Weight decay",
@@ -85,6 +86,11 @@ _OFF_POLICY = (
     ),
     *_excluded("`tau=0`", "tau must lie in (0, 1], not 0", "test_train_eval_mode::test_sac_train_with_batch_norm"),
     *_excluded("The test", "IndexError: list index out of range", "test_save_load::test_save_load[*]"),
+    *_excluded(
+        "The test",
+        "replay_buffer.device.type == model.device.type",
+        "test_save_load::test_save_load_replay_buffer[*]",
+    ),
 )
 _BRO = (
     *_excluded(
@@ -97,6 +103,11 @@ _BRO = (
 _PPO = (
     *_excluded("Errors", "ValueError: clip_range_vf must be above 0", "test_run::test_ppo[-0.2-*]"),
     *_excluded("The test", "is truncated, or no file of sb3_sample", "test_save_load::test_load_bad_zip"),
+    *_excluded(
+        "Schedules in files",
+        "has no attribute '__name__'",
+        "test_save_load::test_save_load_backward_compatible[*]",
+    ),
     *_excluded("The test", "There is no item named 'data'", "test_save_load::test_load_invalid_object"),
     *_excluded("The test", "PPO_1", "test_tensorboard::test_tensorboard[ppo]"),
 )
