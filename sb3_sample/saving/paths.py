@@ -9,6 +9,8 @@ from typing import IO, Any
 
 from stable_baselines3.common.save_util import open_path
 
+from sb3_sample.saving.untrusted import check_regular
+
 PathOrFile = str | pathlib.Path | io.BufferedIOBase
 
 
@@ -39,7 +41,11 @@ def opened(path: PathOrFile, suffix: str) -> Iterator[IO[bytes]]:
     :param suffix: without its dot
     :return: the file, which is closed afterwards if it was opened here
     :raises FileNotFoundError: if there is none
+    :raises BadFile: if it is a pipe or a device
     """
+    if isinstance(path, (str, pathlib.Path)):
+        for name in (path, f"{path}.{suffix}"):
+            check_regular(name)
     file: Any = open_path(path, "r", suffix=suffix)
     try:
         yield file

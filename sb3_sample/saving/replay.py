@@ -13,8 +13,9 @@ from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.saving import container, paths
 from sb3_sample.saving.classes import NotPortable, check_trusted, checked_path
-from sb3_sample.saving.container import MAX_MESSAGE, BadFile, PickledFile
+from sb3_sample.saving.container import BadFile, PickledFile
 from sb3_sample.saving.encoding import decode, encode
+from sb3_sample.saving.untrusted import MAX_MESSAGE
 
 KIND = "replay buffer"
 SUFFIX = "buffer.zip"
