@@ -21,8 +21,10 @@ from sb3_sample.saving.untrusted import BadFile, open_regular, parse_json
 EVALUATIONS = "evaluations.npz"
 #: Arrays of the evaluations, and bytes of all of them: 400,000 evaluations of ten episodes.
 MAX_ARRAYS, MAX_BYTES = 16, 32 * 2**20
-#: Bytes of a header of NumPy, of a line of Monitor's and of a file of Monitor's, and its episodes.
-MAX_HEADER, MAX_LINE, MAX_MONITOR, MAX_EPISODES = 1000, 2**16, 64 * 2**20, 1_000_000
+#: Bytes of a header of NumPy, and of a line of Monitor's.
+MAX_HEADER, MAX_LINE = 1000, 2**16
+#: Bytes of a file of Monitor's, its numbers (of a million episodes), and its columns.
+MAX_MONITOR, MAX_FIELDS, MAX_COLUMNS = 64 * 2**20, 3_000_000, 64
 #: Columns of Monitor's files that anything is drawn of.
 _COLUMNS = ("r", "l", "t", "is_success")
 #: What Gymnasium's ids consist of.
@@ -171,19 +173,17 @@ def read_monitors(folder: str | Path) -> pd.DataFrame:
 
 
 def _read_monitor(path: Path) -> tuple[pd.DataFrame, float]:
-    parts: list[pd.DataFrame] = []
     with open_regular(path) as file:
         head = _head(file, path)
         columns = file.readline(MAX_LINE)
-        # In pieces: what one takes as a table is many times its bytes.
+        if not columns.endswith(b"\n") or columns.count(b",") >= MAX_COLUMNS:
+            raise BadFile(f"{path} is no file of Monitor's: its second line names no columns, or too many")
+        _check_size(file, path)
+        # In pieces: what is taken as a table is many times its bytes.
+        parts = [_table(columns, path)]
         while block := file.read(_BLOCK):
-            block += file.readline(MAX_LINE)
-            parts.append(_table(columns + block, path))
-            if file.tell() > MAX_MONITOR or sum(map(len, parts)) > MAX_EPISODES:
-                raise BadFile(
-                    f"{path} has more than the {MAX_MONITOR:,} bytes or {MAX_EPISODES:,} episodes that are read"
-                )
-    frame = pd.concat(parts) if parts else _table(columns, path)
+            parts.append(_table(columns + block + file.readline(), path))
+    frame = pd.concat([part for part in parts if len(part)] or parts)
     if not {"r", "l", "t"} <= set(frame):
         raise BadFile(f"{path} is no file of Monitor's: it has no columns r, l and t")
     frame = frame.dropna(subset=["l", "t"])
@@ -191,6 +191,16 @@ def _read_monitor(path: Path) -> tuple[pd.DataFrame, float]:
     if not ((lengths >= 1) & (lengths < 2**31)).all() or not (np.abs(times) < 2**53).all():
         raise BadFile(f"{path} is no file of Monitor's: an episode has no length or no time")
     return frame, head["t_start"]
+
+
+def _check_size(file: IO[bytes], path: Path) -> None:
+    """See that the rest of a file is not too much to be read, and go back to where it is."""
+    start, fields = file.tell(), 0
+    while block := file.read(_BLOCK):
+        fields += block.count(b",") + block.count(b"\n")
+        if file.tell() > MAX_MONITOR or fields > MAX_FIELDS:
+            raise BadFile(f"{path} has more than the {MAX_MONITOR:,} bytes or {MAX_FIELDS:,} numbers that are read")
+    file.seek(start)
 
 
 def _table(data: bytes, path: Path) -> pd.DataFrame:

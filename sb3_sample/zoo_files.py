@@ -130,7 +130,10 @@ class _VecNormalize:
         return VecNormalize(*args, **kwargs)
 
     def load(self, path: str, venv: VecEnv) -> VecNormalize:
-        return load_vec_normalize(path, venv, allow_pickle=_allow_pickle is not False)
+        try:
+            return load_vec_normalize(path, venv, allow_pickle=_allow_pickle is not False)
+        except OSError as error:
+            raise Refused(str(error)) from error
 
 
 def adapt(module: types.ModuleType, algorithms: Sequence[str]) -> None:

@@ -189,6 +189,7 @@ def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
     :return: how the run starts; None for one without checkpoints
     :raises RunError: if it cannot
     """
+    _check_agent(arguments)
     if options.run_dir is None and options.checkpoint_freq is None and not options.resume:
         return None
     freq = options.checkpoint_freq
@@ -213,6 +214,14 @@ def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
     # What the command line says besides replaces these.
     command = ["--seed", str(record.seed), "-n", str(record.n_timesteps), *arguments]
     return Start(command, freq or record.checkpoint_freq, folder, record)
+
+
+def _check_agent(arguments: Sequence[str]) -> None:
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("-i", "--trained-agent", default="")
+    agent = parser.parse_known_args(arguments)[0].trained_agent
+    if agent and not (agent.endswith(".zip") and os.path.isfile(agent)):
+        raise RunError(f"-i must be a .zip file of a model, not {agent!r}")
 
 
 def _latest(arguments: Sequence[str]) -> Path:

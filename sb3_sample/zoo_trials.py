@@ -19,6 +19,8 @@ from optuna.storages.journal import JournalFileBackend
 
 from sb3_sample.saving.untrusted import BadFile, open_regular
 
+#: Bytes of a line of a journal.
+MAX_LINE = 2**20
 #: What a table of Optuna's is not: one that computes something when it is read.
 _COMPUTES = re.compile(r"\b(virtual|generated|as)\b", re.IGNORECASE)
 
@@ -45,9 +47,11 @@ def check_storage(storage: str) -> None:
     file = _file_of(storage)
     if file is None or not file.exists():
         return
-    open_regular(file).close()
     with _reading(storage, "its studies"):
-        if not storage.endswith(".log"):
+        if storage.endswith(".log"):
+            _check_lines(file)
+        else:
+            open_regular(file).close()
             _check_tables(file)
         optuna.get_all_study_names(_opened(storage))
 
@@ -76,6 +80,14 @@ def _reading(storage: str, what: str) -> Iterator[None]:
         raise
     except Exception as error:  # Optuna and the database raise whatever they meet
         raise BadFile(f"--storage {storage}: {what} cannot be read: {type(error).__name__}: {error}") from error
+
+
+def _check_lines(file: Path) -> None:
+    """Optuna takes a line of any length into memory."""
+    with open_regular(file) as lines:
+        while line := lines.readline(MAX_LINE + 1):
+            if len(line) > MAX_LINE:
+                raise BadFile(f"{file} is no journal of Optuna's: it has a line of more than {MAX_LINE:,} bytes")
 
 
 def _check_tables(file: Path) -> None:

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import functools
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -141,19 +142,29 @@ class _Watch:
         """
         As ``create_test_env``.
 
-        :raises Refused: if the run's settings make none
+        :raises Refused: if the run's settings make none that works
         """
-        try:
-            self._env = create_test_env(env_id, *args, **kwargs)
-        except (BadFile, Refused):
-            raise
-        except Exception as error:  # what an environment raises is its own business, but not its arguments here
-            if not self._is_safe:
-                raise
-            raise Refused(
-                f"{env_id} cannot be made with the run's settings: {type(error).__name__}: {error}"
-            ) from error
+        make = self._answering_for(env_id, create_test_env) if self._is_safe else create_test_env
+        self._env = make(env_id, *args, **kwargs)
+        for name in ("reset", "step_async", "step_wait", "render") if self._is_safe else ():
+            setattr(self._env, name, self._answering_for(env_id, getattr(self._env, name)))
         return self._env
+
+    @staticmethod
+    def _answering_for(env_id: str, function: Any) -> Any:
+        """What an environment or a wrapper raises, whose arguments are those of a run's file, is said to be theirs."""
+
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            try:
+                return function(*args, **kwargs)
+            except (BadFile, Refused):
+                raise
+            except Exception as error:
+                why = f"{type(error).__name__}: {error}"
+                raise Refused(f"{env_id} with the settings of the run does not work: {why}") from error
+
+        return call
 
     def _fitting(self, load: Any) -> Any:
         def call(*args: Any, **kwargs: Any) -> Any:
