@@ -167,7 +167,10 @@ def _zoo_plot(function: str) -> Callable[[list[str]], None]:
         # NumPy as the zoo uses it, but for what it opens files with.
         numpy = SimpleNamespace(**{**vars(module.np), "load": read_evaluations})
         runs = PlottedRuns(options.allow_pickle)
-        with _drawing(function), _errors(function), replaced(module, "np", numpy), replaced(module, "pickle", runs):
+        replacements = {"np": numpy, "pickle": runs, "open": runs.open}
+        with _drawing(function), _errors(function), contextlib.ExitStack() as stack:
+            for name, value in replacements.items():
+                stack.enter_context(replaced(module, name, value))
             _zoo_function("rl_zoo3.plots", function)(names)
 
     return run

@@ -6,6 +6,7 @@ The zoo's own algorithms are read and written as in the stock zoo, since their m
 """
 
 import argparse
+import builtins
 import contextlib
 import functools
 import io
@@ -30,6 +31,7 @@ from sb3_sample.saving.encoding import decode, encode
 from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.normalization import load_vec_normalize, save_vec_normalize
 from sb3_sample.saving.replay import SafeReplayBuffers
+from sb3_sample.saving.untrusted import open_regular
 from sb3_sample.zoo_settings import read_settings
 
 #: Whether pickles are read: as ``reading`` says, and None outside of it, in the stock zoo's own commands.
@@ -48,16 +50,20 @@ def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
     """
     Something else in the place of an attribute, for a while.
 
-    :param owner: module or class whose own attribute it is
+    :param owner: module or class whose own attribute it is, or, of a module, a built-in function that it uses
     :param name: its name
     :param value: what takes its place
     """
-    before = vars(owner)[name]
+    is_own = name in vars(owner)
+    before = vars(owner if is_own else builtins)[name]
     setattr(owner, name, value)
     try:
         yield
     finally:
-        setattr(owner, name, before)
+        if is_own:
+            setattr(owner, name, before)
+        else:
+            delattr(owner, name)
 
 
 @contextlib.contextmanager
@@ -232,6 +238,17 @@ class PlottedRuns:
 
     def __init__(self, allow_pickle: bool = False):
         self._allow_pickle = allow_pickle
+
+    @staticmethod
+    def open(path: str, mode: str) -> IO[Any]:
+        """
+        As the built-in function, but for pipes and devices, which are not read.
+
+        :param path: of a file
+        :param mode: see there
+        :return: the file
+        """
+        return open_regular(path) if mode == "rb" else open(path, mode)
 
     def dump(self, value: Any, file: IO[bytes]) -> None:
         """

@@ -58,7 +58,7 @@ def importing_nothing() -> Iterator[None]:
     What is read meanwhile names classes and functions of modules that the program has imported. A checkpoint is read
     so: it may name whatever the program consists of, and must not say what else is run.
     """
-    token = _imports.set(False)
+    token = _imports.set(True)
     try:
         yield
     finally:
