@@ -7,16 +7,17 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pytest
 
 from sb3_sample.saving import run_folder
 from sb3_sample.saving.run_folder import Damaged, RunFolder, Segment
+from tests.saving.hostile_folders import facts_of, rewritten
 
 
-def writer(content: bytes) -> Callable[[Path], None]:
-    return lambda path: path.write_bytes(content) and None
+def writer(content: bytes) -> Callable[[IO[bytes]], Any]:
+    return lambda file: file.write(content)
 
 
 def write(folder: RunFolder, steps: int, segments: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -108,12 +109,15 @@ def test_a_manifest_that_points_elsewhere(tmp_path: Path) -> None:
         ("segments", "../elsewhere"),
         ("files", str(tmp_path / "elsewhere")),
     ):
-        manifest = json.loads(path.read_text())
-        del manifest["sha256"]
-        manifest[part] = {name: {**next(iter(manifest[part].values())), **run_folder._facts(tmp_path / "elsewhere")}}
         before = path.read_text()
-        run_folder._write_manifest(path, manifest)
-        with pytest.raises(Damaged, match="names a file elsewhere"):
+
+        def point(manifest: Any, part: str = part, name: str = name) -> None:
+            manifest[part] = {
+                name: {**next(iter(manifest[part].values())), **facts_of((tmp_path / "elsewhere").read_bytes())}
+            }
+
+        rewritten(path, point)
+        with pytest.raises(Damaged, match="names a file elsewhere|its files are"):
             folder.verify(path.parent)
         path.write_text(before)
 
@@ -186,9 +190,10 @@ def test_what_cannot_be_written_leaves_nothing(code: int, where: str, tmp_path: 
     segments = write(folder, 10)
     before = sorted(str(p) for p in tmp_path.rglob("*"))
 
-    def fail(path: Any, *args: Any) -> None:
-        Path(path).write_bytes(b"half") if where != "rename" else None
-        raise OSError(code, os.strerror(code), str(path))
+    def fail(file: Any, *args: Any, **kwargs: Any) -> None:
+        if where != "rename":
+            file.write(b"half")
+        raise OSError(code, os.strerror(code), "the file")
 
     def attempt() -> None:
         if where == "segment":
@@ -209,10 +214,14 @@ def test_what_cannot_be_written_leaves_nothing(code: int, where: str, tmp_path: 
 def test_what_is_read_back_otherwise_is_no_checkpoint(tmp_path: Path, monkeypatch: Any) -> None:
     folder = RunFolder(tmp_path)
     segments = write(folder, 10)
-    checksum = run_folder._checksum
-    monkeypatch.setattr(
-        run_folder, "_checksum", lambda path: "other" if "checkpoint-000000000020" in str(path) else checksum(path)
-    )
-    with pytest.raises(OSError, match="what was written is not what is read"):
-        folder.write(20, {"model.zip": writer(b"m"), "state.zip": writer(b"s")}, segments, {})
+    checksum, n_read = run_folder._checksum, [0]
+
+    def other_the_second_time(file: Any) -> str:
+        n_read[0] += Path(file.name).name == "state.zip"
+        return checksum(file) if n_read[0] != 2 else "other"
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run_folder, "_checksum", other_the_second_time)
+        with pytest.raises(OSError, match="what was written is not what is read"):
+            folder.write(20, {"model.zip": writer(b"m"), "state.zip": writer(b"s")}, segments, {})
     assert folder.newest_good()[1]["steps"] == 10  # type: ignore[index]
