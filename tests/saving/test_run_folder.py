@@ -1,7 +1,6 @@
 """The run's folder: whole at every moment, whatever the program or the disk does."""
 
 import errno
-import json
 import os
 import signal
 import sys
