@@ -23,7 +23,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.envs.workers import EnvironmentDied
+from sb3_sample.envs.workers import EnvironmentDied, end_with_this_process
 from sb3_sample.faults import HoldBack, check_finite_parameters
 from sb3_sample.saving import container, training_state, vec_envs
 from sb3_sample.saving.attributes import DoesNotFit
@@ -223,6 +223,8 @@ class Checkpointer:
         model = self._model
         self._states = CallbackStates(self._callback)
         self._progress = ProgressFile(self._folder.path)
+        for env in self._environments()[1:]:
+            end_with_this_process(env)
         self._interrupts = Interrupts(self._environments(), self._folder.path)
         self._console = LossyLog(model.logger)
         model.logger.output_formats.append(self._progress)

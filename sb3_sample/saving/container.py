@@ -16,7 +16,6 @@ import os
 import pathlib
 import platform
 import re
-import secrets
 import struct
 import zipfile
 from collections.abc import Iterator
@@ -27,6 +26,7 @@ import numpy as np
 import stable_baselines3 as sb3
 import torch
 
+from sb3_sample.saving.temporary import becoming, remove_abandoned
 from sb3_sample.version import __version__ as sb3_sample_version
 
 DATA, TENSORS, CHECKSUMS = "data.json", "tensors.safetensors", "checksums.json"
@@ -122,17 +122,10 @@ def replacing(path: pathlib.Path) -> Iterator[IO[bytes]]:
     """
     # A link stays one.
     path = pathlib.Path(os.path.realpath(path))
-    temporary = path.with_name(f".{path.name[:100]}.{secrets.token_hex(6)}.tmp")
     try:
-        try:
-            with temporary.open("xb") as file:
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+        remove_abandoned(path.parent)
+        with becoming(path) as file:
+            yield file
         sync_folder(path.parent)
     except OSError as error:
         raise OSError(error.errno, f"{error.strerror or error}: this file could not be written", str(path)) from error
