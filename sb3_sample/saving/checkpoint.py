@@ -23,13 +23,13 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_sample.console import LossyLog
 from sb3_sample.envs.workers import EnvironmentDied, end_with_this_process
 from sb3_sample.faults import HoldBack, check_finite_parameters
 from sb3_sample.saving import container, training_state, vec_envs
 from sb3_sample.saving.attributes import DoesNotFit
 from sb3_sample.saving.callbacks import CallbackStates, environments, walk, without_progress_bar
 from sb3_sample.saving.checks import ParametersDoNotFit
-from sb3_sample.saving.console import LossyLog
 from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.encoding import NotPortable, decode, encode
 from sb3_sample.saving.interrupts import Interrupts

@@ -10,9 +10,9 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_sample.console import tell
 from sb3_sample.envs.workers import EnvironmentDied
 from sb3_sample.saving import vec_envs
-from sb3_sample.saving.console import tell
 
 
 class Interrupts:

@@ -42,7 +42,8 @@ def is_elsewhere(attribute: str, node: dict[str, Any], present: Any) -> bool:
     """
     if not brings_text(node, present):
         return False
-    return names_place(attribute) or isinstance(present, os.PathLike) or any(map(_SEPARATOR.search, _described(node)))
+    texts = (*_described(node), *_texts(present))
+    return names_place(attribute) or isinstance(present, os.PathLike) or any(map(_SEPARATOR.search, texts))
 
 
 def is_moved(node: dict[str, Any], present: Any) -> bool:

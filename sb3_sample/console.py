@@ -1,5 +1,6 @@
 """Lines for a terminal, a pipe or a file that may be gone, or full: the training goes on without them."""
 
+import contextlib
 import os
 import sys
 import warnings
@@ -29,13 +30,21 @@ def tell(text: str) -> None:
 
     :param text: a line
     """
-    try:
+    with contextlib.suppress(OSError, ValueError):
         descriptor = standard_error()
         if descriptor is not None:
             os.write(descriptor, text.encode())
-    except (OSError, ValueError):
-        # The reader of a pipe is gone, the disk is full: there is nobody to tell that to.
-        return
+
+
+def say(text: str) -> None:
+    """
+    Print a line in the midst of a turn. It is lost where nobody takes it.
+
+    :param text: the line
+    """
+    # The reader of a pipe is gone, the disk is full: no reason to lose the turn.
+    with contextlib.suppress(OSError):
+        print(text)
 
 
 class LossyLog:
