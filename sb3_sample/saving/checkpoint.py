@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_sample.console import LossyLog
 from sb3_sample.envs.workers import EnvironmentDied, end_with_this_process
 from sb3_sample.faults import HoldBack, check_finite_parameters
-from sb3_sample.saving import container, training_state, vec_envs
+from sb3_sample.saving import container, run_folder, training_state, vec_envs
 from sb3_sample.saving.attributes import DoesNotFit
 from sb3_sample.saving.callbacks import CallbackStates, environments, walk, without_progress_bar
 from sb3_sample.saving.checks import ParametersDoNotFit
@@ -382,6 +382,10 @@ class Checkpointer:
         first, last = ring.advance()
         oldest = last - ring.size()
         needed = {k: facts for k, facts in known.items() if facts["ring"] != name or facts["last"] > oldest}
+        others = {k: facts for k, facts in needed.items() if facts["ring"] != name}
+        if len(needed) - len(others) >= run_folder.MAX_SEGMENTS:
+            # Once in a while all of them in one piece, so that a manifest stays short.
+            first, needed = oldest, others
         if first < last:
             segment = Segment(name, first, last)
             needed[segment.path] = self._folder.write_segment(

@@ -46,8 +46,11 @@ _CLAIMED = re.compile(
 _MARK = b"The folder of one run of sb3_sample, made by learn(checkpoint=...). See docs/saving.md.\n"
 #: Complete checkpoints that are kept.
 KEPT = 2
-#: Bytes of a manifest, of which an entry takes about 200; and for each value in it, as objects of Python take more.
-MAX_MANIFEST, MIN_BYTES_PER_VALUE = 16 * 2**20, 24
+#: Pieces that the rows of one buffer may be in.
+MAX_SEGMENTS = 10_000
+#: Bytes of a manifest, of which a piece of rows takes about 250; and for each value in it, as objects of Python take
+#: more.
+MAX_MANIFEST, MIN_BYTES_PER_VALUE = 8 * 2**20, 24
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 #: Reasons that a message names.
 _SHOWN = 3
@@ -411,7 +414,13 @@ def _is_empty(root: Folder, name: str) -> bool:
     if stat.S_ISDIR(found.st_mode):
         with root.inside(name) as folder:
             return not folder.names()
-    return stat.S_ISREG(found.st_mode) and found.st_size == 0
+    if not stat.S_ISREG(found.st_mode):
+        return False
+    if name == _LOCK and found.st_size < len(_MARK):
+        # A run that was killed, or whose disk was full, in the midst of its first write.
+        with root.read(name) as file:
+            return _MARK.startswith(file.read())
+    return found.st_size == 0
 
 
 def _checkpoints(root: Folder) -> list[tuple[int, str]]:

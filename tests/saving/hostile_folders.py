@@ -271,6 +271,7 @@ def manifest_bytes(rng: random.Random, original: dict[str, bytes]) -> Case:
         b"[" * 10**5, b'{"a":' * 10**5, b'{"a": [' + b"[]," * 10**6 + b"[]]", b'{"a": "' + b"x" * 10**7 + b'"',
         b"{" + b",".join(b'"%d":%d' % (i, i) for i in range(10**6)), b"{" + b'"a": NaN', b"{" + b'"a": ' + b"9" * 10**6,
         b"\xff", b"", b"null", b"{" * 10**6, b'{"steps": ' + b"[" * 900 + b"]" * 900,
+        b"{" + b",".join(b'"%06d":"%014d"' % (i, i) for i in range(6 * 10**5)),
         b'{"segments": {' + b",".join(b'"%d": {}' % i for i in range(10**6)) + b"}",
     ])  # fmt: skip
     whole = body + b"\n}"
