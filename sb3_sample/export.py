@@ -230,23 +230,22 @@ def _described(name: str, space: spaces.Space) -> dict[str, Any]:
 
 def _apart(work: Callable[[], Any]) -> Any:
     """
-    Do something in a process of its own, where the system can fork one: torch keeps the types and functions of all that
-    it ever traced, a megabyte for each export.
+    Do something in a process of its own, where one can be forked: torch keeps the types and functions of all that it
+    ever traced, a megabyte for each export. A process that has used a GPU is not forked.
 
     :param work: without effects but for what it returns, which can be pickled as what it raises
     :return: what it returns
     :raises Exception: what it raises
     """
-    if not sys.platform.startswith("linux"):
+    if not sys.platform.startswith("linux") or torch.cuda.is_initialized():
         return work()
     ours, theirs = os.pipe()
     child = os.fork()
     if child == 0:
         try:
             os.close(ours)
-            # The threads of OpenMP are not there after a fork, and CUDA cannot be used.
+            # The threads of OpenMP are not there after a fork.
             torch.set_num_threads(1)
-            torch.cuda.is_available = lambda: False
             with open(theirs, "wb") as file:
                 file.write(_answer(work))
         finally:
