@@ -30,7 +30,8 @@ def brings_text(node: dict[str, Any], present: Any) -> bool:
     :param present: what the program has there
     :return: whether the checkpoint has a text there that the program does not
     """
-    return not set(_described(node)) <= set(_texts(present))
+    texts = set(_described(node))
+    return bool(texts) and not texts <= set(_texts(present))
 
 
 def is_elsewhere(attribute: str, node: dict[str, Any], present: Any) -> bool:

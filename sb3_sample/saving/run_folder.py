@@ -35,7 +35,8 @@ _CHECKPOINT = re.compile(r"checkpoint-(\d{12,})")
 #: cannot be removed is in nobody's way.
 _HIDDEN = re.compile(rf"({re.escape(_WRITING)}|{re.escape(_REMOVED)})-[0-9a-f]{{12}}")
 _SEGMENT = re.compile(r"[^\W\d]\w*-\d{12,}-\d{12,}\.zip")
-_HIDDEN_SEGMENT = re.compile(rf"\.{_SEGMENT.pattern}\.[0-9a-f]{{12}}")
+#: Files that are made to be renamed.
+_HIDDEN_FILE = re.compile(rf"\.({_SEGMENT.pattern}|{re.escape(LOG)}|{re.escape(_LOCK)})\.[0-9a-f]{{12}}")
 #: What is used here, and must be no link; and names that only a run of ours may have for what is not empty.
 _USED = re.compile(rf"{SEGMENTS}|{re.escape(LOG)}|{re.escape(_LOCK)}|{_CHECKPOINT.pattern}|{_HIDDEN.pattern}")
 _CLAIMED = re.compile(
@@ -366,9 +367,9 @@ class RunFolder:
             if _HIDDEN.fullmatch(name):
                 self._clear_one(root, name, "a checkpoint")
         with root.inside(SEGMENTS) as rows:
-            for name in rows.names():
-                if _HIDDEN_SEGMENT.fullmatch(name):
-                    self._remove_rows(rows, name)
+            for folder in (root, rows):
+                for name in filter(_HIDDEN_FILE.fullmatch, folder.names()):
+                    self._remove_file(folder, name)
 
     def _prune(self, root: Folder, steps: int) -> None:
         """Remove all but the newest checkpoints up to that of ``steps``, and rows that no checkpoint needs."""
@@ -381,13 +382,13 @@ class RunFolder:
         with root.inside(SEGMENTS) as rows:
             for name in rows.names():
                 if _SEGMENT.fullmatch(name) and f"{SEGMENTS}/{name}" not in needed:
-                    self._remove_rows(rows, name)
+                    self._remove_file(rows, name)
 
-    def _remove_rows(self, rows: Folder, name: str) -> None:
+    def _remove_file(self, folder: Folder, name: str) -> None:
         try:
-            rows.remove(name)
+            folder.remove(name)
         except OSError as error:
-            self._warn(f"{rows.path / name} cannot be removed ({error})")
+            self._warn(f"{folder.path / name} cannot be removed ({error})")
 
 
 def _some(reasons: list[str]) -> str:
