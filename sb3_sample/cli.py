@@ -8,10 +8,11 @@ import importlib
 import runpy
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import NamedTuple
 
 from sb3_sample.envs.base import select_gl_backend
+from sb3_sample.exits import refuse
 from sb3_sample.version import __version__
 
 
@@ -38,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     elif name in COMMANDS:
         COMMANDS[name].run(arguments[1:])
     else:
-        sys.exit(f"sb3-sample: command must be one of {', '.join(COMMANDS)}, not {name!r}")
+        refuse("", f"command must be one of {', '.join(COMMANDS)}, not {name!r}")
 
 
 def _usage() -> str:
@@ -119,16 +120,27 @@ def _own_options(parser: argparse.ArgumentParser, arguments: list[str]) -> tuple
 @contextlib.contextmanager
 def _errors(command: str) -> Iterator[None]:
     """A run or a file that is refused is told of without a traceback."""
-    from sb3_sample.saving.classes import NotPortable
+    from sb3_sample.saving.checks import ParametersDoNotFit
     from sb3_sample.saving.container import BadFile, PickledFile
+    from sb3_sample.saving.encoding import NotPortable
+    from sb3_sample.zoo_files import Refused
     from sb3_sample.zoo_runs import RunError
 
     try:
         yield
     except PickledFile as error:
-        sys.exit(f"sb3-sample {command}: {error}. Here it is the option --allow-pickle")
-    except (BadFile, NotPortable, RunError) as error:
-        sys.exit(f"sb3-sample {command}: {error}")
+        refuse(command, f"{error}. Here it is the option --allow-pickle")
+    except (BadFile, NotPortable, ParametersDoNotFit, Refused, RunError) as error:
+        refuse(command, error)
+
+
+@contextlib.contextmanager
+def _drawing(command: str) -> Iterator[None]:
+    """The zoo's pictures are of whatever numbers a run has logged, and fail in many ways with those of several runs."""
+    try:
+        yield
+    except (ValueError, TypeError, LookupError, ArithmeticError, OSError) as error:
+        refuse(command, f"these runs cannot be drawn: {type(error).__name__}: {error}")
 
 
 def _zoo_plot(function: str) -> Callable[[list[str]], None]:
@@ -137,19 +149,23 @@ def _zoo_plot(function: str) -> Callable[[list[str]], None]:
         import gymnasium as gym
 
         import sb3_sample.envs  # noqa: F401  # registers the ids
+        from sb3_sample.run_logs import read_evaluations, read_monitors
 
         names = [argument.replace("/", "-") if argument in gym.registry else argument for argument in arguments]
         module = _zoo_module(f"rl_zoo3.plots.{function}")
-        if function == "plot_train":
-            _zoo_function("rl_zoo3.plots", function)(names)
-            return
         from sb3_sample.zoo_files import PlottedRuns, replaced
 
+        if function == "plot_train":
+            with _drawing(function), _errors(function), replaced(module, "load_results", read_monitors):
+                _zoo_function("rl_zoo3.plots", function)(names)
+            return
         parser = argparse.ArgumentParser(f"sb3-sample {function}", usage=argparse.SUPPRESS, add_help=False)
         parser.add_argument(
             "--allow-pickle", action="store_true", help="Read a pickled file too, which can run any code"
         )
         options, names = _own_options(parser, names)
+        # NumPy as the zoo uses it, but for what it opens files with.
+        numpy = SimpleNamespace(**{**vars(module.np), "load": read_evaluations})
         runs = PlottedRuns(options.allow_pickle)
         said: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
         if function == "plot_from_file":
@@ -158,7 +174,10 @@ def _zoo_plot(function: str) -> Callable[[list[str]], None]:
             rliable, *tasks = zoo_scores.rliable_options(names)
             if rliable:
                 runs, said = zoo_scores.NormalizedRuns(options.allow_pickle, *tasks), zoo_scores.saying_so()
-        with _errors(function), said, replaced(module, "pickle", runs):
+        replacements = {"np": numpy, "pickle": runs, "open": runs.open}
+        with _drawing(function), _errors(function), said, contextlib.ExitStack() as stack:
+            for name, value in replacements.items():
+                stack.enter_context(replaced(module, name, value))
             _zoo_function("rl_zoo3.plots", function)(names)
 
     return run

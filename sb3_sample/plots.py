@@ -8,18 +8,20 @@ import argparse
 import contextlib
 import functools
 import itertools
-import json
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
-from stable_baselines3.common.monitor import get_monitor_files, load_results
 
 from sb3_sample.envs import published_key
+from sb3_sample.exits import refuse
+from sb3_sample.run_logs import EVALUATIONS, monitor_files, monitor_head, read_evaluations, read_monitors
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -144,14 +146,27 @@ def select_published(env_id: str, names: Sequence[str] | None, metric: str) -> l
 # ---------------------------------------------------------------- runs
 
 
+def _folders(path: Path) -> Iterator[Path]:
+    """The folder and all below it; links are not followed, and there is no limit to how deep they lie."""
+    waiting = [path] if path.is_dir() else []
+    while waiting:
+        folder = waiting.pop()
+        yield folder
+        with os.scandir(folder) as entries:
+            waiting += [Path(entry) for entry in entries if entry.is_dir(follow_symlinks=False)]
+
+
+def _is_run(folder: Path) -> bool:
+    return (folder / EVALUATIONS).exists() or bool(monitor_files(folder))
+
+
 def find_runs(path: Path) -> list[Path]:
     """
     :param path: a run's folder, or a folder with such folders at any depth
     :return: the folders of runs: those with ``evaluations.npz`` or Monitor files
     :raises ValueError: there are none
     """
-    files = [*path.rglob("evaluations.npz"), *path.rglob("*monitor.csv")] if path.is_dir() else []
-    folders = {file.parent for file in files}
+    folders = {folder for folder in _folders(path) if _is_run(folder)}
     if path in folders:
         return [path]
     if not folders:
@@ -164,13 +179,8 @@ def run_env_id(folder: Path) -> str | None:
     :param folder: a run's folder
     :return: the environment's id as Monitor wrote it into its files; None if there are none
     """
-    for file in get_monitor_files(str(folder)):
-        with open(file) as lines:
-            header = lines.readline()
-        env_id = json.loads(header.removeprefix("#")).get("env_id") if header.startswith("#") else None
-        if env_id not in (None, "None"):
-            return env_id
-    return None
+    ids = (monitor_head(file)["env_id"] for file in monitor_files(folder))
+    return next((env_id for env_id in ids if env_id is not None), None)
 
 
 def read_run(folder: Path, label: str, metric: str, bin_steps: int) -> Run:
@@ -184,23 +194,22 @@ def read_run(folder: Path, label: str, metric: str, bin_steps: int) -> Run:
     :return: the run
     :raises ValueError: the run did not record the metric, or has no episode
     """
-    file = folder / "evaluations.npz"
+    file = folder / EVALUATIONS
     if file.exists():
         key = {"return": "results", "success_rate": "successes"}[metric]
-        with np.load(file) as data:
-            if key not in data:
-                raise ValueError(f"metric must be one that was recorded, not {metric!r}: {file} has no {key!r}")
-            return Run(label, folder, data["timesteps"], np.asarray(data[key], float).mean(axis=1))
+        data = read_evaluations(file)
+        if key not in data:
+            raise ValueError(f"metric must be one that was recorded, not {metric!r}: {file} has no {key!r}")
+        return Run(label, folder, data["timesteps"], data[key].astype(float).reshape(len(data[key]), -1).mean(axis=1))
     steps, values = _episodes(folder, metric)
-    bins = np.ceil(steps / bin_steps).astype(int)
-    filled = np.unique(bins)
-    means = np.array([values[bins == index].mean() for index in filled])
+    filled, bins = np.unique(np.ceil(steps / bin_steps).astype(int), return_inverse=True)
+    means = np.bincount(bins, values) / np.bincount(bins)
     return Run(label, folder, filled * bin_steps, means)
 
 
 def _episodes(folder: Path, metric: str) -> tuple[np.ndarray, np.ndarray]:
     """Environment step at the end of each training episode, and its return or success."""
-    episodes = load_results(str(folder))
+    episodes = read_monitors(folder)
     key = {"return": "r", "success_rate": "is_success"}[metric]
     if key not in episodes:
         raise ValueError(f"metric must be one that was recorded, not {metric!r}: {folder} has no column {key!r}")
@@ -211,7 +220,7 @@ def _episodes(folder: Path, metric: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _default_bin(folders: Sequence[Path]) -> int:
     """The published curves' 25,000 steps; for short runs about a twentieth of the shortest, as a round number."""
-    lengths = [load_results(str(folder))["l"].sum() for folder in folders]
+    lengths = [read_monitors(folder)["l"].sum() for folder in folders]
     width = max(min(lengths, default=0) / 20, 1)
     if width >= 25_000:
         return 25_000
@@ -411,8 +420,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     try:
         _plot(args)
-    except (ValueError, ImportError) as error:
-        sys.exit(f"sb3-sample plot: {error}")
+    except (ValueError, ImportError, OSError) as error:
+        refuse("plot", error)
 
 
 def _plot(args: argparse.Namespace) -> None:
@@ -424,7 +433,7 @@ def _plot(args: argparse.Namespace) -> None:
     published = published_curves(env_id)
     metric = args.metric or (published["metric"].iloc[0] if len(published) else "return")
 
-    without_evaluations = [folder for _, folder in labelled if not (folder / "evaluations.npz").exists()]
+    without_evaluations = [folder for _, folder in labelled if not (folder / EVALUATIONS).exists()]
     for folder in without_evaluations:
         print(f"{folder} has no evaluations.npz: its training episodes are shown, which explore", file=sys.stderr)
     bin_steps = args.bin or _default_bin(without_evaluations)
@@ -448,11 +457,19 @@ def _plot(args: argparse.Namespace) -> None:
         print(f"no curves of {env_id} were published", file=sys.stderr)
 
     figure = draw(env_id, curves, metric, None if args.xlim is None else tuple([0.0, *args.xlim][-2:]))
-    output = args.output or Path(env_id.replace("/", "-") + ".png")
+    output = args.output or _picture(env_id, args.env is not None)
     output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(output)
     of_task = f"; published{_of_task(env_id)}" if len(curves) > len(groups) and _published_task(env_id) else ""
     print(f"{env_id}, {METRICS[metric]}{of_task}\n\n{format_table(curves, args.all_steps)}\n\nSaved to {output}")
+
+
+def _picture(env_id: str, is_given: bool) -> Path:
+    """The picture's name, if it is not given. A run's file does not choose which of the user's files is replaced."""
+    path = Path(env_id.replace("/", "-") + ".png")
+    if path.exists() and not is_given and env_id not in gym.registry:
+        raise ValueError(f"output must be given: {path} is there, and {env_id!r} is known from the runs' files only")
+    return path
 
 
 def _labelled_folders(arguments: Sequence[str], env_id: str | None) -> tuple[str, list[tuple[str, Path]]]:

@@ -26,7 +26,7 @@ except ModuleNotFoundError as error:
     ) from error
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_sample import zoo_files
+from sb3_sample import zoo_files, zoo_trials
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
 from sb3_sample.sac.regularized_sac import (
@@ -34,6 +34,7 @@ from sb3_sample.sac.regularized_sac import (
     NETWORK_REGULARIZATIONS,
     PLASTICITY_REGULARIZATIONS,
 )
+from sb3_sample.saving.untrusted import BadFile
 
 #: The files ``<algorithm>.yml``, read when ``--conf-file`` is not given.
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
@@ -212,7 +213,10 @@ def sampler(space: Space, convert: Converter = decode) -> Sampler:
 
     def sample(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
         uses_her = additional_args["using_her_replay_buffer"]
-        params = {name: suggest(trial, name) for name, suggest in {**space, **(HER_SPACE if uses_her else {})}.items()}
+        whole = {**space, **(HER_SPACE if uses_her else {})}
+        params = {name: suggest(trial, name) for name, suggest in whole.items()}
+        # What waits in a storage to be tried is not held to the space by Optuna.
+        zoo_trials.check_params(params, whole, f"trial {trial.number}")
         arguments = convert(params)
         for name in arguments.keys() - params.keys() - {"replay_buffer_kwargs"}:
             trial.set_user_attr(name, arguments[name])  # so that reports show the value itself, not its code
@@ -264,6 +268,22 @@ ALGORITHMS: dict[str, ZooAlgorithm] = {
 }
 
 
+def stored_arguments(algo: str, params: dict[str, Any], where: str) -> dict[str, Any]:
+    """
+    :param algo: name of an algorithm of ours
+    :param params: parameters of a stored trial, which anybody may have written
+    :param where: whose they are, for messages
+    :return: arguments of the constructor
+    :raises BadFile: (a ``ValueError``) if they are not what a search of the algorithm stores
+    """
+    entry = ALGORITHMS[algo]
+    zoo_trials.check_params(params, {**entry.space, **HER_SPACE}, where)
+    try:
+        return entry.convert(params)
+    except KeyError as error:
+        raise BadFile(f"{where} has no {error}, which a search of {algo} stores") from error
+
+
 def register() -> None:
     """
     Put the algorithms, their search spaces and their hyperparameters into the zoo. More than one call does no harm.
@@ -301,6 +321,7 @@ def _adapt_experiment_manager() -> None:
     original_init = manager.__init__
     original_is_robotics_env = manager.is_robotics_env
     original_read = manager.read_hyperparameters
+    original_load_trial, original_optimize = manager.load_trial, manager.hyperparameters_optimization
     signature = inspect.signature(original_init)
 
     @functools.wraps(original_init)
@@ -316,8 +337,23 @@ def _adapt_experiment_manager() -> None:
                 )
         original_init(*given.args, **given.kwargs)
 
+    def load_trial(self: Any, storage: str, study_name: str, trial_id: int | None = None, convert: bool = True) -> Any:
+        if self.algo not in ALGORITHMS:
+            return original_load_trial(self, storage, study_name, trial_id, convert)
+        params = zoo_trials.stored_params(storage, study_name, trial_id)
+        return stored_arguments(self.algo, params, f"trial {trial_id} of {storage}") if convert else params
+
+    def optimize(self: Any) -> None:
+        if self.algo in ALGORITHMS and self.storage is not None:
+            zoo_trials.check_storage(self.storage)
+        original_optimize(self)
+
     def read_hyperparameters(self: Any) -> Any:
         hyperparams, saved = original_read(self)
+        buffer = hyperparams.get("replay_buffer_kwargs")
+        goals = sorted(HER_SPACE.keys() & buffer.keys()) if isinstance(buffer, dict) else []
+        if self.algo in ALGORITHMS and goals and "replay_buffer_class" not in hyperparams:
+            raise BadFile(f"{', '.join(goals)} belong to a trial with HerReplayBuffer, which this run has not")
         if self.algo in ALGORITHMS and "env_kwargs" in hyperparams and self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = hyperparams["env_kwargs"]
         return hyperparams, saved
@@ -328,5 +364,7 @@ def _adapt_experiment_manager() -> None:
 
     zoo_files.adapt(module, list(ALGORITHMS))
     manager.__init__ = init
+    manager.load_trial = load_trial
+    manager.hyperparameters_optimization = optimize
     manager.read_hyperparameters = read_hyperparameters
     manager.is_robotics_env = staticmethod(is_robotics_env)

@@ -6,11 +6,10 @@ The zoo's own algorithms are read and written as in the stock zoo, since their m
 """
 
 import argparse
-import ast
+import builtins
 import contextlib
 import functools
-import importlib
-import inspect
+import os
 import pickle
 import sys
 import types
@@ -18,30 +17,31 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-import gymnasium as gym
+import numpy as np
 import rl_zoo3.utils
 import torch
 import yaml
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_sample.saving import container
-from sb3_sample.saving.classes import resolve
+from sb3_sample.saving.checks import ParametersDoNotFit
 from sb3_sample.saving.container import BadFile, PickledFile
 from sb3_sample.saving.encoding import decode, encode
 from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.normalization import load_vec_normalize, save_vec_normalize
 from sb3_sample.saving.replay import SafeReplayBuffers
+from sb3_sample.saving.untrusted import open_regular
+from sb3_sample.zoo_settings import read_settings
 
 #: Whether pickles are read: as ``reading`` says, and None outside of it, in the stock zoo's own commands.
 _allow_pickle: bool | None = None
-_UNSAFE = "which can run code: --allow-pickle reads it nevertheless"
 _PLOT_KIND = "plotted runs"
-_YAML = "tag:yaml.org,2002:"
-#: What the zoo's settings consist of.
-_TAGS = {
-    *(_YAML + kind for kind in ("map", "seq", "str", "int", "float", "bool", "null", "python/tuple")),
-    f"{_YAML}python/object/apply:collections.OrderedDict",
-}
+
+
+class Refused(Exception):
+    """
+    What is refused while the zoo runs, which takes a ``ValueError`` for a model that it can get from a hub.
+    """
 
 
 @contextlib.contextmanager
@@ -49,16 +49,20 @@ def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
     """
     Something else in the place of an attribute, for a while.
 
-    :param owner: module or class whose own attribute it is
+    :param owner: module or class whose own attribute it is, or, of a module, a built-in function that it uses
     :param name: its name
     :param value: what takes its place
     """
-    before = vars(owner)[name]
+    is_own = name in vars(owner)
+    before = vars(owner if is_own else builtins)[name]
     setattr(owner, name, value)
     try:
         yield
     finally:
-        setattr(owner, name, before)
+        if is_own:
+            setattr(owner, name, before)
+        else:
+            delattr(owner, name)
 
 
 @contextlib.contextmanager
@@ -90,7 +94,14 @@ def _with(method: Any, pickles: bool, trusted: tuple[str, ...]) -> Any:
     @functools.wraps(function)
     def call(*args: Any, allow_pickle: bool = False, trusted_modules: Sequence[str] = (), **kwargs: Any) -> Any:
         more = (*trusted_modules, *trusted)
-        return function(*args, allow_pickle=allow_pickle or pickles, trusted_modules=more, **kwargs)
+        try:
+            return function(*args, allow_pickle=allow_pickle or pickles, trusted_modules=more, **kwargs)
+        except (BadFile, ParametersDoNotFit):
+            raise
+        except (ValueError, OSError) as error:
+            if not function.__name__.startswith("load"):
+                raise
+            raise Refused(str(error)) from error
 
     return classmethod(call) if isinstance(method, classmethod) else call
 
@@ -124,7 +135,10 @@ class _VecNormalize:
         return VecNormalize(*args, **kwargs)
 
     def load(self, path: str, venv: VecEnv) -> VecNormalize:
-        return load_vec_normalize(path, venv, allow_pickle=_allow_pickle is not False)
+        try:
+            return load_vec_normalize(path, venv, allow_pickle=_allow_pickle is not False)
+        except OSError as error:
+            raise Refused(str(error)) from error
 
 
 def adapt(module: types.ModuleType, algorithms: Sequence[str]) -> None:
@@ -169,90 +183,38 @@ def _safe_statistics(safe: bool) -> Iterator[None]:
 # ---------------------------------------------------------------- settings of a run
 
 
-def check_settings(folder: Path, trusted_modules: Sequence[str] = ()) -> None:
+def check_settings(folder: Path, trusted_modules: Sequence[str] = (), given: Sequence[str] = ()) -> None:
     """
-    Look at a run's ``args.yml`` and ``config.yml`` before the zoo does, which makes whatever objects they name and
-    evaluates what stands in them as Python.
+    Look at a run's ``args.yml`` and ``config.yml`` before the zoo does.
 
     :param folder: where they are
     :param trusted_modules: modules, or packages of modules, whose classes they may name
-    :raises BadFile: if they hold more than plain values and classes that a model's file may name
+    :param given: arguments of the environment that the command line gives
+    :raises BadFile: see ``read_settings``
     """
     for name in ("args.yml", "config.yml"):
-        file = folder / name
-        if not file.is_file():
-            continue
-        text = file.read_text()
-        try:
-            nodes = [yaml.compose(text, Loader=yaml.SafeLoader)]
-            while nodes:
-                node = nodes.pop()
-                _check_tag(node, file, trusted_modules)
-                if isinstance(node, yaml.CollectionNode):
-                    pairs = isinstance(node, yaml.MappingNode)
-                    nodes += [part for item in node.value for part in (item if pairs else [item])]
-            settings: Any = yaml.load(text, Loader=yaml.UnsafeLoader)  # what it makes was looked at
-        except (yaml.YAMLError, RecursionError) as error:
-            raise BadFile(f"{file} is no YAML file of the zoo: {error}") from error
-        if not isinstance(settings, dict):
-            raise BadFile(f"{file} does not hold settings by name")
-        if name == "config.yml":
-            _check_evaluated(settings, file, trusted_modules)
+        # The zoo passes over what is there and no file.
+        if os.path.lexists(folder / name):
+            read_settings(folder / name, trusted_modules, given)
 
 
-def _check_tag(node: Any, file: Path, trusted_modules: Sequence[str]) -> None:
-    if node is None or node.tag in _TAGS:
-        return
-    kind, _, path = node.tag.removeprefix(_YAML).partition(":")
-    if kind != "python/name":
-        raise BadFile(f"{file}: it makes an object, {node.tag.removeprefix(_YAML)!r:.100}, {_UNSAFE}")
-    module, _, name = path.rpartition(".")
-    try:
-        resolve(f"{module}:{name}", trusted_modules)
-    except ValueError as error:
-        raise BadFile(f"{file}: {error}, {_UNSAFE}") from error
+@contextlib.contextmanager
+def reading_settings(trusted_modules: Sequence[str] = (), given: Sequence[str] = ()) -> Iterator[None]:
+    """
+    The zoo reads a run's settings with ``read_settings`` meanwhile.
 
+    :param trusted_modules: see there
+    :param given: see there
+    """
+    load = yaml.load
 
-def _check_evaluated(settings: dict[str, Any], file: Path, trusted_modules: Sequence[str]) -> None:
-    text = settings.get("normalize")
-    if isinstance(text, str) and not _is_literal(text):
-        raise BadFile(f"{file}: normalize is Python, {text!r:.100}, {_UNSAFE}")
-    for key in ("env_wrapper", "vec_env_wrapper"):
-        wrappers = settings.get(key) or []
-        for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:
-            names = list(wrapper) if isinstance(wrapper, dict) else [wrapper]
-            if not all(_is_wrapper(name, trusted_modules) for name in names):
-                raise BadFile(f"{file}: {key} is {wrapper!r:.100}, {_UNSAFE}. --trusted-modules takes its module")
+    def read(stream: Any, Loader: Any) -> Any:
+        if Loader is yaml.UnsafeLoader:
+            return read_settings(Path(stream.name), trusted_modules, given)
+        return load(stream, Loader)
 
-
-def _is_literal(text: str) -> bool:
-    """Whether a text is a value, or ``dict(name=value, ...)``."""
-    try:
-        tree = ast.parse(text, mode="eval").body
-        is_dict = isinstance(tree, ast.Call) and isinstance(tree.func, ast.Name) and tree.func.id == "dict"
-        if isinstance(tree, ast.Call) and is_dict and not tree.args:
-            values: list[ast.expr] = [keyword.value for keyword in tree.keywords]
-        else:
-            values = [tree]
-        for value in values:
-            ast.literal_eval(value)
-    except (SyntaxError, ValueError, TypeError, MemoryError, RecursionError):
-        return False
-    return True
-
-
-def _is_wrapper(path: Any, trusted_modules: Sequence[str]) -> bool:
-    """Whether a path is that of a wrapper of the libraries that are used anyway, or of a trusted module."""
-    module, _, name = str(path).rpartition(".")
-    if any(module == trusted or module.startswith(f"{trusted}.") for trusted in trusted_modules):
-        return True
-    if module.partition(".")[0] not in ("gymnasium", "stable_baselines3", "sb3_contrib", "rl_zoo3", "sb3_sample"):
-        return False
-    try:
-        value = getattr(importlib.import_module(module), name, None)
-    except ImportError:
-        return False
-    return inspect.isclass(value) and issubclass(value, (gym.Wrapper, VecEnvWrapper))
+    with replaced(yaml, "load", read):
+        yield
 
 
 # ---------------------------------------------------------------- what all_plots saves
@@ -267,6 +229,17 @@ class PlottedRuns:
 
     def __init__(self, allow_pickle: bool = False):
         self._allow_pickle = allow_pickle
+
+    @staticmethod
+    def open(path: str, mode: str) -> IO[Any]:
+        """
+        As the built-in function, but for pipes and devices, which are not read.
+
+        :param path: of a file
+        :param mode: see there
+        :return: the file
+        """
+        return open_regular(path) if mode == "rb" else open(path, mode)
 
     def dump(self, value: Any, file: IO[bytes]) -> None:
         """
@@ -283,9 +256,49 @@ class PlottedRuns:
         :raises BadFile: if it is damaged, or pickled and not allowed to be
         """
         try:
-            return decode(*container.read(file, _PLOT_KIND), "runs")  # type: ignore[arg-type]
+            runs = decode(*container.read(file, _PLOT_KIND), "runs")  # type: ignore[arg-type]
         except PickledFile:
             if not self._allow_pickle:
                 raise
             file.seek(0)
             return pickle.load(file)
+        _check_runs(runs, str(getattr(file, "name", "the file")))
+        return runs
+
+
+def _check_runs(runs: Any, name: str) -> None:
+    """
+    :param runs: tables by name of the task and of the curve, and one for the terminal
+    :param name: the file, for messages
+    :raises BadFile: if they hold other values than numbers and words
+    """
+    if not _is_table(runs):
+        raise BadFile(f"{name} does not hold what all_plots has gathered")
+    for task, curves in runs.items():
+        if task == "results_table":
+            fits = _is_table(curves) and all(map(_are_words, (curves.get("headers"), *_rows(curves))))
+        else:
+            fits = _is_table(curves) and all(
+                _is_table(curve) and all(map(_are_numbers, curve.values())) for curve in curves.values()
+            )
+        if not fits:
+            raise BadFile(f"{name}: {task} is not what all_plots has gathered")
+
+
+def _is_table(value: Any) -> bool:
+    return isinstance(value, dict) and _are_words(list(value))
+
+
+def _rows(table: dict[str, Any]) -> list[Any]:
+    rows = table.get("value_matrix")
+    return rows if isinstance(rows, list) else [None]
+
+
+def _are_words(value: Any) -> bool:
+    # What is not printable could tell a terminal what to do.
+    return isinstance(value, list) and all(isinstance(word, str) and word.isprintable() for word in value)
+
+
+def _are_numbers(value: Any) -> bool:
+    array = np.asarray(value) if isinstance(value, (np.ndarray, np.generic, float, int, list)) else None
+    return array is not None and array.dtype.kind in "biuf"

@@ -11,7 +11,7 @@ import json
 import os
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,10 +26,14 @@ from stable_baselines3.common.monitor import Monitor, get_monitor_files
 from stable_baselines3.common.utils import get_latest_run_id
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_sample.run_logs import monitor_head
+from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.zoo import ALGORITHMS
 from sb3_sample.zoo_files import add_trust, replaced
 
 RECORD = "run.json"
+#: Bytes of a record.
+MAX_RECORD = 2**18
 #: Environment steps between two checkpoints.
 CHECKPOINT_FREQ = 10_000
 #: Arguments of the zoo that make a run what it is, besides its hyperparameters. How long it is, where it computes, what
@@ -81,16 +85,47 @@ class Record(NamedTuple):
         :return: its record
         :raises RunError: there is none, or it is no such record
         """
+        path = folder / RECORD
         try:
-            record = cls(**json.loads((folder / RECORD).read_text()))
+            found = parse_json(read_regular(path, MAX_RECORD), "it")
         except FileNotFoundError as error:
             raise RunError(f"{folder} is no folder of a run of sb3-sample train: it has no {RECORD}") from error
-        except (OSError, ValueError, TypeError) as error:
-            raise RunError(f"{folder / RECORD} is not what sb3-sample train has written: {error}") from error
-        kinds: tuple[Any, ...] = (str, str, int, int, int, dict, (str, type(None)))
-        if not all(isinstance(value, kind) for value, kind in zip(record, kinds, strict=True)):
-            raise RunError(f"{folder / RECORD} is not what sb3-sample train has written: a value is of the wrong kind")
+        except (OSError, BadFile) as error:
+            raise RunError(f"{path} is not what sb3-sample train has written: {error}") from error
+        if not isinstance(found, dict) or not cls._field_defaults.keys() | found.keys() == set(cls._fields):
+            raise RunError(f"{path} is not what sb3-sample train has written: it has other entries")
+        record = cls(**found)
+        for name, value in record._asdict().items():
+            if not _RECORDED[name](value):
+                raise RunError(
+                    f"{path} is not what sb3-sample train has written: a value is of the wrong kind, {name} is "
+                    f"{value!r:.100}"
+                )
         return record
+
+
+def _is_id(value: Any) -> bool:
+    return isinstance(value, str) and re.fullmatch(r"\w[\w:./-]{0,200}", value) is not None
+
+
+def _is_within(low: int, high: int) -> Callable[[Any], bool]:
+    return lambda value: type(value) is int and low <= value < high
+
+
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(text, str) for text in value.values())
+
+
+#: What the entries of a record may be.
+_RECORDED: dict[str, Callable[[Any], bool]] = {
+    "algo": _is_id,
+    "env": _is_id,
+    "seed": _is_within(0, 2**32),
+    "n_timesteps": _is_within(-1, 2**53),
+    "checkpoint_freq": _is_within(1, 2**53),
+    "settings": _are_texts,
+    "tensorboard": lambda value: value is None or isinstance(value, str),
+}
 
 
 class Start(NamedTuple):
@@ -154,6 +189,7 @@ def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
     :return: how the run starts; None for one without checkpoints
     :raises RunError: if it cannot
     """
+    _check_agent(arguments)
     if options.run_dir is None and options.checkpoint_freq is None and not options.resume:
         return None
     freq = options.checkpoint_freq
@@ -178,6 +214,14 @@ def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
     # What the command line says besides replaces these.
     command = ["--seed", str(record.seed), "-n", str(record.n_timesteps), *arguments]
     return Start(command, freq or record.checkpoint_freq, folder, record)
+
+
+def _check_agent(arguments: Sequence[str]) -> None:
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("-i", "--trained-agent", default="")
+    agent = parser.parse_known_args(arguments)[0].trained_agent
+    if agent and not (agent.endswith(".zip") and os.path.isfile(agent)):
+        raise RunError(f"-i must be a .zip file of a model, not {agent!r}")
 
 
 def _latest(arguments: Sequence[str]) -> Path:
@@ -281,9 +325,10 @@ class RunManager(ExperimentManager):
     def _tensorboard_folder(self) -> str:
         """That of the run's beginning if it lies where the command says, or a new one."""
         before = self._start.record and self._start.record.tensorboard
-        if before and Path(before).parent == Path(str(self.tensorboard_log)):
-            return before
         name = ALGORITHMS[self.algo].algorithm.__name__
+        is_ours = before and re.fullmatch(rf"{name}_\d+", Path(before).name)
+        if before and is_ours and Path(before).parent == Path(str(self.tensorboard_log)):
+            return before
         return f"{self.tensorboard_log}/{name}_{get_latest_run_id(str(self.tensorboard_log), name) + 1}"
 
     def create_callbacks(self) -> None:
@@ -333,8 +378,7 @@ def _make_vec_env(make: Any, *args: Any, monitor_kwargs: dict[str, Any], wrapper
     def wrap(env: Monitor) -> gym.Env:
         if env.results_writer is not None:
             # Their times count from the beginning in the file's head.
-            with open(env.results_writer.file_handler.name) as file:
-                env.t_start = json.loads(file.readline().removeprefix("#"))["t_start"]
+            env.t_start = monitor_head(env.results_writer.file_handler.name)["t_start"]
         return env if wrapper_class is None else wrapper_class(env)
 
     return make(*args, monitor_kwargs={**monitor_kwargs, "override_existing": False}, wrapper_class=wrap, **kwargs)

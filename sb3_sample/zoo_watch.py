@@ -2,16 +2,22 @@
 
 import argparse
 import contextlib
+import functools
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from rl_zoo3.utils import get_model_path
+from rl_zoo3.utils import create_test_env, get_model_path
+from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_sample.exits import refuse
 from sb3_sample.saving.checkpoint import MODEL
+from sb3_sample.saving.model import SafeFiles
+from sb3_sample.saving.untrusted import BadFile
 from sb3_sample.zoo import ALGORITHMS
-from sb3_sample.zoo_files import add_trust, check_settings, reading, replaced
+from sb3_sample.zoo_files import Refused, add_trust, check_settings, reading, reading_settings, replaced
 from sb3_sample.zoo_runs import Record, RunError, checkpoints
 
 
@@ -42,36 +48,144 @@ def watching(options: argparse.Namespace, arguments: Sequence[str], *modules: An
 
     :param options: what ``watch_parser`` has parsed
     :param arguments: the rest of the command line
-    :param modules: those that look for a run with ``get_model_path``
+    :param modules: those that look for a run with ``get_model_path`` and make environments with ``create_test_env``
     :return: command line for the zoo
-    :raises RunError: if ``--run-dir`` is no run's
+    :raises RunError: if ``--run-dir`` is no run's, or of another algorithm than ours
     """
-    command = list(arguments)
-    if options.run_dir is not None:
-        record = Record.read(options.run_dir)
-        if not {"--env"} & set(command) and record.env not in gym.registry:
-            raise RunError(f"{record.env}, the environment of {options.run_dir}, is not registered: give --env")
-        # What the command line says besides replaces these.
-        command = ["--algo", record.algo, "--env", record.env, *command]
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--algo", default="")
-    is_ours = parser.parse_known_args(command)[0].algo in ALGORITHMS
+    given = _given(arguments)
+    with contextlib.ExitStack() as stack:
+        watch = _Watch(options, given, stack)
+        for module in modules:
+            stack.enter_context(replaced(module, "get_model_path", watch.find))
+            stack.enter_context(replaced(module, "create_test_env", watch.make_env))
+        yield [*(_of_record(options, given) if options.run_dir is not None else []), *arguments]
 
-    def find(exp_id: int, folder: str, algo: str, env_name: Any, *which: Any) -> tuple[str, str, str]:
-        if options.run_dir is None:
-            found = get_model_path(exp_id, folder, algo, env_name, *which)
-        else:
-            found = model_path(options.run_dir, algo, env_name, *which)
-        if is_ours and not options.allow_pickle:
-            check_settings(Path(found[2]) / env_name, options.trusted_modules)
+
+def _given(arguments: Sequence[str]) -> argparse.Namespace:
+    """What a command line says of the algorithm and the environment's arguments, in whatever spelling the zoo takes."""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--algo")
+    parser.add_argument("--env-kwargs", nargs="+", default=[])
+    # Before these, abbreviations are ambiguous, as for the zoo.
+    parser.add_argument("--env")
+    parser.add_argument("--exp-id")
+    return parser.parse_known_args(arguments)[0]
+
+
+def _of_record(options: argparse.Namespace, given: argparse.Namespace) -> list[str]:
+    """
+    Algorithm and environment of the run, which the command line replaces. The run's own file does not say whether it
+    is read as one of ours, or as the stock zoo reads its own, whose files can run code.
+    """
+    record = Record.read(options.run_dir)
+    if record.algo not in ALGORITHMS and given.algo is None and not options.allow_pickle:
+        raise RunError(
+            f"{options.run_dir} says that it is a run of {record.algo}, whose files can run any code that their author "
+            f"wanted, and which is none of this package ({', '.join(ALGORITHMS)}). If you trust its author: "
+            f"--algo {record.algo}, or --allow-pickle"
+        )
+    # In one word: what follows an option could be taken for another one.
+    return [f"--env={record.env}", *([] if given.algo is not None else [f"--algo={record.algo}"])]
+
+
+class _Watch:
+    """
+    Stands before two functions of the zoo.
+
+    :param options: what ``watch_parser`` has parsed
+    :param given: what ``_given`` has found
+    :param stack: what is in force until the command ends
+    """
+
+    def __init__(self, options: argparse.Namespace, given: argparse.Namespace, stack: contextlib.ExitStack):
+        self._options, self._stack = options, stack
+        self._env_kwargs = [argument.partition(":")[0] for argument in given.env_kwargs]
+        #: Whether only files are read that run no code.
+        self._is_safe = False
+        self._env: VecEnv | None = None
+
+    def find(self, exp_id: int, folder: str, algo: str, env_name: Any, *which: Any) -> tuple[str, str, str]:
+        """
+        As ``get_model_path``. What the zoo has parsed is what it is about to read.
+
+        :raises Refused: if the run is refused, which is no ``ValueError`` that the zoo answers by a download
+        """
+        options, is_ours = self._options, algo in ALGORITHMS
+        if not is_ours and not options.allow_pickle:
+            print(
+                f"sb3-sample: {algo} is an algorithm of the zoo's own: its files are pickled, and reading them runs "
+                "whatever code their author wanted",
+                file=sys.stderr,
+            )
+        try:
+            if env_name.gym_id not in gym.registry:
+                raise RunError(f"{env_name.gym_id} is not registered: give --env, or --gym-packages")
+            if options.run_dir is None:
+                found = get_model_path(exp_id, folder, algo, env_name, *which)
+            else:
+                found = model_path(options.run_dir, algo, env_name, *which)
+            self._is_safe = is_ours and not options.allow_pickle
+            if self._is_safe:
+                check_settings(Path(found[2]) / env_name, options.trusted_modules, self._env_kwargs)
+                self._stack.enter_context(reading_settings(options.trusted_modules, self._env_kwargs))
+        except (ValueError, AssertionError) as error:
+            if options.run_dir is None and not is_ours and "rl-trained-agents" in folder:
+                raise
+            raise Refused(str(error)) from error
+        if is_ours:
+            self._stack.enter_context(reading(options.allow_pickle, options.trusted_modules))
+            load = vars(SafeFiles)["load"].__func__
+            self._stack.enter_context(replaced(SafeFiles, "load", classmethod(self._fitting(load))))
         return found
 
-    with contextlib.ExitStack() as stack:
-        if is_ours:
-            stack.enter_context(reading(options.allow_pickle, options.trusted_modules))
-        for module in modules:
-            stack.enter_context(replaced(module, "get_model_path", find))
-        yield command
+    def make_env(self, env_id: str, *args: Any, **kwargs: Any) -> VecEnv:
+        """
+        As ``create_test_env``.
+
+        :raises Refused: if the run's settings make none that works
+        """
+        make = self._answering_for(env_id, create_test_env) if self._is_safe else create_test_env
+        self._env = make(env_id, *args, **kwargs)
+        for name in ("reset", "step_async", "step_wait", "render") if self._is_safe else ():
+            setattr(self._env, name, self._answering_for(env_id, getattr(self._env, name)))
+        return self._env
+
+    @staticmethod
+    def _answering_for(env_id: str, function: Any) -> Any:
+        """What an environment or a wrapper raises, whose arguments are those of a run's file, is said to be theirs."""
+
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            try:
+                return function(*args, **kwargs)
+            except (BadFile, Refused):
+                raise
+            except Exception as error:
+                why = f"{type(error).__name__}: {error}"
+                raise Refused(f"{env_id} with the settings of the run does not work: {why}") from error
+
+        return call
+
+    def _fitting(self, load: Any) -> Any:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            model = load(*args, **kwargs)
+            env = self._env
+            if env is not None:
+                for its, saved in (
+                    (env.observation_space, model.observation_space), (env.action_space, model.action_space)
+                ):  # fmt: skip
+                    if _shapes(its) != _shapes(saved):
+                        raise Refused(f"the model is of {saved!r:.200}, the run's environment of {its!r:.200}")
+            return model
+
+        return call
+
+
+def _shapes(space: gym.Space) -> Any:
+    """What of a space a model cannot do without."""
+    if isinstance(space, gym.spaces.Dict):
+        return {name: _shapes(part) for name, part in space.items()}
+    return type(space), space.shape
 
 
 def model_path(
@@ -92,6 +206,7 @@ def model_path(
     :param load_checkpoint: steps of the zoo's checkpoint that is asked for
     :param load_last_checkpoint: whether the last checkpoint is asked for
     :return: name for a video, the model's file, the run's folder
+    :raises Refusal: (a ``SystemExit``) if there is no model yet
     """
     made = checkpoints(run_dir)
     if load_last_checkpoint and made and not (load_best or load_checkpoint is not None):
@@ -99,8 +214,7 @@ def model_path(
         return f"checkpoint-{steps}-{algo}-{env_name}", str(made[-1] / MODEL), str(run_dir)
     if not (load_best or load_last_checkpoint or load_checkpoint is not None or (run_dir / f"{env_name}.zip").exists()):
         if not made:
-            # Not an error that the zoo answers by looking for a model on a hub.
-            raise SystemExit(f"sb3-sample: {run_dir} has neither a model of a finished run nor a checkpoint")
+            refuse("", f"{run_dir} has neither a model of a finished run nor a checkpoint")
         print(f"The run in {run_dir} is not finished: its last checkpoint, {made[-1].name}, is taken")
         return model_path(run_dir, algo, env_name, load_last_checkpoint=True)
     # The zoo adds the algorithm's name to the folder.

@@ -28,6 +28,7 @@ from sb3_sample.faults import HoldBack, check_finite_parameters
 from sb3_sample.saving import container, training_state, vec_envs
 from sb3_sample.saving.attributes import DoesNotFit
 from sb3_sample.saving.callbacks import CallbackStates, environments, walk, without_progress_bar
+from sb3_sample.saving.classes import importing_nothing
 from sb3_sample.saving.encoding import NotPortable, decode, encode
 from sb3_sample.saving.identity import identity_of
 from sb3_sample.saving.model import SafeFiles
@@ -104,7 +105,8 @@ class Checkpointer:
         found = self._folder.newest_good()
         if found is not None:
             folder, self._manifest = found
-            self._resumed = decode(*container.read(folder / STATE, KIND), "checkpoint")
+            with importing_nothing():
+                self._resumed = decode(*container.read(folder / STATE, KIND), "checkpoint")
             self._check_identity(self._resumed["identity"])
             self._resumed["path"] = folder
 
@@ -162,7 +164,8 @@ class Checkpointer:
                 f"checkpoint was made with {', '.join(changed)}",
                 stacklevel=3,
             )
-        model.set_parameters(state["path"] / MODEL, trusted_modules=_own_modules())
+        with importing_nothing():
+            model.set_parameters(state["path"] / MODEL, trusted_modules=_own_modules())
         training_state.restore_attributes(model, state["attributes"])
         model.start_time = time.time_ns() - state["elapsed_ns"]
         assert self._folder is not None
@@ -175,7 +178,9 @@ class Checkpointer:
     def _pieces(self, segments: list[Segment]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
         assert self._folder is not None
         for segment in segments:
-            yield segment.first, decode(*container.read(self._folder.path / segment.path, SEGMENT_KIND), "rows")
+            with importing_nothing():
+                rows = decode(*container.read(self._folder.path / segment.path, SEGMENT_KIND), "rows")
+            yield segment.first, rows
 
     def start(self) -> None:
         """

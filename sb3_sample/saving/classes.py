@@ -1,12 +1,14 @@
 """What a file may hold: which classes and functions it may name, and objects of which classes. Nothing else."""
 
+import contextlib
+import contextvars
 import enum
 import importlib
 import inspect
 import re
 import sys
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,6 +39,32 @@ KINDS = (nn.Module, torch.optim.Optimizer, BaseBuffer)
 
 class NotPortable(ValueError):
     """A value that cannot stand in a file that runs no code."""
+
+
+#: Whether modules that are not there may be imported.
+_imports = contextvars.ContextVar("imports", default=True)
+
+
+@contextlib.contextmanager
+def importing_nothing() -> Iterator[None]:
+    """
+    What is read meanwhile names classes and functions of modules that the program has imported. A checkpoint is read
+    so: it may name whatever the program consists of, and must not say what else is run.
+    """
+    token = _imports.set(False)
+    try:
+        yield
+    finally:
+        _imports.reset(token)
+
+
+def _module(name: str) -> types.ModuleType:
+    if _imports.get():
+        return importlib.import_module(name)
+    module = sys.modules.get(name)
+    if not isinstance(module, types.ModuleType):
+        raise ImportError(f"the module {name!r} is not imported by this program, and a checkpoint imports none")
+    return module
 
 
 def check_trusted(trusted: Sequence[str]) -> tuple[str, ...]:
@@ -100,7 +128,7 @@ def resolve(path: str, trusted: Sequence[str]) -> Any:
     if not is_trusted:
         _check_known(path, module, names)
     try:
-        value = _at(importlib.import_module(module), names)
+        value = _at(_module(module), names)
     except ImportError as error:
         raise ValueError(f"{path!r:.300} cannot be imported: {error}") from error
     # Names that a module has imported from elsewhere are not its own.
@@ -210,7 +238,7 @@ def class_of(path: Any, table: Any, name: str) -> type:
         raise BadFile(f"{name}: the file holds an object of {path!r}, which is not allowed")
     module, _, attribute = path.partition(":")
     try:
-        cls = getattr(importlib.import_module(module), attribute)
+        cls = getattr(_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise BadFile(f"{name}: the file holds an object of {path!r}, which is not installed: {error}") from error
     assert isinstance(cls, type)  # the tables name classes

@@ -29,6 +29,7 @@ import numpy as np
 import stable_baselines3 as sb3
 import torch
 
+from sb3_sample.saving.untrusted import BadFile, PickledFile, open_regular
 from sb3_sample.version import __version__ as sb3_sample_version
 
 DATA, TENSORS, CHECKSUMS = "data.json", "tensors.safetensors", "checksums.json"
@@ -37,9 +38,7 @@ ENTRIES = (TENSORS, DATA, CHECKSUMS)
 FORMAT = 1
 #: Bytes of JSON, in general and of some kinds: as objects of Python they take up to some thirty times as much memory.
 MAX_JSON = 32 * 2**20
-MAX_JSON_OF = {"model": 8 * 2**20}
-#: Characters of a message.
-MAX_MESSAGE = 1000
+MAX_JSON_OF = {"model": 8 * 2**20, "plotted runs": 2**20}
 #: Dimensions of a tensor, as many as NumPy has.
 MAX_DIMENSIONS = 64
 #: The kinds of number of the safetensors format.
@@ -63,21 +62,6 @@ _NOT_OFFERED = (
 #: Folders of which it was said.
 _not_synced: set[pathlib.Path] = set()
 PathOrFile = str | pathlib.Path | IO[bytes]
-
-
-class BadFile(ValueError):
-    """
-    A file that is damaged, of another kind, or not made by this package.
-
-    :param message: what it is; cut where a file makes it longer than anybody reads
-    """
-
-    def __init__(self, message: str):
-        super().__init__(message if len(message) <= MAX_MESSAGE else f"{message[:MAX_MESSAGE]} ...")
-
-
-class PickledFile(BadFile):
-    """A file that could run code when it is read."""
 
 
 # ---------------------------------------------------------------- writing
@@ -240,7 +224,7 @@ def read_with_versions(path_or_file: PathOrFile, kind: str) -> tuple[Any, dict[s
     """
     if not isinstance(path_or_file, (str, pathlib.Path)):
         return _read(path_or_file, kind, str(getattr(path_or_file, "name", "the file")))
-    with open(path_or_file, "rb") as file:
+    with open_regular(path_or_file) as file:
         return _read(file, kind, str(path_or_file))
 
 
@@ -275,7 +259,7 @@ def _read(file: IO[bytes], kind: str, name: str) -> tuple[Any, dict[str, torch.T
 def _opened(file: IO[bytes], kind: str, name: str) -> zipfile.ZipFile:
     """Open the archive, if its table of contents holds our entries and nothing else."""
     size = file.seek(0, io.SEEK_END)
-    _check_table(file, size, name)
+    check_table(file, size, name)
     archive = zipfile.ZipFile(file)
     entries = archive.infolist()
     names = [entry.filename for entry in entries]
@@ -299,7 +283,7 @@ def _opened(file: IO[bytes], kind: str, name: str) -> zipfile.ZipFile:
     return archive
 
 
-def _check_table(file: IO[bytes], size: int, name: str) -> None:
+def check_table(file: IO[bytes], size: int, name: str) -> None:
     """Look at the end of the file by hand: the library would read a table of contents of any length into memory."""
     file.seek(0)
     start = file.read(2)

@@ -11,6 +11,8 @@ from typing import IO, Any
 
 from stable_baselines3.common.save_util import open_path
 
+from sb3_sample.saving.untrusted import check_regular
+
 PathOrFile = str | pathlib.Path | io.BufferedIOBase
 
 
@@ -59,9 +61,11 @@ def opened(path: PathOrFile, *suffixes: str) -> Iterator[IO[bytes]]:
     :param suffixes: as of :func:`find`
     :return: the file, which is closed afterwards if it was opened here
     :raises FileNotFoundError: if there is none
+    :raises BadFile: if it is a pipe or a device
     """
     found = find(path, *suffixes)
     if isinstance(found, pathlib.Path):
+        check_regular(found)
         with found.open("rb") as file:
             yield file
     else:

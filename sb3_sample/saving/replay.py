@@ -14,9 +14,10 @@ from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.saving import container, notice, paths
 from sb3_sample.saving.classes import PACKAGES, check_trusted, may_be_set, path_of, within
-from sb3_sample.saving.container import MAX_MESSAGE, BadFile, PickledFile
+from sb3_sample.saving.container import BadFile, PickledFile
 from sb3_sample.saving.decoding import NotTrusted
 from sb3_sample.saving.encoding import Lenient, decode, is_left_out
+from sb3_sample.saving.untrusted import MAX_MESSAGE
 
 KIND = "replay buffer"
 #: What is added to a path that is written, and what else may have been, by those who expect a pickle.

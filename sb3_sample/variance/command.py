@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_sample.envs import make_env
 from sb3_sample.envs.states import check_restorable
+from sb3_sample.exits import refuse
 from sb3_sample.plots import needing_matplotlib
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.saving import load_vec_normalize
@@ -311,7 +312,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _run(args)
     except (ValueError, TypeError, ImportError, OSError, NotImplementedError, gym.error.Error) as error:
         # NotImplementedError is what Stable-Baselines3 raises for spaces that it has no policy for.
-        sys.exit(f"sb3-sample variance: {error}")
+        refuse("variance", error)
 
 
 def _run(args: argparse.Namespace) -> None:
