@@ -20,6 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
+from sb3_sample.console import say
 from sb3_sample.networks import neuron_scores
 from sb3_sample.sac import SAC, losses
 from sb3_sample.sac.batch import Batch
@@ -277,7 +278,7 @@ class DiagnosticsCallback(BaseCallback):
             shown = ", ".join(
                 f"{name} {results[name]:.3g}" for name in ("overestimation", "overfitting") if name in results
             )
-            print(f"Diagnostics at {self.num_timesteps} steps: {shown}")
+            say(f"Diagnostics at {self.num_timesteps} steps: {shown}")
         return True
 
     def _steps_between_updates(self) -> int:

@@ -8,8 +8,11 @@ import io
 import json
 import logging
 import os
+import pickle
+import sys
+import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,6 +27,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_sample.faults import check_finite_parameters
+from sb3_sample.saving.container import replacing
 from sb3_sample.saving.normalization import lacks_vec_normalize
 from sb3_sample.version import __version__
 
@@ -58,6 +62,7 @@ class Exportable:
         :raises TrainingDiverged: if a parameter is not finite
         :raises ValueError: if the observation space is not supported, the normalisation is not this model's or missing,
             or a policy of the user's own computes differently for another length of the batch
+        :raises OSError: if a file cannot be written; what was there is still there
         """
         assert isinstance(self, BaseAlgorithm)
         for package in ("onnx", "onnxscript"):
@@ -82,12 +87,12 @@ class Exportable:
         policy = _RawPolicy(self.policy, self.get_vec_normalize_env() if vec_normalize is None else vec_normalize)
         metadata = _metadata(self, policy)
         with _quiet(), _without_checks_of_values(), torch.no_grad():
-            onnx_bytes, script_bytes = _as_onnx(policy, metadata), _as_torchscript(policy, metadata)
+            importlib.import_module("onnxscript")
+            onnx_bytes, script_bytes = _apart(lambda: (_as_onnx(policy, metadata), _as_torchscript(policy, metadata)))
         path.parent.mkdir(parents=True, exist_ok=True)
         for target, content in ((onnx_path, onnx_bytes), (script_path, script_bytes)):
-            beside = target.with_name(f".{target.name}.part")
-            beside.write_bytes(content)
-            beside.replace(target)
+            with replacing(target) as file:
+                file.write(content)
         return onnx_path, script_path
 
 
@@ -233,6 +238,55 @@ def _described(name: str, space: spaces.Space) -> dict[str, Any]:
 def _action_dtype(space: spaces.Space) -> Any:
     """Type of the actions that ``predict`` gives: the policy's float32 numbers, scaled to the bounds of a Box."""
     return np.result_type(np.float32, space.dtype) if isinstance(space, spaces.Box) else space.dtype
+
+
+def _apart(work: Callable[[], Any]) -> Any:
+    """
+    Do something in a process of its own, where one can be forked: torch keeps the types and functions of all that it
+    ever traced, a megabyte for each export. A process that has used a GPU is not forked.
+
+    :param work: without effects but for what it returns, which can be pickled as what it raises
+    :return: what it returns
+    :raises Exception: what it raises
+    """
+    if not sys.platform.startswith("linux") or torch.cuda.is_initialized():
+        return work()
+    ours, theirs = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            os.close(ours)
+            # The threads of OpenMP are not there after a fork.
+            torch.set_num_threads(1)
+            with open(theirs, "wb") as file:
+                file.write(_answer(work))
+        finally:
+            os._exit(0)
+    os.close(theirs)
+    try:
+        with open(ours, "rb") as file:
+            data = file.read()
+    finally:
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    if not data:
+        raise RuntimeError(f"the process that exports has ended without an answer (exit code {status})")
+    # Of this program itself: nobody else has written it.
+    value, trace = pickle.loads(data)
+    if trace is not None:
+        raise value from RuntimeError(f"in the process that exports:\n{trace}")
+    return value
+
+
+def _answer(work: Callable[[], Any]) -> bytes:
+    """What comes of it, and the traceback if that is an exception."""
+    try:
+        return pickle.dumps((work(), None))
+    except Exception as error:
+        trace = traceback.format_exc()
+        try:
+            return pickle.dumps((error, trace))
+        except Exception:  # of a class that cannot be pickled
+            return pickle.dumps((RuntimeError(f"{type(error).__name__}: {error}"), trace))
 
 
 def _as_onnx(policy: _RawPolicy, metadata: dict[str, str]) -> bytes:

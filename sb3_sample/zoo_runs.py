@@ -27,6 +27,7 @@ from stable_baselines3.common.utils import get_latest_run_id
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.run_logs import monitor_head
+from sb3_sample.saving.folders import Folder, is_plain
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.zoo import ALGORITHMS
 from sb3_sample.zoo_files import add_trust, replaced
@@ -144,6 +145,20 @@ class Start(NamedTuple):
     record: Record | None = None
 
 
+def refuse_links(folder: Path) -> None:
+    """
+    :param folder: a run's
+    :raises RunError: something in it, or in a folder of it, is a link: what a run writes by such a name would be
+        written elsewhere
+    """
+    for path in (*folder.glob("*"), *folder.glob("*/*")):
+        if path.is_symlink():
+            raise RunError(
+                f"{path} is a link, and a run follows none in its folder (the folder itself may be one): remove it, or "
+                "name another --run-dir"
+            )
+
+
 def checkpoints(folder: Path) -> list[Path]:
     """
     :param folder: a run's
@@ -200,6 +215,7 @@ def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
         if not options.resume:
             return Start(list(arguments), freq)
         folder = _latest(arguments)
+    refuse_links(folder)
     if not checkpoints(folder):
         if options.resume:
             raise RunError(f"--resume: {folder} has no checkpoint to go on from")
@@ -407,12 +423,9 @@ class RunFiles(BaseCallback):
         :param state: from ``state_dict``
         """
         for name, size in state.items():
-            file = self.folder / name
-            there = file.stat().st_size if file.exists() else 0
-            if there < size:
-                warnings.warn(f"{file} has {there} bytes, {size} at the checkpoint: episodes are missing", stacklevel=2)
-            elif there > size:
-                os.truncate(file, size)
+            if not is_plain(name) or not name.endswith(Monitor.EXT) or type(size) is not int or not 0 <= size < 2**63:
+                raise ValueError(f"{name!r:.200} of {size!r:.50} bytes is no file of Monitor's in {self.folder}")
+            self._cut(name, size)
         for each in self.model.logger.output_formats:
             if isinstance(each, TensorBoardOutputFormat):
                 each.writer.close()
@@ -420,6 +433,25 @@ class RunFiles(BaseCallback):
                 each.writer = type(each.writer)(
                     log_dir=self.model.logger.get_dir(), purge_step=self.model.num_timesteps + 1
                 )
+
+    def _cut(self, name: str, size: int) -> None:
+        path = self.folder / name
+        try:
+            with Folder.at(self.folder) as folder:
+                file = folder.descriptor(name, os.O_RDWR)
+            try:
+                there = os.fstat(file).st_size
+                if there > size:
+                    os.ftruncate(file, size)
+            finally:
+                os.close(file)
+        except FileNotFoundError:
+            there = 0
+        except OSError as error:
+            warnings.warn(f"{path} cannot be cut back to the checkpoint ({error})", stacklevel=3)
+            return
+        if there < size:
+            warnings.warn(f"{path} has {there} bytes, {size} at the checkpoint: episodes are missing", stacklevel=3)
 
     def _on_step(self) -> bool:
         return True

@@ -2,10 +2,12 @@
 
 import importlib.util
 import json
+import resource
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import torch
 from gymnasium import spaces
@@ -240,6 +242,34 @@ def test_no_state_is_touched(tmp_path: Path) -> None:
     assert all(torch.equal(before[name], value) for name, value in model.policy.state_dict().items())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["policy.onnx", "policy.pt"]
     model.learn(20)
+
+
+@pytest.mark.slow
+def test_the_process_does_not_grow(tmp_path: Path) -> None:
+    """torch keeps all that was ever traced in a process, a megabyte each time."""
+    model = sac()
+    model.export(tmp_path / "policy")
+    functions = len(torch.jit._state._python_cu.get_functions())  # type: ignore[attr-defined]
+    before = psutil.Process().memory_info().rss
+    for _ in range(5):
+        model.export(tmp_path / "policy")
+    assert len(torch.jit._state._python_cu.get_functions()) == functions  # type: ignore[attr-defined]
+    assert psutil.Process().memory_info().rss - before < 2 * 2**20
+
+
+def test_a_full_disk_leaves_what_was_there_and_nothing_else(tmp_path: Path) -> None:
+    for name in ("policy.onnx", "policy.pt"):
+        (tmp_path / name).write_text("before")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"could not be written.*policy\.onnx"):
+            sac().export(tmp_path / "policy")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == dict.fromkeys(
+        ("policy.onnx", "policy.pt"), "before"
+    )
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from rl_zoo3 import ALGOS
 from sb3_sample import cli, zoo
 from sb3_sample.saving import container
 from sb3_sample.saving.decoding import decode
-from sb3_sample.zoo_runs import Record, RunError, plan, train_parser
+from sb3_sample.zoo_runs import Record, RunError, RunFiles, plan, train_parser
 from sb3_sample.zoo_watch import model_path
 
 zoo.register()
@@ -242,6 +243,54 @@ def test_a_folder_of_a_run_that_never_had_a_checkpoint_starts_anew(run) -> None:
     Path("a/0.monitor.csv").write_text("#{}\nr,l,t\n")
     run("--run-dir", "a", "-n", "220")
     assert outcome("a")["0.monitor.csv"][0][1] == "200"
+
+
+def files_of(folder: Path) -> RunFiles:
+    callback = RunFiles(folder)
+    callback.model = SimpleNamespace(logger=SimpleNamespace(output_formats=[]))  # type: ignore[assignment]
+    return callback
+
+
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [("/absolute", 0), ("../b/0.monitor.csv", 0), ("run.json", 0), ("", 0), ("0.monitor.csv", -1), (3, 0),
+     ("0.monitor.csv", True), ("0.monitor.csv", 1.0), ("0.monitor.csv", 2**70), ("a\0.monitor.csv", 0)],
+)  # fmt: skip
+def test_only_files_of_monitor_in_the_folder_are_cut(name: Any, size: Any, tmp_path: Path) -> None:
+    """What they are is said by a file, which may be anybody's."""
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        for file in ("0.monitor.csv", "run.json"):
+            (tmp_path / folder / file).write_text("the user's")
+    name = str(tmp_path / "b" / "0.monitor.csv") if name == "/absolute" else name
+    with pytest.raises(ValueError, match="is no file of Monitor's"):
+        files_of(tmp_path / "a").load_state_dict({name: size})
+    assert {path.read_text() for path in tmp_path.glob("*/*")} == {"the user's"}
+    files_of(tmp_path / "a").load_state_dict({"0.monitor.csv": 3})
+    assert (tmp_path / "a" / "0.monitor.csv").read_text() == "the"
+
+
+@pytest.mark.parametrize("make", [os.symlink, os.link])
+def test_what_leads_elsewhere_is_not_cut(make: Any, tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "profile").write_text("the user's")
+    make(tmp_path / "profile", tmp_path / "a" / "0.monitor.csv")
+    with pytest.warns(UserWarning, match="cannot be cut back to the checkpoint"):
+        files_of(tmp_path / "a").load_state_dict({"0.monitor.csv": 0})
+    assert (tmp_path / "profile").read_text() == "the user's"
+
+
+@pytest.mark.parametrize("name", ["0.monitor.csv", "best_model.zip", "Pendulum-v1/args.yml", "Pendulum-v1", "run.json"])
+def test_a_folder_with_links_is_refused(name: str, run, tmp_path: Path) -> None:
+    Record("sac_sample", "Pendulum-v1", 1, 60, 30, {}).write(Path("a"))
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "file").write_text("the user's")
+    Path("a", name).parent.mkdir(exist_ok=True)
+    Path("a", name).unlink(missing_ok=True)
+    Path("a", name).symlink_to(tmp_path / "there" / "file")
+    with pytest.raises(SystemExit, match=f"a/{name} is a link, and a run follows none"):
+        run("--run-dir", "a", "-n", "60")
+    assert (tmp_path / "there" / "file").read_text() == "the user's"
 
 
 def test_help_has_both_kinds_of_options(run, capsys: pytest.CaptureFixture[str]) -> None:

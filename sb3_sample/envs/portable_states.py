@@ -63,6 +63,9 @@ def unpack(env: gym.Env, state: dict[str, Any]) -> None:
     restorer = Restorer(_origin(simulator))
     for layer, saved in zip(layers, state["layers"], strict=True):
         restorer.attributes(layer, saved["attributes"])
+    if restorer.kept:
+        # What they hold may decide what comes next.
+        raise DoesNotFit(f"{', '.join(restorer.kept)} name other files than the saved ones")
 
 
 def _physics(env: gym.Env) -> list[Any]:

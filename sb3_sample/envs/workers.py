@@ -1,13 +1,18 @@
 """
-Workers of vectorised environments that die: who, how and why, instead of a bare ``EOFError``; and, where it is asked
-for, another in the dead one's place.
+Workers of vectorised environments that die, or hang: who, how and why, instead of a bare ``EOFError`` or of waiting
+without end; and, where it is asked for, another in the dead one's place.
 """
 
 import contextlib
+import math
 import multiprocessing
 import multiprocessing.connection
+import numbers
+import os
 import signal
 import sys
+import threading
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
@@ -24,11 +29,15 @@ from stable_baselines3.common.vec_env.subproc_vec_env import _worker as serve
 
 #: Seconds for a worker that has hung up to be gone.
 PATIENCE = 5.0
+#: Seconds that making an environment may take, where answers have less: libraries are imported for it.
+MAKING = 60.0
+#: Seconds between two looks of a worker at whether its parent lives.
+_LOOK = 0.5
 
 
 class EnvironmentDied(RuntimeError):
     """
-    The worker process of an environment has died.
+    The worker process of an environment has died, or was killed since it gave no answer.
 
     :param index: of the environment
     :param pid: of the process
@@ -36,12 +45,28 @@ class EnvironmentDied(RuntimeError):
     :param request: what it was asked to do, as Stable-Baselines3's workers call it ("step", "reset", ...)
     :param trace: the traceback of the exception that ended it; None if it could not tell
     :param note: what else is to be said
+    :param silence: seconds without an answer after which it was killed; None if it died otherwise
+    :param action: the last action that it was given; None if there was none
     """
 
-    def __init__(self, index: int, pid: int | None, exit_code: int | None, request: str, trace: str | None, note: str):
+    def __init__(
+        self,
+        index: int,
+        pid: int | None,
+        exit_code: int | None,
+        request: str,
+        trace: str | None,
+        note: str,
+        silence: float | None = None,
+        action: Any = None,
+    ):
         self.index, self.pid, self.exit_code, self.request = index, pid, exit_code, request
-        self.trace, self.note = trace, note
-        if trace is not None:
+        self.trace, self.note, self.silence, self.action = trace, note, silence, action
+        verb = "died" if silence is None else "hangs"
+        if silence is not None:
+            last = "It was given no action yet." if action is None else f"Its last action was {action!r:.500}."
+            how = f"gave no answer within {silence:g} s, and was killed. {last}"
+        elif trace is not None:
             how = f"raised an exception:\n\n{trace.rstrip()}\n"
         elif exit_code is not None and exit_code < 0:
             name = next((s.name for s in signal.Signals if s == -exit_code), f"signal {-exit_code}")
@@ -52,10 +77,19 @@ class EnvironmentDied(RuntimeError):
             how = "closed its connection."
         else:
             how = f"ended with exit code {exit_code}."
-        super().__init__(f"environment {index} died at {request!r}: its worker, process {pid}, {how}{note}")
+        super().__init__(f"environment {index} {verb} at {request!r}: its worker, process {pid}, {how}{note}")
 
     def __reduce__(self) -> Any:
-        return type(self), (self.index, self.pid, self.exit_code, self.request, self.trace, self.note)
+        values = (self.index, self.pid, self.exit_code, self.request, self.trace, self.note, self.silence, self.action)
+        return type(self), values
+
+    def noting(self, note: str) -> "EnvironmentDied":
+        """
+        :param note: what else is to be said
+        :return: the same error that says it
+        """
+        cls, values = self.__reduce__()
+        return cls(*values[:5], note, *values[6:])
 
 
 class _Failure(NamedTuple):
@@ -64,21 +98,30 @@ class _Failure(NamedTuple):
     trace: str
 
 
+class _Made(NamedTuple):
+    """What a worker says when its environment is made."""
+
+
 class WatchedConnection:
     """
-    The connection to a worker, which says so when the worker has died: at the answer, so that of several workers that
-    are asked one after the other each is asked.
+    The connection to a worker, which says so when the worker has died, or hangs: at the answer, so that of several
+    workers that are asked one after the other each is asked.
 
     :param connection: the connection
     :param process: the worker
     :param index: of its environment
     :param note: added to the error if the worker did not say why it ended
+    :param timeout: seconds from a question to its answer, after which the worker is killed; None to wait without end.
+        It must be a worker that says when its environment is made
     """
 
-    def __init__(self, connection: Connection, process: Any, index: int, note: str = ""):
+    def __init__(self, connection: Connection, process: Any, index: int, note: str = "", timeout: float | None = None):
         self._connection, self._process, self._index, self._note = connection, process, index, note
-        #: Questions that wait for their answers.
-        self._asked: list[str] = []
+        self._timeout = timeout
+        #: Questions that wait for their answers, and when they were asked.
+        self._asked: list[tuple[str, float]] = []
+        self._began, self._made = time.monotonic(), -math.inf
+        self._action: Any = None
         self._error: EnvironmentDied | None = None
 
     def send(self, question: tuple[str, Any]) -> None:
@@ -89,30 +132,50 @@ class WatchedConnection:
         with contextlib.suppress(EnvironmentDied):
             while self._asked:
                 self.recv()
+        if question[0] == "step":
+            self._action = question[1]
         with contextlib.suppress(OSError):
             self._connection.send(question)
-        self._asked = [question[0]]
+        self._asked = [(question[0], time.monotonic())]
 
     def recv(self) -> Any:
         """
         :return: the worker's answer
-        :raises EnvironmentDied: it has died
+        :raises EnvironmentDied: it has died, or was killed since it gave none
         """
-        request = self._asked.pop(0) if self._asked else "start"
+        request, asked = self._asked.pop(0) if self._asked else ("start", self._began)
         if self._error is not None:
             raise self._error
         try:
-            if isinstance(self._process, ForkProcess):
-                # A forked worker holds copies of the others' ends of their connections, which then never close.
-                multiprocessing.connection.wait([self._connection, self._process.sentinel])
-                if not self._connection.poll():
-                    raise EOFError
-            answer = self._connection.recv()
+            answer = self._receive(request, asked)
+            while isinstance(answer, _Made):
+                self._made = time.monotonic()
+                answer = self._receive(request, asked)
         except (EOFError, OSError):
             raise self._died(request, None) from None
         if isinstance(answer, _Failure):
             raise self._died(request, answer.trace)
         return answer
+
+    def _receive(self, request: str, asked: float) -> Any:
+        """
+        :raises EnvironmentDied: it hangs
+        :raises OSError: it is gone
+        :raises EOFError: it is gone
+        """
+        # A forked worker holds copies of the others' ends of their connections, which then never close.
+        forked = isinstance(self._process, ForkProcess)
+        allowed = self._timeout
+        if allowed is not None and self._made < 0:
+            asked, allowed = self._began, max(allowed, MAKING)
+        if forked or allowed is not None:
+            left = None if allowed is None else max(0.0, max(asked, self._made) + allowed - time.monotonic())
+            waited_for: list[Any] = [self._connection, *([self._process.sentinel] if forked else [])]
+            if not multiprocessing.connection.wait(waited_for, left):
+                raise self._hangs(request, allowed)
+            if not self._connection.poll():
+                raise EOFError
+        return self._connection.recv()
 
     def _died(self, request: str, trace: str | None) -> EnvironmentDied:
         self._process.join(PATIENCE)
@@ -120,14 +183,24 @@ class WatchedConnection:
         self._error = EnvironmentDied(self._index, self._process.pid, self._process.exitcode, request, trace, note)
         return self._error
 
+    def _hangs(self, request: str, allowed: float | None) -> EnvironmentDied:
+        self._process.kill()
+        self._process.join(PATIENCE)
+        note = " Its environment was not made by then." if self._made < 0 else ""
+        self._error = EnvironmentDied(
+            self._index, self._process.pid, self._process.exitcode, request, None, note, allowed, self._action
+        )
+        return self._error
+
     def finish(self) -> None:
         """
         Ask the worker to end, if it still can, and wait until it has.
         """
         self.send(("close", None))
-        if self._error is not None:
-            # Whatever is left of it.
-            self._process.kill()
+        if self._error is None:
+            self._process.join(self._timeout)
+        # Whatever is left of it.
+        self._process.kill()
         self._process.join()
         self._connection.close()
 
@@ -158,6 +231,50 @@ def watch_workers(venv: VecEnv) -> None:
         for index, (connection, process) in enumerate(workers)
     )
     innermost.close = lambda: _close(innermost)  # type: ignore[method-assign]
+    end_with_this_process(innermost)
+
+
+def end_with_this_process(venv: VecEnv) -> None:
+    """
+    Let the forked workers of a ``SubprocVecEnv`` end when this process does, however that ends: each holds copies of
+    the others' ends of their connections, so that none of them would hear of it. Other kinds stay as they are.
+
+    :param venv: a vectorised environment, wrapped or not
+    """
+    innermost = venv.unwrapped
+    if not isinstance(innermost, SubprocVecEnv) or isinstance(innermost, SupervisedSubprocVecEnv):
+        return
+    if isinstance(innermost.processes[0], ForkProcess) and not innermost.waiting:
+        # Of one that has died is told at the next question.
+        with contextlib.suppress(EnvironmentDied, EOFError, OSError):
+            innermost.env_is_wrapped(_EndWithThisProcess())  # type: ignore[arg-type]
+
+
+def _end_with(parent: int) -> type:
+    """
+    End this process when another is not its parent any more.
+
+    :param parent: the other
+    :return: a class that the environment may be wrapped in
+    """
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_LOOK)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    threading.Thread(target=watch, daemon=True).start()
+    return gym.Wrapper
+
+
+class _EndWithThisProcess:
+    """
+    Sent to a worker of Stable-Baselines3 in the place of a class, it is a call when it arrives: the workers answer a
+    fixed set of questions, of which none is this one.
+    """
+
+    def __reduce__(self) -> Any:
+        return _end_with, (os.getpid(),)
 
 
 def _close(venv: SubprocVecEnv) -> None:
@@ -169,12 +286,20 @@ def _close(venv: SubprocVecEnv) -> None:
         remote.finish()
 
 
-def _supervised(remote: Connection, parent_remote: Connection, env_fn: CloudpickleWrapper) -> None:
-    """Stable-Baselines3's worker, which says at its end why it ends."""
+def _supervised(remote: Connection, parent_remote: Connection, env_fn: CloudpickleWrapper, parent: int | None) -> None:
+    """Stable-Baselines3's worker, which says when its environment is made, and at its end why it ends."""
     # A terminal's Ctrl-C goes to every process: it is for the training to end its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The parent of those that are not forked is a process that ends with the training's.
+    _end_with(os.getppid() if parent is None else parent)
+
+    def make() -> gym.Env:
+        env = env_fn.var()
+        remote.send(_Made())
+        return env
+
     try:
-        serve(remote, parent_remote, env_fn)
+        serve(remote, parent_remote, CloudpickleWrapper(make))
     except Exception:
         remote.send(_Failure(traceback.format_exc()))
         remote.close()
@@ -197,6 +322,9 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
     :param restart_envs: whether a worker that dies is replaced; otherwise its death is an error
     :param max_restarts: how many are replaced in the life of this object, so that an environment that is broken does
         end the training
+    :param timeout: seconds after which a worker that gives no answer is killed, which is a death like others; the error
+        names its last action. Making an environment may take a minute, if that is longer. None: a worker that hangs is
+        waited for without end
     :raises ValueError: if an argument is out of range
     :raises EnvironmentDied: if an environment cannot be made
     """
@@ -207,6 +335,7 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
         start_method: str | None = None,
         restart_envs: bool = False,
         max_restarts: int = 10,
+        timeout: float | None = None,
     ):
         if not env_fns:
             raise ValueError("env_fns must make at least one environment, not none")
@@ -214,8 +343,11 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
             raise ValueError(f"restart_envs must be True or False, not {restart_envs!r}")
         if isinstance(max_restarts, bool) or not isinstance(max_restarts, int) or max_restarts < 0:
             raise ValueError(f"max_restarts must be an integer of at least 0, not {max_restarts!r}")
+        number = isinstance(timeout, numbers.Real) and not isinstance(timeout, bool)
+        if timeout is not None and not (number and 0 < timeout < math.inf):
+            raise ValueError(f"timeout must be a positive number of seconds, or None, not {timeout!r}")
         self.waiting = self.closed = False
-        self.restart_envs, self.max_restarts = restart_envs, max_restarts
+        self.restart_envs, self.max_restarts, self.timeout = restart_envs, max_restarts, timeout
         #: Workers replaced so far.
         self.n_restarts = 0
         self._base_seed: int | None = None
@@ -241,12 +373,13 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
 
     def _start(self, index: int) -> tuple[Any, WatchedConnection]:
         ours, theirs = self._context.Pipe()
-        arguments = (theirs, ours, CloudpickleWrapper(self._env_fns[index]))
+        parent = os.getpid() if self._context.get_start_method() == "fork" else None
+        arguments = (theirs, ours, CloudpickleWrapper(self._env_fns[index]), parent)
         # A daemon ends with this process, however that ends.
         process = self._context.Process(target=_supervised, args=arguments, daemon=True)  # type: ignore[attr-defined]
         process.start()
         theirs.close()
-        return process, WatchedConnection(ours, process, index)
+        return process, WatchedConnection(ours, process, index, timeout=self.timeout)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """
@@ -327,7 +460,7 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
         if not self.restart_envs:
             raise error
         note = f" It was not restarted once more: max_restarts={self.max_restarts} were."
-        raise EnvironmentDied(error.index, error.pid, error.exit_code, error.request, error.trace, note)
+        raise error.noting(error.note + note)
 
     def close(self) -> None:
         """

@@ -27,6 +27,7 @@ from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_known, default_of, naming_changes
+from sb3_sample.console import say
 from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.envs.workers import watch_workers
 from sb3_sample.export import Exportable
@@ -688,7 +689,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
                 if self.target_kl is not None and divergences[-1] > 1.5 * self.target_kl:
                     goes_on = False
                     if self.verbose >= 1:
-                        print(f"Early stopping at step {epoch} due to reaching max kl: {divergences[-1]:.2f}")
+                        say(f"Early stopping at step {epoch} due to reaching max kl: {divergences[-1]:.2f}")
                     break
                 self.policy.optimizer.zero_grad()
                 loss.backward()

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from sb3_sample.console import say
 from sb3_sample.optim import AdamW
 
 if TYPE_CHECKING:
@@ -226,14 +227,14 @@ class Execution:
 
     def _compile(self, agent: "SAC", *inputs: Any) -> Metrics:
         if agent.verbose >= 1:
-            print("Compiling the gradient step ...")
+            say("Compiling the gradient step ...")
         start = time.perf_counter()
         with torch._dynamo.config.patch(trace_autograd_ops=True):
             metrics = self._step(agent, *inputs)
         seconds = time.perf_counter() - start
         self.seconds_compiling += seconds
         if agent.verbose >= 1:
-            print(f"Compiled in {seconds:.1f} s")
+            say(f"Compiled in {seconds:.1f} s")
         return metrics
 
 

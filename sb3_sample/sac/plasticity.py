@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from sb3_sample.arguments import is_integer
+from sb3_sample.console import say
 from sb3_sample.networks.dormant import recycle
 from sb3_sample.sac.parts import Part
 
@@ -97,7 +98,7 @@ class Resets(Part):
         agent.reinitialize(self.shrink)
         self.n_done += 1
         if agent.verbose >= 1:
-            print(f"Reset of all parameters {when}")
+            say(f"Reset of all parameters {when}")
 
     def get_extra_state(self) -> dict[str, Any]:
         return {"reached": self._reached, "n_done": self.n_done}

@@ -18,6 +18,8 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from sb3_sample.saving.places import is_elsewhere, is_moved
+
 _CONSTANTS = (type(None), bool, int, float, complex, str, bytes, np.generic, np.dtype, torch.dtype, torch.device)
 _GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
 _CONTAINERS = (list, tuple, dict, set, frozenset, collections.deque, np.ndarray)
@@ -214,6 +216,8 @@ class Restorer:
     def __init__(self, origin: int | None = None) -> None:
         self._origin = origin
         self._made: dict[int, Any] = {}
+        #: Attributes that stayed as they are, since the tree names other files in them.
+        self.kept: list[str] = []
 
     def attributes(self, owner: Any, described: dict[str, Node]) -> None:
         """
@@ -223,6 +227,10 @@ class Restorer:
         """
         own = vars(owner)
         for name, node in described.items():
+            if is_elsewhere(name, node, own.get(name)):
+                if not is_moved(node, own.get(name)):
+                    self.kept.append(f"{type(owner).__name__}.{name}")
+                continue
             own[name] = self.restore(node, own.get(name), f"{type(owner).__name__}.{name}")
 
     def restore(self, node: Node, present: Any, name: str) -> Any:

@@ -3,8 +3,9 @@ The state of callbacks: of those that give one (``state_dict`` and ``load_state_
 attributes has changed since the training began, so that what was never changed stays as the present program says.
 """
 
+import inspect
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_sample.envs.portable_states import pack, unpack
 from sb3_sample.saving import vec_envs
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Node, Restorer, class_name, same
+from sb3_sample.saving.places import brings_text
 
 #: What every callback has and that is not its own.
 _NOT_OWN = ("model", "parent", "locals", "globals", "verbose")
@@ -80,11 +82,7 @@ class CallbackStates:
         self._changed: dict[str, set[str]] = {path: set() for path in self._callbacks}
 
     def _attributes(self, callback: BaseCallback) -> tuple[dict[str, Node], list[str]]:
-        children = {name for name, value in vars(callback).items() if _is_or_holds_callbacks(value)}
-        skip = {*_NOT_OWN, *children, *(name for name, _ in environments(callback))}
-        if _gives_state(callback):
-            skip = vars(callback).keys() - {"n_calls", "num_timesteps"}
-        return Describer().attributes(callback, skip)
+        return Describer().attributes(callback, _skipped(callback))
 
     def lost(self) -> list[str]:
         """
@@ -141,13 +139,43 @@ class CallbackStates:
                 )
 
     def _restore(self, path: str, callback: BaseCallback, state: dict[str, Any]) -> None:
-        Restorer().attributes(callback, state["attributes"])
-        self._changed[path] |= state["attributes"].keys()
+        attributes, own, arguments = state["attributes"], vars(callback), _arguments(callback)
+        for name in attributes:
+            if name in _skipped(callback) or (name not in own and hasattr(type(callback), name)):
+                raise DoesNotFit(f"{name!r:.100} is not saved of it")
+        # Where it writes, and what it writes, is said by the present program.
+        said = [name for name in attributes if name in arguments and brings_text(attributes[name], own.get(name))]
+        restorer = Restorer()
+        restorer.attributes(callback, {name: node for name, node in attributes.items() if name not in said})
+        kept = [*(f"{type(callback).__name__}.{name}" for name in said), *restorer.kept]
+        if kept:
+            warnings.warn(
+                f"{', '.join(kept)} of the checkpoint may name files, and stay as they are ({path})", stacklevel=5
+            )
+        self._changed[path] |= attributes.keys()
         if state["state"] is not None:
             callback.load_state_dict(Restorer().restore(state["state"], None, path))  # type: ignore[attr-defined]
         for name, env in environments(callback):
             if name in state["environments"]:
                 _restore_env(env, state["environments"][name], f"{type(callback).__name__}.{name}")
+
+
+def _skipped(callback: BaseCallback) -> Set[str]:
+    """Names of what is not saved of a callback, or is saved otherwise."""
+    if _gives_state(callback):
+        return vars(callback).keys() - {"n_calls", "num_timesteps"}
+    children = {name for name, value in vars(callback).items() if _is_or_holds_callbacks(value)}
+    return {*_NOT_OWN, *children, *(name for name, _ in environments(callback))}
+
+
+def _arguments(callback: BaseCallback) -> set[str]:
+    """Names of the arguments that a callback is made with."""
+    return {
+        name
+        for cls in type(callback).__mro__
+        if (init := vars(cls).get("__init__")) is not None and inspect.isfunction(init)
+        for name in inspect.signature(init).parameters
+    }
 
 
 def _is_or_holds_callbacks(value: Any) -> bool:

@@ -7,16 +7,13 @@ moment when everything agrees: between the environment's step and ``train`` a tr
 update yet.
 """
 
-import os
-import signal
+import contextlib
 import sys
-import threading
 import time
-import types
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -24,20 +21,29 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_sample.console import LossyLog
+from sb3_sample.envs.workers import EnvironmentDied, end_with_this_process
 from sb3_sample.faults import HoldBack, check_finite_parameters
-from sb3_sample.saving import container, training_state, vec_envs
+from sb3_sample.saving import container, run_folder, training_state, vec_envs
 from sb3_sample.saving.attributes import DoesNotFit
 from sb3_sample.saving.callbacks import CallbackStates, environments, walk, without_progress_bar
+from sb3_sample.saving.checks import ParametersDoNotFit
 from sb3_sample.saving.classes import importing_nothing
+from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.encoding import NotPortable, decode, encode
 from sb3_sample.saving.identity import identity_of
+from sb3_sample.saving.interrupts import Interrupts
 from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.progress import ProgressFile
 from sb3_sample.saving.rings import Ring
-from sb3_sample.saving.run_folder import RunFolder, Segment
+from sb3_sample.saving.run_folder import MODEL, STATE, RunFolder, Segment
 
 KIND, SEGMENT_KIND = "checkpoint", "replay rows"
-MODEL, STATE = "model.zip", "state.zip"
+#: The kinds of what the state of a checkpoint consists of.
+_PARTS: dict[str, type] = {
+    "identity": dict, "attributes": dict, "elapsed_ns": int, "rings": dict, "env": dict, "callbacks": dict,
+    "progress": dict, "logger": dict, "generators": dict,
+}  # fmt: skip
 
 
 class Checkpointer:
@@ -67,7 +73,7 @@ class Checkpointer:
         self._manifest: dict[str, Any] = {"segments": {}}
         self._saved_at: int | None = None
         self._whole_at: int | None = None
-        self._interrupts: _Interrupts | None = None
+        self._interrupts: Interrupts | None = None
         # How many times every steps there were when it was last asked.
         self._period = 0
 
@@ -105,8 +111,8 @@ class Checkpointer:
         found = self._folder.newest_good()
         if found is not None:
             folder, self._manifest = found
-            with importing_nothing():
-                self._resumed = decode(*container.read(folder / STATE, KIND), "checkpoint")
+            self._resumed = self._read(f"{folder.name}/{STATE}", KIND)
+            _check_parts(self._resumed, folder / STATE)
             self._check_identity(self._resumed["identity"])
             self._resumed["path"] = folder
 
@@ -131,6 +137,7 @@ class Checkpointer:
         assert self._folder is not None
         if self._interrupts is not None:
             self._interrupts.restore(orderly)
+            self._console.close()
             logger = self._model.logger
             logger.output_formats = [each for each in logger.output_formats if each is not self._progress]
             self._progress.close()
@@ -164,23 +171,46 @@ class Checkpointer:
                 f"checkpoint was made with {', '.join(changed)}",
                 stacklevel=3,
             )
-        with importing_nothing():
-            model.set_parameters(state["path"] / MODEL, trusted_modules=_own_modules())
-        training_state.restore_attributes(model, state["attributes"])
-        model.start_time = time.time_ns() - state["elapsed_ns"]
         assert self._folder is not None
         segments = self._folder.segments(self._manifest)
-        for name, ring in self._rings.items():
-            if name in state["rings"]:
-                ring.restore(state["rings"][name], self._pieces([s for s in segments if s.ring == _file_name(name)]))
+        with self._restoring(state):
+            with self._folder.opened(f"{state['path'].name}/{MODEL}") as file, importing_nothing():
+                model.set_parameters(file, trusted_modules=_own_modules())  # type: ignore[arg-type]
+            training_state.restore_attributes(model, state["attributes"])
+            model.start_time = time.time_ns() - state["elapsed_ns"]
+            for name, ring in self._rings.items():
+                if name in state["rings"]:
+                    rows = [s for s in segments if s.ring == _file_name(name)]
+                    ring.restore(state["rings"][name], self._pieces(rows))
         self._saved_at = self._whole_at = model.num_timesteps
 
+    @contextlib.contextmanager
+    def _restoring(self, state: dict[str, Any]) -> Iterator[None]:
+        """What the content of a checkpoint makes raise is said to be its fault, in one kind of error."""
+        try:
+            yield
+        except (BadFile, ParametersDoNotFit, EnvironmentDied, OSError):
+            raise
+        except Exception as error:
+            raise BadFile(
+                f"{state['path']} is damaged or hostile, or was not made by this program: {type(error).__name__}: "
+                f"{error!s:.500}"
+            ) from error
+
     def _pieces(self, segments: list[Segment]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-        assert self._folder is not None
         for segment in segments:
+            yield segment.first, self._read(segment.path, SEGMENT_KIND)
+
+    def _read(self, path: str, kind: str) -> Any:
+        """What a file in the run's folder holds."""
+        assert self._folder is not None
+        with self._folder.opened(path) as file:
+            tree, tensors = container.read(file, kind)
+        try:
             with importing_nothing():
-                rows = decode(*container.read(self._folder.path / segment.path, SEGMENT_KIND), "rows")
-            yield segment.first, rows
+                return decode(tree, tensors, kind)
+        except BadFile as error:
+            raise BadFile(f"{self._folder.path / path}: {error}") from error
 
     def start(self) -> None:
         """
@@ -194,7 +224,10 @@ class Checkpointer:
         model = self._model
         self._states = CallbackStates(self._callback)
         self._progress = ProgressFile(self._folder.path)
-        self._interrupts = _Interrupts(self._environments(), self._folder.path)
+        for env in self._environments()[1:]:
+            end_with_this_process(env)
+        self._interrupts = Interrupts(self._environments(), self._folder.path)
+        self._console = LossyLog(model.logger)
         model.logger.output_formats.append(self._progress)
         self._period = model.num_timesteps // self._every
         self._warn_of_losses()
@@ -221,16 +254,18 @@ class Checkpointer:
             warnings.warn(f"A checkpoint does not hold all of the callbacks' state: {'; '.join(lost)}", stacklevel=4)
 
     def _restore_rest(self, state: dict[str, Any]) -> None:
-        try:
-            reasons = vec_envs.restore(self._env, state["env"])
-        except DoesNotFit as error:
-            raise ValueError(f"env: {error}") from error
+        with self._restoring(state):
+            try:
+                reasons = vec_envs.restore(self._env, state["env"])
+            except DoesNotFit as error:
+                raise ValueError(f"env: {error}") from error
         if reasons:
             self._start_episodes_anew(reasons)
-        self._states.restore(state["callbacks"])
-        self._progress.restore(state["progress"])
-        training_state.restore_logger(self._model.logger, state["logger"])
-        training_state.restore_generators(state["generators"], self._model.device)
+        with self._restoring(state):
+            self._states.restore(state["callbacks"])
+            self._progress.restore(state["progress"])
+            training_state.restore_logger(self._model.logger, state["logger"])
+            training_state.restore_generators(state["generators"], self._model.device)
 
     def _start_episodes_anew(self, reasons: list[str]) -> None:
         model: Any = self._model
@@ -335,9 +370,9 @@ class Checkpointer:
             "logger": training_state.save_logger(model.logger),
             "generators": training_state.save_generators(model.device),
         }
-        files: dict[str, Callable[[Path], None]] = {
-            MODEL: model.save,
-            STATE: lambda path: _write(path, KIND, state),
+        files: dict[str, Callable[[IO[bytes]], Any]] = {
+            MODEL: lambda file: model.save(file),  # type: ignore[arg-type]
+            STATE: lambda file: _write(file, KIND, state),
         }
         about = {"circumstances": training_state.circumstances(model.device)}
         self._folder.write(model.num_timesteps, files, segments, about)
@@ -348,10 +383,14 @@ class Checkpointer:
         first, last = ring.advance()
         oldest = last - ring.size()
         needed = {k: facts for k, facts in known.items() if facts["ring"] != name or facts["last"] > oldest}
+        others = {k: facts for k, facts in needed.items() if facts["ring"] != name}
+        if len(needed) - len(others) >= run_folder.MAX_SEGMENTS:
+            # Once in a while all of them in one piece, so that a manifest stays short.
+            first, needed = oldest, others
         if first < last:
             segment = Segment(name, first, last)
             needed[segment.path] = self._folder.write_segment(
-                segment, lambda path: _write(path, SEGMENT_KIND, ring.rows(first))
+                segment, lambda file: _write(file, SEGMENT_KIND, ring.rows(first))
             )
         return needed
 
@@ -370,80 +409,23 @@ def _file_name(ring: str) -> str:
     return "".join(c if c.isalnum() else "_" for c in ring)
 
 
-def _write(path: Path, kind: str, value: Any) -> None:
+def _write(file: IO[bytes], kind: str, value: Any) -> None:
     tensors: dict[str, torch.Tensor] = {}
-    container.write(path, kind, encode(value, kind, tensors), tensors)
+    container.write(file, kind, encode(value, kind, tensors), tensors)
+
+
+def _check_parts(state: Any, path: Path) -> None:
+    parts = state if isinstance(state, dict) else {}
+    wrong = [name for name, kind in _PARTS.items() if type(parts.get(name)) is not kind]
+    if not wrong and not all(
+        isinstance(pair, list) and len(pair) == 2 and all(isinstance(text, str) for text in pair)
+        for pair in parts["identity"].values()
+    ):
+        wrong = ["identity"]
+    if wrong or parts.keys() != _PARTS.keys():
+        raise BadFile(f"{path} is damaged or hostile: {wrong or sorted(map(str, parts))!r:.200} is not what it must be")
 
 
 def _own_modules() -> tuple[str, ...]:
     """Whose classes a checkpoint's parameters may name: those of this program, which wrote them."""
     return tuple(sorted({name.split(".")[0] for name in sys.modules}))
-
-
-class _Interrupts:
-    """
-    SIGINT and SIGTERM during a training: they are noted, so that the turn is finished and saved; a second one of them
-    ends the process at once. Handlers can be set in the main thread only; in another one signals stay as they are. What
-    the process ignores stays ignored: a shell's background jobs ignore SIGINT, so that a Ctrl-C meant for the job in
-    the foreground does not end them.
-
-    :param envs: whose workers shall ignore the SIGINT that a terminal sends to all processes
-    :param folder: for the message
-    """
-
-    def __init__(self, envs: list[VecEnv], folder: Path):
-        self.received: int | None = None
-        self._process, self._folder = os.getpid(), folder
-        self._before: dict[int, Any] = {}
-        self._envs: list[VecEnv] = []
-        if threading.current_thread() is not threading.main_thread():
-            return
-        for number in (signal.SIGINT, signal.SIGTERM):
-            # None: a handler that is not Python's, which could not be given back.
-            if signal.getsignal(number) not in (signal.SIG_IGN, None):
-                self._before[number] = signal.signal(number, self._receive)
-        for env in envs:
-            vec_envs.set_sigint_ignored(env, True)
-            self._envs.append(env)
-
-    def _receive(self, number: int, frame: types.FrameType | None) -> None:
-        if os.getpid() != self._process:
-            # A process that was forked in the meantime: what it was asked to do is no business of the training.
-            signal.signal(number, signal.SIG_DFL)
-            os.kill(os.getpid(), number)
-            return
-        if self.received is not None:
-            self.received = number
-            self.leave(orderly=False)
-        self.received = number
-        name = signal.Signals(number).name
-        os.write(
-            2, f"\n{name}: finishing the turn, to save it in {self._folder}; once more to leave at once\n".encode()
-        )
-
-    def leave(self, orderly: bool = True) -> None:
-        """
-        :param orderly: whether this is between two turns
-        :raises KeyboardInterrupt: after SIGINT
-        :raises SystemExit: after SIGTERM
-        """
-        number = self.received
-        assert number is not None
-        self.restore(orderly)
-        if number == signal.SIGINT:
-            raise KeyboardInterrupt
-        raise SystemExit(128 + number)
-
-    def restore(self, orderly: bool) -> None:
-        """
-        Give the signals back.
-
-        :param orderly: whether nobody is in the midst of talking to the workers, so that they can be told too
-        """
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-        self._before = {}
-        for env in self._envs if orderly else ():
-            if not getattr(env.unwrapped, "closed", False):
-                vec_envs.set_sigint_ignored(env, False)
-        self._envs = []

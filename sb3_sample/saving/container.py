@@ -17,7 +17,6 @@ import os
 import pathlib
 import platform
 import re
-import secrets
 import struct
 import warnings
 import zipfile
@@ -29,6 +28,7 @@ import numpy as np
 import stable_baselines3 as sb3
 import torch
 
+from sb3_sample.saving.temporary import becoming, remove_abandoned
 from sb3_sample.saving.untrusted import BadFile, PickledFile, open_regular
 from sb3_sample.version import __version__ as sb3_sample_version
 
@@ -114,17 +114,10 @@ def replacing(path: pathlib.Path) -> Iterator[IO[bytes]]:
     """
     # A link stays one.
     path = pathlib.Path(os.path.realpath(path))
-    temporary = path.with_name(f".{path.name[:100]}.{secrets.token_hex(6)}.tmp")
     try:
-        try:
-            with temporary.open("xb") as file:
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+        remove_abandoned(path.parent)
+        with becoming(path) as file:
+            yield file
         sync_folder(path.parent)
     except OSError as error:
         raise OSError(error.errno, f"{error.strerror or error}: this file could not be written", str(path)) from error

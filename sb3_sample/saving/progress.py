@@ -1,5 +1,7 @@
 """The log of a whole run in one file, however often it was interrupted."""
 
+import collections
+import contextlib
 import json
 import os
 import warnings
@@ -10,7 +12,11 @@ import numpy as np
 import torch
 from stable_baselines3.common.logger import KVWriter, filter_excluded_keys
 
-FILE = "progress.jsonl"
+from sb3_sample.saving.folders import Folder
+from sb3_sample.saving.run_folder import LOG
+
+#: Characters of the lines that are kept while they cannot be written.
+MAX_PENDING = 2**20
 
 
 class ProgressFile(KVWriter):
@@ -18,23 +24,32 @@ class ProgressFile(KVWriter):
     Appends a line of JSON for each time the log is written: ``{"step": ..., "train/critic_loss": ..., ...}``. Numbers
     are written so that they are read back bit by bit.
 
-    :param folder: the run's folder
+    Whatever the file answers, the training goes on: lines that cannot be written are kept for the next time, and a
+    warning says so.
+
+    :param folder: the run's folder; the file is opened by :meth:`restore`
     """
 
     def __init__(self, folder: Path):
-        self.path = folder / FILE
-        self._file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
-        self._size = os.lseek(self._file, 0, os.SEEK_END)
+        self.folder, self.path = folder, folder / LOG
+        self._file = -1
+        #: Bytes of the file that belong to the run.
+        self._size = 0
         #: Lines that could not be written yet.
-        self._pending: list[str] = []
+        self._pending: collections.deque[str] = collections.deque()
         self._warned = False
 
     def state(self) -> dict[str, Any]:
         """
-        :return: how much of the file belongs to the run so far; it is on the disk when this returns
+        :return: how much of the file belongs to the run so far, which is on the disk when this returns, and the lines
+            that are not in it
         """
         self._flush()
-        os.fsync(self._file)
+        try:
+            if self._file >= 0:
+                os.fsync(self._file)
+        except OSError as error:
+            self._fail(error)
         return {"size": self._size, "pending": list(self._pending)}
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -42,15 +57,45 @@ class ProgressFile(KVWriter):
         Cut back what was written after the checkpoint, since it will be written once more.
 
         :param state: from :meth:`state`
+        :raises ValueError: it is something else
         """
-        if self._size < state["size"]:
+        size, pending = state.get("size"), state.get("pending")
+        lines = isinstance(pending, list) and all(isinstance(line, str) and line.isascii() for line in pending)
+        if type(size) is not int or not 0 <= size < 2**63 or not isinstance(pending, list) or not lines:
+            raise ValueError(f"{LOG} cannot go on: its size is no number of bytes, or its lines are no text")
+        self._size, self._pending = size, collections.deque(pending)
+        try:
+            self._open()
+        except OSError as error:
+            self._fail(error)
+
+    def _open(self) -> None:
+        with Folder.at(self.folder) as folder:
+            folder.separate(LOG)
+            self._file = folder.descriptor(LOG, os.O_RDWR | os.O_CREAT)
+        there = os.lseek(self._file, 0, os.SEEK_END)
+        if there < self._size:
+            warnings.warn(f"{self.path} has {there} bytes instead of {self._size}: lines are missing", stacklevel=6)
+            self._size = there
+        elif there > self._size:
+            os.ftruncate(self._file, self._size)
+
+    def _fail(self, error: OSError) -> None:
+        """Say, once until it works again, that it does not. The next attempt opens the file anew."""
+        file, self._file = self._file, -1
+        if file >= 0:
+            # Half a line is cut off where that is possible; opening the file does it in any case.
+            with contextlib.suppress(OSError):
+                os.ftruncate(file, self._size)
+            with contextlib.suppress(OSError):
+                os.close(file)
+        if not self._warned:
+            self._warned = True
             warnings.warn(
-                f"{self.path} has {self._size} bytes, {state['size']} at the checkpoint: lines are missing",
+                f"{self.path} cannot be written to ({error}): its lines are kept, the last {MAX_PENDING} characters of "
+                "them. The training goes on.",
                 stacklevel=5,
             )
-        self._size = min(self._size, state["size"])
-        os.ftruncate(self._file, self._size)
-        self._pending = list(state["pending"])
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
         """
@@ -63,31 +108,35 @@ class ProgressFile(KVWriter):
         line = {"step": step, **{name: value for name, value in plain.items() if value is not None}}
         self._pending.append(json.dumps(line) + "\n")
         self._flush()
+        n_characters = sum(map(len, self._pending))
+        while n_characters > MAX_PENDING:
+            n_characters -= len(self._pending.popleft())
 
     def _flush(self) -> None:
-        """Write what is pending, or keep it for the next time: a full disk does not end the training."""
-        while self._pending:
-            data = self._pending[0].encode()
-            try:
+        """Write what is pending, or keep it for the next time."""
+        try:
+            while self._pending:
+                if self._file < 0:
+                    self._open()
+                data = self._pending[0].encode()
                 os.lseek(self._file, self._size, os.SEEK_SET)
                 if os.write(self._file, data) < len(data):
                     raise OSError(None, "only a part could be written", str(self.path))
-            except OSError as error:
-                os.ftruncate(self._file, self._size)
-                if not self._warned:
-                    warnings.warn(f"{self.path} cannot be written to ({error}): its lines are kept", stacklevel=4)
-                    self._warned = True
-                return
-            self._size += len(data)
-            self._warned = False
-            self._pending.pop(0)
+                self._size += len(data)
+                self._pending.popleft()
+                self._warned = False
+        except OSError as error:
+            self._fail(error)
 
     def close(self) -> None:
         """Write what is pending and close the file."""
-        if self._file >= 0:
-            self._flush()
-            os.close(self._file)
-            self._file = -1
+        self._flush()
+        file, self._file = self._file, -1
+        if file >= 0:
+            try:
+                os.close(file)
+            except OSError as error:
+                self._fail(error)
 
 
 def _plain(value: Any) -> Any:

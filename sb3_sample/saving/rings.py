@@ -6,7 +6,7 @@ that rows ``first`` to ``last`` are a piece of the run that never changes once i
 ``capacity`` rows are needed.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -102,7 +102,7 @@ class Ring:
         """
         :return: everything else of the buffer, as plain values
         """
-        small: dict[str, Any] = {"n_rows": self.n_rows}
+        small: dict[str, Any] = {"n_rows": self.n_rows, "size": self.size()}
         if isinstance(self.buffer, CompactReplay):
             return small
         own = vars(self.buffer)
@@ -118,17 +118,32 @@ class Ring:
 
         :param small: from :meth:`small`
         :param pieces: first row and rows, oldest first
-        :raises ValueError: they are of another buffer
+        :raises ValueError: they are of another buffer, or some are missing
         """
+        n_rows, size = small.get("n_rows"), small.get("size")
+        if type(n_rows) is not int or type(size) is not int or not 0 <= size <= n_rows < 2**63:
+            raise ValueError(f"of the buffer's rows {size!r:.50} of {n_rows!r:.50} are to be there")
+        followed = _Followed(pieces)
         if isinstance(self.buffer, CompactReplay):
-            self.buffer.restore_rows(pieces)
+            self.buffer.restore_rows(followed)
         else:
-            self._restore(small, pieces)
-        self.n_rows = self.n_written = int(small["n_rows"])
+            self._restore(small, followed)
+        complete = followed.end == n_rows and n_rows - followed.begin >= size
+        if self.size() != size or not (complete or size == 0):
+            raise ValueError(f"the rows {followed.begin} to {followed.end} are there, of {size} up to {n_rows}")
+        self.n_rows = self.n_written = n_rows
         self._count = self._counter()
 
     def _restore(self, small: dict[str, Any], pieces: Iterable[tuple[int, dict[str, np.ndarray]]]) -> None:
         columns = self._columns()
+        own = {name: value for name, value in vars(self.buffer).items() if isinstance(value, (bool, int, float))}
+        numbers = small["numbers"]
+        for name, value in numbers.items():
+            fixed = name in ("buffer_size", "n_envs", "optimize_memory_usage")
+            if name not in own or type(value) is not type(own[name]) or (fixed and value != own[name]):
+                raise ValueError(f"the buffer's {name:.50} cannot be {value!r:.50}")
+        if not 0 <= numbers["pos"] < self.capacity:
+            raise ValueError(f"the buffer's pos cannot be {numbers['pos']}: it has {self.capacity} rows")
         for first, rows in pieces:
             if rows.keys() != columns.keys():
                 raise ValueError(f"the buffer has the columns {sorted(columns)}, the saved one {sorted(rows)}")
@@ -141,12 +156,18 @@ class Ring:
                     array[torch.from_numpy(places).to(array.device)] = torch.from_numpy(values).to(array)
                 else:
                     array[places] = values
-        for name, value in small["numbers"].items():
+        for name, value in numbers.items():
             setattr(self.buffer, name, value)
         for name, value in small["arrays"].items():
-            getattr(self.buffer, name)[...] = value
+            array = getattr(self.buffer, name) if name in _SMALL else None
+            if array is None or np.shape(value) != array.shape:
+                raise ValueError(f"the buffer has no {name:.50} of shape {np.shape(value)}")
+            array[...] = value
         if small["head"] is not None:
-            self.buffer.observations[self.buffer.pos] = small["head"]
+            head = self.buffer.observations[self.buffer.pos]
+            if np.shape(small["head"]) != head.shape:
+                raise ValueError(f"the buffer's observations are {head.shape}, the last one {np.shape(small['head'])}")
+            head[...] = small["head"]
 
     def interrupt(self) -> None:
         """
@@ -167,3 +188,26 @@ class Ring:
                 buffer.timeouts[last][goes_on] = 1
         # The last row has changed, and is written once more.
         self.n_written = max(self.n_rows - 1, 0)
+
+
+class _Followed:
+    """
+    Pieces, with where the first begins and the last ends.
+
+    :param pieces: first row and rows, oldest first
+    """
+
+    def __init__(self, pieces: Iterable[tuple[int, dict[str, np.ndarray]]]):
+        self._pieces = pieces
+        self.begin = self.end = 0
+
+    def __iter__(self) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        for number, (first, rows) in enumerate(self._pieces):
+            if not (isinstance(rows, dict) and all(isinstance(value, np.ndarray) for value in rows.values())):
+                raise ValueError(f"the rows from {first} on are no arrays")
+            if number == 0:
+                self.begin = first
+            elif not self.begin <= first <= self.end:
+                raise ValueError(f"the rows {self.begin} to {self.end} are followed by those from {first} on")
+            self.end = first + len(rows["actions"])
+            yield first, rows

@@ -3,8 +3,12 @@ The folder of a run on disk: complete checkpoints, each in a folder of its own, 
 share.
 
 Nothing that is complete is ever written to again. A checkpoint is made in a hidden folder and renamed when all of it is
-on the disk; the rows are files that are renamed in the same way, and that a checkpoint names with their checksums. The
-program may be killed at any moment: what a checkpoint's ``manifest.json`` names is there.
+on the disk and was read back; the rows are files that are renamed in the same way, and that a checkpoint names with
+their checksums. The program may be killed at any moment: what a checkpoint's ``manifest.json`` names is there. Once it
+is renamed a checkpoint counts, whatever fails afterwards.
+
+A folder may come from somebody else, and may hold files of the user's: see :mod:`sb3_sample.saving.folders`, and
+:meth:`RunFolder._check`.
 """
 
 import contextlib
@@ -12,22 +16,45 @@ import hashlib
 import json
 import os
 import re
-import shutil
+import secrets
+import stat
 import warnings
+import weakref
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 from sb3_sample.saving.container import sync_folder
+from sb3_sample.saving.folders import Folder
 
-MANIFEST = "manifest.json"
-SEGMENTS = "replay"
-_LOCK = ".lock"
-_WRITING = ".writing"
-_REMOVED = ".removed"
+MODEL, STATE, MANIFEST = "model.zip", "state.zip", "manifest.json"
+SEGMENTS, LOG = "replay", "progress.jsonl"
+_LOCK, _WRITING, _REMOVED = ".lock", ".writing", ".removed"
 _CHECKPOINT = re.compile(r"checkpoint-(\d{12,})")
+#: Folders that are made to be renamed, or were renamed to be removed; a number drawn anew each time, so that what
+#: cannot be removed is in nobody's way.
+_HIDDEN = re.compile(rf"({re.escape(_WRITING)}|{re.escape(_REMOVED)})-[0-9a-f]{{12}}")
+_SEGMENT = re.compile(r"[^\W\d]\w*-\d{12,}-\d{12,}\.zip")
+#: Files that are made to be renamed.
+_HIDDEN_FILE = re.compile(rf"\.({_SEGMENT.pattern}|{re.escape(LOG)}|{re.escape(_LOCK)})\.[0-9a-f]{{12}}")
+#: What is used here, and must be no link; and names that only a run of ours may have for what is not empty.
+_USED = re.compile(rf"{SEGMENTS}|{re.escape(LOG)}|{re.escape(_LOCK)}|{_CHECKPOINT.pattern}|{_HIDDEN.pattern}")
+_CLAIMED = re.compile(
+    rf"{SEGMENTS}|{re.escape(LOG)}|{re.escape(_LOCK)}|checkpoint-.*|({re.escape(_WRITING)}|{re.escape(_REMOVED)})(-.*)?",
+    re.DOTALL,
+)
+#: What the first file of a run says, by which its folder is known before it has a checkpoint.
+_MARK = b"The folder of one run of sb3_sample, made by learn(checkpoint=...). See docs/saving.md.\n"
 #: Complete checkpoints that are kept.
 KEPT = 2
+#: Pieces that the rows of one buffer may be in.
+MAX_SEGMENTS = 10_000
+#: Bytes of a manifest, of which a piece of rows takes about 250; and for each value in it, as objects of Python take
+#: more.
+MAX_MANIFEST, MIN_BYTES_PER_VALUE = 8 * 2**20, 24
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+#: Reasons that a message names.
+_SHOWN = 3
 
 
 class Damaged(ValueError):
@@ -48,9 +75,27 @@ class Segment(NamedTuple):
     last: int
 
     @property
+    def name(self) -> str:
+        """Name of the file."""
+        return f"{self.ring}-{self.first:012d}-{self.last:012d}.zip"
+
+    @property
     def path(self) -> str:
         """Path in the run's folder."""
-        return f"{SEGMENTS}/{self.ring}-{self.first:012d}-{self.last:012d}.zip"
+        return f"{SEGMENTS}/{self.name}"
+
+
+#: Folders whose locks this process has. Workers that are forked later must not keep them.
+_LOCKED: weakref.WeakSet["RunFolder"] = weakref.WeakSet()
+
+
+def _let_go() -> None:
+    for folder in list(_LOCKED):
+        folder.close()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_let_go)
 
 
 class RunFolder:
@@ -59,41 +104,94 @@ class RunFolder:
 
     :param path: the folder; it is made if it is not there
     :raises OSError: it cannot be made or written to
-    :raises ValueError: another process has it, or it is a file
+    :raises ValueError: another process has it, it is a file, or what is in it is of no run of ours
     """
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"checkpoint must name a folder, but {self.path} is a file")
-        (self.path / SEGMENTS).mkdir(parents=True, exist_ok=True)
-        self._lock: int | None = self._take_lock()
-        for left in (_WRITING, _REMOVED):
-            shutil.rmtree(self.path / left, ignore_errors=True)
+        self.path.mkdir(parents=True, exist_ok=True)
+        #: What was warned of.
+        self._told: set[str] = set()
+        self._lock: int | None = None
+        with Folder.at(self.path) as root:
+            self._check(root)
+            self._lock = self._take_lock(root)
+            try:
+                if root.look(SEGMENTS) is None:
+                    root.make(SEGMENTS)
+                    sync_folder(self.path)
+                self._clear(root)
+            except BaseException:
+                self.close()
+                raise
 
-    def _take_lock(self) -> int | None:
+    def _check(self, root: Folder) -> None:
+        """
+        :raises ValueError: the folder has something of a name that runs write to, and is the folder of no run of ours;
+            or there is a link in such a place
+        """
+        ours = _is_ours(root)
+        for name in root.names():
+            if _USED.fullmatch(name) and root.is_link(name):
+                raise ValueError(
+                    f"checkpoint={str(self.path)!r}: {name} is a link, and a run follows none in its folder (the "
+                    "folder itself may be one). Nothing was changed."
+                )
+            if not ours and _CLAIMED.fullmatch(name) and not _is_empty(root, name):
+                raise ValueError(
+                    f"checkpoint={str(self.path)!r} holds {name}, which is of no run of sb3_sample and would be "
+                    "overwritten: name another folder. Nothing was changed."
+                )
+
+    def _take_lock(self, root: Folder) -> int | None:
+        root.separate(_LOCK)
+        lock = root.descriptor(_LOCK, os.O_RDWR | os.O_CREAT)
+        try:
+            held = self._locked(lock)
+            # The first thing that a run leaves, before anything of which it could be asked whose it is.
+            said = os.pread(lock, len(_MARK) + 1, 0) if hasattr(os, "pread") else _MARK
+            if said != _MARK and _MARK.startswith(said):
+                os.ftruncate(lock, 0)
+                os.write(lock, _MARK)
+                os.fsync(lock)
+        except BaseException:
+            os.close(lock)
+            raise
+        if not held:
+            os.close(lock)
+            return None
+        _LOCKED.add(self)
+        return lock
+
+    def _locked(self, lock: int) -> bool:
         try:
             import fcntl
         except ImportError:  # not on Windows
-            return None
-        lock = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+            return False
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            os.close(lock)
             raise ValueError(
                 f"checkpoint={str(self.path)!r} is in use: another process trains in this folder"
             ) from error
         except OSError:  # a file system without locks
-            os.close(lock)
-            return None
-        return lock
+            return False
+        return True
 
     def close(self) -> None:
         """Let others have the folder."""
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
+        lock, self._lock = self._lock, None
+        _LOCKED.discard(self)
+        if lock is not None:
+            os.close(lock)
+
+    def _warn(self, message: str) -> None:
+        """Once: the same is found again at each checkpoint."""
+        if message not in self._told:
+            self._told.add(message)
+            warnings.warn(f"{message}. Nothing of the run is lost by it.", stacklevel=4)
 
     # ---------------------------------------------------------------- reading
 
@@ -101,8 +199,8 @@ class RunFolder:
         """
         :return: steps and folder of each checkpoint, the newest first, looked at from outside only
         """
-        found = [(int(m[1]), path) for path in self.path.iterdir() if (m := _CHECKPOINT.fullmatch(path.name))]
-        return sorted(found, reverse=True)
+        with Folder.at(self.path) as root:
+            return [(steps, self.path / name) for steps, name in _checkpoints(root)]
 
     def newest_good(self) -> tuple[Path, dict[str, Any]] | None:
         """
@@ -117,37 +215,45 @@ class RunFolder:
                 reasons.append(str(error))
                 continue
             if reasons:
-                warnings.warn(f"{'; '.join(reasons)}. Going on from {path} instead.", stacklevel=3)
+                warnings.warn(f"{_some(reasons)}. Going on from {path} instead.", stacklevel=3)
                 self._put_aside(path)
             return path, manifest
         if reasons:
             raise Damaged(
-                f"checkpoint={str(self.path)!r} has no checkpoint that is whole: {'; '.join(reasons)}. Remove the "
+                f"checkpoint={str(self.path)!r} has no checkpoint that is whole: {_some(reasons)}. Remove the "
                 "folder to start anew."
             )
         return None
 
     def _put_aside(self, good: Path) -> None:
         """Damaged checkpoints that are newer get another name, so that theirs is free."""
-        for _, path in self.checkpoints():
-            if path == good:
-                return
-            aside = path.with_name(f"damaged-{path.name}")
-            shutil.rmtree(aside, ignore_errors=True)
-            path.rename(aside)
+        with Folder.at(self.path) as root:
+            for _, name in _checkpoints(root):
+                if name == good.name:
+                    return
+                aside = f"damaged-{name}"
+                if root.look(aside) is not None:
+                    aside = f"{aside}-{secrets.token_hex(6)}"
+                try:
+                    root.rename(name, aside)
+                except OSError as error:
+                    self._warn(f"{self.path / name} is damaged and cannot be renamed ({error})")
 
     def verify(self, path: Path) -> dict[str, Any]:
         """
         :param path: folder of a checkpoint
         :return: its manifest
         :raises Damaged: a file is missing or not as it was written; the message names it
+        :raises OSError: it cannot be read
         """
-        manifest = _read_manifest(path / MANIFEST)
-        for root, part in ((path, "files"), (self.path, "segments")):
-            for name, facts in manifest[part].items():
-                if name != (Path(name).name if part == "files" else Segment(*_place(facts)).path):
-                    raise Damaged(f"{path / MANIFEST} names a file elsewhere: {name}")
-                _verify_file(root / name, facts)
+        with Folder.at(self.path) as root, root.inside(path.name) as folder:
+            manifest = _read_manifest(folder)
+            for name, facts in manifest["files"].items():
+                _verify_file(folder, name, facts)
+            if manifest["segments"]:
+                with root.inside(SEGMENTS) as rows:
+                    for segment, facts in zip(self.segments(manifest), manifest["segments"].values(), strict=True):
+                        _verify_file(rows, segment.name, facts)
         return manifest
 
     @staticmethod
@@ -156,157 +262,307 @@ class RunFolder:
         :param manifest: of a checkpoint
         :return: the rows that it needs, oldest first
         """
-        return [Segment(*_place(facts)) for facts in manifest["segments"].values()]
+        return [Segment(facts["ring"], facts["first"], facts["last"]) for facts in manifest["segments"].values()]
+
+    @contextlib.contextmanager
+    def opened(self, path: str) -> Iterator[IO[bytes]]:
+        """
+        :param path: of a file in a folder of the run's folder
+        :return: the file, open for reading, and closed afterwards
+        :raises OSError: it cannot be read, or is no regular file
+        """
+        parent, name = path.split("/")
+        with Folder.at(self.path) as root, root.inside(parent) as folder, folder.read(name) as file:
+            yield file
 
     # ---------------------------------------------------------------- writing
 
-    def write_segment(self, segment: Segment, write: Callable[[Path], None]) -> dict[str, Any]:
+    def write_segment(self, segment: Segment, write: Callable[[IO[bytes]], Any]) -> dict[str, Any]:
         """
-        Write rows, if they are not there yet.
+        Write rows.
 
         :param segment: which rows
-        :param write: writes them to a path
+        :param write: writes them to a file
         :return: what the manifest says of the file
         :raises OSError: they cannot be written
         """
-        path = self.path / segment.path
-        hidden = path.with_name(f".{path.name}")
-        try:
-            write(hidden)
-            facts = _facts(hidden)
-            os.replace(hidden, path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                hidden.unlink(missing_ok=True)
-            raise
-        sync_folder(path.parent)
-        _verify_file(path, facts)
+        hidden = f".{segment.name}.{secrets.token_hex(6)}"
+        with Folder.at(self.path) as root, root.inside(SEGMENTS) as rows:
+            try:
+                facts = _write_file(rows, hidden, write)
+                rows.rename(hidden, segment.name)
+            except BaseException:
+                with contextlib.suppress(OSError):
+                    rows.remove(hidden)
+                raise
+            sync_folder(rows.path)
         return {"ring": segment.ring, "first": segment.first, "last": segment.last, **facts}
 
-    def remove_segments(self, names: Iterable[str]) -> None:
+    def remove_segments(self, paths: Iterable[str]) -> None:
         """
-        :param names: paths, in the run's folder, of rows whose checkpoint was not written
+        :param paths: in the run's folder, of rows whose checkpoint was not written. Those that a checkpoint names
+            nevertheless stay
         """
-        for name in names:
-            with contextlib.suppress(OSError):
-                (self.path / name).unlink(missing_ok=True)
+        with contextlib.suppress(OSError), Folder.at(self.path) as root, root.inside(SEGMENTS) as rows:
+            for path in set(paths) - _needed(root).keys():
+                with contextlib.suppress(OSError):
+                    rows.remove(path.removeprefix(f"{SEGMENTS}/"))
 
     def write(
-        self, steps: int, files: dict[str, Callable[[Path], None]], segments: dict[str, Any], about: dict[str, Any]
+        self, steps: int, files: dict[str, Callable[[IO[bytes]], Any]], segments: dict[str, Any], about: dict[str, Any]
     ) -> Path:
         """
-        Write a checkpoint, and remove what is not needed any more when it is whole.
+        Write a checkpoint, and remove what is not needed any more when it is whole. What cannot be removed is a
+        warning.
 
         :param steps: environment steps, by which it is named
-        :param files: by name, what writes it to a path
+        :param files: by name, what writes it to a file
         :param segments: the rows that it needs, by their path in the run's folder, with what :meth:`write_segment` said
         :param about: what else the manifest says
         :return: the checkpoint's folder
         :raises OSError: it cannot be written; nothing of it is left
         """
-        target, hidden = self.path / f"checkpoint-{steps:012d}", self.path / _WRITING
-        shutil.rmtree(hidden, ignore_errors=True)
-        try:
-            hidden.mkdir()
-            for name, write in files.items():
-                write(hidden / name)
-            facts = {name: _facts(hidden / name) for name in files}
-            _write_manifest(hidden / MANIFEST, {"steps": steps, **about, "files": facts, "segments": segments})
-            sync_folder(hidden)
-            if target.exists():
-                self._remove(target)
-            os.rename(hidden, target)
-            sync_folder(self.path)
-        except BaseException:
-            shutil.rmtree(hidden, ignore_errors=True)
-            raise
-        try:
-            # The rows that were there before were verified when they were new.
-            for name in files:
-                _verify_file(target / name, facts[name])
-            _read_manifest(target / MANIFEST)
-        except Damaged as error:
-            self._remove(target)
-            raise OSError(f"what was written is not what is read: {error}") from error
-        self._prune(steps)
-        return target
+        name, hidden = f"checkpoint-{steps:012d}", f"{_WRITING}-{secrets.token_hex(6)}"
+        with Folder.at(self.path) as root:
+            try:
+                root.make(hidden)
+                with root.inside(hidden) as folder:
+                    facts = {file: _write_file(folder, file, write) for file, write in files.items()}
+                    text = _manifest_text({"steps": steps, **about, "files": facts, "segments": segments})
+                    _write_file(folder, MANIFEST, lambda file: file.write(text))
+                    sync_folder(folder.path)
+                if root.look(name) is not None:
+                    self._remove(root, name)
+                root.rename(hidden, name)
+            except BaseException:
+                with contextlib.suppress(OSError):
+                    _empty(root, hidden)
+                raise
+            # From here on it counts.
+            try:
+                sync_folder(self.path)
+                self._prune(root, steps)
+            except OSError as error:
+                self._warn(f"{self.path} cannot be tidied up ({error})")
+        return self.path / name
 
-    def _remove(self, path: Path) -> None:
-        """Remove a checkpoint, which is whole or not there at every moment."""
-        hidden = self.path / _REMOVED
-        shutil.rmtree(hidden, ignore_errors=True)
-        os.rename(path, hidden)
-        shutil.rmtree(hidden, ignore_errors=True)
+    def _remove(self, root: Folder, name: str) -> None:
+        """
+        Remove a checkpoint, which is whole or not there at every moment. Files in it that are not ours stay, in the
+        folder's new place.
+        """
+        hidden = f"{_REMOVED}-{secrets.token_hex(6)}"
+        root.rename(name, hidden)
+        self._clear_one(root, hidden, name)
 
-    def _prune(self, steps: int) -> None:
+    def _clear_one(self, root: Folder, hidden: str, name: str) -> None:
+        try:
+            _empty(root, hidden)
+        except OSError as error:
+            self._warn(f"{self.path / hidden}, the rest of {name}, cannot be removed ({error})")
+
+    def _clear(self, root: Folder) -> None:
+        """Remove what a program that was killed has left half done."""
+        for name in root.names():
+            if _HIDDEN.fullmatch(name):
+                self._clear_one(root, name, "a checkpoint")
+        with root.inside(SEGMENTS) as rows:
+            for folder in (root, rows):
+                for name in filter(_HIDDEN_FILE.fullmatch, folder.names()):
+                    self._remove_file(folder, name)
+
+    def _prune(self, root: Folder, steps: int) -> None:
         """Remove all but the newest checkpoints up to that of ``steps``, and rows that no checkpoint needs."""
-        found = [path for there, path in self.checkpoints() if there <= steps]
-        for path in found[KEPT:]:
-            self._remove(path)
-        needed: set[str] = set()
-        for _, path in self.checkpoints():
-            # One that cannot be read is not worth rows: they would be found to be missing anyway.
-            with contextlib.suppress(Damaged, OSError):
-                needed |= _read_manifest(path / MANIFEST)["segments"].keys()
-        for file in (self.path / SEGMENTS).iterdir():
-            if f"{SEGMENTS}/{file.name}" not in needed:
-                file.unlink(missing_ok=True)
+        for name in [name for there, name in _checkpoints(root) if there <= steps][KEPT:]:
+            try:
+                self._remove(root, name)
+            except OSError as error:
+                self._warn(f"{self.path / name} cannot be removed ({error})")
+        needed = _needed(root)
+        with root.inside(SEGMENTS) as rows:
+            for name in rows.names():
+                if _SEGMENT.fullmatch(name) and f"{SEGMENTS}/{name}" not in needed:
+                    self._remove_file(rows, name)
+
+    def _remove_file(self, folder: Folder, name: str) -> None:
+        try:
+            folder.remove(name)
+        except OSError as error:
+            self._warn(f"{folder.path / name} cannot be removed ({error})")
 
 
-def _place(facts: dict[str, Any]) -> tuple[str, int, int]:
-    ring = str(facts.get("ring"))
-    # What follows is a name of a file, and nothing else.
-    return ring if ring.isidentifier() else "?", int(facts.get("first", -1)), int(facts.get("last", -1))
+def _some(reasons: list[str]) -> str:
+    more = f"; and {len(reasons) - _SHOWN} more" if len(reasons) > _SHOWN else ""
+    return "; ".join(reasons[:_SHOWN]) + more
 
 
-def _facts(path: Path) -> dict[str, Any]:
-    """Size and checksum of a file, which is on the disk when this returns."""
-    with path.open("rb") as file:
+def _is_ours(root: Folder) -> bool:
+    """Whether a folder is that of a run of ours: it says so itself, or has a checkpoint, as a copy without the rest."""
+    with contextlib.suppress(OSError), root.read(_LOCK) as file:
+        if file.read(len(_MARK) + 1) == _MARK:
+            return True
+    for _, name in _checkpoints(root):
+        with contextlib.suppress(OSError, Damaged), root.inside(name) as folder:
+            _read_manifest(folder)
+            return True
+    return False
+
+
+def _is_empty(root: Folder, name: str) -> bool:
+    found = root.look(name)
+    if found is None:
+        return True
+    if stat.S_ISDIR(found.st_mode):
+        with root.inside(name) as folder:
+            return not folder.names()
+    if not stat.S_ISREG(found.st_mode):
+        return False
+    if name == _LOCK and found.st_size < len(_MARK):
+        # A run that was killed, or whose disk was full, in the midst of its first write.
+        with root.read(name) as file:
+            return _MARK.startswith(file.read())
+    return found.st_size == 0
+
+
+def _checkpoints(root: Folder) -> list[tuple[int, str]]:
+    """Steps and names of what has the name of a checkpoint, the newest first."""
+    found = [(int(m[1]), name) for name in root.names() if (m := _CHECKPOINT.fullmatch(name))]
+    return sorted(found, reverse=True)
+
+
+def _needed(root: Folder) -> dict[str, Any]:
+    """
+    What the checkpoints' manifests say of the rows that they need. One that is damaged needs none: they would be found
+    to be missing.
+
+    :raises OSError: a manifest is there and cannot be read at present
+    """
+    needed: dict[str, Any] = {}
+    for _, name in _checkpoints(root):
+        with contextlib.suppress(Damaged), root.inside(name) as folder:
+            needed.update(_read_manifest(folder)["segments"])
+    return needed
+
+
+def _empty(root: Folder, name: str) -> None:
+    """Remove a folder and the files of a checkpoint in it."""
+    with root.inside(name) as folder:
+        for file in (MANIFEST, STATE, MODEL):
+            folder.remove(file)
+    root.remove_folder(name)
+
+
+def _write_file(folder: Folder, name: str, write: Callable[[IO[bytes]], Any]) -> dict[str, Any]:
+    """
+    Write a file and read it back.
+
+    :return: its size and checksum; it is on the disk then
+    """
+    with folder.create(name) as file:
+        write(file)
+        file.flush()
         os.fsync(file.fileno())
-    return {"size": path.stat().st_size, "sha256": _checksum(path)}
+    facts = _facts(folder, name)
+    try:
+        _verify_file(folder, name, facts)
+    except Damaged as error:
+        raise OSError(f"what was written is not what is read: {error}") from error
+    return facts
 
 
-def _checksum(path: Path) -> str:
-    with path.open("rb") as file:
-        digest = hashlib.sha256()
-        for block in _blocks(file):
-            digest.update(block)
+def _facts(folder: Folder, name: str) -> dict[str, Any]:
+    with folder.read(name) as file:
+        return {"size": os.fstat(file.fileno()).st_size, "sha256": _checksum(file)}
+
+
+def _checksum(file: IO[bytes]) -> str:
+    digest = hashlib.sha256()
+    while block := file.read(2**20):
+        digest.update(block)
     return digest.hexdigest()
 
 
-def _blocks(file: Any, size: int = 2**20) -> Iterator[bytes]:
-    while block := file.read(size):
-        yield block
-
-
-def _verify_file(path: Path, facts: dict[str, Any]) -> None:
-    if not path.is_file():
-        raise Damaged(f"{path} is missing")
-    size = path.stat().st_size
-    if size != facts["size"]:
-        raise Damaged(f"{path} is damaged: it has {size} bytes instead of {facts['size']}")
-    if _checksum(path) != facts["sha256"]:
-        raise Damaged(f"{path} is damaged: its checksum is not that of what was written")
-
-
-def _write_manifest(path: Path, manifest: dict[str, Any]) -> None:
-    body = json.dumps(manifest, indent=1)
-    digest = hashlib.sha256(body.encode()).hexdigest()
-    with path.open("w", encoding="utf-8") as file:
-        file.write(f'{body[:-2]},\n "sha256": "{digest}"\n}}')
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _read_manifest(path: Path) -> dict[str, Any]:
+def _verify_file(folder: Folder, name: str, facts: dict[str, Any]) -> None:
+    path = folder.path / name
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        digest = manifest.pop("sha256")
-        whole = hashlib.sha256(json.dumps(manifest, indent=1).encode()).hexdigest() == digest
+        with folder.read(name) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size != facts["size"]:
+                raise Damaged(f"{path} is damaged: it has {size} bytes instead of {facts['size']}")
+            if _checksum(file) != facts["sha256"]:
+                raise Damaged(f"{path} is damaged: its checksum is not that of what was written")
     except FileNotFoundError as error:
         raise Damaged(f"{path} is missing") from error
-    except (ValueError, KeyError, AttributeError, TypeError) as error:
-        raise Damaged(f"{path} is damaged: {error}") from error
-    if not whole or not {"files", "segments", "steps"} <= manifest.keys():
+
+
+# ---------------------------------------------------------------- manifests
+
+
+def _manifest_text(manifest: dict[str, Any]) -> bytes:
+    """A manifest with the checksum of the rest of it."""
+    body = json.dumps(manifest, indent=1)
+    digest = hashlib.sha256(body.encode()).hexdigest()
+    return f'{body[:-2]},\n "sha256": "{digest}"\n}}'.encode()
+
+
+def _read_manifest(folder: Folder) -> dict[str, Any]:
+    """
+    :param folder: of a checkpoint
+    :return: its manifest, of which everything is of the kind that it must be
+    :raises Damaged: it is missing or damaged
+    :raises OSError: it cannot be read
+    """
+    path = folder.path / MANIFEST
+    try:
+        with folder.read(MANIFEST) as file:
+            data = file.read(MAX_MANIFEST + 1)
+    except FileNotFoundError as error:
+        raise Damaged(f"{path} is missing") from error
+    body, _, rest = data.rpartition(b',\n "sha256": "')
+    whole = body + b"\n}"
+    if rest != hashlib.sha256(whole).hexdigest().encode() + b'"\n}':
         raise Damaged(f"{path} is damaged: its checksum is not that of what was written")
+    if len(data) > MAX_MANIFEST or sum(map(whole.count, (b",", b"[", b"{"))) > 100 + len(whole) // MIN_BYTES_PER_VALUE:
+        raise Damaged(f"{path} is damaged: it holds more than a checkpoint has to say")
+    try:
+        manifest = json.loads(whole)
+    except (ValueError, RecursionError) as error:
+        raise Damaged(f"{path} is damaged: {error!s:.200}") from error
+    wrong = _wrong_with(manifest)
+    if wrong:
+        raise Damaged(f"{path} is damaged: {wrong:.300}")
     return manifest
+
+
+def _wrong_with(manifest: Any) -> str | None:
+    if not isinstance(manifest, dict):
+        return "it is no object"
+    for part in ("circumstances", "files", "segments"):
+        if not isinstance(manifest.setdefault(part, {}), dict):
+            return f"it does not say its {part}"
+    if not _is_count(manifest.get("steps")):
+        return f"its steps are {manifest.get('steps')!r:.50}"
+    if not all(isinstance(value, str) for value in manifest["circumstances"].values()):
+        return "its circumstances are no words"
+    if manifest["files"].keys() != {MODEL, STATE}:
+        return f"its files are {sorted(manifest['files'])!r:.200}, not {MODEL} and {STATE}"
+    for name, facts in (*manifest["files"].items(), *manifest["segments"].items()):
+        if not isinstance(facts, dict) or not _is_count(facts.get("size")) or not _is_sha256(facts.get("sha256")):
+            return f"it does not say size and checksum of {name!r:.100}"
+    for name, facts in manifest["segments"].items():
+        ring, first, last = facts.get("ring"), facts.get("first"), facts.get("last")
+        if not (
+            _is_count(first) and _is_count(last) and first < last and isinstance(ring, str) and ring.isidentifier()
+        ):
+            return f"it does not say which rows are in {name!r:.100}"
+        if name != Segment(ring, first, last).path:
+            return f"it names a file elsewhere: {name!r:.200}"
+    return None
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 2**63
+
+
+def _is_sha256(value: Any) -> bool:
+    return isinstance(value, str) and _SHA256.fullmatch(value) is not None

@@ -17,7 +17,7 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 
-from sb3_sample.saving.attributes import Describer, Node, Opaque, Restorer, without_generators
+from sb3_sample.saving.attributes import Describer, DoesNotFit, Node, Opaque, Restorer, without_generators
 from sb3_sample.saving.classes import NotPortable
 from sb3_sample.version import __version__
 
@@ -69,7 +69,10 @@ def restore_attributes(model: BaseAlgorithm, described: dict[str, Node]) -> None
     if getattr(model, "compile", "auto") != "auto":
         # How it is run is said by the present program; what "auto" once decided stays.
         described = {name: node for name, node in described.items() if name != "compiled"}
-    Restorer().attributes(model, described)
+    restorer = Restorer()
+    restorer.attributes(model, described)
+    if restorer.kept:
+        raise DoesNotFit(f"{', '.join(restorer.kept)} name other files than this program")
 
 
 # ---------------------------------------------------------------- generators

@@ -8,6 +8,7 @@ processes values are pickled, as always there; in the files they are not.
 """
 
 import signal
+import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -193,6 +194,10 @@ def restore(venv: VecEnv, state: dict[str, Any]) -> list[str]:
     restorer = Restorer()
     for wrapper, saved in zip(wrappers, state["wrappers"], strict=True):
         restorer.attributes(wrapper, saved["attributes"])
+    if restorer.kept:
+        warnings.warn(
+            f"{', '.join(restorer.kept)} of the checkpoint name other files, and stay as they are", stacklevel=5
+        )
     if isinstance(innermost, SupervisedSubprocVecEnv) and state.get("last") is not None:
         innermost.last_observations = list(state["last"])
     innermost._seeds, innermost._options = list(state["seeds"]), list(state["options"])

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 import time
@@ -18,6 +19,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_sample import MBMAPPO, SAC, EnvironmentDied, SupervisedSubprocVecEnv
+from sb3_sample.envs import workers
 from sb3_sample.envs.workers import WatchedConnection, watch_workers
 from tests.ppo.common import tiny
 from tests.sac.common import Toy, sac, vec
@@ -363,9 +365,110 @@ def test_a_training_goes_on(family: Any, how: Callable[[], Any], make: Any, tmp_
         ({"restart_envs": 1}, "restart_envs must be True or False, not 1"),
         ({"max_restarts": -1}, "max_restarts must be an integer of at least 0, not -1"),
         ({"max_restarts": True}, "max_restarts must be an integer of at least 0, not True"),
+        ({"timeout": 0}, "timeout must be a positive number of seconds, or None, not 0"),
+        ({"timeout": True}, "timeout must be a positive number of seconds, or None, not True"),
+        ({"timeout": float("nan")}, "timeout must be .*not nan"),
+        ({"timeout": "5"}, "timeout must be .*not '5'"),
         ({"env_fns": []}, "env_fns must make at least one environment"),
     ],
 )
 def test_what_is_refused(kwargs: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         SupervisedSubprocVecEnv(**{"env_fns": fns(), **kwargs})
+
+
+# ---------------------------------------------------------------- hanging
+
+
+def _hang() -> None:
+    time.sleep(1000)
+
+
+@pytest.mark.parametrize("start_method", ["fork", pytest.param("forkserver", marks=pytest.mark.slow)])
+def test_a_worker_that_hangs_is_named_with_its_last_action(start_method: str, make: Any) -> None:
+    venv = make(SupervisedSubprocVecEnv, fns(step=3, how=_hang), start_method=start_method, timeout=2)
+    venv.reset()
+    actions = ACTIONS.copy()
+    actions[1] = [0.25, -0.5]
+    for _ in range(2):
+        venv.step(ACTIONS)
+    words = (
+        r"environment 1 hangs at 'step': its worker, process \d+, gave no answer within 2 s, and was killed. Its "
+        r"last action was array\(\[ 0.25, -0.5 \], dtype=float32\)\."
+    )
+    with pytest.raises(EnvironmentDied, match=words) as caught:
+        venv.step(actions)
+    assert caught.value.silence == 2 and caught.value.exit_code == -signal.SIGKILL
+    np.testing.assert_array_equal(caught.value.action, actions[1])
+    again = pickle.loads(pickle.dumps(caught.value))
+    assert str(again) == str(caught.value) and again.silence == 2
+
+
+def test_a_worker_that_hangs_is_replaced(make: Any, tmp_path: Path) -> None:
+    env_fns = fns(step=3, how=_hang, marker=tmp_path / "hung")
+    venv = make(SupervisedSubprocVecEnv, env_fns, restart_envs=True, timeout=2)
+    with pytest.warns(UserWarning, match="environment 1 hangs at 'step'.*restarted, as 1 of"):
+        run(venv, 6)
+    assert venv.n_restarts == 1
+
+
+def test_a_worker_that_hangs_at_the_end_is_not_waited_for(make: Any) -> None:
+    class Stays(Fragile):
+        def close(self) -> None:
+            _hang()
+
+    venv = make(SupervisedSubprocVecEnv, [Stays], timeout=1)
+    venv.reset()
+
+
+def test_making_an_environment_has_its_own_time(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow() -> Any:
+        time.sleep(1.5)
+        return Monitor(Fragile())
+
+    venv = make(SupervisedSubprocVecEnv, [slow], timeout=0.5)
+    venv.reset()
+
+    def never() -> Any:
+        _hang()
+
+    monkeypatch.setattr(workers, "MAKING", 1.0)
+    words = "environment 0 hangs at 'get_spaces'.*no action yet. Its environment was not made"
+    with pytest.raises(EnvironmentDied, match=words):
+        SupervisedSubprocVecEnv([never], start_method="fork", timeout=0.5)
+
+
+# ---------------------------------------------------------------- the end of the program
+
+
+def _program(cls: Any, pids: Any) -> None:
+    venv = cls(fns(step=2, how=_hang), start_method="fork")
+    model = sac(env=venv)
+    pids.send([process.pid for process in venv.processes])
+    model.learn(100)
+
+
+@pytest.mark.parametrize("cls", [SubprocVecEnv, SupervisedSubprocVecEnv])
+def test_forked_workers_do_not_outlive_a_killed_program(cls: Any) -> None:
+    """Busy or not; and no other end of a connection tells them, since each holds copies of the others' ends."""
+    ours, theirs = multiprocessing.Pipe()
+    program = multiprocessing.get_context("fork").Process(target=_program, args=(cls, theirs))
+    program.start()
+    pids = ours.recv()
+    time.sleep(0.5)
+    program.kill()
+    program.join()
+    deadline = time.monotonic() + 20
+    while any(map(_lives, pids)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    left = [pid for pid in pids if _lives(pid)]
+    for pid in left:
+        os.kill(pid, signal.SIGKILL)
+    assert not left
+
+
+def _lives(pid: int) -> bool:
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False

@@ -4,10 +4,14 @@ checksums by name, so that two runs can be compared bit by bit.
 """
 
 import collections
+import errno
 import hashlib
 import json
 import multiprocessing
 import os
+import random
+import re
+import resource
 import signal
 import sys
 import threading
@@ -23,7 +27,12 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import EvalCallback, StopTrainingOnMaxEpisodes, StopTrainingOnNoModelImprovement
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    EvalCallback,
+    StopTrainingOnMaxEpisodes,
+    StopTrainingOnNoModelImprovement,
+)
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
@@ -35,6 +44,7 @@ from sb3_sample.sac.buffers import DeviceReplayBuffer
 from sb3_sample.sac.compact_buffer import CompactReplay
 from sb3_sample.saving import training_state, vec_envs
 from sb3_sample.saving.callbacks import walk
+from sb3_sample.saving.folders import Folder
 from tests.ppo.common import TINY, TINY_MODELS
 from tests.sac.common import MAKERS
 
@@ -127,35 +137,102 @@ def callbacks(folder: str, env: dict[str, Any], evaluate: bool = False, diagnose
     return [evaluation, *others]
 
 
-def kill_in_writing(folder: str, k: int) -> None:
-    """End this process by SIGKILL at the k-th thing that it does to the files in a folder from now on."""
+_RUN_NAMES = re.compile(r"\.?(model|state|manifest|checkpoint-|writing-|removed-|replay|progress|lock)")
+
+
+def kill_in_writing(folder: str, k: int) -> Callable[[], int]:
+    """
+    End this process by SIGKILL at the k-th thing that it does to the files in a folder from now on.
+
+    :return: tells how many there were
+    """
     count = 0
 
     def hook(event: str, args: Any) -> None:
         nonlocal count
-        if (event == "open" or event.startswith("os.")) and args and folder in str(args[0]):
+        if (event == "open" or event.startswith("os.")) and args:
+            # Files of a run's folder are reached by their names, from the folder.
+            if folder not in str(args[0]) and not _RUN_NAMES.match(str(args[0])):
+                return
             count += 1
             if count == k:
                 os.kill(os.getpid(), signal.SIGKILL)
 
     sys.addaudithook(hook)
+    return lambda: count
 
 
 class _Kill(threading.Thread):
-    """Ends this process by SIGKILL a while after a checkpoint is there, wherever it is then."""
+    """Sends this process SIGKILL, or another signal, a while after a checkpoint is there, wherever it is then."""
 
-    def __init__(self, folder: str, after_steps: int, seconds: float):
+    def __init__(self, folder: str, after_steps: int, seconds: float, number: int = signal.SIGKILL):
         super().__init__(daemon=True)
         self.folder, self.after, self.seconds = Path(folder), f"checkpoint-{after_steps:012d}", seconds
+        self.number = number
 
     def run(self) -> None:
         while not any(path.name >= self.after for path in self.folder.glob("checkpoint-*")):
             time.sleep(0.0005)
         time.sleep(self.seconds)
-        os.kill(os.getpid(), signal.SIGKILL)
+        os.kill(os.getpid(), self.number)
 
 
-def train(case: dict[str, Any], steps: int, every: int, folder: str, kill: tuple[int, float] | None = None) -> None:
+class _Trouble(BaseCallback):
+    """
+    What is wrong with the machine from some step on.
+
+    :param kind: "full disk": no file grows beyond some bytes, for some steps; "no log": the log's file cannot be
+        opened, written to or cut; "tee": nobody reads what is printed; "nothing"
+    :param rng: draws when it begins, and ends
+    """
+
+    def __init__(self, kind: str, rng: random.Random):
+        super().__init__()
+        self.kind, self.begin = kind, rng.randrange(20, 150)
+        self.end = self.begin + rng.randrange(10, 60)
+
+    # Not part of what is saved: it is no business of the run.
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        pass
+
+    def _on_step(self) -> bool:
+        begins = self.num_timesteps >= self.begin
+        if self.kind == "full disk":
+            _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+            limited = begins and self.num_timesteps < self.end
+            resource.setrlimit(resource.RLIMIT_FSIZE, (700 if limited else hard, hard))
+        elif begins and self.kind == "no log":
+            Folder.descriptor = _no_log(Folder.descriptor)  # type: ignore[method-assign]
+            os.write = os.ftruncate = _read_only
+            self.kind = "nothing"
+        elif begins and self.kind == "tee":
+            reader, writer = os.pipe()
+            os.close(reader)
+            os.dup2(writer, 1)
+            os.dup2(writer, 2)
+            self.kind = "nothing"
+        return True
+
+
+def _read_only(*args: Any, **kwargs: Any) -> Any:
+    raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+
+def _no_log(descriptor: Any) -> Any:
+    return lambda folder, name, flags: (_read_only if name == "progress.jsonl" else descriptor)(folder, name, flags)
+
+
+def train(
+    case: dict[str, Any],
+    steps: int,
+    every: int,
+    folder: str,
+    kill: tuple[int, float] | None = None,
+    trouble: tuple[str, int] | None = None,
+) -> None:
     """
     Train, as a user's program does, and write down what came out.
 
@@ -165,18 +242,26 @@ def train(case: dict[str, Any], steps: int, every: int, folder: str, kill: tuple
     :param folder: the run's
     :param kill: after the checkpoint of how many steps, and how many seconds later, the process is killed; or -1, and
         at which of the things that it does to the folder's files
+    :param trouble: what else goes wrong, and the seed by which it is drawn when; the kill is an interrupt if it is
+        "tee", as by Ctrl-C
     """
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     env = case.get("env", {})
     agent = model(case["algorithm"], folder, env, **case.get("kwargs", {}))
     callback = callbacks(folder, env, case.get("evaluate", False), case.get("diagnose", False))
+    if trouble is not None:
+        agent.verbose = 1
+        callback = [*(callback or []), _Trouble(trouble[0], random.Random(trouble[1]))]
     if kill is not None and kill[0] < 0:
-        kill_in_writing(folder, int(kill[1]))
+        n_done = kill_in_writing(folder, int(kill[1]))
     elif kill is not None:
-        _Kill(folder, *kill).start()
+        tee = trouble is not None and trouble[0] == "tee"
+        _Kill(folder, *kill, signal.SIGINT if tee else signal.SIGKILL).start()
     agent.learn(steps, callback=callback, log_interval=1, checkpoint=folder, checkpoint_freq=every)
     Path(f"{folder}.json").write_text(json.dumps(outcome(agent, folder, callback)))
+    if kill is not None and kill[0] < 0:
+        Path(f"{folder}.count").write_text(str(n_done()))
 
 
 # ---------------------------------------------------------------- what came out

@@ -18,19 +18,22 @@ import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, EveryNTimesteps, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_sample import MBMAPPO
 from sb3_sample.sac.buffers import DeviceReplayBuffer
 from sb3_sample.sac.policies import MlpPolicy
-from sb3_sample.saving import container, training_state
+from sb3_sample.saving import container, run_folder, training_state
 from sb3_sample.saving.attributes import Describer, same
 from sb3_sample.saving.callbacks import CallbackStates
+from sb3_sample.saving.encoding import decode, encode
 from sb3_sample.saving.run_folder import RunFolder
 from tests.ppo.common import ALGORITHMS, tiny
 from tests.sac.common import MAKERS, bro, differing, sac, state, vec
+from tests.saving.hostile_folders import facts_of, rewritten
 from tests.saving.program import Goal, outcome
 
 STEPS = dict(checkpoint_freq=10)
@@ -143,6 +146,33 @@ def test_the_model_can_be_loaded_alone(tmp_path: Path) -> None:
     assert not differing(state(trained), state(loaded))
 
 
+def test_many_pieces_become_one(tmp_path: Path, monkeypatch: Any) -> None:
+    """So that a manifest stays short, however long the run is."""
+    monkeypatch.setattr(run_folder, "MAX_SEGMENTS", 4)
+    sac(buffer_size=60).learn(75, checkpoint=tmp_path, checkpoint_freq=5)
+    pieces = sorted(path.name for path in (tmp_path / "replay").iterdir())
+    assert len(pieces) <= 5 and pieces[0] == "model-000000000005-000000000065.zip"
+    again = sac(buffer_size=60).learn(100, checkpoint=tmp_path, checkpoint_freq=5)
+    assert not differing(state(sac(buffer_size=60).learn(100)), state(again))
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+@pytest.mark.parametrize("buffer", [None, ReplayBuffer])
+def test_rows_that_a_manifest_does_not_name_are_missed(which: int, buffer: Any, tmp_path: Path) -> None:
+    def model() -> Any:
+        return sac() if buffer is None else sac(replay_buffer_class=buffer)
+
+    model().learn(30, checkpoint=tmp_path, **STEPS)
+    (path,) = tmp_path.glob("checkpoint-*30/manifest.json")
+
+    def leave_out(manifest: Any) -> None:
+        del manifest["segments"][sorted(manifest["segments"])[which]]
+
+    rewritten(path, leave_out)
+    with pytest.raises(ValueError, match="the rows|the steps"):
+        model().learn(40, checkpoint=tmp_path, **STEPS)
+
+
 def test_rows_are_written_once(tmp_path: Path) -> None:
     sizes: dict[str, tuple[int, int]] = {}
 
@@ -205,6 +235,32 @@ def test_a_time_limit_is_part_of_the_run(tmp_path: Path) -> None:
     sac(env(20)).learn(20, checkpoint=tmp_path)
     with pytest.raises(ValueError, match="env=.*max_episode_steps=30"):
         sac(env(30)).learn(40, checkpoint=tmp_path)
+
+
+def test_a_folder_of_the_users_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    (tmp_path / "replay").mkdir()
+    (tmp_path / "replay" / "model-000000000000-000000000010.zip").write_text("the user's")
+    (tmp_path / "progress.jsonl").write_text("the user's")
+    for model in (sac(), tiny()):
+        with pytest.raises(ValueError, match=r"holds progress\.jsonl, which is of no run of sb3_sample"):
+            model.learn(20, checkpoint=tmp_path)
+        assert model.num_timesteps == 0
+    assert {path.read_text() for path in tmp_path.rglob("*") if path.is_file()} == {"the user's"}
+    assert len(list(tmp_path.rglob("*"))) == 3
+
+
+def test_a_run_that_was_killed_before_its_first_checkpoint_is_taken_up(tmp_path: Path, monkeypatch: Any) -> None:
+    def killed(*args: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunFolder, "write", killed)
+        patch.setattr(RunFolder, "remove_segments", lambda *_: None)
+        with pytest.raises(KeyboardInterrupt):
+            sac().learn(20, checkpoint=tmp_path)
+    (tmp_path / "progress.jsonl").write_text('{"step": 7}\n')
+    assert not steps_of(tmp_path)
+    assert not differing(state(sac().learn(20)), state(sac().learn(20, checkpoint=tmp_path)))
 
 
 @pytest.mark.parametrize("freq", [0, -1, 1.5, True, None])
@@ -489,6 +545,75 @@ def test_what_a_callback_changed_is_restored_and_its_arguments_are_the_programs(
     assert first.seen == list(range(1, 31)) and first.n_calls == 30 and first.best == {"step": 30.0}
     assert inner.seen == [5, 10, 15, 20, 25, 30]
     assert first.bound == 2.0
+
+
+class Writes(BaseCallback):
+    """Knows where it writes, in several ways, and has texts that are its state."""
+
+    def __init__(self, target: str, name_prefix: str = "a"):
+        super().__init__()
+        self.target, self.name_prefix, self.csv = target, name_prefix, f"{target}/log.csv"
+        self.saved = [f"{target}/a.zip"]
+        self.phase, self.words = "first", ["a"]
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == 15:
+            self.phase, self.words = "second", ["a", "b"]
+            self.saved = [f"{self.target}/b.zip"]
+            self.target, self.name_prefix, self.csv = "other/place", "b", "here.csv"
+        return True
+
+
+def test_where_a_callback_writes_is_said_by_the_program(tmp_path: Path) -> None:
+    """Also where an earlier part of the run has changed it, with a word about it."""
+    first = Writes("old/place")
+    sac().learn(20, first, checkpoint=tmp_path)
+    again = Writes("new/place")
+    with pytest.warns(UserWarning, match="of the checkpoint may name files, and stay as they are") as caught:
+        sac().learn(21, again, checkpoint=tmp_path)
+    (message,) = [str(w.message) for w in caught if "may name files" in str(w.message)]
+    assert {word for word in ("target", "name_prefix", "csv", "saved") if f"Writes.{word}" in message} == {
+        "target", "name_prefix", "csv", "saved"
+    }  # fmt: skip
+    assert (again.target, again.name_prefix, again.csv) == ("new/place", "a", "new/place/log.csv")
+    assert again.saved == ["new/place/a.zip"]
+    assert (again.phase, again.words) == ("second", ["a", "b"])
+
+
+#: Of the state of callbacks, by name: what a hostile file says there.
+HOSTILE_ATTRIBUTES: dict[str, Any] = {
+    "best_model_save_path": {"value": "victim"}, "log_path": {"value": "victim/evaluations"},
+    "eval_env": {"value": 1}, "model": {"value": None}, "_on_step": {"value": True},
+    "verbose": {"value": 10}, "__class__": {"value": 1},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOSTILE_ATTRIBUTES)
+def test_another_runs_best_model_is_not_overwritten(name: str, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("victim").mkdir()
+    for file in ("best_model.zip", "evaluations.npz"):
+        (tmp_path / "victim" / file).write_text("the user's")
+
+    def evaluation() -> EvalCallback:
+        return EvalCallback(
+            vec(), eval_freq=5, n_eval_episodes=1, best_model_save_path="mine", log_path="mine", verbose=0
+        )
+
+    sac().learn(20, evaluation(), checkpoint="run")
+    (path,) = Path("run").glob("checkpoint-*20/state.zip")
+    state_ = decode(*container.read(path, "checkpoint"), "checkpoint")
+    state_["callbacks"]["callback"]["attributes"][name] = HOSTILE_ATTRIBUTES[name]
+    state_["callbacks"]["callback"]["attributes"]["best_mean_reward"] = {"value": -1e9}
+    tensors: dict[str, Any] = {}
+    container.write(path, "checkpoint", encode(state_, "checkpoint", tensors), tensors)
+    rewritten(path.parent / "manifest.json", lambda m: m["files"].update({"state.zip": facts_of(path.read_bytes())}))
+    callback = evaluation()
+    with pytest.warns(UserWarning, match=f"{name}.* stay as they are|starts anew: '{name}' is not saved of it"):
+        sac().learn(40, callback, checkpoint="run")
+    assert (callback.best_model_save_path, callback.log_path) == ("mine", "mine/evaluations")
+    assert {path.read_text() for path in Path("victim").iterdir()} == {"the user's"}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "run", "victim"]
 
 
 def test_callbacks_that_come_and_go_are_named(tmp_path: Path) -> None:

@@ -4,8 +4,10 @@ import contextlib
 import errno
 import io
 import json
+import multiprocessing
 import os
 import pickle
+import re
 import resource
 import signal
 import stat
@@ -13,6 +15,7 @@ import struct
 import subprocess
 import sys
 import textwrap
+import time
 import warnings
 import zipfile
 from pathlib import Path
@@ -247,6 +250,55 @@ def test_a_folder_that_cannot_be_written_to(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(PermissionError, match="could not be written"):
         write(tmp_path / "m", "model", TREE, {})
     assert not list(tmp_path.iterdir())
+
+
+def _write_until_killed(path: Path, ready: Any) -> None:
+    with container.replacing(path) as file:
+        file.write(b"half")
+        file.flush()
+        ready.send(True)
+        time.sleep(1000)
+
+
+def test_what_a_killed_save_left_is_removed_and_what_another_writes_is_not(tmp_path: Path) -> None:
+    """Whoever saves next in the folder does it, under whatever name; and only files of this kind."""
+    others = [".m.zip.tmp", ".m.zip.0123456789ab", ".m.zip.0123456789AB.tmp", "m.zip.0123456789ab.tmp"]
+    for name in others:
+        (tmp_path / name).write_text("of somebody else")
+    (tmp_path / ".m.zip.0123456789ab.tmp").mkdir()
+    (tmp_path / ".n.zip.0123456789ab.tmp").symlink_to(tmp_path / others[0])
+    before = {path.name for path in tmp_path.iterdir()}
+    context = multiprocessing.get_context("fork")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_write_until_killed, args=(tmp_path / "m.zip", theirs))
+    process.start()
+    assert ours.recv()
+    write(tmp_path / "other", "model", TREE, {})
+    (halfway,) = {path.name for path in tmp_path.iterdir()} - before - {"other"}
+    assert re.fullmatch(r"\.m\.zip\.[0-9a-f]{12}\.tmp", halfway)
+    process.kill()
+    process.join()
+    write(tmp_path / "another", "model", TREE, {})
+    assert {path.name for path in tmp_path.iterdir()} == {*before, "other", "another"}
+    assert all((tmp_path / name).read_text() == "of somebody else" for name in others)
+
+
+def _write_often(folder: Path, name: str) -> None:
+    for i in range(100):
+        write(folder / name, "model", {"i": i}, {})
+
+
+def test_several_programs_save_in_one_folder(tmp_path: Path) -> None:
+    """None takes for abandoned what another has just begun."""
+    context = multiprocessing.get_context("fork")
+    processes = [context.Process(target=_write_often, args=(tmp_path, str(i))) for i in range(4)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert [process.exitcode for process in processes] == [0] * 4
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0", "1", "2", "3"]
+    assert all(read(tmp_path / str(i), "model")[0] == {"i": 99} for i in range(4))
 
 
 def test_a_link_stays_a_link(tmp_path: Path) -> None:

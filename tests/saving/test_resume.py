@@ -6,11 +6,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.sac.common import MAKERS
 from tests.saving.program import PPOS, result, run
 
 N = 96
@@ -88,11 +90,63 @@ def test_killed_and_started_again_everywhere(name: str, tmp_path: Path) -> None:
 def test_killed_while_a_checkpoint_is_written(seed: int, tmp_path: Path) -> None:
     case = {"algorithm": "VPLSAC", "kwargs": {"buffer_size": 70}}
     whole, killed = str(tmp_path / "whole"), str(tmp_path / "killed")
-    run(case, 2 * N, 24, whole)
-    at = random.Random(seed).randrange(60, 300)
-    run(case, 2 * N, 24, killed, (-1, at), code=-9)
+    run(case, 2 * N, 24, whole, (-1, 10**9))
+    count = int(Path(f"{whole}.count").read_text())
+    run(case, 2 * N, 24, killed, (-1, random.Random(seed).randrange(count // 4, count)), code=-9)
     run(case, 2 * N, 24, killed)
     assert not differing(result(whole), result(killed))
+
+
+#: Every algorithm, and what goes wrong besides the kill.
+ALGORITHMS = (*MAKERS, *PPOS)
+TROUBLE = ("tee", "full disk", "no log", "writing", "nothing")
+#: How many kills there are; ``KILLS=100`` has every algorithm under every circumstance.
+KILLS = int(os.environ.get("KILLS", "20"))
+
+
+@pytest.fixture(scope="module")
+def wholes(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], str]:
+    """The folder of an algorithm's run that is never killed, made when it is first asked for."""
+    folder = tmp_path_factory.mktemp("wholes")
+
+    def whole(algorithm: str) -> str:
+        path = str(folder / algorithm)
+        if not Path(f"{path}.json").exists():
+            run({"algorithm": algorithm}, _total(algorithm), 24, path, (-1, 10**9))
+        return path
+
+    return whole
+
+
+def _total(algorithm: str) -> int:
+    return 3 * N if algorithm in PPOS else 2 * N
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(KILLS))
+def test_killed_under_all_circumstances(number: int, wholes: Callable[[str], str], tmp_path: Path) -> None:
+    """
+    Ctrl-C with nobody who reads what is printed, and SIGKILL while the disk is full, while the log cannot be written,
+    while a checkpoint is being written, and anywhere.
+    """
+    algorithm = ALGORITHMS[number % len(ALGORITHMS)]
+    trouble = TROUBLE[(number + number // len(ALGORITHMS)) % len(TROUBLE)]
+    rng = random.Random(number)
+    case, total, killed = {"algorithm": algorithm}, _total(algorithm), str(tmp_path / "killed")
+    whole = wholes(algorithm)
+    kill: tuple[int, float] = (N, rng.uniform(0, 0.02))
+    if trouble == "writing":
+        count = int(Path(f"{whole}.count").read_text())
+        kill = (-1, rng.randrange(count // 4, count))
+    run(case, total, 24, killed, kill, (trouble, number), code=1 if trouble == "tee" else -9)
+    assert not Path(f"{killed}.json").exists()
+    if trouble == "tee":
+        assert max(int(path.name.split("-")[1]) for path in Path(killed).glob("checkpoint-*")) > N
+    run(case, total, 24, killed)
+    assert len(result(whole)) > 100
+    assert not differing(result(whole), result(killed))
+    left = {path.name for path in Path(killed).iterdir()} | {path.name[0] for path in Path(killed, "replay").iterdir()}
+    assert {name for name in left if not name.startswith(("checkpoint-", "m"))} == {".lock", "progress.jsonl", "replay"}
 
 
 @pytest.mark.slow

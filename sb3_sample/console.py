@@ -1,0 +1,85 @@
+"""Lines for a terminal, a pipe or a file that may be gone, or full: the training goes on without them."""
+
+import contextlib
+import os
+import sys
+import warnings
+from typing import Any
+
+from stable_baselines3.common.logger import Logger
+
+
+def standard_error() -> int | None:
+    """
+    :return: the descriptor of the standard error; None if the program has none (any more), and another file may have
+        got its number
+    :raises OSError: there is no such descriptor
+    """
+    stream = sys.__stderr__
+    if stream is None or stream.closed:
+        return None
+    descriptor = stream.fileno()
+    # Files that Python opens are not inherited by other programs; what the standard error was given is.
+    return descriptor if os.get_inheritable(descriptor) else None
+
+
+def tell(text: str) -> None:
+    """
+    Write to the standard error from the handler of a signal: nothing is raised, whatever has become of it, since the
+    handler runs in the midst of anything.
+
+    :param text: a line
+    """
+    with contextlib.suppress(OSError, ValueError):
+        descriptor = standard_error()
+        if descriptor is not None:
+            os.write(descriptor, text.encode())
+
+
+def say(text: str) -> None:
+    """
+    Print a line in the midst of a turn. It is lost where nobody takes it.
+
+    :param text: the line
+    """
+    # The reader of a pipe is gone, the disk is full: no reason to lose the turn.
+    with contextlib.suppress(OSError):
+        print(text)
+
+
+class LossyLog:
+    """
+    While it is in force, lines of the log that a terminal, a pipe or a file does not take are lost with a warning, and
+    do not end the training in the midst of a turn.
+
+    :param logger: the algorithm's
+    """
+
+    def __init__(self, logger: Logger):
+        self._formats: list[Any] = list(logger.output_formats)
+        for each in self._formats:
+            each.write = _Lossy(each)
+
+    def close(self) -> None:
+        """Leave the log as it was."""
+        for each in self._formats:
+            del each.write
+        self._formats = []
+
+
+class _Lossy:
+    def __init__(self, output: Any):
+        self._name, self._write = type(output).__name__, output.write
+        self._warned = False
+
+    def __call__(self, *args: Any, **kwargs: Any) -> None:
+        try:
+            self._write(*args, **kwargs)
+        except OSError as error:
+            if not self._warned:
+                self._warned = True
+                warnings.warn(
+                    f"{self._name} of the log cannot be written to ({error}): lines of it are lost. The training goes "
+                    "on.",
+                    stacklevel=4,
+                )

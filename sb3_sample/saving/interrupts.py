@@ -1,0 +1,91 @@
+"""Signals during a training."""
+
+import contextlib
+import os
+import signal
+import threading
+import types
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_sample.console import tell
+from sb3_sample.envs.workers import EnvironmentDied
+from sb3_sample.saving import vec_envs
+
+
+class Interrupts:
+    """
+    SIGINT and SIGTERM during a training: they are noted, so that the turn is finished and saved; a second one of them
+    ends the process at once. Handlers can be set in the main thread only; in another one signals stay as they are. What
+    the process ignores stays ignored: a shell's background jobs ignore SIGINT, so that a Ctrl-C meant for the job in
+    the foreground does not end them.
+
+    A handler runs in the midst of anything, so that the first signal raises nothing there, whatever the standard error
+    answers.
+
+    :param envs: whose workers shall ignore the SIGINT that a terminal sends to all processes
+    :param folder: for the message
+    """
+
+    def __init__(self, envs: list[VecEnv], folder: Path):
+        self.received: int | None = None
+        self._process, self._folder = os.getpid(), folder
+        self._before: dict[int, Any] = {}
+        self._envs: list[VecEnv] = []
+        if threading.current_thread() is not threading.main_thread():
+            return
+        try:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                # None: a handler that is not Python's, which could not be given back.
+                if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                    self._before[number] = signal.signal(number, self._receive)
+            for env in envs:
+                vec_envs.set_sigint_ignored(env, True)
+                self._envs.append(env)
+        except BaseException:
+            self.restore(orderly=False)
+            raise
+
+    def _receive(self, number: int, frame: types.FrameType | None) -> None:
+        if os.getpid() != self._process:
+            # A process that was forked in the meantime: what it was asked to do is no business of the training.
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+            return
+        if self.received is not None:
+            self.received = number
+            self.leave(orderly=False)
+        self.received = number
+        name = signal.Signals(number).name
+        tell(f"\n{name}: finishing the turn, to save it in {self._folder}; once more to leave at once\n")
+
+    def leave(self, orderly: bool = True) -> None:
+        """
+        :param orderly: whether this is between two turns
+        :raises KeyboardInterrupt: after SIGINT
+        :raises SystemExit: after SIGTERM
+        """
+        number = self.received
+        assert number is not None
+        self.restore(orderly)
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise SystemExit(128 + number)
+
+    def restore(self, orderly: bool) -> None:
+        """
+        Give the signals back.
+
+        :param orderly: whether nobody is in the midst of talking to the workers, so that they can be told too
+        """
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
+        for env in self._envs if orderly else ():
+            if not getattr(env.unwrapped, "closed", False):
+                # A worker that is dead has nothing to listen to.
+                with contextlib.suppress(EnvironmentDied, EOFError, OSError):
+                    vec_envs.set_sigint_ignored(env, False)
+        self._envs = []

@@ -1,0 +1,95 @@
+"""
+Files that become others when they are complete, and those that a program left which was killed before that.
+
+Who writes one has it locked, and the system unlocks what a process had that is gone: so a file that can be locked is
+one that nobody writes any more, on this machine or on another that shares the folder.
+"""
+
+import contextlib
+import os
+import re
+import secrets
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+try:
+    import fcntl
+except ImportError:  # on Windows
+    fcntl = None  # type: ignore[assignment]
+
+_NAME = re.compile(r"\..+\.[0-9a-f]{12}\.tmp", re.DOTALL)
+
+
+@contextlib.contextmanager
+def becoming(path: Path) -> Iterator[IO[bytes]]:
+    """
+    A file beside another, whose place it takes at the end, when all of it is on the disk.
+
+    :param path: the other, which need not be there
+    :return: the file, open for writing
+    :raises OSError: it cannot be written; nothing of it is left then
+    """
+    while True:
+        temporary = path.with_name(f".{path.name[:100]}.{secrets.token_hex(6)}.tmp")
+        with temporary.open("xb") as file:
+            # Before it was locked, another program may have taken it for one that is abandoned.
+            if not _lock(file.fileno()) or os.fstat(file.fileno()).st_nlink == 0:
+                continue
+            try:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+                if fcntl is None:
+                    file.close()  # Windows renames no open file
+                os.replace(temporary, path)
+            except BaseException:
+                # What is left in its buffer may fail once more.
+                with contextlib.suppress(OSError):
+                    file.close()
+                temporary.unlink(missing_ok=True)
+                raise
+            return
+
+
+def _lock(descriptor: int, there: bool = True) -> bool:
+    """
+    :return: whether this process has the lock now; ``there`` where the file system has none
+    """
+    if fcntl is None:
+        return there
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return there
+    return True
+
+
+def remove_abandoned(folder: Path) -> None:
+    """
+    Remove the temporary files of this user in a folder whose writers are gone. What cannot be removed stays.
+
+    :param folder: the folder
+    """
+    names: list[str] = []
+    with contextlib.suppress(OSError):
+        names = os.listdir(folder)
+    for name in names:
+        if _NAME.fullmatch(name):
+            with contextlib.suppress(OSError):
+                _remove_if_abandoned(folder / name)
+
+
+def _remove_if_abandoned(path: Path) -> None:
+    facts = path.lstat()
+    if fcntl is None or not stat.S_ISREG(facts.st_mode) or facts.st_uid != os.geteuid() or facts.st_nlink != 1:
+        return
+    descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        if _lock(descriptor, there=False):
+            path.unlink()
+    finally:
+        os.close(descriptor)
