@@ -1,4 +1,4 @@
-"""What a run has logged is read as NumPy and Stable-Baselines3 read it. Hostile files: test_hostile_folders.py."""
+"""What a run has logged is read as NumPy and Stable-Baselines3 read it. Hostile files: test_hostile_zoo_files.py."""
 
 from pathlib import Path
 

@@ -2,7 +2,7 @@
 Hostile files in the places of all that the zoo's commands read: each is refused in one line, within a moment and some
 memory, or used; none runs code, writes elsewhere, imports what it names, or hangs.
 
-``python -m tests.test_hostile_folders FOLDER [WORD ...]`` throws the cases that have all the words in them, and prints
+``python -m tests.test_hostile_zoo_files FOLDER [WORD ...]`` throws the cases that have all the words in them, and prints
 a line of JSON for each.
 """
 
@@ -23,8 +23,8 @@ pytest.importorskip("seaborn")
 
 from sb3_sample import cli
 from sb3_sample.envs.base import select_gl_backend
-from tests import hostile_folders
-from tests.hostile_folders import (
+from tests import hostile_zoo_files
+from tests.hostile_zoo_files import (
     COMMANDS,
     ENV,
     EVAL,
@@ -52,14 +52,14 @@ def prepare(folder: Path) -> Path:
     os.chdir(folder)
     select_gl_backend()
     try:
-        hostile_folders.make()
+        hostile_zoo_files.make()
         used = folder.with_name("used")
         shutil.copytree(folder, used)
         os.chdir(used)
         # What is imported when it is needed does not count as taken by a hostile file.
         for name, command in COMMANDS.items():
             if name != "record":  # which needs a screen
-                hostile_folders.run(command)
+                hostile_zoo_files.run(command)
     finally:
         os.chdir(before)
         sys.argv = argv
@@ -258,7 +258,7 @@ def test_a_stored_trial_gives_what_was_searched(here: Path, capsys: pytest.Captu
 
     for name, storage in (
         ("trial", "sqlite:///study.db"),
-        ("trial of a journal", hostile_folders.journal("study.log")),
+        ("trial of a journal", hostile_zoo_files.journal("study.log")),
     ):
         params = optuna.load_study(storage=storage, study_name="s").trials[1].params
         cli.main(COMMANDS[name])
