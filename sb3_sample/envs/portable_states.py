@@ -8,6 +8,7 @@ by some tasks before they are computed anew, so that they are written too.
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -33,15 +34,33 @@ def pack(env: gym.Env) -> tuple[dict[str, Any], list[str]]:
     :return: its state; and what of it is not in it, because nothing is known about its class, as
         ``class of the layer: attribute (class)``: the state is all of it if there is nothing of this kind
     """
-    layers, simulator = layers_of(env), simulator_of(env)
-    describer = Describer([*layers, *(simulator or ()), *_physics(env)], _origin(simulator))
-    described, opaque = [], []
-    for layer in layers:
-        name = class_name(layer)
-        attributes, unknown = describer.attributes(layer, (*_SKIPPED, *_CLOCKS.get(name, ())))
-        described.append({"class": name, "attributes": attributes})
-        opaque += [f"{type(layer).__name__}: {what}" for what in unknown]
-    return {"layers": described, "simulator": None if simulator is None else _pack_simulator(*simulator)}, opaque
+    (state,), opaque = pack_all([env])
+    return state, opaque
+
+
+def pack_all(envs: Sequence[gym.Env]) -> tuple[list[dict[str, Any]], list[str]]:
+    """
+    :param envs: the environments of one process, which may share values, and the attributes of their classes
+    :return: their states; and what of them is not in it, as of :func:`pack`
+    """
+    describer = Describer(whole=True)
+    states, opaque = [], []
+    for env in envs:
+        layers, simulator = layers_of(env), simulator_of(env)
+        describer.enter([*layers, *(simulator or ()), *_physics(env)], _origin(simulator))
+        described = []
+        for layer in layers:
+            attributes, unknown = describer.attributes(layer, _skipped(layer))
+            described.append({"class": class_name(layer), "attributes": attributes})
+            opaque += [f"{type(layer).__name__}: {what}" for what in unknown]
+        classes, unknown = describer.classes()
+        opaque += unknown
+        states.append({
+            "layers": described,
+            "simulator": None if simulator is None else _pack_simulator(*simulator),
+            "classes": classes,
+        })  # fmt: skip
+    return states, opaque + describer.finish()
 
 
 def unpack(env: gym.Env, state: dict[str, Any]) -> None:
@@ -52,6 +71,24 @@ def unpack(env: gym.Env, state: dict[str, Any]) -> None:
     :param state: from :func:`pack`; it stays as it is
     :raises DoesNotFit: the environment was made in another way
     """
+    unpack_all([env], [state])
+
+
+def unpack_all(envs: Sequence[gym.Env], states: Sequence[dict[str, Any]]) -> None:
+    """
+    :param envs: environments made as those that were packed
+    :param states: from :func:`pack_all`; they stay as they are
+    :raises DoesNotFit: the environments were made in another way
+    """
+    restorer = Restorer()
+    for env, state in zip(envs, states, strict=True):
+        _unpack(env, state, restorer)
+    if restorer.kept:
+        # What they hold may decide what comes next.
+        raise DoesNotFit(f"{', '.join(restorer.kept)} name other files than the saved ones")
+
+
+def _unpack(env: gym.Env, state: dict[str, Any], restorer: Restorer) -> None:
     layers, simulator = layers_of(env), simulator_of(env)
     ours, theirs = [class_name(layer) for layer in layers], [layer["class"] for layer in state["layers"]]
     if ours != theirs:
@@ -60,12 +97,15 @@ def unpack(env: gym.Env, state: dict[str, Any]) -> None:
         raise DoesNotFit("only one of the environment and the saved one is simulated by MuJoCo")
     if simulator is not None:
         _unpack_simulator(*simulator, state["simulator"])
-    restorer = Restorer(_origin(simulator))
+    restorer.origin = _origin(simulator)
     for layer, saved in zip(layers, state["layers"], strict=True):
-        restorer.attributes(layer, saved["attributes"])
-    if restorer.kept:
-        # What they hold may decide what comes next.
-        raise DoesNotFit(f"{', '.join(restorer.kept)} name other files than the saved ones")
+        restorer.attributes(layer, saved["attributes"], _skipped(layer))
+    # Checkpoints of earlier versions are without.
+    restorer.classes(state.get("classes", {}))
+
+
+def _skipped(layer: Any) -> tuple[str, ...]:
+    return (*_SKIPPED, *_CLOCKS.get(class_name(layer), ()))
 
 
 def _physics(env: gym.Env) -> list[Any]:

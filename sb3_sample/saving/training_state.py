@@ -48,14 +48,17 @@ def _saved_elsewhere(model: BaseAlgorithm) -> set[str]:
     return {*modules, *model._excluded_save_params(), *DERIVED} - set(KEPT)
 
 
+def _skipped(model: BaseAlgorithm) -> set[str]:
+    return (_saved_elsewhere(model) | argument_names(type(model))) - set(KEPT)
+
+
 def save_attributes(model: BaseAlgorithm) -> dict[str, Node]:
     """
     :param model: the algorithm, at the end of a turn of its loop
     :return: everything that its turns change and that is not saved elsewhere
     :raises NotPortable: (a ``ValueError``) the action noise, or an attribute of a subclass, cannot be described
     """
-    skip = (_saved_elsewhere(model) | argument_names(type(model))) - set(KEPT)
-    described, opaque = Describer().attributes(model, skip)
+    described, opaque = Describer().attributes(model, _skipped(model))
     if opaque:
         raise NotPortable(f"{type(model).__name__} has attributes that a checkpoint cannot hold: {', '.join(opaque)}")
     return described
@@ -70,7 +73,7 @@ def restore_attributes(model: BaseAlgorithm, described: dict[str, Node]) -> None
         # How it is run is said by the present program; what "auto" once decided stays.
         described = {name: node for name, node in described.items() if name != "compiled"}
     restorer = Restorer()
-    restorer.attributes(model, described)
+    restorer.attributes(model, described, _skipped(model))
     if restorer.kept:
         raise DoesNotFit(f"{', '.join(restorer.kept)} name other files than this program")
 

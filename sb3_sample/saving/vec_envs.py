@@ -7,6 +7,7 @@ hold of the environment in this way and puts a helper into it, whose methods ``e
 processes values are pickled, as always there; in the files they are not.
 """
 
+import random
 import signal
 import warnings
 from collections.abc import Iterator
@@ -14,9 +15,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 
-from sb3_sample.envs.portable_states import HELPER, pack, unpack
+from sb3_sample.envs.portable_states import HELPER, pack, pack_all, unpack, unpack_all
 from sb3_sample.envs.workers import SupervisedSubprocVecEnv
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name
 
@@ -41,12 +43,17 @@ class _Helper:
         self._sigint: Any = None
 
     def pack(self) -> tuple[dict[str, Any], list[str]]:
-        return pack(self._env)
+        state, opaque = pack(self._env)
+        # Of this process, in which nobody else saves them.
+        return {**state, "generators": _global_generators()}, opaque
 
     def unpack(self, state: dict[str, Any]) -> str | None:
         # An exception would end the worker.
         try:
             unpack(self._env, state)
+            # Checkpoints of earlier versions, and of environments in the training's process, are without.
+            if "generators" in state:
+                _restore_global_generators(state["generators"])
         except DoesNotFit as error:
             return str(error)
         return None
@@ -64,6 +71,26 @@ class _Helper:
 
     def __call__(self, method: str, *args: Any) -> Any:
         return getattr(self, method)(*args)
+
+
+def _global_generators() -> dict[str, Any]:
+    """The generators of this process, as objects that are written in few bytes."""
+    python, numpy = random.Random(), np.random.RandomState()
+    python.setstate(random.getstate())
+    numpy.set_state(np.random.get_state())  # noqa: NPY002  # the one that environments draw from
+    return {"python": python, "numpy": numpy, "torch": torch.get_rng_state()}
+
+
+def _restore_global_generators(state: Any) -> None:
+    kinds = {"python": random.Random, "numpy": np.random.RandomState, "torch": torch.Tensor}
+    if not isinstance(state, dict) or {name: type(value) for name, value in state.items()} != kinds:
+        raise DoesNotFit("the generators of a worker are not described as they must be")
+    try:
+        torch.set_rng_state(state["torch"])
+    except (RuntimeError, TypeError) as error:
+        raise DoesNotFit(f"the state of torch's generator in a worker is none: {error}") from error
+    random.setstate(state["python"].getstate())
+    np.random.set_state(state["numpy"].get_state())  # noqa: NPY002
 
 
 class _AttachType(type):
@@ -151,30 +178,57 @@ def save(venv: VecEnv) -> tuple[dict[str, Any], list[str]]:
     """
     innermost = venv.unwrapped
     missing: list[str] = []
-    describer = Describer([venv, innermost, *_wrappers(venv)])
+    describer = Describer([venv, innermost, *_wrappers(venv)], whole=True)
     wrappers = []
     for wrapper in _wrappers(venv):
         attributes, opaque = describer.attributes(wrapper, _SKIPPED)
         wrappers.append({"class": class_name(wrapper), "attributes": attributes})
         missing += [f"{type(wrapper).__name__}: {what}" for what in opaque]
+    classes, opaque = describer.classes()
+    missing += [*opaque, *describer.finish()]
     state: dict[str, Any] = {
         "wrappers": wrappers,
+        "classes": classes,
         "seeds": list(innermost._seeds),
         "options": list(innermost._options),
         "environments": None,
         # What a worker's episode is cut off with, should it die.
         "last": innermost.last_observations if isinstance(innermost, SupervisedSubprocVecEnv) else None,
     }
-    packed = call(venv, "pack")
+    packed, opaque = _pack(innermost)
     if packed is None:
         kind = class_name(innermost)
         reason = "an environment in a worker needs a wrapper, such as Monitor, to be reached"
         missing.append(reason if isinstance(innermost, SubprocVecEnv) else f"{kind} is not known")
     else:
-        missing += sorted({what for _, opaque in packed for what in opaque})
+        missing += sorted(set(opaque))
         if not missing:
-            state["environments"] = [packed_state for packed_state, _ in packed]
+            state["environments"] = packed
     return state, missing
+
+
+def _pack(innermost: VecEnv) -> tuple[list[dict[str, Any]] | None, list[str]]:
+    """The states of the environments, and what is not in them; None if they cannot be reached."""
+    if isinstance(innermost, DummyVecEnv):
+        return pack_all(innermost.envs)
+    answers = call(innermost, "pack")
+    if answers is None:
+        return None, []
+    return [state for state, _ in answers], [what for _, opaque in answers for what in opaque]
+
+
+def _unpack(innermost: VecEnv, states: list[dict[str, Any]]) -> list[str]:
+    """Why they do not fit, if they do not."""
+    if isinstance(innermost, DummyVecEnv):
+        try:
+            unpack_all(innermost.envs, states)
+        except DoesNotFit as error:
+            return [str(error)]
+        return []
+    answers = call(innermost, "unpack", states)
+    if answers is None:
+        return [f"{class_name(innermost)} cannot be reached"]
+    return [answer for answer in answers if answer is not None]
 
 
 def restore(venv: VecEnv, state: dict[str, Any]) -> list[str]:
@@ -193,7 +247,8 @@ def restore(venv: VecEnv, state: dict[str, Any]) -> list[str]:
         raise DoesNotFit(f"the environment is wrapped in {ours}, the saved one in {theirs}")
     restorer = Restorer()
     for wrapper, saved in zip(wrappers, state["wrappers"], strict=True):
-        restorer.attributes(wrapper, saved["attributes"])
+        restorer.attributes(wrapper, saved["attributes"], _SKIPPED)
+    restorer.classes(state.get("classes", {}))
     if restorer.kept:
         warnings.warn(
             f"{', '.join(restorer.kept)} of the checkpoint name other files, and stay as they are", stacklevel=5
@@ -203,10 +258,7 @@ def restore(venv: VecEnv, state: dict[str, Any]) -> list[str]:
     innermost._seeds, innermost._options = list(state["seeds"]), list(state["options"])
     if state["environments"] is None:
         return ["they are not in the checkpoint"]
-    answers = call(venv, "unpack", state["environments"])
-    if answers is None:
-        return [f"{class_name(innermost)} cannot be reached"]
-    return [answer for answer in answers if answer is not None]
+    return _unpack(innermost, state["environments"])
 
 
 def set_sigint_ignored(venv: VecEnv, ignored: bool) -> None:
