@@ -254,6 +254,18 @@ class ClassAttributes(Curriculum):
         return float(sum(self.history[-5:]) + self.episodes + self.level + drawn + self.helper.call() + self.newest)  # type: ignore[attr-defined]
 
 
+class Counting(Kind):
+    """Has a constant of its class, and a number that changes."""
+
+    n, limit = 0, 3
+
+    def begin(self, seed: int | None) -> None:
+        type(self).n += 1
+
+    def number(self) -> float:
+        return 0.0
+
+
 # ---------------------------------------------------------------- global generators
 
 
