@@ -20,7 +20,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_sample import SupervisedSubprocVecEnv
 from tests.sac.common import sac
@@ -190,6 +190,33 @@ class Closure(Kind):
         return self.add() + self.calls() + self.draw() + self.of_itself() + self.again()
 
 
+class Wrapped(Kind):
+    """In a vectorised wrapper with state of these kinds (:class:`Noisy`)."""
+
+    def number(self) -> float:
+        return 0.0
+
+
+class Noisy(VecEnvWrapper):
+    n_steps = 0.0
+
+    def __init__(self, venv: VecEnv):
+        super().__init__(venv)
+        self.draw = np.random.default_rng(3).uniform
+        self.add = counter()
+        self.state = np.zeros(3)
+        self.first = self.state[:1]
+
+    def reset(self) -> Any:
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        observations, rewards, dones, infos = self.venv.step_wait()
+        type(self).n_steps += 1
+        self.first += self.draw()
+        return observations + np.float32(self.state.sum() + self.add() + self.n_steps), rewards, dones, infos
+
+
 # ---------------------------------------------------------------- slots and classes
 
 
@@ -354,6 +381,8 @@ def environments(cls: type[Kind], workers: str) -> Any:
         shared = np.zeros(2), np.random.default_rng(3)
         return DummyVecEnv([lambda: Monitor(cls(*shared)) for _ in range(2)])
     makers: list[Callable[[], gym.Env]] = [lambda: Monitor(cls()) for _ in range(2)]
+    if cls is Wrapped:
+        return Noisy(DummyVecEnv(makers))
     if workers == "dummy":
         return DummyVecEnv(makers)
     venv = SupervisedSubprocVecEnv if workers == "supervised" else SubprocVecEnv

@@ -27,6 +27,7 @@ RESTORED: dict[str, tuple[str, ...]] = {
     "BoundMethod": ("dummy", "workers"),
     "Partial": ("dummy",),
     "Closure": ("dummy", "workers"),
+    "Wrapped": ("dummy",),
     "Slots": ("dummy",),
     "ClassAttributes": ("workers", "dummy"),
     "Globals": ("dummy", "workers", "supervised"),
