@@ -8,6 +8,8 @@ come from the tree. What is shared between attributes, as a random generator oft
 import collections
 import copy
 import enum
+import functools
+import inspect
 import pathlib
 import random
 import types
@@ -18,6 +20,9 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from sb3_sample.saving.classes import may_be_set
+from sb3_sample.saving.hashes import distinct_hashes, part_name
+from sb3_sample.saving.moments import check_moments
 from sb3_sample.saving.places import is_elsewhere, is_moved
 
 _CONSTANTS = (type(None), bool, int, float, complex, str, bytes, np.generic, np.dtype, torch.dtype, torch.device)
@@ -105,6 +110,21 @@ def without_generators(space: gym.Space) -> gym.Space:
     for part in _generators_of(bare):
         part._np_random = None
     return bare
+
+
+def _is_opaque(value: Any) -> bool:
+    """Whether a value is more than its attributes, so that none of them is described."""
+    foreign = isinstance(value, (gym.Env, *_CONTAINERS)) or _in(value, _FOREIGN_MODULES)
+    return foreign or not hasattr(value, "__dict__")
+
+
+def _may_have(owner: Any, name: str) -> bool:
+    """
+    Whether an object can have an attribute: one that is there, or comes in the course of its life, and is never what
+    its class does, but for a value that a class keeps once it is computed.
+    """
+    kept = isinstance(inspect.getattr_static(type(owner), name, None), functools.cached_property)
+    return name in vars(owner) or may_be_set(type(owner), name) or kept
 
 
 class Describer:
@@ -200,8 +220,7 @@ class Describer:
             return {"inert": class_name(value)}
         if _has_state_dict(value):
             return {"state_dict": self.describe(value.state_dict())}
-        foreign = isinstance(value, (gym.Env, *_CONTAINERS)) or _in(value, _FOREIGN_MODULES)
-        if foreign or not hasattr(value, "__dict__"):
+        if _is_opaque(value):
             raise Opaque(class_name(value))
         return {"object": class_name(value), "attributes": {k: self.describe(v) for k, v in vars(value).items()}}
 
@@ -210,28 +229,41 @@ class Restorer:
     """
     Gives objects the attributes that trees describe.
 
+    :param inert: as of the :class:`Describer`, the same objects in this process
     :param origin: as of the :class:`Describer`, the same memory in this process
     """
 
-    def __init__(self, origin: int | None = None) -> None:
+    def __init__(self, inert: Collection[Any] = (), origin: int | None = None) -> None:
         self._origin = origin
+        self._inert = {id(value) for value in inert}
         self._made: dict[int, Any] = {}
         #: Attributes that stayed as they are, since the tree names other files in them.
         self.kept: list[str] = []
 
-    def attributes(self, owner: Any, described: dict[str, Node]) -> None:
+    def attributes(self, owner: Any, described: dict[str, Node], skip: Collection[str] = ()) -> None:
         """
         :param owner: the object, made as the one that was described
         :param described: from :meth:`Describer.attributes`
-        :raises DoesNotFit: it is of another class, or was made in another way
+        :param skip: names of attributes that were left out
+        :raises DoesNotFit: it is of another class, or was made in another way; or an attribute is described that never
+            is
         """
         own = vars(owner)
         for name, node in described.items():
-            if is_elsewhere(name, node, own.get(name)):
-                if not is_moved(node, own.get(name)):
+            present, whole = own.get(name), part_name(type(owner).__name__, f".{name}")
+            if name in skip or not _may_have(owner, name):
+                raise DoesNotFit(f"{name!r:.100} is not saved of a {type(owner).__name__}")
+            if is_elsewhere(name, node, present):
+                if not is_moved(node, present):
                     self.kept.append(f"{type(owner).__name__}.{name}")
                 continue
-            own[name] = self.restore(node, own.get(name), f"{type(owner).__name__}.{name}")
+            value = self.restore(node, present, whole)
+            if self._is_inert(present) and value is not present:
+                raise DoesNotFit(f"{whole} is a {class_name(present)}, which stays as it is")
+            own[name] = value
+
+    def _is_inert(self, value: Any) -> bool:
+        return id(value) in self._inert or is_inert(value)
 
     def restore(self, node: Node, present: Any, name: str) -> Any:
         """
@@ -242,9 +274,14 @@ class Restorer:
         :raises DoesNotFit: ``present`` is not of the kind that was described
         """
         if "same" in node:
-            if node["same"] not in self._made:
+            if type(node["same"]) is not int or node["same"] not in self._made:
                 raise DoesNotFit(f"{name} refers to something that is not there")
             return self._made[node["same"]]
+        if self._is_inert(present) and "inert" not in node:
+            raise DoesNotFit(f"{name} is a {class_name(present)}, which stays as it is")
+        # Counted up when it was written, so that each has a hash of its own.
+        if type(node.get("id", 0)) is not int or not 0 <= node.get("id", 0) < 2**60:
+            raise DoesNotFit(f"{name} cannot have the number {node['id']!r:.50}")
         value = self._restore(node, present, name)
         if "id" in node:
             self._made[node["id"]] = value
@@ -281,12 +318,12 @@ class Restorer:
             case {"list": items}:
                 old = present if isinstance(present, list) and len(present) == len(items) else [None] * len(items)
                 made: list[Any] = early([])
-                made.extend(self.restore(item, old[i], f"{name}[{i}]") for i, item in enumerate(items))
+                made.extend(self.restore(item, old[i], part_name(name, f"[{i}]")) for i, item in enumerate(items))
                 return made
             case {"tuple": items, "of": what}:
                 need(what == "builtins.tuple" or class_name(present) == what, what)
                 parts = present if isinstance(present, tuple) and len(present) == len(items) else (None,) * len(items)
-                values = [self.restore(item, parts[i], f"{name}[{i}]") for i, item in enumerate(items)]
+                values = [self.restore(item, parts[i], part_name(name, f"[{i}]")) for i, item in enumerate(items)]
                 # Named tuples take their items one by one.
                 return tuple(values) if what == "builtins.tuple" else type(present)(*values)
             case {"deque": items, "maxlen": maxlen}:
@@ -300,9 +337,9 @@ class Restorer:
                     mapping = copy.copy(present)
                     mapping.clear()
                 early(mapping)
-                for key_node, item in items:
-                    key = self.restore(key_node, None, name)
-                    mapping[key] = self.restore(item, before.get(key), f"{name}[{key!r}]")
+                keys = distinct_hashes([self.restore(key, None, name) for key, _ in items], name)
+                for key, (_, item) in zip(keys, items, strict=True):
+                    mapping[key] = self.restore(item, before.get(key), part_name(name, f"[{key!r:.100}]"))
                 return mapping
             case {"space": generators}:
                 need(isinstance(present, gym.Space), "a space")
@@ -313,13 +350,16 @@ class Restorer:
                 return present
             case {"state_dict": state}:
                 need(_has_state_dict(present), "something with load_state_dict")
-                present.load_state_dict(self.restore(state, None, name))
+                restored = self.restore(state, None, name)
+                if isinstance(present, torch.optim.Optimizer):
+                    check_moments(present, restored, name)
+                present.load_state_dict(restored)
                 return present
             case {"inert": what}:
                 need(class_name(present) == what, what)
                 return present
             case {"object": what, "attributes": attributes}:
-                need(class_name(present) == what, what)
+                need(class_name(present) == what and not _is_opaque(present), what)
                 early(present)
                 self.attributes(present, attributes)
                 return present
