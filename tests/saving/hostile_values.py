@@ -155,7 +155,7 @@ def too_much(original: Original, most: int) -> Iterator[tuple[str, bytes, str]]:
     :param original: a good file
     :param most: bytes that its JSON may have
     """
-    for piece in (b"[],", b"{},", b"0,", b'"",', b'{"a":0},', b"[[[0]]],"):
+    for piece in (b"[],", b"0,", b'{"a":0},'):
         data = b"[" + piece * ((most - 1000) // len(piece)) + b"0]"
         yield f"{most} bytes of {piece!r}", with_entries(original, data=data), "its JSON holds .* values, more than"
     for n in (49_000, 60_000, 300_000):
@@ -171,7 +171,8 @@ def too_much(original: Original, most: int) -> Iterator[tuple[str, bytes, str]]:
 
 #: Of the decoded state of a checkpoint: what it consists of is plain values.
 STATE: tuple[tuple[Place, Any, str], ...] = (
-    *((("attributes", "_updates_owed"), {"value": value}, "_updates_owed must lie in") for value in (1e9, -1e9, math.nan)),
+    *((("attributes", "_updates_owed"), {"value": value}, "_updates_owed must lie in")
+      for value in (1e9, -1e9, math.nan)),
     *((("attributes", "num_timesteps"), {"value": value}, "num_timesteps must be|its state is of step")
       for value in (-(10**9), 0.5, 29, 10**9)),
     (("attributes", "num_transitions"), {"value": -5}, "num_transitions must be"),
@@ -188,8 +189,9 @@ STATE: tuple[tuple[Place, Any, str], ...] = (
     (("generators", "python"), (3, (0,) * 624 + (10**9,), None), "generator of Python"),
     (("generators", "python"), (3, (0,) * 624 + (1,), "x"), "generator of Python"),
     *((("env", "wrappers", 0, "attributes", name), {"value": value}, f"{name} of a VecNormalize must be")
-      for name, values in (("clip_obs", (-5, 0, math.nan)), ("clip_reward", (-5, 0, math.nan)), ("gamma", (7, math.nan)),
-                           ("epsilon", (-1e9, math.nan)), ("returns", (np.array([math.nan]),)), ("training", ("x",)))
+      for name, values in (("clip_obs", (-5, 0, math.nan)), ("clip_reward", (-5, 0, math.nan)),
+                           ("gamma", (7, math.nan)), ("epsilon", (-1e9, math.nan)),
+                           ("returns", (np.array([math.nan]),)), ("training", ("x",)))
       for value in values),
     *((("env", "wrappers", 0, "attributes", name, "attributes", key), {"value": value}, words)
       for name, key, value, words in (
