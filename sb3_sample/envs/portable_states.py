@@ -47,7 +47,7 @@ def pack_all(envs: Sequence[gym.Env]) -> tuple[list[dict[str, Any]], list[str]]:
     states, opaque = [], []
     for env in envs:
         layers, simulator = layers_of(env), simulator_of(env)
-        describer.enter([*layers, *(simulator or ()), *_physics(env)], _origin(simulator))
+        describer.enter(_saved_otherwise(env), _origin(simulator))
         described = []
         for layer in layers:
             attributes, unknown = describer.attributes(layer, _skipped(layer))
@@ -97,11 +97,16 @@ def _unpack(env: gym.Env, state: dict[str, Any], restorer: Restorer) -> None:
         raise DoesNotFit("only one of the environment and the saved one is simulated by MuJoCo")
     if simulator is not None:
         _unpack_simulator(*simulator, state["simulator"])
-    restorer.origin = _origin(simulator)
+    restorer.enter(_saved_otherwise(env), _origin(simulator))
     for layer, saved in zip(layers, state["layers"], strict=True):
         restorer.attributes(layer, saved["attributes"], _skipped(layer))
     # Checkpoints of earlier versions are without.
     restorer.classes(state.get("classes", {}))
+
+
+def _saved_otherwise(env: gym.Env) -> list[Any]:
+    """Objects that are no attributes' values: each layer, and the simulator."""
+    return [*layers_of(env), *(simulator_of(env) or ()), *_physics(env)]
 
 
 def _skipped(layer: Any) -> tuple[str, ...]:
@@ -135,21 +140,35 @@ def _unpack_simulator(model: Any, data: Any, state: dict[str, Any]) -> None:
     import mujoco
 
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
-    wrong = [
-        f"{name} {getattr(owner, name).shape} instead of {array.shape}"
-        for owner, part in ((model, "model"), (data, "data"))
-        for name, array in state[part].items()
-        if getattr(owner, name).shape != array.shape
-    ]
-    if mujoco.mj_stateSize(model, kind) != len(state["integration"]) or wrong:
-        raise DoesNotFit(f"the environment has another MuJoCo model than the saved one: {', '.join(wrong[:3])}")
-    for name, array in state["model"].items():
-        getattr(model, name)[...] = array
+    owners = {"model": (model, model_arrays()), "data": (data, _data_arrays())}
+    if state.keys() != {"integration", *owners}:
+        raise DoesNotFit("the state of the simulator is not what is saved of one")
+    _check_like(np.empty(mujoco.mj_stateSize(model, kind)), state["integration"], "integration")
+    for part, (owner, names) in owners.items():
+        # What is an index in MuJoCo's memory is never written, and would not be looked at by MuJoCo.
+        if not isinstance(state[part], dict) or state[part].keys() != set(names):
+            raise DoesNotFit(f"the arrays of the simulator's {part} are not those that are saved of one")
+        for name in names:
+            _check_like(getattr(owner, name), state[part][name], name)
+    for name in model_arrays():
+        getattr(model, name)[...] = state["model"][name]
     mujoco.mj_setState(model, data, state["integration"], kind)
     # Contacts and constraints, which dm_control computes at the end of a step for the next one.
     mujoco.mj_step1(model, data)
-    for name, array in state["data"].items():
-        getattr(data, name)[...] = array
+    for name in _data_arrays():
+        getattr(data, name)[...] = state["data"][name]
+
+
+def _check_like(own: np.ndarray, array: Any, name: str) -> None:
+    """An array of the simulator, to be put in the place of its own."""
+    if not isinstance(array, np.ndarray) or array.shape != own.shape or array.dtype != own.dtype:
+        saved = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else f"{array!r:.50}"
+        raise DoesNotFit(
+            f"the environment has another MuJoCo model than the saved one: {name} {own.dtype} {own.shape} instead of "
+            f"{saved}"
+        )
+    if not np.isfinite(array).all():
+        raise DoesNotFit(f"{name} of the simulator holds what is not finite")
 
 
 @functools.cache

@@ -29,6 +29,8 @@ import torch
 
 from sb3_sample.saving.classes import may_be_set
 from sb3_sample.saving.functions import FUNCTIONS, OtherKind, held, holding, name_of
+from sb3_sample.saving.hashes import distinct_hashes, part_name
+from sb3_sample.saving.moments import check_moments
 from sb3_sample.saving.places import is_elsewhere, is_moved
 from sb3_sample.saving.shared_memory import as_array, block_of, group, view_at
 
@@ -131,11 +133,6 @@ def attributes_of(owner: Any) -> dict[str, Any]:
     return {**slots, **getattr(owner, "__dict__", {})}
 
 
-def _may_have(cls: type, name: str) -> bool:
-    """Whether an object of a class may get a plain attribute of a name that it did not have."""
-    return may_be_set(cls, name) or isinstance(inspect.getattr_static(cls, name, None), functools.cached_property)
-
-
 def _keeps_more(cls: type) -> bool:
     """Whether objects of a class have a state besides their attributes: in memory that a library in C has added."""
     n_pointers = len(_slots(cls)) + (cls.__dictoffset__ > 0) + (cls.__weakrefoffset__ > 0)
@@ -181,6 +178,22 @@ def without_generators(space: gym.Space) -> gym.Space:
     for part in _generators_of(bare):
         part._np_random = None
     return bare
+
+
+def _is_opaque(value: Any) -> bool:
+    """Whether a value is more than its attributes, so that none of them is described."""
+    foreign = isinstance(value, (gym.Env, *_CONTAINERS)) or _in(value, _FOREIGN_MODULES)
+    return foreign or _keeps_more(type(value)) or not (hasattr(value, "__dict__") or _slots(type(value)))
+
+
+def _may_have(owner: Any, name: str) -> bool:
+    """
+    Whether an object can have an attribute: one that is there, or comes in the course of its life, and is never what
+    its class does, but for a value that a class keeps once it is computed.
+    """
+    kept = isinstance(inspect.getattr_static(type(owner), name, None), functools.cached_property)
+    known = name in attributes_of(owner) or name in _slots(type(owner))
+    return known or may_be_set(type(owner), name) or kept
 
 
 class Describer:
@@ -377,8 +390,7 @@ class Describer:
             # Its tensors are loaded into those that are there, which share what they shared.
             del self._arrays[n_arrays:]
             return node
-        foreign = isinstance(value, (gym.Env, *_CONTAINERS)) or _in(value, _FOREIGN_MODULES)
-        if foreign or _keeps_more(type(value)) or not (hasattr(value, "__dict__") or _slots(type(value))):
+        if _is_opaque(value):
             raise Opaque(class_name(value))
         self._note_classes(value)
         attributes = {name: self.describe(item) for name, item in attributes_of(value).items()}
@@ -397,29 +409,42 @@ class Describer:
 class Restorer:
     """
     Gives objects the attributes that trees describe.
+
+    :param inert: as of the :class:`Describer`, the same objects in this process
     """
 
-    def __init__(self) -> None:
-        #: Address of memory that is restored elsewhere, as of :meth:`Describer.enter`.
-        self.origin: int | None = None
+    def __init__(self, inert: Collection[Any] = ()) -> None:
+        self._inert = {id(value) for value in (*_GLOBAL, *inert)}
+        self._origin: int | None = None
         self._made: dict[int, Any] = {}
         self._blocks: dict[int, np.ndarray] = {}
         self._classes: dict[str, type] = {}
         #: Attributes that stayed as they are, since the tree names other files in them.
         self.kept: list[str] = []
 
+    def enter(self, inert: Collection[Any], origin: int | None) -> None:
+        """
+        Go on to further objects, as of :meth:`Describer.enter`.
+
+        :param inert: the same objects in this process
+        :param origin: the same memory in this process
+        """
+        self._inert |= {id(value) for value in inert}
+        self._origin = origin
+
     def attributes(self, owner: Any, described: dict[str, Node], skip: Collection[str] = ()) -> None:
         """
         :param owner: the object, made as the one that was described
         :param described: from :meth:`Describer.attributes`
-        :param skip: as there
-        :raises DoesNotFit: it is of another class, or was made in another way
+        :param skip: names of attributes that were left out
+        :raises DoesNotFit: it is of another class, or was made in another way; or an attribute is described that never
+            is
         """
         own, slots = attributes_of(owner), _slots(type(owner))
         self._classes.update((f"{cls.__module__}.{cls.__qualname__}", cls) for cls in _classes_of(owner))
         for name in described:
-            if name in skip or not (name in own or name in slots or _may_have(type(owner), name)):
-                raise DoesNotFit(f"{name!r:.100} is not saved of {class_name(owner)}")
+            if name in skip or not _may_have(owner, name):
+                raise DoesNotFit(f"{name!r:.100} is not saved of a {type(owner).__name__}")
         for name, value in self._restored(described, own, type(owner).__name__):
             if name in slots:
                 slots[name].__set__(owner, value)
@@ -429,9 +454,10 @@ class Restorer:
     def _restored(self, described: dict[str, Node], own: dict[str, Any], place: str) -> Iterator[tuple[str, Any]]:
         """What was described by name, without what names other files than what is there."""
         for name, node in described.items():
-            if not is_elsewhere(name, node, own.get(name)):
-                yield name, self.restore(node, own.get(name), f"{place}.{name}")
-            elif not is_moved(node, own.get(name)):
+            present = own.get(name)
+            if not is_elsewhere(name, node, present):
+                yield name, self.restore(node, present, part_name(place, f".{name}"))
+            elif not is_moved(node, present):
                 self.kept.append(f"{place}.{name}")
 
     def classes(self, described: dict[str, dict[str, Node]]) -> None:
@@ -450,6 +476,9 @@ class Restorer:
             for name, value in self._restored(attributes, data, cls.__name__):
                 setattr(cls, name, value)
 
+    def _is_inert(self, value: Any) -> bool:
+        return id(value) in self._inert or is_inert(value)
+
     def restore(self, node: Node, present: Any, name: str) -> Any:
         """
         :param node: from :meth:`Describer.describe`
@@ -459,16 +488,20 @@ class Restorer:
         :raises DoesNotFit: ``present`` is not of the kind that was described
         """
         if "same" in node:
-            if node["same"] not in self._made:
+            if type(node["same"]) is not int or node["same"] not in self._made:
                 raise DoesNotFit(f"{name} refers to something that is not there")
             value = self._made[node["same"]]
         else:
+            if self._is_inert(present) and not {"inert", "function"} & node.keys():
+                raise DoesNotFit(f"{name} is a {class_name(present)}, which stays as it is")
+            # Counted up when it was written, so that each has a hash of its own.
+            if type(node.get("id", 0)) is not int or not 0 <= node.get("id", 0) < 2**60:
+                raise DoesNotFit(f"{name} cannot have the number {node['id']!r:.50}")
             value = self._restore(node, present, name)
-        if isinstance(present, (types.ModuleType, *FUNCTIONS)) and type(value) is not type(present):
-            # What is called is never data.
-            raise DoesNotFit(f"{name} is {class_name(present)}, but was {class_name(value)}")
-        if "same" in node:
-            return value
+        # A function may be bound to another object of the same kind.
+        rebound = isinstance(present, FUNCTIONS) and type(value) is type(present) and id(present) not in self._inert
+        if self._is_inert(present) and value is not present and not rebound:
+            raise DoesNotFit(f"{name} is a {class_name(present)}, which stays as it is")
         if "id" in node:
             self._made[node["id"]] = value
         return value
@@ -496,7 +529,7 @@ class Restorer:
                 return self._function(early(present), holds, name)
             case {"view": place}:
                 there = isinstance(present, np.ndarray) and is_view_of_foreign_memory(present)
-                fits = there and self.origin is not None and _place(present, self.origin) == list(place)
+                fits = there and self._origin is not None and _place(present, self._origin) == list(place)
                 need(fits, f"a view of the simulator's memory at {place}")
                 return present
             case {"enum": member}:
@@ -509,12 +542,12 @@ class Restorer:
             case {"list": items}:
                 old = present if isinstance(present, list) and len(present) == len(items) else [None] * len(items)
                 made: list[Any] = early([])
-                made.extend(self.restore(item, old[i], f"{name}[{i}]") for i, item in enumerate(items))
+                made.extend(self.restore(item, old[i], part_name(name, f"[{i}]")) for i, item in enumerate(items))
                 return made
             case {"tuple": items, "of": what}:
                 need(what == "builtins.tuple" or class_name(present) == what, what)
                 parts = present if isinstance(present, tuple) and len(present) == len(items) else (None,) * len(items)
-                values = [self.restore(item, parts[i], f"{name}[{i}]") for i, item in enumerate(items)]
+                values = [self.restore(item, parts[i], part_name(name, f"[{i}]")) for i, item in enumerate(items)]
                 # Named tuples take their items one by one.
                 return tuple(values) if what == "builtins.tuple" else type(present)(*values)
             case {"deque": items, "maxlen": maxlen}:
@@ -528,9 +561,9 @@ class Restorer:
                     mapping = copy.copy(present)
                     mapping.clear()
                 early(mapping)
-                for key_node, item in items:
-                    key = self.restore(key_node, None, name)
-                    mapping[key] = self.restore(item, before.get(key), f"{name}[{key!r}]")
+                keys = distinct_hashes([self.restore(key, None, name) for key, _ in items], name)
+                for key, (_, item) in zip(keys, items, strict=True):
+                    mapping[key] = self.restore(item, before.get(key), part_name(name, f"[{key!r:.100}]"))
                 return mapping
             case {"space": generators}:
                 need(isinstance(present, gym.Space), "a space")
@@ -541,13 +574,16 @@ class Restorer:
                 return present
             case {"state_dict": state}:
                 need(_has_state_dict(present), "something with load_state_dict")
-                present.load_state_dict(self.restore(state, None, name))
+                restored = self.restore(state, None, name)
+                if isinstance(present, torch.optim.Optimizer):
+                    check_moments(present, restored, name)
+                present.load_state_dict(restored)
                 return present
             case {"inert": what}:
                 need(class_name(present) == what, what)
                 return present
             case {"object": what, "attributes": attributes}:
-                need(class_name(present) == what, what)
+                need(class_name(present) == what and not _is_opaque(present), what)
                 early(present)
                 self.attributes(present, attributes)
                 return present

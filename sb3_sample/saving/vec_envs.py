@@ -16,19 +16,18 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_sample.envs.portable_states import HELPER, pack, pack_all, unpack, unpack_all
 from sb3_sample.envs.workers import SupervisedSubprocVecEnv
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name
+from sb3_sample.saving.statistics import ARGUMENTS, check_normalization, shapes_of
 
 #: Of each wrapper: what leads elsewhere, what is an argument, and clocks, which count from when it was made.
 _SKIPPED = (
     "venv", "class_attributes", "observation_space", "action_space", "num_envs", "render_mode", "metadata",
     "reset_infos", "_seeds", "_options", "t_start",
 )  # fmt: skip
-#: Arguments by which VecNormalize computes what the model sees.
-_NORMALIZATION = ("norm_obs", "norm_reward", "clip_obs", "clip_reward", "gamma", "epsilon", "norm_obs_keys", "training")
 
 
 class _Helper:
@@ -47,7 +46,7 @@ class _Helper:
         # Of this process, in which nobody else saves them.
         return {**state, "generators": _global_generators()}, opaque
 
-    def unpack(self, state: dict[str, Any]) -> str | None:
+    def unpack(self, state: dict[str, Any]) -> tuple[str, str] | None:
         # An exception would end the worker.
         try:
             unpack(self._env, state)
@@ -55,7 +54,9 @@ class _Helper:
             if "generators" in state:
                 _restore_global_generators(state["generators"])
         except DoesNotFit as error:
-            return str(error)
+            return "does not fit", str(error)
+        except Exception as error:
+            return "is damaged", f"{type(error).__name__}: {error!s:.500}"
         return None
 
     def spec(self) -> list[str]:
@@ -164,7 +165,7 @@ def fingerprint(venv: VecEnv) -> dict[str, Any]:
     made: dict[str, Any] = {"n_envs": venv.num_envs, "wrappers": [class_name(wrapper) for wrapper in _wrappers(venv)]}
     for wrapper in _wrappers(venv):
         if class_name(wrapper).endswith(".VecNormalize"):
-            made["VecNormalize"] = {name: getattr(wrapper, name) for name in _NORMALIZATION}
+            made["VecNormalize"] = {name: getattr(wrapper, name) for name in ARGUMENTS}
     specs = call(venv, "spec")
     if specs is not None:
         made["environments"] = specs
@@ -178,7 +179,7 @@ def save(venv: VecEnv) -> tuple[dict[str, Any], list[str]]:
     """
     innermost = venv.unwrapped
     missing: list[str] = []
-    describer = Describer([venv, innermost, *_wrappers(venv)], whole=True)
+    describer = Describer([innermost, *_wrappers(venv)], whole=True)
     wrappers = []
     for wrapper in _wrappers(venv):
         attributes, opaque = describer.attributes(wrapper, _SKIPPED)
@@ -228,7 +229,10 @@ def _unpack(innermost: VecEnv, states: list[dict[str, Any]]) -> list[str]:
     answers = call(innermost, "unpack", states)
     if answers is None:
         return [f"{class_name(innermost)} cannot be reached"]
-    return [answer for answer in answers if answer is not None]
+    for answer in answers:
+        if answer is not None and answer[0] == "is damaged":
+            raise ValueError(f"the state of an environment is none: {answer[1]}")
+    return [answer[1] for answer in answers if answer is not None]
 
 
 def restore(venv: VecEnv, state: dict[str, Any]) -> list[str]:
@@ -245,9 +249,14 @@ def restore(venv: VecEnv, state: dict[str, Any]) -> list[str]:
     ours, theirs = [class_name(wrapper) for wrapper in wrappers], [saved["class"] for saved in state["wrappers"]]
     if ours != theirs:
         raise DoesNotFit(f"the environment is wrapped in {ours}, the saved one in {theirs}")
-    restorer = Restorer()
+    restorer = Restorer([innermost, *wrappers])
     for wrapper, saved in zip(wrappers, state["wrappers"], strict=True):
+        before = _shapes(wrapper)
         restorer.attributes(wrapper, saved["attributes"], _SKIPPED)
+        if isinstance(wrapper, VecNormalize):
+            check_normalization(vars(wrapper), "the checkpoint")
+            if _shapes(wrapper) != before:
+                raise DoesNotFit(f"the statistics of VecNormalize are of the shapes {_shapes(wrapper)}, not {before}")
     restorer.classes(state.get("classes", {}))
     if restorer.kept:
         warnings.warn(
@@ -255,10 +264,27 @@ def restore(venv: VecEnv, state: dict[str, Any]) -> list[str]:
         )
     if isinstance(innermost, SupervisedSubprocVecEnv) and state.get("last") is not None:
         innermost.last_observations = list(state["last"])
-    innermost._seeds, innermost._options = list(state["seeds"]), list(state["options"])
+    innermost._seeds, innermost._options = _for_the_next_reset(state, innermost.num_envs)
     if state["environments"] is None:
         return ["they are not in the checkpoint"]
     return _unpack(innermost, state["environments"])
+
+
+def _shapes(wrapper: VecEnvWrapper) -> list[Any]:
+    """The shapes of the statistics of a VecNormalize; none of another wrapper."""
+    if not isinstance(wrapper, VecNormalize):
+        return []
+    return [shapes_of(getattr(wrapper, name, None), name) for name in ("obs_rms", "ret_rms")]
+
+
+def _for_the_next_reset(state: dict[str, Any], n_envs: int) -> tuple[list[Any], list[Any]]:
+    """Seeds and options that the next reset of each environment gets."""
+    seeds, options = state["seeds"], state["options"]
+    for name, values, kind in (("seeds", seeds, int), ("options", options, dict)):
+        of_kind = isinstance(values, list) and all(value is None or type(value) is kind for value in values)
+        if not of_kind or len(values) != n_envs:
+            raise DoesNotFit(f"the {name} of {n_envs} environments cannot be {values!r:.100}")
+    return list(seeds), list(options)
 
 
 def set_sigint_ignored(venv: VecEnv, ignored: bool) -> None:
