@@ -5,6 +5,9 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn
 
+#: What is larger is infinite in the single precision of buffers and networks.
+LARGEST = float(np.finfo(np.float32).max)
+
 
 class FiniteCheck:
     """
@@ -66,13 +69,31 @@ class FiniteCheck:
     @staticmethod
     def _check(what: str, values: Any, when: str, offset: int = 0) -> None:
         for key, array in values.items() if isinstance(values, dict) else (("", values),):
-            # Integers (images) are always finite.
-            if array.dtype.kind != "f" or np.isfinite(array).all():
+            if _is_fine(array):
                 continue
-            index = int(np.argwhere(~np.isfinite(array))[0][0])
+            index = next(i for i in range(len(array)) if not _is_fine(np.asarray(array[i])))
             name = f"{what} {key!r}" if key else what
             article = "an" if what == "observation" else "a"
             raise ValueError(
-                f"environment {index + offset} gave {article} {name} that is not finite {when}: {array[index]}. "
-                "Allowed are finite numbers. Training stopped before the value reached the replay buffer."
+                f"environment {index + offset} gave {article} {name} that is not finite {when}: {array[index]!s:.300}. "
+                f"Allowed are finite numbers, up to {LARGEST:.3g}, the largest that networks take. Training stopped "
+                "before the value reached the replay buffer."
             )
+
+
+def _is_fine(array: np.ndarray) -> bool:
+    """Whether all are numbers that are finite as networks take them."""
+    kind = array.dtype.kind
+    if kind == "f":
+        if array.dtype.itemsize <= 4:
+            return bool(np.isfinite(array).all())
+        # No comparison holds of a NaN.
+        return bool((np.abs(array) <= LARGEST).all())
+    # Of whatever a worker gives an array of objects is made: None becomes a NaN here.
+    if kind != "O":
+        # Integers (images) are always finite.
+        return kind in "iub"
+    try:
+        return _is_fine(array.astype(np.float64))
+    except (TypeError, ValueError, ArithmeticError):
+        return False

@@ -8,6 +8,7 @@ by some tasks before they are computed anew, so that they are written too.
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -33,15 +34,33 @@ def pack(env: gym.Env) -> tuple[dict[str, Any], list[str]]:
     :return: its state; and what of it is not in it, because nothing is known about its class, as
         ``class of the layer: attribute (class)``: the state is all of it if there is nothing of this kind
     """
-    layers, simulator = layers_of(env), simulator_of(env)
-    describer = Describer([*layers, *(simulator or ()), *_physics(env)], _origin(simulator))
-    described, opaque = [], []
-    for layer in layers:
-        name = class_name(layer)
-        attributes, unknown = describer.attributes(layer, (*_SKIPPED, *_CLOCKS.get(name, ())))
-        described.append({"class": name, "attributes": attributes})
-        opaque += [f"{type(layer).__name__}: {what}" for what in unknown]
-    return {"layers": described, "simulator": None if simulator is None else _pack_simulator(*simulator)}, opaque
+    (state,), opaque = pack_all([env])
+    return state, opaque
+
+
+def pack_all(envs: Sequence[gym.Env]) -> tuple[list[dict[str, Any]], list[str]]:
+    """
+    :param envs: the environments of one process, which may share values, and the attributes of their classes
+    :return: their states; and what of them is not in it, as of :func:`pack`
+    """
+    describer = Describer(whole=True)
+    states, opaque = [], []
+    for env in envs:
+        layers, simulator = layers_of(env), simulator_of(env)
+        describer.enter(_saved_otherwise(env), _origin(simulator))
+        described = []
+        for layer in layers:
+            attributes, unknown = describer.attributes(layer, _skipped(layer))
+            described.append({"class": class_name(layer), "attributes": attributes})
+            opaque += [f"{type(layer).__name__}: {what}" for what in unknown]
+        classes, unknown = describer.classes()
+        opaque += unknown
+        states.append({
+            "layers": described,
+            "simulator": None if simulator is None else _pack_simulator(*simulator),
+            "classes": classes,
+        })  # fmt: skip
+    return states, opaque + describer.finish()
 
 
 def unpack(env: gym.Env, state: dict[str, Any]) -> None:
@@ -52,6 +71,24 @@ def unpack(env: gym.Env, state: dict[str, Any]) -> None:
     :param state: from :func:`pack`; it stays as it is
     :raises DoesNotFit: the environment was made in another way
     """
+    unpack_all([env], [state])
+
+
+def unpack_all(envs: Sequence[gym.Env], states: Sequence[dict[str, Any]]) -> None:
+    """
+    :param envs: environments made as those that were packed
+    :param states: from :func:`pack_all`; they stay as they are
+    :raises DoesNotFit: the environments were made in another way
+    """
+    restorer = Restorer()
+    for env, state in zip(envs, states, strict=True):
+        _unpack(env, state, restorer)
+    if restorer.kept:
+        # What they hold may decide what comes next.
+        raise DoesNotFit(f"{', '.join(restorer.kept)} name other files than the saved ones")
+
+
+def _unpack(env: gym.Env, state: dict[str, Any], restorer: Restorer) -> None:
     layers, simulator = layers_of(env), simulator_of(env)
     ours, theirs = [class_name(layer) for layer in layers], [layer["class"] for layer in state["layers"]]
     if ours != theirs:
@@ -60,12 +97,20 @@ def unpack(env: gym.Env, state: dict[str, Any]) -> None:
         raise DoesNotFit("only one of the environment and the saved one is simulated by MuJoCo")
     if simulator is not None:
         _unpack_simulator(*simulator, state["simulator"])
-    restorer = Restorer(_origin(simulator))
+    restorer.enter(_saved_otherwise(env), _origin(simulator))
     for layer, saved in zip(layers, state["layers"], strict=True):
-        restorer.attributes(layer, saved["attributes"])
-    if restorer.kept:
-        # What they hold may decide what comes next.
-        raise DoesNotFit(f"{', '.join(restorer.kept)} name other files than the saved ones")
+        restorer.attributes(layer, saved["attributes"], _skipped(layer))
+    # Checkpoints of earlier versions are without.
+    restorer.classes(state.get("classes", {}))
+
+
+def _saved_otherwise(env: gym.Env) -> list[Any]:
+    """Objects that are no attributes' values: each layer, and the simulator."""
+    return [*layers_of(env), *(simulator_of(env) or ()), *_physics(env)]
+
+
+def _skipped(layer: Any) -> tuple[str, ...]:
+    return (*_SKIPPED, *_CLOCKS.get(class_name(layer), ()))
 
 
 def _physics(env: gym.Env) -> list[Any]:
@@ -95,21 +140,35 @@ def _unpack_simulator(model: Any, data: Any, state: dict[str, Any]) -> None:
     import mujoco
 
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
-    wrong = [
-        f"{name} {getattr(owner, name).shape} instead of {array.shape}"
-        for owner, part in ((model, "model"), (data, "data"))
-        for name, array in state[part].items()
-        if getattr(owner, name).shape != array.shape
-    ]
-    if mujoco.mj_stateSize(model, kind) != len(state["integration"]) or wrong:
-        raise DoesNotFit(f"the environment has another MuJoCo model than the saved one: {', '.join(wrong[:3])}")
-    for name, array in state["model"].items():
-        getattr(model, name)[...] = array
+    owners = {"model": (model, model_arrays()), "data": (data, _data_arrays())}
+    if state.keys() != {"integration", *owners}:
+        raise DoesNotFit("the state of the simulator is not what is saved of one")
+    _check_like(np.empty(mujoco.mj_stateSize(model, kind)), state["integration"], "integration")
+    for part, (owner, names) in owners.items():
+        # What is an index in MuJoCo's memory is never written, and would not be looked at by MuJoCo.
+        if not isinstance(state[part], dict) or state[part].keys() != set(names):
+            raise DoesNotFit(f"the arrays of the simulator's {part} are not those that are saved of one")
+        for name in names:
+            _check_like(getattr(owner, name), state[part][name], name)
+    for name in model_arrays():
+        getattr(model, name)[...] = state["model"][name]
     mujoco.mj_setState(model, data, state["integration"], kind)
     # Contacts and constraints, which dm_control computes at the end of a step for the next one.
     mujoco.mj_step1(model, data)
-    for name, array in state["data"].items():
-        getattr(data, name)[...] = array
+    for name in _data_arrays():
+        getattr(data, name)[...] = state["data"][name]
+
+
+def _check_like(own: np.ndarray, array: Any, name: str) -> None:
+    """An array of the simulator, to be put in the place of its own."""
+    if not isinstance(array, np.ndarray) or array.shape != own.shape or array.dtype != own.dtype:
+        saved = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else f"{array!r:.50}"
+        raise DoesNotFit(
+            f"the environment has another MuJoCo model than the saved one: {name} {own.dtype} {own.shape} instead of "
+            f"{saved}"
+        )
+    if not np.isfinite(array).all():
+        raise DoesNotFit(f"{name} of the simulator holds what is not finite")
 
 
 @functools.cache

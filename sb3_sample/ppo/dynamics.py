@@ -111,13 +111,23 @@ class TransitionBuffer:
         """
         :param state: transitions as ``state_dict`` gives them; of more than the capacity the most recent are taken
         :param strict: there for Stable-Baselines3, which passes it
+        :raises ValueError: if they are no transitions of this buffer, or not finite
         """
+        self._check(state)
         self.size = 0
         n = len(state["rewards"])
         # Full arrays are turned as they were, so that the same rows are drawn; others fill up from the first row on,
         # which drawing relies on. Files of earlier versions are without "next".
         self._next = (int(state.get("next", 0)) - n) % self.capacity if n >= self.capacity else 0
         self.add(Transitions(*(state[name].cpu().numpy() for name in Transitions._fields)))
+
+    def _check(self, state: Mapping[str, torch.Tensor]) -> None:
+        for name, own in self.data._asdict().items():
+            values = state[name]
+            if values.shape != (len(state["rewards"]), *own.shape[1:]) or values.dtype != torch.from_numpy(own).dtype:
+                raise ValueError(f"{name} of transitions must be of shape (N, {own.shape[1:]}), not {values.shape}")
+            if not values.isfinite().all():
+                raise ValueError(f"{name} of transitions holds what is not finite")
 
 
 class Standardizer(nn.Module):

@@ -7,10 +7,19 @@ come from the tree. What is shared between attributes, as a random generator oft
 
 import collections
 import copy
+import datetime
+import decimal
 import enum
+import fractions
+import functools
+import inspect
 import pathlib
 import random
+import re
+import struct
 import types
+import uuid
+import weakref
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
@@ -18,16 +27,20 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from sb3_sample.saving.classes import may_be_set
+from sb3_sample.saving.functions import FUNCTIONS, OtherKind, held, holding, name_of
+from sb3_sample.saving.hashes import distinct_hashes, part_name
+from sb3_sample.saving.moments import check_moments
 from sb3_sample.saving.places import is_elsewhere, is_moved
+from sb3_sample.saving.shared_memory import as_array, block_of, group, view_at
 
 _CONSTANTS = (type(None), bool, int, float, complex, str, bytes, np.generic, np.dtype, torch.dtype, torch.device)
 _GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
 _CONTAINERS = (list, tuple, dict, set, frozenset, collections.deque, np.ndarray)
 #: What describes and does not change; what a program is made of.
-_INERT = (
-    gym.envs.registration.EnvSpec, type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType,
-    types.MethodType, pathlib.PurePath,
-)  # fmt: skip
+_INERT = (gym.envs.registration.EnvSpec, types.ModuleType, pathlib.PurePath, *FUNCTIONS)
+#: The generators of a process, which are saved with it.
+_GLOBAL = (random._inst, np.random.mtrand._rand, torch.default_generator)  # type: ignore[attr-defined]
 #: Modules of what draws and what writes, whose state decides nothing that follows.
 _INERT_MODULES = (
     "gymnasium.envs.mujoco.mujoco_rendering", "pygame", "glfw", "OpenGL", "matplotlib", "moviepy", "logging", "tqdm",
@@ -37,7 +50,24 @@ _INERT_CLASSES = ("stable_baselines3.common.monitor.ResultsWriter",)
 #: Modules whose objects have a state that their attributes do not show.
 _FOREIGN_MODULES = ("mujoco", "dm_control", "gymnasium.envs", "multiprocessing", "threading", "subprocess", "socket")
 
+#: Packages whose classes keep nothing that a training changes.
+_LIBRARIES = (
+    "builtins", "abc", "typing", "collections", "enum", "numpy", "torch", "gymnasium", "stable_baselines3",
+    "sb3_contrib", "sb3_sample", "mujoco", "dm_control", "dm_env", "metaworld", "myosuite",
+)  # fmt: skip
+#: What is no plain value, but can be told to have stayed the same.
+_IMMUTABLE = (
+    range, slice, re.Pattern, datetime.date, datetime.time, datetime.timedelta, datetime.tzinfo, decimal.Decimal,
+    fractions.Fraction, uuid.UUID,
+)  # fmt: skip
+#: What classes have besides data.
+_OF_CLASSES = (type, types.FunctionType, classmethod, staticmethod, property)
+_POINTER = struct.calcsize("P")
+
 Node = dict[str, Any]
+
+#: What the attributes of a class were when they were first looked at in this process, by name.
+_FIRST: weakref.WeakKeyDictionary[type, dict[str, Node]] = weakref.WeakKeyDictionary()
 
 
 class Opaque(ValueError):
@@ -84,6 +114,49 @@ def _place(view: np.ndarray, origin: int) -> list[Any]:
     return [view.__array_interface__["data"][0] - origin, list(view.shape), list(view.strides), view.dtype.str]
 
 
+def _slots(cls: type) -> dict[str, Any]:
+    """The members that the classes of an object keep in slots, by name; those of a subclass hide its bases'."""
+    members: dict[str, Any] = {}
+    for base in reversed(cls.__mro__):
+        if "__slots__" in vars(base):
+            found = ((name, member) for name, member in vars(base).items() if inspect.ismemberdescriptor(member))
+            members.update(found)
+    return members
+
+
+def attributes_of(owner: Any) -> dict[str, Any]:
+    """
+    :param owner: an object
+    :return: its attributes, those in slots included
+    """
+    slots = {name: getattr(owner, name) for name in _slots(type(owner)) if hasattr(owner, name)}
+    return {**slots, **getattr(owner, "__dict__", {})}
+
+
+def _keeps_more(cls: type) -> bool:
+    """Whether objects of a class have a state besides their attributes: in memory that a library in C has added."""
+    n_pointers = len(_slots(cls)) + (cls.__dictoffset__ > 0) + (cls.__weakrefoffset__ > 0)
+    return cls.__itemsize__ != 0 or cls.__basicsize__ > object.__basicsize__ + n_pointers * _POINTER
+
+
+def _data_of(cls: type) -> dict[str, Any]:
+    """What of a class' own attributes may be data that a program changes."""
+    return {
+        name: value
+        for name, value in vars(cls).items()
+        if not name.startswith(("__", "_abc_"))
+        and not isinstance(value, _OF_CLASSES)
+        and (isinstance(value, types.MethodType) or not hasattr(type(value), "__get__"))
+        and (isinstance(value, FUNCTIONS) or not is_inert(value))
+    }
+
+
+def _classes_of(value: Any) -> list[type]:
+    """The classes of an object that the program itself, or a library that is not known, has written."""
+    mro = type(value).__mro__
+    return [cls for cls in mro if cls.__module__.partition(".")[0] not in _LIBRARIES]
+
+
 def _has_state_dict(value: Any) -> bool:
     return callable(getattr(value, "state_dict", None)) and callable(getattr(value, "load_state_dict", None))
 
@@ -107,20 +180,53 @@ def without_generators(space: gym.Space) -> gym.Space:
     return bare
 
 
+def _is_opaque(value: Any) -> bool:
+    """Whether a value is more than its attributes, so that none of them is described."""
+    foreign = isinstance(value, (gym.Env, *_CONTAINERS)) or _in(value, _FOREIGN_MODULES)
+    return foreign or _keeps_more(type(value)) or not (hasattr(value, "__dict__") or _slots(type(value)))
+
+
+def _may_have(owner: Any, name: str) -> bool:
+    """
+    Whether an object can have an attribute: one that is there, or comes in the course of its life, and is never what
+    its class does, but for a value that a class keeps once it is computed.
+    """
+    kept = isinstance(inspect.getattr_static(type(owner), name, None), functools.cached_property)
+    known = name in attributes_of(owner) or name in _slots(type(owner))
+    return known or may_be_set(type(owner), name) or kept
+
+
 class Describer:
     """
     Makes trees of the attributes of several objects that may share values.
 
     :param inert: further objects (by identity) whose state is saved elsewhere
-    :param origin: address of memory that is saved elsewhere: where a view of it lies is all that is described of it
+    :param whole: whether what functions hold is described too, which memory arrays share (:meth:`finish`), and what
+        classes keep (:meth:`classes`); otherwise functions are inert
     """
 
-    def __init__(self, inert: Collection[Any] = (), origin: int | None = None):
-        self._origin = origin
-        self._inert = {id(value) for value in inert}
+    def __init__(self, inert: Collection[Any] = (), whole: bool = False):
+        self._whole = whole
+        self._origin: int | None = None
+        self._inert = {id(value) for value in (*_GLOBAL, *inert)}
         # The objects are kept, so that no identity is given twice.
         self._seen: dict[int, tuple[int, Any]] = {}
         self._count = 0
+        self._place = ""
+        #: Arrays, with their descriptions and the attributes that they are of.
+        self._arrays: list[tuple[Node, Any, str]] = []
+        self._classes: dict[type, None] = {}
+        self._n_classes = 0
+
+    def enter(self, inert: Collection[Any], origin: int | None) -> None:
+        """
+        Go on to further objects, which may share values with those that were described.
+
+        :param inert: further objects (by identity) whose state is saved elsewhere
+        :param origin: address of memory that is saved elsewhere: where a view of it lies is all that is described of it
+        """
+        self._inert |= {id(value) for value in inert}
+        self._origin = origin
 
     def attributes(self, owner: Any, skip: Collection[str] = ()) -> tuple[dict[str, Node], list[str]]:
         """
@@ -129,14 +235,20 @@ class Describer:
         :return: its attributes, without those that are inert; and what of them cannot be described, as
             ``name (class)``
         """
+        self._note_classes(owner)
+        own = {name: value for name, value in attributes_of(owner).items() if name not in skip}
+        return self._describe_each(own, type(owner).__name__)
+
+    def _describe_each(self, values: dict[str, Any], place: str) -> tuple[dict[str, Node], list[str]]:
         described: dict[str, Node] = {}
         opaque: list[str] = []
-        for name, value in vars(owner).items():
-            if name in skip or id(value) in self._inert or is_inert(value):
+        for name, value in values.items():
+            if id(value) in self._inert or (is_inert(value) and not self._is_function(value)):
                 continue
+            self._place = f"{place}: {name}"
             if isinstance(value, gym.Space) and all(part._np_random is None for part in _generators_of(value)):
                 continue
-            known = len(self._seen)
+            known, n_arrays = len(self._seen), len(self._arrays)
             try:
                 described[name] = self.describe(value)
             except Opaque as error:
@@ -144,7 +256,74 @@ class Describer:
                 # What was described half way is not there to be referred to.
                 for key in list(self._seen)[known:]:
                     del self._seen[key]
+                del self._arrays[n_arrays:]
         return described, opaque
+
+    def _is_function(self, value: Any) -> bool:
+        return self._whole and isinstance(value, FUNCTIONS)
+
+    def _note_classes(self, value: Any) -> None:
+        if self._whole:
+            self._classes.update(dict.fromkeys(_classes_of(value)))
+
+    def classes(self) -> tuple[dict[str, dict[str, Node]], list[str]]:
+        """
+        :return: of the classes of what was described since this was last called, the attributes that have changed
+            since they were first looked at in this process, by the name of the class; and what of them cannot be
+            described, as ``class: name (class)``
+        """
+        described: dict[str, dict[str, Node]] = {}
+        opaque: list[str] = []
+        # What they hold may have further classes.
+        while self._n_classes < len(self._classes):
+            cls = list(self._classes)[self._n_classes]
+            self._n_classes += 1
+            data = _data_of(cls)
+            now = {name: self._glance(value) for name, value in data.items()}
+            first = _FIRST.setdefault(cls, now)
+            changed = {
+                name: value
+                for name, value in data.items()
+                if "opaque" in now[name] or name not in first or not same(now[name], first[name])
+            }
+            attributes, unknown = self._describe_each(changed, cls.__name__)
+            if attributes:
+                described[f"{cls.__module__}.{cls.__qualname__}"] = attributes
+            opaque += [f"{cls.__name__}: {what}" for what in unknown]
+        return described, opaque
+
+    def _glance(self, value: Any) -> Node:
+        """A description that can be compared with one of another time."""
+        if isinstance(value, _IMMUTABLE):
+            return {"value": value}
+        other = Describer(whole=True)
+        other._inert = self._inert
+        try:
+            return other.describe(value)
+        except Opaque:
+            return {"opaque": class_name(value)}
+
+    def finish(self) -> list[str]:
+        """
+        Tell in the descriptions which arrays share memory, when everything is described that may share it.
+
+        :return: what shares memory in a way that cannot be described, as ``class: name (why)``
+        """
+        opaque = []
+        arrays = [array for _, value, _ in self._arrays if (array := as_array(value)) is not None]
+        for indices in group(arrays):
+            found = block_of([arrays[i] for i in indices])
+            nodes = [self._arrays[i][0] for i in indices]
+            if found is None:
+                opaque += [f"{self._arrays[i][2]} (an array that shares the memory of another)" for i in indices]
+                continue
+            block, places = found
+            for node, place in zip(nodes, places, strict=True):
+                what = node.pop("value")
+                node |= {"memory": block if node is nodes[0] else nodes[0]["id"], "place": place}
+                node |= {"dtype": what.dtype} if isinstance(what, torch.Tensor) else {}
+        self._arrays = []
+        return opaque
 
     def describe(self, value: Any) -> Node:
         """
@@ -160,9 +339,14 @@ class Describer:
             return {"same": self._seen[id(value)][0]}
         number, self._count = self._count, self._count + 1
         self._seen[id(value)] = (number, value)
-        return {"id": number, **self._describe(value)}
+        node = {"id": number, **self._describe(value)}
+        if self._whole and "value" in node and as_array(value) is not None:
+            self._arrays.append((node, value, self._place))
+        return node
 
     def _describe(self, value: Any) -> Node:
+        if id(value) in self._inert:
+            return {"inert": class_name(value)}
         if isinstance(value, np.ndarray) and value.dtype != object:
             if not is_view_of_foreign_memory(value):
                 return {"value": value.copy()}
@@ -196,42 +380,104 @@ class Describer:
             return {"dict": items, "of": class_name(value)}
         if isinstance(value, gym.Space):
             return {"space": [self.describe(part._np_random) for part in _generators_of(value)]}
-        if is_inert(value) or id(value) in self._inert:
+        if self._is_function(value):
+            return self._describe_function(value)
+        if is_inert(value):
             return {"inert": class_name(value)}
         if _has_state_dict(value):
-            return {"state_dict": self.describe(value.state_dict())}
-        foreign = isinstance(value, (gym.Env, *_CONTAINERS)) or _in(value, _FOREIGN_MODULES)
-        if foreign or not hasattr(value, "__dict__"):
+            n_arrays = len(self._arrays)
+            node = {"state_dict": self.describe(value.state_dict())}
+            # Its tensors are loaded into those that are there, which share what they shared.
+            del self._arrays[n_arrays:]
+            return node
+        if _is_opaque(value):
             raise Opaque(class_name(value))
-        return {"object": class_name(value), "attributes": {k: self.describe(v) for k, v in vars(value).items()}}
+        self._note_classes(value)
+        attributes = {name: self.describe(item) for name, item in attributes_of(value).items()}
+        return {"object": class_name(value), "attributes": attributes}
+
+    def _describe_function(self, function: Any) -> Node:
+        name, holds = name_of(function), {}
+        for where, value in held(function).items():
+            try:
+                holds[where] = self.describe(value)
+            except Opaque as error:
+                raise Opaque(f"{name} with {where}: {error}") from error
+        return {"function": name, "holds": holds}
 
 
 class Restorer:
     """
     Gives objects the attributes that trees describe.
 
-    :param origin: as of the :class:`Describer`, the same memory in this process
+    :param inert: as of the :class:`Describer`, the same objects in this process
     """
 
-    def __init__(self, origin: int | None = None) -> None:
-        self._origin = origin
+    def __init__(self, inert: Collection[Any] = ()) -> None:
+        self._inert = {id(value) for value in (*_GLOBAL, *inert)}
+        self._origin: int | None = None
         self._made: dict[int, Any] = {}
+        self._blocks: dict[int, np.ndarray] = {}
+        self._classes: dict[str, type] = {}
         #: Attributes that stayed as they are, since the tree names other files in them.
         self.kept: list[str] = []
 
-    def attributes(self, owner: Any, described: dict[str, Node]) -> None:
+    def enter(self, inert: Collection[Any], origin: int | None) -> None:
+        """
+        Go on to further objects, as of :meth:`Describer.enter`.
+
+        :param inert: the same objects in this process
+        :param origin: the same memory in this process
+        """
+        self._inert |= {id(value) for value in inert}
+        self._origin = origin
+
+    def attributes(self, owner: Any, described: dict[str, Node], skip: Collection[str] = ()) -> None:
         """
         :param owner: the object, made as the one that was described
         :param described: from :meth:`Describer.attributes`
-        :raises DoesNotFit: it is of another class, or was made in another way
+        :param skip: names of attributes that were left out
+        :raises DoesNotFit: it is of another class, or was made in another way; or an attribute is described that never
+            is
         """
-        own = vars(owner)
+        own, slots = attributes_of(owner), _slots(type(owner))
+        self._classes.update((f"{cls.__module__}.{cls.__qualname__}", cls) for cls in _classes_of(owner))
+        for name in described:
+            if name in skip or not _may_have(owner, name):
+                raise DoesNotFit(f"{name!r:.100} is not saved of a {type(owner).__name__}")
+        for name, value in self._restored(described, own, type(owner).__name__):
+            if name in slots:
+                slots[name].__set__(owner, value)
+            else:
+                vars(owner)[name] = value
+
+    def _restored(self, described: dict[str, Node], own: dict[str, Any], place: str) -> Iterator[tuple[str, Any]]:
+        """What was described by name, without what names other files than what is there."""
         for name, node in described.items():
-            if is_elsewhere(name, node, own.get(name)):
-                if not is_moved(node, own.get(name)):
-                    self.kept.append(f"{type(owner).__name__}.{name}")
-                continue
-            own[name] = self.restore(node, own.get(name), f"{type(owner).__name__}.{name}")
+            present = own.get(name)
+            if not is_elsewhere(name, node, present):
+                yield name, self.restore(node, present, part_name(place, f".{name}"))
+            elif not is_moved(node, present):
+                self.kept.append(f"{place}.{name}")
+
+    def classes(self, described: dict[str, dict[str, Node]]) -> None:
+        """
+        :param described: from :meth:`Describer.classes`, of the classes of what was restored
+        :raises DoesNotFit: it is of other classes
+        """
+        for class_, attributes in described.items():
+            if class_ not in self._classes:
+                raise DoesNotFit(f"{class_!r:.100} is no class of what was saved")
+            cls = self._classes[class_]
+            data = _data_of(cls)
+            for name in attributes:
+                if name not in data and not (may_be_set(cls, name) and not hasattr(cls, name)):
+                    raise DoesNotFit(f"{name!r:.100} is not saved of {class_}")
+            for name, value in self._restored(attributes, data, cls.__name__):
+                setattr(cls, name, value)
+
+    def _is_inert(self, value: Any) -> bool:
+        return id(value) in self._inert or is_inert(value)
 
     def restore(self, node: Node, present: Any, name: str) -> Any:
         """
@@ -242,10 +488,20 @@ class Restorer:
         :raises DoesNotFit: ``present`` is not of the kind that was described
         """
         if "same" in node:
-            if node["same"] not in self._made:
+            if type(node["same"]) is not int or node["same"] not in self._made:
                 raise DoesNotFit(f"{name} refers to something that is not there")
-            return self._made[node["same"]]
-        value = self._restore(node, present, name)
+            value = self._made[node["same"]]
+        else:
+            if self._is_inert(present) and not {"inert", "function"} & node.keys():
+                raise DoesNotFit(f"{name} is a {class_name(present)}, which stays as it is")
+            # Counted up when it was written, so that each has a hash of its own.
+            if type(node.get("id", 0)) is not int or not 0 <= node.get("id", 0) < 2**60:
+                raise DoesNotFit(f"{name} cannot have the number {node['id']!r:.50}")
+            value = self._restore(node, present, name)
+        # A function may be bound to another object of the same kind.
+        rebound = isinstance(present, FUNCTIONS) and type(value) is type(present) and id(present) not in self._inert
+        if self._is_inert(present) and value is not present and not rebound:
+            raise DoesNotFit(f"{name} is a {class_name(present)}, which stays as it is")
         if "id" in node:
             self._made[node["id"]] = value
         return value
@@ -266,6 +522,11 @@ class Restorer:
                 return copy.deepcopy(value)
             case {"numbers": array}:
                 return array.tolist()
+            case {"memory": memory, "place": where}:
+                return self._view(node, memory, where, name)
+            case {"function": what, "holds": holds}:
+                need(isinstance(present, FUNCTIONS) and name_of(present) == what, f"the function {what!r:.100}")
+                return self._function(early(present), holds, name)
             case {"view": place}:
                 there = isinstance(present, np.ndarray) and is_view_of_foreign_memory(present)
                 fits = there and self._origin is not None and _place(present, self._origin) == list(place)
@@ -281,12 +542,12 @@ class Restorer:
             case {"list": items}:
                 old = present if isinstance(present, list) and len(present) == len(items) else [None] * len(items)
                 made: list[Any] = early([])
-                made.extend(self.restore(item, old[i], f"{name}[{i}]") for i, item in enumerate(items))
+                made.extend(self.restore(item, old[i], part_name(name, f"[{i}]")) for i, item in enumerate(items))
                 return made
             case {"tuple": items, "of": what}:
                 need(what == "builtins.tuple" or class_name(present) == what, what)
                 parts = present if isinstance(present, tuple) and len(present) == len(items) else (None,) * len(items)
-                values = [self.restore(item, parts[i], f"{name}[{i}]") for i, item in enumerate(items)]
+                values = [self.restore(item, parts[i], part_name(name, f"[{i}]")) for i, item in enumerate(items)]
                 # Named tuples take their items one by one.
                 return tuple(values) if what == "builtins.tuple" else type(present)(*values)
             case {"deque": items, "maxlen": maxlen}:
@@ -300,9 +561,9 @@ class Restorer:
                     mapping = copy.copy(present)
                     mapping.clear()
                 early(mapping)
-                for key_node, item in items:
-                    key = self.restore(key_node, None, name)
-                    mapping[key] = self.restore(item, before.get(key), f"{name}[{key!r}]")
+                keys = distinct_hashes([self.restore(key, None, name) for key, _ in items], name)
+                for key, (_, item) in zip(keys, items, strict=True):
+                    mapping[key] = self.restore(item, before.get(key), part_name(name, f"[{key!r:.100}]"))
                 return mapping
             case {"space": generators}:
                 need(isinstance(present, gym.Space), "a space")
@@ -313,17 +574,45 @@ class Restorer:
                 return present
             case {"state_dict": state}:
                 need(_has_state_dict(present), "something with load_state_dict")
-                present.load_state_dict(self.restore(state, None, name))
+                restored = self.restore(state, None, name)
+                if isinstance(present, torch.optim.Optimizer):
+                    check_moments(present, restored, name)
+                present.load_state_dict(restored)
                 return present
             case {"inert": what}:
                 need(class_name(present) == what, what)
                 return present
             case {"object": what, "attributes": attributes}:
-                need(class_name(present) == what, what)
+                need(class_name(present) == what and not _is_opaque(present), what)
                 early(present)
                 self.attributes(present, attributes)
                 return present
         raise DoesNotFit(f"{name} is described by {sorted(node)}")
+
+    def _view(self, node: Node, memory: Any, place: Any, name: str) -> Any:
+        if isinstance(memory, np.ndarray) and memory.dtype == np.uint8 and memory.ndim == 1 and "id" in node:
+            memory, self._blocks[node["id"]] = node["id"], memory.copy()
+        if not isinstance(memory, int) or memory not in self._blocks:
+            raise DoesNotFit(f"{name} lies in memory that is not there")
+        try:
+            array = view_at(self._blocks[memory], place)
+        except ValueError as error:
+            raise DoesNotFit(f"{name}: {error}") from error
+        if "dtype" not in node:
+            return array
+        tensor = torch.from_numpy(array)
+        return tensor if tensor.dtype == node["dtype"] else tensor.view(torch.bfloat16)
+
+    def _function(self, function: Any, described: dict[str, Node], name: str) -> Any:
+        holds = held(function)
+        if described.keys() != holds.keys():
+            raise DoesNotFit(f"{name} holds {sorted(holds)}, but held {sorted(described)}")
+        # What names files stays as it is.
+        values = {**holds, **dict(self._restored(described, holds, name))}
+        try:
+            return holding(function, values)
+        except OtherKind as error:
+            raise DoesNotFit(f"{name}: {error}") from error
 
 
 def same(first: Any, second: Any) -> bool:

@@ -27,7 +27,7 @@ from sb3_sample.faults import HoldBack, check_finite_parameters
 from sb3_sample.saving import container, run_folder, training_state, vec_envs
 from sb3_sample.saving.attributes import DoesNotFit
 from sb3_sample.saving.callbacks import CallbackStates, environments, walk, without_progress_bar
-from sb3_sample.saving.checks import ParametersDoNotFit
+from sb3_sample.saving.checks import ParametersDoNotFit, check_counts, check_last_observations
 from sb3_sample.saving.classes import importing_nothing
 from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.encoding import NotPortable, decode, encode
@@ -177,6 +177,10 @@ class Checkpointer:
             with self._folder.opened(f"{state['path'].name}/{MODEL}") as file, importing_nothing():
                 model.set_parameters(file, trusted_modules=_own_modules())  # type: ignore[arg-type]
             training_state.restore_attributes(model, state["attributes"])
+            check_counts(model, "the checkpoint")
+            if model.num_timesteps != self._manifest["steps"]:
+                raise BadFile(f"its state is of step {model.num_timesteps}, its manifest of {self._manifest['steps']}")
+            check_last_observations(model)
             model.start_time = time.time_ns() - state["elapsed_ns"]
             for name, ring in self._rings.items():
                 if name in state["rings"]:
@@ -189,8 +193,11 @@ class Checkpointer:
         """What the content of a checkpoint makes raise is said to be its fault, in one kind of error."""
         try:
             yield
-        except (BadFile, ParametersDoNotFit, EnvironmentDied, OSError):
+        except (ParametersDoNotFit, EnvironmentDied, OSError):
             raise
+        except BadFile as error:
+            where = str(state["path"])
+            raise error if where in str(error) else BadFile(f"{where}: {error}") from error
         except Exception as error:
             raise BadFile(
                 f"{state['path']} is damaged or hostile, or was not made by this program: {type(error).__name__}: "
@@ -327,7 +334,7 @@ class Checkpointer:
     def _try_to_save(self) -> None:
         try:
             self._save()
-        except (OSError, NotPortable) as error:
+        except (OSError, NotPortable, container.TooLarge) as error:
             last = "there is none yet" if self._saved_at is None else f"the last one is of {self._saved_at} steps"
             warnings.warn(
                 f"No checkpoint at {self._model.num_timesteps} steps, {last}: {self._name} cannot be written to "

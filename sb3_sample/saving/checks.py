@@ -3,6 +3,7 @@
 import collections.abc
 import functools
 import inspect
+import math
 import numbers
 import pathlib
 import types
@@ -12,23 +13,39 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.saving.classes import PACKAGES, may_be_set, within
 from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.replay import MAX_HER_TRANSITIONS, MAX_TRANSITIONS
+from sb3_sample.saving.statistics import check_finite_numbers
 
 #: Environments that a file can ask for.
 MAX_ENVS = 100_000
 #: The largest width, depth or number of networks that a file can ask for. Python makes lists of such lengths.
 MAX_WIDTH = 1_000_000
+#: The most that a file can ask for of what costs work or memory by its value alone: far above what anybody trains with.
+MOST = {
+    "replay_ratio": 10_000, "gradient_steps": 1_000_000, "batch_size": 10_000_000, "n_steps": 10_000_000,
+    "n_epochs": 100_000, "n_simulated": 1_000_000, "simulation_horizon": 100_000, "dynamics_batch_size": 10_000_000,
+    "dynamics_buffer_size": MAX_TRANSITIONS, "train_freq": 10_000_000,
+}  # fmt: skip
+#: Bytes of a replay buffer that no machine holds.
+MAX_BUFFER_BYTES = 2**44
+#: Counts of what was done, and what is owed: less than a gradient step, but for rounding, at the end of each turn.
+_COUNTS = (
+    "num_timesteps", "_num_timesteps_at_start", "_total_timesteps", "_episode_num", "_n_updates", "num_transitions",
+    "_iteration", "_n_new",
+)  # fmt: skip
+_MAX_COUNT = 2**53
+_NUMBER = (int, float, np.integer, np.floating)
 #: What belongs to the program in which a model is, and to no file.
 NEVER = (
     "policy", "env", "replay_buffer", "rollout_buffer", "_vec_normalize_env", "_logger", "_custom_logger",
     "_trusted_modules", "_told",
 )  # fmt: skip
-#: What the common optimizers keep of each parameter, in its shape. torch's fused kernels do not check it.
-_MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq", "momentum_buffer", "square_avg", "grad_avg")
 
 
 class ParametersDoNotFit(ValueError, RuntimeError):
@@ -60,33 +77,6 @@ def check_finite(owner: Any, state: Any, name: str, words: str, error: type[Valu
         bad = tensor.float().isnan() if learned is not None and key not in learned else ~tensor.float().isfinite()
         if bad.any():
             raise error(f"{key} {words + ' ' if words else ''}holds {int(bad.sum())} numbers that are not finite")
-
-
-def check_moments(optimizer: torch.optim.Optimizer, state: Any, name: str) -> None:
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    moments = state.get("state") if isinstance(state, dict) else None
-    groups = state.get("param_groups") if isinstance(state, dict) else None
-    if not isinstance(moments, dict) or not isinstance(groups, list):
-        raise BadFile(f"{name} is no state of an optimizer")
-    group_of: dict[int, int] = {}
-    for n, group in enumerate(groups):
-        indices = group.get("params") if isinstance(group, dict) else None
-        if not isinstance(indices, list) or not all(type(i) is int for i in indices):
-            raise BadFile(f"{name} does not say which parameters are in group {n}")
-        group_of.update(dict.fromkeys(indices, n))
-    order = list(group_of)
-    kinds: dict[Any, set[Any]] = {}
-    for index, kept in moments.items():
-        if index not in order or order.index(index) >= len(parameters) or not isinstance(kept, dict):
-            raise BadFile(f"{name} keeps something of a parameter {index!r:.50} that is not there")
-        shape = parameters[order.index(index)].shape
-        for key, value in kept.items():
-            wanted = shape if key in _MOMENTS else torch.Size(()) if key == "step" else None
-            if wanted is not None and (not isinstance(value, torch.Tensor) or value.shape != wanted):
-                raise BadFile(f"{name}: {key} of parameter {index} must be a tensor of shape {tuple(wanted)}")
-        # An optimizer may keep something else of vectors than of matrices, but the same of all matrices.
-        if kinds.setdefault((group_of[index], len(shape)), set(kept)) != set(kept):
-            raise BadFile(f"{name} keeps {sorted(map(str, kept))} of parameter {index}, but others of other parameters")
 
 
 def library_class(cls: type) -> type:
@@ -123,7 +113,69 @@ def check_sizes(model: Any, name: str, given: Collection[str]) -> None:
     if isinstance(buffer_class, type) and issubclass(buffer_class, HerReplayBuffer):
         most = MAX_HER_TRANSITIONS
     if "buffer_size" not in given and (type(size) is not int or not 1 <= size <= most):
-        raise BadFile(f"{name}: buffer_size must lie in [1, {most}], not be {size!r:.100}: pass another one to load")
+        raise BadFile(f"{name}: buffer_size must lie in [1, {most}], not be {size!r:.100}: pass buffer_size= to load")
+    if "buffer_size" not in given and getattr(model, "buffer_size", None) is not None:
+        n_bytes = size * _bytes_of(model.observation_space)
+        if n_bytes > MAX_BUFFER_BYTES:
+            raise BadFile(
+                f"{name}: a buffer_size of {size} takes {n_bytes} bytes, more than any machine has: pass buffer_size= "
+                "to load"
+            )
+    for key, limit in MOST.items():
+        value = getattr(model, key, None)
+        number = value.frequency if isinstance(value, TrainFreq) else value
+        # What is no number is refused by the algorithm.
+        if key not in given and isinstance(number, _NUMBER) and number > limit:
+            raise BadFile(f"{name}: {key} must be at most {limit}, not {number!r:.100}: pass {key}= to load")
+
+
+def _bytes_of(space: Any) -> int:
+    """Bytes of an observation, as a replay buffer holds it."""
+    inside = getattr(space, "spaces", None)
+    if inside is not None:
+        return sum(map(_bytes_of, inside.values() if isinstance(inside, dict) else inside))
+    return math.prod(space.shape or ()) * np.dtype(space.dtype or np.float32).itemsize
+
+
+def check_counts(model: Any, name: str) -> None:
+    """
+    :param model: a model with what a file sets
+    :param name: the file, for messages
+    :raises BadFile: if it has counted what no training comes to, or owes gradient steps that no turn of one owes
+    """
+    for key in _COUNTS:
+        value = getattr(model, key, 0)
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value < _MAX_COUNT:
+            raise BadFile(f"{name}: {key} must be an integer of at least 0, not {value!r:.100}")
+    owed = getattr(model, "_updates_owed", 0.0)
+    if not isinstance(owed, _NUMBER) or not -1 <= owed <= 1:
+        raise BadFile(f"{name}: _updates_owed must lie in [-1, 1], not be {owed!r:.100}")
+
+
+def check_last_observations(model: Any) -> None:
+    """
+    :param model: a model with what a checkpoint sets: what its next step is stored with
+    :raises BadFile: if it is not what its environments can have given
+    """
+    for name in ("_last_obs", "_last_original_obs"):
+        value = getattr(model, name)
+        check_finite_numbers(value, name)
+        arrays = value.values() if isinstance(value, dict) else [] if value is None else [value]
+        if any(array.shape[:1] != (model.n_envs,) for array in arrays):
+            raise BadFile(f"{name} is not one of each of {model.n_envs} environments")
+    if _shapes_of(model._last_obs) != _shapes_in(model.observation_space):
+        raise BadFile(f"_last_obs is of shape {_shapes_of(model._last_obs)}, not of {model.observation_space}")
+
+
+def _shapes_of(observations: Any) -> Any:
+    """Without the axis of the environments."""
+    if isinstance(observations, dict):
+        return {key: array.shape[1:] for key, array in observations.items()}
+    return None if observations is None else observations.shape[1:]
+
+
+def _shapes_in(space: Any) -> Any:
+    return {key: part.shape for key, part in space.spaces.items()} if isinstance(space, spaces.Dict) else space.shape
 
 
 def _check_widths(value: Any, argument: str, name: str) -> None:

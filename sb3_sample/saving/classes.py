@@ -24,10 +24,6 @@ from sb3_sample.saving.container import DTYPES, BadFile
 MAX_DEPTH = 60
 INT_MAX = 2**63
 DTYPE_TEXT = re.compile(r"[<>|=][biufcSUMm][0-9]{1,9}(\[[0-9]*[a-zA-Z]+\])?")
-#: Generators, and up to where their position in the numbers drawn beforehand can be: NumPy does not check it.
-BIT_GENERATORS: dict[str, tuple[str, int] | None] = {
-    "PCG64": None, "PCG64DXSM": None, "SFC64": None, "MT19937": ("pos", 624), "Philox": ("buffer_pos", 4),
-}  # fmt: skip
 SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Dict, spaces.Tuple)
 #: Packages whose classes a file may name: as far as they are of the kinds below.
 PACKAGES = ("torch.nn", "torch.optim", "stable_baselines3", "sb3_contrib", "sb3_sample")

@@ -39,6 +39,12 @@ FORMAT = 1
 #: Bytes of JSON, in general and of some kinds: as objects of Python they take up to some thirty times as much memory.
 MAX_JSON = 32 * 2**20
 MAX_JSON_OF = {"model": 8 * 2**20, "plotted runs": 2**20}
+#: Values in the JSON, however short they are, without and for the numbers of the tensors beside it: each takes some 100
+#: bytes as an object of Python, and a microsecond.
+MAX_VALUES, BYTES_PER_VALUE = 400_000, 16
+#: Tensors, each of which takes some ten microseconds, and values in what is said of them.
+MAX_TENSORS = 50_000
+MAX_HEADER_VALUES = 12 * MAX_TENSORS
 #: Dimensions of a tensor, as many as NumPy has.
 MAX_DIMENSIONS = 64
 #: The kinds of number of the safetensors format.
@@ -64,6 +70,10 @@ _not_synced: set[pathlib.Path] = set()
 PathOrFile = str | pathlib.Path | IO[bytes]
 
 
+class TooLarge(ValueError):
+    """What would be more than a reader takes, and is not written."""
+
+
 # ---------------------------------------------------------------- writing
 
 
@@ -77,7 +87,8 @@ def write(path_or_file: PathOrFile, kind: str, tree: Any, tensors: dict[str, tor
     :param tree: what JSON can hold
     :param tensors: strided tensors on the CPU
     :raises OSError: if it cannot be written; it names the path
-    :raises ValueError: if the tree takes more than 32 MiB of JSON, or 8 MiB for a model
+    :raises TooLarge: (a ``ValueError``) if the tree takes more than 32 MiB of JSON, or 8 MiB for a model; if it holds
+        more values, or there are more tensors, than a reader takes
     """
     content = {"kind": kind, "format": FORMAT, "versions": versions(), "tree": tree}
     try:
@@ -85,13 +96,34 @@ def write(path_or_file: PathOrFile, kind: str, tree: Any, tensors: dict[str, tor
     except RecursionError as error:
         raise ValueError(f"the {kind} is nested too deeply to be written") from error
     if len(data) > _max_json(kind):
-        raise ValueError(f"the {kind} takes {len(data)} bytes of JSON, more than the {_max_json(kind)} allowed")
+        raise TooLarge(f"the {kind} takes {len(data)} bytes of JSON, more than the {_max_json(kind)} allowed")
+    n_bytes = sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
+    if n_values(data) > most_values(n_bytes):
+        raise TooLarge(f"the {kind} consists of {n_values(data)} values, more than the {most_values(n_bytes)} allowed")
+    if len(tensors) > MAX_TENSORS:
+        raise TooLarge(f"the {kind} consists of {len(tensors)} arrays, more than the {MAX_TENSORS} allowed")
     if not isinstance(path_or_file, (str, pathlib.Path)):
         _write(path_or_file, data, tensors)
         path_or_file.flush()
         return
     with replacing(pathlib.Path(path_or_file)) as file:
         _write(file, data, tensors)
+
+
+def n_values(data: bytes) -> int:
+    """
+    :param data: JSON
+    :return: how many values it holds at most; what looks like more in texts counts, too
+    """
+    return sum(map(data.count, (b",", b"[", b"{")))
+
+
+def most_values(n_bytes: int) -> int:
+    """
+    :param n_bytes: of the tensors in a file
+    :return: how many values its JSON may hold
+    """
+    return MAX_VALUES + n_bytes // BYTES_PER_VALUE
 
 
 def versions() -> dict[str, str]:
@@ -181,6 +213,8 @@ def _safetensors(tensors: dict[str, torch.Tensor]) -> Iterator[bytes | memoryvie
         start, end = end, end + tensor.numel() * tensor.element_size()
         header[name] = {"dtype": _NAMES[tensor.dtype], "shape": list(tensor.shape), "data_offsets": [start, end]}
     text = json.dumps(header, separators=(",", ":")).encode()
+    if len(text) > MAX_JSON or n_values(text) > MAX_HEADER_VALUES:
+        raise TooLarge("the arrays' names and shapes take more than a reader takes")
     # The numbers start at a multiple of eight.
     text += b" " * (-len(text) % 8)
     yield struct.pack("<Q", len(text)) + text
@@ -224,13 +258,11 @@ def read_with_versions(path_or_file: PathOrFile, kind: str) -> tuple[Any, dict[s
 def _read(file: IO[bytes], kind: str, name: str) -> tuple[Any, dict[str, torch.Tensor], dict[str, str]]:
     try:
         with _opened(file, kind, name) as archive:
-            checksums = _json(archive.read(CHECKSUMS), name)
+            checksums = _json(_text(archive.read(CHECKSUMS), name, 10), name)
             if not isinstance(checksums, dict) or checksums.keys() != {DATA, TENSORS}:
                 raise BadFile(f"{name}: the checksums are not those of {DATA} and {TENSORS}")
-            data = archive.read(DATA)
-            _compare(hashlib.sha256(data), checksums[DATA], name, DATA)
-            tree, versions = _checked(_json(data, name), kind, name)
             size = archive.getinfo(TENSORS).file_size
+            tree, versions = _checked(_data(archive, checksums[DATA], most_values(size), name), kind, name)
             with archive.open(TENSORS) as entry:
                 tensors, digest = _read_safetensors(entry, size, name)
             _compare(digest, checksums[TENSORS], name, TENSORS)
@@ -302,7 +334,23 @@ def check_table(file: IO[bytes], size: int, name: str) -> None:
         raise BadFile(f"{name} is damaged: its table of contents lies elsewhere than it says")
 
 
-def _json(data: bytes, name: str) -> Any:
+def _data(archive: zipfile.ZipFile, checksum: Any, most: int, name: str) -> Any:
+    data = archive.read(DATA)
+    _compare(hashlib.sha256(data), checksum, name, DATA)
+    text = _text(data, name, most)
+    # Texts in it are the third copy.
+    del data
+    return _json(text, name)
+
+
+def _text(data: bytes, name: str, most: int) -> str:
+    """The text of JSON, if it holds no more than so many values."""
+    if (n := n_values(data)) > most:
+        raise BadFile(f"{name} is damaged or hostile: its JSON holds {n} values, more than the {most} allowed")
+    return data.decode()
+
+
+def _json(text: str, name: str) -> Any:
     def refuse(constant: str) -> Any:
         raise BadFile(f"{name}: {constant} is no number of JSON")
 
@@ -314,7 +362,7 @@ def _json(data: bytes, name: str) -> Any:
     # What is read has no cycles, and looking for them again and again takes ten times as long as reading.
     gc.disable()
     try:
-        return json.loads(data, parse_constant=refuse, parse_float=finite)
+        return json.loads(text, parse_constant=refuse, parse_float=finite)
     except RecursionError as error:
         raise BadFile(f"{name} is nested too deeply") from error
     finally:
@@ -351,11 +399,13 @@ def _read_safetensors(entry: IO[bytes], size: int, name: str) -> tuple[dict[str,
     (length,) = struct.unpack("<Q", start)
     if length > min(size - 8, MAX_JSON):
         raise BadFile(f"{name}: the header of the tensors claims {length} bytes")
-    text = entry.read(length)
-    digest.update(start + text)
-    header = _json(text, name)
+    data = entry.read(length)
+    digest.update(start + data)
+    header = _json(_text(data, name, MAX_HEADER_VALUES), name)
     if not isinstance(header, dict):
         raise BadFile(f"{name}: the header of the tensors is no object")
+    if len(header) > MAX_TENSORS + 1:
+        raise BadFile(f"{name}: the header of the tensors names {len(header)}, more than the {MAX_TENSORS} allowed")
     header.pop("__metadata__", None)
     layout, end = [], 0
     for key, described in header.items():

@@ -16,7 +16,6 @@ import torch
 from gymnasium import spaces
 
 from sb3_sample.saving.classes import (
-    BIT_GENERATORS,
     DTYPE_TEXT,
     ENUMERATIONS,
     INT_MAX,
@@ -33,6 +32,8 @@ from sb3_sample.saving.classes import (
     within,
 )
 from sb3_sample.saving.container import BadFile
+from sb3_sample.saving.generators import check_python_state, numpy_generator
+from sb3_sample.saving.hashes import distinct_hashes, part_name
 
 #: What the library's constructors raise where a file holds nonsense.
 _NONSENSE = (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError, AssertionError, RuntimeError)
@@ -77,7 +78,7 @@ class _Decoder:
         if tree is None or isinstance(tree, (bool, int, float, str)):
             return tree
         if isinstance(tree, list):
-            return [self.decode(item, f"{name}[{i}]", depth + 1) for i, item in enumerate(tree)]
+            return [self.decode(item, part_name(name, f"[{i}]"), depth + 1) for i, item in enumerate(tree)]
         if not isinstance(tree, dict) or not tree:
             raise BadFile(f"{name} is not described as it must be")
         tag, *further = tree
@@ -127,15 +128,20 @@ class _Decoder:
     def _dict(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
         if not isinstance(tree, dict):
             raise BadFile(f"{name} must be an object in the file, not {type(tree).__name__}")
-        items = {key: self.decode(value, f"{name}.{key}", depth + 1) for key, value in tree.items()}
+        items = {key: self.decode(value, part_name(name, f".{key}"), depth + 1) for key, value in tree.items()}
         return items if "dict" in whole else collections.OrderedDict(items)
 
     def _dict_items(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
-        items = {}
-        for key, value in tree:
-            decoded = self.decode(key, name, depth + 1)
-            items[decoded] = self.decode(value, f"{name}[{decoded!r}]", depth + 1)
+        keys = distinct_hashes((self.decode(key, name, depth + 1) for key, _ in tree), name)
+        items = {
+            key: self.decode(value, part_name(name, f"[{key!r:.100}]"), depth + 1)
+            for key, (_, value) in zip(keys, tree, strict=True)
+        }
         return items if "dict_items" in whole else collections.OrderedDict(items)
+
+    def _set(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
+        items = distinct_hashes(self._list(tree, name, depth), name)
+        return set(items) if "set" in whole else frozenset(items)
 
     def _scalar(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
         text, item = tree
@@ -197,7 +203,7 @@ class _Decoder:
         for key, item in attributes.items():
             if not may_be_set(cls, key):
                 raise BadFile(f"{name}: an object of {tree} must not have its {key!r:.100} set")
-            vars(made)[key] = self.decode(item, f"{name}.{key}", depth + 1)
+            vars(made)[key] = self.decode(item, part_name(name, f".{key}"), depth + 1)
         return made
 
     def _object(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
@@ -207,7 +213,7 @@ class _Decoder:
             raise BadFile(f"{name}: an object of {tree} must have the attributes {sorted(OBJECTS[tree])}")
         made = cls.__new__(cls)
         for key, item in attributes.items():
-            value = self.decode(item, f"{name}.{key}", depth + 1)
+            value = self.decode(item, part_name(name, f".{key}"), depth + 1)
             check_attribute(tree, key, value, name, BadFile)
             vars(made)[key] = value
         return made
@@ -215,7 +221,7 @@ class _Decoder:
     def _space(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
         by_name: dict[str, Any] = {cls.__name__: cls for cls in SPACES}
         cls, described = by_name[tree], whole["arguments"]
-        arguments = {key: self.decode(value, f"{name}.{key}", depth + 1) for key, value in described.items()}
+        arguments = {key: self.decode(value, part_name(name, f".{key}"), depth + 1) for key, value in described.items()}
         if cls is spaces.Box:
             low, high = arguments["low"], arguments["high"]
             if not (isinstance(low, np.ndarray) and isinstance(high, np.ndarray)) or low.shape != high.shape:
@@ -241,30 +247,14 @@ class _Decoder:
         return space
 
     def _numpy_random(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
-        state = self.decode(whole["state"], name, depth + 1)
-        kind = state["bit_generator"]
-        place = BIT_GENERATORS[kind]
-        if place is not None:
-            key, most = place
-            position = state["state"].get(key, state.get(key))
-            if type(position) is not int or not 0 <= position <= most:
-                raise BadFile(f"{name}: {key} of a generator must lie in [0, {most}], not be {position!r}")
-        bits = getattr(np.random, kind)(0)
-        if tree == "Generator":
-            bits.state = state
-            return np.random.Generator(bits)
-        if tree != "RandomState":
-            raise BadFile(f"{name}: unknown generator {tree!r}")
-        made = np.random.RandomState(bits)
-        made.set_state(state)
-        return made
+        return numpy_generator(tree, self.decode(whole["state"], name, depth + 1), name)
 
     def _random(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
         version, words, gauss = self.decode(tree, name, depth + 1)
-        if gauss is not None and type(gauss) is not float:
-            raise BadFile(f"{name}: the state of a generator holds {gauss!r}")
+        state = (version, tuple(words.tolist()), gauss)
+        check_python_state(state, name)
         made = random.Random(0)
-        made.setstate((version, tuple(words.tolist()), gauss))
+        made.setstate(state)
         return made
 
     def _torch_generator(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
@@ -313,8 +303,8 @@ _READERS: dict[str, Callable[[_Decoder, Any, Any, str, int], Any]] = {
     "numbers": _Decoder._numbers,
     "bytes": lambda d, tree, whole, name, depth: base64.b64decode(tree, validate=True),
     "tuple": lambda d, tree, whole, name, depth: tuple(d._list(tree, name, depth)),
-    "set": lambda d, tree, whole, name, depth: set(d._list(tree, name, depth)),
-    "frozenset": lambda d, tree, whole, name, depth: frozenset(d._list(tree, name, depth)),
+    "set": _Decoder._set,
+    "frozenset": _Decoder._set,
     "deque": _Decoder._deque,
     "dict": _Decoder._dict,
     "ordered_dict": _Decoder._dict,

@@ -27,7 +27,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.saving.classes import (
-    BIT_GENERATORS,
     DTYPE_TEXT,
     ENUMERATIONS,
     INT_MAX,
@@ -48,6 +47,7 @@ from sb3_sample.saving.classes import (
 )
 from sb3_sample.saving.container import DTYPES
 from sb3_sample.saving.decoding import decode
+from sb3_sample.saving.generators import BIT_GENERATORS
 from sb3_sample.saving.schedules import ScheduleTable
 
 __all__ = ["Encoder", "Lenient", "NotPortable", "decode", "encode", "is_left_out"]

@@ -14,7 +14,14 @@ from stable_baselines3.common.utils import check_for_correct_spaces, get_system_
 
 from sb3_sample.saving import container, notice, paths
 from sb3_sample.saving.budget import Budget
-from sb3_sample.saving.checks import ParametersDoNotFit, check_kinds, check_names, check_sizes, library_class
+from sb3_sample.saving.checks import (
+    ParametersDoNotFit,
+    check_counts,
+    check_kinds,
+    check_names,
+    check_sizes,
+    library_class,
+)
 from sb3_sample.saving.classes import check_trusted
 from sb3_sample.saving.container import BadFile, PickledFile
 from sb3_sample.saving.model_tree import KIND, Content, Description
@@ -177,6 +184,7 @@ class SafeFiles(BaseAlgorithm):
                 check_kinds(plain, {k: v for k, v in attributes.items() if k not in given}, content.name)
                 vars(model).update({"n_envs": 1, **attributes, **kwargs})
                 check_sizes(model, content.name, given)
+                check_counts(model, content.name)
                 model._setup_model()
             if kwargs:
                 content.check_shapes(model)
@@ -195,6 +203,8 @@ class SafeFiles(BaseAlgorithm):
             if given:
                 raise
             why = f"{type(error).__name__}: {error}"
+            if isinstance(error, MemoryError):
+                why = f"{why} (pass a smaller buffer_size= or n_steps= to load)"
             raise BadFile(f"{lacks}{content.name}: no {cls.__name__} can be made of what it holds: {why}") from error
         return model
 

@@ -2,6 +2,7 @@
 
 import collections.abc
 import functools
+import itertools
 import json
 import typing
 from collections import OrderedDict
@@ -19,7 +20,6 @@ from sb3_sample.saving.checks import (
     check_extra,
     check_finite,
     check_metadata,
-    check_moments,
     hints_of,
     library_class,
 )
@@ -27,6 +27,7 @@ from sb3_sample.saving.classes import PACKAGES, NotPortable, may_be_set, path_of
 from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.decoding import NotTrusted, decode
 from sb3_sample.saving.encoding import LEFT_OUT, Encoder, Lenient, is_left_out
+from sb3_sample.saving.moments import check_moments
 from sb3_sample.saving.training_state import argument_names
 
 KIND = "model"
@@ -55,11 +56,13 @@ class Description:
         values = {name: value for name, value in vars(model).items() if name not in skipped}
         #: Modules and the like of a subclass's own, which are written by their states.
         self._own = {name: value for name, value in values.items() if name not in always and _has_state(value)}
-        self.attributes = {
-            name: self._attribute(value, name, name in schedules, name in always)
-            for name, value in values.items()
-            if name not in self._own
-        }
+        self.attributes: dict[str, Any] = {}
+        self._tensors: dict[str, list[str]] = {}
+        for name, value in values.items():
+            if name not in self._own:
+                n_before = len(self.encoder.tensors)
+                self.attributes[name] = self._attribute(value, name, name in schedules, name in always)
+                self._tensors[name] = list(itertools.islice(self.encoder.tensors, n_before, None))
         self._keep_small()
 
     def _attribute(self, value: Any, name: str, is_schedule: bool, is_derived: bool) -> Any:
@@ -73,11 +76,22 @@ class Description:
 
     def _keep_small(self) -> None:
         """Leave out the largest attributes of a model that would be more than a reader takes."""
-        sizes = {name: len(json.dumps(tree)) for name, tree in self.attributes.items()}
-        for name in sorted(sizes, key=lambda name: -sizes[name]):
-            if sum(sizes.values()) <= container.MAX_JSON_OF[KIND] // 2:
-                return
-            self.attributes[name] = self.encoder.leave_out(name, f"it takes {sizes.pop(name)} bytes of JSON")
+        texts = {name: json.dumps(tree).encode() for name, tree in self.attributes.items()}
+        for most, measure in (
+            (container.MAX_JSON_OF[KIND], lambda name: len(texts[name])),
+            (container.MAX_VALUES, lambda name: container.n_values(texts[name])),
+            (container.MAX_TENSORS, lambda name: len(self._tensors[name])),
+        ):
+            sizes = {name: measure(name) for name in texts}
+            for name in sorted(sizes, key=lambda name: -sizes[name]):
+                if sum(sizes.values()) <= most // 2:
+                    break
+                del sizes[name]
+                reason = f"it takes {len(texts.pop(name))} bytes of JSON"
+                reason += f" and {len(self._tensors[name])} arrays" if self._tensors[name] else ""
+                self.attributes[name] = self.encoder.leave_out(name, reason)
+                for key in self._tensors[name]:
+                    del self.encoder.tensors[key]
 
     def tree(self, family: type) -> dict[str, Any]:
         """

@@ -3,23 +3,16 @@
 import pathlib
 from typing import Any
 
-import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_sample.saving import container
 from sb3_sample.saving.container import BadFile, PickledFile
 from sb3_sample.saving.encoding import decode, encode
+from sb3_sample.saving.statistics import ARGUMENTS, check_normalization, shapes_of
 
 KIND = "VecNormalize"
-#: The arguments of its constructor, which are its attributes' names, and the statistics.
-_ARGUMENTS = ("training", "norm_obs", "norm_reward", "clip_obs", "clip_reward", "gamma", "epsilon", "norm_obs_keys")
-_TYPES: dict[str, tuple[type, ...]] = {
-    "training": (bool,), "norm_obs": (bool,), "norm_reward": (bool,), "norm_obs_keys": (list, type(None)),
-}  # fmt: skip
-_NUMBER = (int, float, np.floating, np.integer)
 
 
 def lacks_vec_normalize(model: BaseAlgorithm) -> bool:
@@ -44,7 +37,7 @@ def save_vec_normalize(venv: VecEnv, path: str | pathlib.Path) -> None:
     if type(venv) is not VecNormalize:
         raise ValueError(f"venv must be a VecNormalize, not a {type(venv).__name__}")
     tensors: dict[str, torch.Tensor] = {}
-    state = {name: getattr(venv, name) for name in _ARGUMENTS}
+    state = {name: getattr(venv, name) for name in ARGUMENTS}
     state.update(obs_rms=venv.obs_rms if venv.norm_obs else None, ret_rms=venv.ret_rms)
     tree = encode(state, "VecNormalize", tensors)
     container.write(path, KIND, tree, tensors)
@@ -70,37 +63,20 @@ def load_vec_normalize(path: str | pathlib.Path, venv: VecEnv, *, allow_pickle: 
             raise
         return VecNormalize.load(str(path), venv)
     state: Any = decode(tree, tensors, str(path))
-    if not isinstance(state, dict) or state.keys() != {*_ARGUMENTS, "obs_rms", "ret_rms"}:
+    if not isinstance(state, dict) or state.keys() != {*ARGUMENTS, "obs_rms", "ret_rms"}:
         raise BadFile(f"{path} does not hold what a VecNormalize consists of")
-    for name in _ARGUMENTS:
-        allowed = _TYPES.get(name, _NUMBER)
-        if not isinstance(state[name], allowed) or (isinstance(state[name], bool) and bool not in allowed):
-            raise BadFile(f"{path}: {name} of a VecNormalize cannot be {state[name]!r:.100}")
-    arguments = {name: state[name] for name in _ARGUMENTS}
+    check_normalization(state, str(path))
+    arguments = {name: state[name] for name in ARGUMENTS}
     try:
         wanted = VecNormalize(venv, **arguments)
     except (ValueError, TypeError, AssertionError) as error:
         raise BadFile(f"{path} does not fit to the environment: {error}") from error
     for name in ("obs_rms", "ret_rms"):
         own, saved = getattr(wanted, name, None), state[name]
-        if _shapes(own, f"{path}: {name}") != _shapes(saved, f"{path}: {name}"):
+        if shapes_of(own, f"{path}: {name}") != shapes_of(saved, f"{path}: {name}"):
             raise ValueError(
-                f"{path}: {name} is of shape {_shapes(saved, name)}, but the environment needs {_shapes(own, name)}"
+                f"{path}: {name} is of shape {shapes_of(saved, name)}, but the environment needs {shapes_of(own, name)}"
             )
         if saved is not None:
             setattr(wanted, name, saved)
     return wanted
-
-
-def _shapes(statistics: Any, name: str) -> Any:
-    if statistics is None:
-        return None
-    if isinstance(statistics, dict):
-        return {key: _shapes(part, name) for key, part in statistics.items()}
-    if not isinstance(statistics, RunningMeanStd):
-        raise BadFile(f"{name} holds no statistics")
-    mean, var, count = statistics.mean, statistics.var, statistics.count
-    finite = np.isfinite(mean).all() and np.isfinite(var).all() and np.isfinite(count)
-    if np.shape(mean) != np.shape(var) or not finite or (np.asarray(var) < 0).any() or count <= 0:
-        raise BadFile(f"{name} holds no statistics: mean and variance must be finite and of one shape")
-    return np.shape(mean)

@@ -17,6 +17,7 @@ from sb3_sample.saving.classes import PACKAGES, check_trusted, may_be_set, path_
 from sb3_sample.saving.container import BadFile, PickledFile
 from sb3_sample.saving.decoding import NotTrusted
 from sb3_sample.saving.encoding import Lenient, decode, is_left_out
+from sb3_sample.saving.rings import check_episodes, check_values
 from sb3_sample.saving.untrusted import MAX_MESSAGE
 
 KIND = "replay buffer"
@@ -31,6 +32,7 @@ MAX_OTHER, MAX_OTHER_HER = 20_000_000, 1_000_000
 _NOT_SAVED = ("device", "env")
 #: Arguments with which a buffer is made again that gives and takes its own state.
 _ARGUMENTS = ("buffer_size", "n_envs", "handle_timeout_termination", "validation_proportion")
+_ARRAYS = (np.ndarray, torch.Tensor)
 _COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
@@ -160,11 +162,17 @@ def _encode_attribute(buffer: ReplayBuffer, value: Any, name: str, encoder: Leni
         infos = [list(row) for row in value]
         while infos and not any(infos[-1]):
             infos.pop()
+        known = set(encoder.tensors)
         first = [[_encode_info(info, name, encoder) for info in row] for row in infos]
-        if infos and (size := len(json.dumps(first))) > container.MAX_JSON // 2:
+        new = encoder.tensors.keys() - known
+        text, n_bytes = json.dumps(first).encode(), sum(tensor.nbytes for tensor in encoder.tensors.values())
+        too_large = len(text) > container.MAX_JSON // 2 or len(new) > container.MAX_TENSORS // 2
+        if too_large or container.n_values(text) > container.most_values(n_bytes) // 2:
             # More than a reader takes: the transitions are worth more than what was said of them.
-            encoder.leave_out(name, f"they take {size} bytes of JSON")
+            encoder.leave_out(name, f"they take {len(text)} bytes of JSON and {len(new)} arrays")
             first = []
+            for key in new:
+                del encoder.tensors[key]
         return {"infos": list(value.shape), "first": first}
     filled = _filled(buffer, len(value))
     if filled < len(value) and not value[filled:].any():
@@ -231,6 +239,7 @@ def _with_state(
     size, n_envs = arguments["buffer_size"], arguments["n_envs"]
     _check_size(size, n_envs, cls, model)
     state = decode(tree["state"], tensors, "replay_buffer", trusted)
+    check_values({key: value for key, value in state.items() if isinstance(value, _ARRAYS)}, "replay_buffer")
     own: Any = getattr(model, "replay_buffer", None)
     buffer = own
     if type(own) is not cls or any(getattr(own, name, None) != value for name, value in arguments.items()):
@@ -251,6 +260,10 @@ def _with_attributes(
     described = tree["attributes"]
     size, n_envs = described["buffer_size"]["whole"], described["n_envs"]["whole"]
     _check_size(size, n_envs, cls, model)
+    full, pos = described["full"]["whole"], described["pos"]["whole"]
+    if type(full) is not bool or type(pos) is not int or not 0 <= pos < size:
+        raise BadFile(f"it is filled up to {pos!r:.50} of {size} rows")
+    filled = size if full else pos
     own = getattr(model, "replay_buffer", None)
     buffer: Any = cls.__new__(cls)
     for name, value in described.items():
@@ -259,7 +272,8 @@ def _with_attributes(
         if is_left_out(value.get("whole")) and type(own) is cls and name in vars(own):
             vars(buffer)[name] = vars(own)[name]
         else:
-            vars(buffer)[name] = _decode_attribute(value, (size, n_envs), f"replay_buffer.{name}", tensors, trusted)
+            sizes = (size, n_envs, filled)
+            vars(buffer)[name] = _decode_attribute(value, sizes, f"replay_buffer.{name}", tensors, trusted)
     if type(own) is cls:
         _check_alike(buffer, own)
     buffer.device = model.device
@@ -268,14 +282,14 @@ def _with_attributes(
     for name, value in vars(buffer).items():
         if isinstance(value, torch.Tensor):
             vars(buffer)[name] = value.to(model.device)
-    if type(buffer.full) is not bool or type(buffer.pos) is not int or not 0 <= buffer.pos < size:
-        raise BadFile(f"it is filled up to {buffer.pos!r:.50} of {size} rows")
     for name in _COLUMNS:
         # With optimize_memory_usage the next observations are those of the next row.
         columns = {} if name == "next_observations" and buffer.optimize_memory_usage else getattr(buffer, name)
         for column in columns.values() if isinstance(columns, dict) else [columns]:
             if column.shape[:2] != (size, n_envs):
                 raise BadFile(f"{name} is of shape {tuple(column.shape)}, not of {size} rows of {n_envs} environments")
+            check_values({name: column[:filled]}, "replay_buffer")
+    check_episodes(buffer, "replay_buffer")
     _check_spaces(buffer, model)
     return buffer
 
@@ -339,7 +353,7 @@ def _kind(space: Any) -> Any:
 
 
 def _decode_attribute(
-    tree: Any, sizes: tuple[int, int], name: str, tensors: dict[str, torch.Tensor], trusted: Sequence[str]
+    tree: Any, sizes: tuple[int, int, int], name: str, tensors: dict[str, torch.Tensor], trusted: Sequence[str]
 ) -> Any:
     if "dict" in tree:
         return {
@@ -347,7 +361,7 @@ def _decode_attribute(
         }
     if "whole" in tree:
         return decode(tree["whole"], tensors, name, trusted)
-    size, n_envs = sizes
+    size, n_envs, filled = sizes
     first = decode(tree["first"], tensors, name, trusted)
     if "infos" in tree:
         infos = np.array([[{} for _ in range(n_envs)] for _ in range(size)])
@@ -359,6 +373,9 @@ def _decode_attribute(
     n_rows = tree["rows"]
     if n_rows not in (size, size * n_envs) or len(first) > n_rows:
         raise BadFile(f"{name} has {n_rows!r:.50} rows, of which {len(first)} are filled")
+    if len(first) < filled * (n_rows // size):
+        # In the place of the others would be zeros, which nobody has seen.
+        raise BadFile(f"{name} has {len(first)} rows in the file, but {filled * (n_rows // size)} count as filled")
     rows: Any
     if isinstance(first, torch.Tensor):
         rows = first.new_zeros((n_rows, *first.shape[1:]))

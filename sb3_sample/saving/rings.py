@@ -6,7 +6,7 @@ that rows ``first`` to ``last`` are a piece of the run that never changes once i
 ``capacity`` rows are needed.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,13 +14,58 @@ import torch
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_sample.sac.compact_buffer import CompactReplay
+from sb3_sample.saving.untrusted import BadFile
 
 #: What a buffer of Stable-Baselines3 keeps of each row.
 COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "ep_start")
+#: Of these, what is measured and what is yes or no.
+_NUMBERS, _FLAGS = ("observations", "next_observations", "actions", "rewards"), ("dones", "timeouts", "held_out")
 #: What changes in rows that are there already, or is no row; written anew each time.
 _SMALL = ("ep_length", "_current_ep_start")
 #: Never used (infos, without copy_info_dict), or never changes; and what follows from the rows of a compact buffer.
 _DERIVED = ("infos", "obs_shape", "device", "observation_space", "action_space", "env", "slot", "held_out", "_ring")
+
+
+def check_values(columns: Mapping[str, Any], name: str) -> None:
+    """
+    Look at the rows of a replay buffer, whatever else is among them.
+
+    :param columns: arrays or tensors by the column's name
+    :param name: where they are from, for messages
+    :raises BadFile: if observations, actions or rewards are not finite, or flags are neither 0 nor 1: none are stored
+        in a training
+    """
+    for column, values in columns.items():
+        kind = column.split("/")[0]
+        if isinstance(values, torch.Tensor):
+            values = values.cpu().numpy()
+        if isinstance(values, Mapping):
+            check_values({f"{column}/{key}": inside for key, inside in values.items()}, name)
+        elif kind in _NUMBERS and values.dtype.kind == "f" and values.size > 0:
+            # What is not finite is the smallest or the largest of them, without a copy.
+            low, high = values.min(), values.max()
+            if not (np.isfinite(low) and np.isfinite(high)):
+                bad = low if not np.isfinite(low) else high
+                raise BadFile(f"{name}: {column} hold {bad}, which is not finite, and no training stores it")
+        elif kind in _FLAGS and values.size > 0 and (wrong := values[(values != 0) & (values != 1)]).size > 0:
+            raise BadFile(f"{name}: {column} hold {wrong[0]!r:.50}, but must be 0 or 1")
+
+
+def check_episodes(buffer: ReplayBuffer, name: str) -> None:
+    """
+    :param buffer: a replay buffer of any class
+    :param name: where its content is from, for messages
+    :raises BadFile: if it keeps where episodes begin and how long they are, as hindsight does, and one is not in it
+    """
+    for key, most in (
+        ("ep_start", buffer.buffer_size - 1), ("_current_ep_start", buffer.buffer_size - 1),
+        ("ep_length", buffer.buffer_size),
+    ):  # fmt: skip
+        places = getattr(buffer, key, None)
+        if not isinstance(places, np.ndarray) or places.size == 0:
+            continue
+        if places.dtype.kind not in "iu" or places.min() < 0 or places.max() > most:
+            raise BadFile(f"{name}: {key} must be integers in [0, {most}], where the buffer has rows")
 
 
 class Ring:
@@ -142,8 +187,8 @@ class Ring:
             fixed = name in ("buffer_size", "n_envs", "optimize_memory_usage")
             if name not in own or type(value) is not type(own[name]) or (fixed and value != own[name]):
                 raise ValueError(f"the buffer's {name:.50} cannot be {value!r:.50}")
-        if not 0 <= numbers["pos"] < self.capacity:
-            raise ValueError(f"the buffer's pos cannot be {numbers['pos']}: it has {self.capacity} rows")
+        if numbers["pos"] != small["n_rows"] % self.capacity:
+            raise ValueError(f"the buffer's pos cannot be {numbers['pos']} after {small['n_rows']} rows")
         for first, rows in pieces:
             if rows.keys() != columns.keys():
                 raise ValueError(f"the buffer has the columns {sorted(columns)}, the saved one {sorted(rows)}")
@@ -160,14 +205,16 @@ class Ring:
             setattr(self.buffer, name, value)
         for name, value in small["arrays"].items():
             array = getattr(self.buffer, name) if name in _SMALL else None
-            if array is None or np.shape(value) != array.shape:
+            if not isinstance(value, np.ndarray) or array is None or value.shape != array.shape:
                 raise ValueError(f"the buffer has no {name:.50} of shape {np.shape(value)}")
             array[...] = value
         if small["head"] is not None:
             head = self.buffer.observations[self.buffer.pos]
             if np.shape(small["head"]) != head.shape:
                 raise ValueError(f"the buffer's observations are {head.shape}, the last one {np.shape(small['head'])}")
+            check_values({"observations": np.asarray(small["head"])}, "the last row")
             head[...] = small["head"]
+        check_episodes(self.buffer, "the buffer")
 
     def interrupt(self) -> None:
         """
@@ -205,6 +252,7 @@ class _Followed:
         for number, (first, rows) in enumerate(self._pieces):
             if not (isinstance(rows, dict) and all(isinstance(value, np.ndarray) for value in rows.values())):
                 raise ValueError(f"the rows from {first} on are no arrays")
+            check_values(rows, f"the rows from {first} on")
             if number == 0:
                 self.begin = first
             elif not self.begin <= first <= self.end:

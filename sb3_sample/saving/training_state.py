@@ -19,6 +19,7 @@ from stable_baselines3.common.logger import Logger
 
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Node, Opaque, Restorer, without_generators
 from sb3_sample.saving.classes import NotPortable
+from sb3_sample.saving.generators import check_python_state, set_numpy_state
 from sb3_sample.version import __version__
 
 #: Attributes of an algorithm that its file leaves out and that the future of the run depends on nevertheless.
@@ -48,14 +49,17 @@ def _saved_elsewhere(model: BaseAlgorithm) -> set[str]:
     return {*modules, *model._excluded_save_params(), *DERIVED} - set(KEPT)
 
 
+def _not_saved(model: BaseAlgorithm) -> set[str]:
+    return (_saved_elsewhere(model) | argument_names(type(model))) - set(KEPT)
+
+
 def save_attributes(model: BaseAlgorithm) -> dict[str, Node]:
     """
     :param model: the algorithm, at the end of a turn of its loop
     :return: everything that its turns change and that is not saved elsewhere
     :raises NotPortable: (a ``ValueError``) the action noise, or an attribute of a subclass, cannot be described
     """
-    skip = (_saved_elsewhere(model) | argument_names(type(model))) - set(KEPT)
-    described, opaque = Describer().attributes(model, skip)
+    described, opaque = Describer().attributes(model, _not_saved(model))
     if opaque:
         raise NotPortable(f"{type(model).__name__} has attributes that a checkpoint cannot hold: {', '.join(opaque)}")
     return described
@@ -70,7 +74,7 @@ def restore_attributes(model: BaseAlgorithm, described: dict[str, Node]) -> None
         # How it is run is said by the present program; what "auto" once decided stays.
         described = {name: node for name, node in described.items() if name != "compiled"}
     restorer = Restorer()
-    restorer.attributes(model, described)
+    restorer.attributes(model, described, _not_saved(model))
     if restorer.kept:
         raise DoesNotFit(f"{', '.join(restorer.kept)} name other files than this program")
 
@@ -93,8 +97,9 @@ def restore_generators(state: dict[str, Any], device: torch.device) -> None:
     :param state: from :func:`save_generators`
     :param device: where the algorithm computes
     """
+    check_python_state(state["python"], "Python")
     random.setstate(state["python"])
-    np.random.set_state(state["numpy"])  # noqa: NPY002
+    set_numpy_state(state["numpy"])
     torch.set_rng_state(state["torch"])
     if device.type == "cuda" and state["cuda"] is not None:
         torch.cuda.set_rng_state(state["cuda"], device)

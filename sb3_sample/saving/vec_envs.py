@@ -7,6 +7,7 @@ hold of the environment in this way and puts a helper into it, whose methods ``e
 processes values are pickled, as always there; in the files they are not.
 """
 
+import random
 import signal
 import warnings
 from collections.abc import Iterator
@@ -14,19 +15,19 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
+import torch
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper, VecNormalize
 
-from sb3_sample.envs.portable_states import HELPER, pack, unpack
+from sb3_sample.envs.portable_states import HELPER, pack, pack_all, unpack, unpack_all
 from sb3_sample.envs.workers import SupervisedSubprocVecEnv
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name
+from sb3_sample.saving.statistics import ARGUMENTS, check_normalization, shapes_of
 
 #: Of each wrapper: what leads elsewhere, what is an argument, and clocks, which count from when it was made.
 _SKIPPED = (
     "venv", "class_attributes", "observation_space", "action_space", "num_envs", "render_mode", "metadata",
     "reset_infos", "_seeds", "_options", "t_start",
 )  # fmt: skip
-#: Arguments by which VecNormalize computes what the model sees.
-_NORMALIZATION = ("norm_obs", "norm_reward", "clip_obs", "clip_reward", "gamma", "epsilon", "norm_obs_keys", "training")
 
 
 class _Helper:
@@ -41,14 +42,21 @@ class _Helper:
         self._sigint: Any = None
 
     def pack(self) -> tuple[dict[str, Any], list[str]]:
-        return pack(self._env)
+        state, opaque = pack(self._env)
+        # Of this process, in which nobody else saves them.
+        return {**state, "generators": _global_generators()}, opaque
 
-    def unpack(self, state: dict[str, Any]) -> str | None:
+    def unpack(self, state: dict[str, Any]) -> tuple[str, str] | None:
         # An exception would end the worker.
         try:
             unpack(self._env, state)
+            # Checkpoints of earlier versions, and of environments in the training's process, are without.
+            if "generators" in state:
+                _restore_global_generators(state["generators"])
         except DoesNotFit as error:
-            return str(error)
+            return "does not fit", str(error)
+        except Exception as error:
+            return "is damaged", f"{type(error).__name__}: {error!s:.500}"
         return None
 
     def spec(self) -> list[str]:
@@ -64,6 +72,26 @@ class _Helper:
 
     def __call__(self, method: str, *args: Any) -> Any:
         return getattr(self, method)(*args)
+
+
+def _global_generators() -> dict[str, Any]:
+    """The generators of this process, as objects that are written in few bytes."""
+    python, numpy = random.Random(), np.random.RandomState()
+    python.setstate(random.getstate())
+    numpy.set_state(np.random.get_state())  # noqa: NPY002  # the one that environments draw from
+    return {"python": python, "numpy": numpy, "torch": torch.get_rng_state()}
+
+
+def _restore_global_generators(state: Any) -> None:
+    kinds = {"python": random.Random, "numpy": np.random.RandomState, "torch": torch.Tensor}
+    if not isinstance(state, dict) or {name: type(value) for name, value in state.items()} != kinds:
+        raise DoesNotFit("the generators of a worker are not described as they must be")
+    try:
+        torch.set_rng_state(state["torch"])
+    except (RuntimeError, TypeError) as error:
+        raise DoesNotFit(f"the state of torch's generator in a worker is none: {error}") from error
+    random.setstate(state["python"].getstate())
+    np.random.set_state(state["numpy"].get_state())  # noqa: NPY002
 
 
 class _AttachType(type):
@@ -137,7 +165,7 @@ def fingerprint(venv: VecEnv) -> dict[str, Any]:
     made: dict[str, Any] = {"n_envs": venv.num_envs, "wrappers": [class_name(wrapper) for wrapper in _wrappers(venv)]}
     for wrapper in _wrappers(venv):
         if class_name(wrapper).endswith(".VecNormalize"):
-            made["VecNormalize"] = {name: getattr(wrapper, name) for name in _NORMALIZATION}
+            made["VecNormalize"] = {name: getattr(wrapper, name) for name in ARGUMENTS}
     specs = call(venv, "spec")
     if specs is not None:
         made["environments"] = specs
@@ -151,30 +179,60 @@ def save(venv: VecEnv) -> tuple[dict[str, Any], list[str]]:
     """
     innermost = venv.unwrapped
     missing: list[str] = []
-    describer = Describer([venv, innermost, *_wrappers(venv)])
+    describer = Describer([innermost, *_wrappers(venv)], whole=True)
     wrappers = []
     for wrapper in _wrappers(venv):
         attributes, opaque = describer.attributes(wrapper, _SKIPPED)
         wrappers.append({"class": class_name(wrapper), "attributes": attributes})
         missing += [f"{type(wrapper).__name__}: {what}" for what in opaque]
+    classes, opaque = describer.classes()
+    missing += [*opaque, *describer.finish()]
     state: dict[str, Any] = {
         "wrappers": wrappers,
+        "classes": classes,
         "seeds": list(innermost._seeds),
         "options": list(innermost._options),
         "environments": None,
         # What a worker's episode is cut off with, should it die.
         "last": innermost.last_observations if isinstance(innermost, SupervisedSubprocVecEnv) else None,
     }
-    packed = call(venv, "pack")
+    packed, opaque = _pack(innermost)
     if packed is None:
         kind = class_name(innermost)
         reason = "an environment in a worker needs a wrapper, such as Monitor, to be reached"
         missing.append(reason if isinstance(innermost, SubprocVecEnv) else f"{kind} is not known")
     else:
-        missing += sorted({what for _, opaque in packed for what in opaque})
+        missing += sorted(set(opaque))
         if not missing:
-            state["environments"] = [packed_state for packed_state, _ in packed]
+            state["environments"] = packed
     return state, missing
+
+
+def _pack(innermost: VecEnv) -> tuple[list[dict[str, Any]] | None, list[str]]:
+    """The states of the environments, and what is not in them; None if they cannot be reached."""
+    if isinstance(innermost, DummyVecEnv):
+        return pack_all(innermost.envs)
+    answers = call(innermost, "pack")
+    if answers is None:
+        return None, []
+    return [state for state, _ in answers], [what for _, opaque in answers for what in opaque]
+
+
+def _unpack(innermost: VecEnv, states: list[dict[str, Any]]) -> list[str]:
+    """Why they do not fit, if they do not."""
+    if isinstance(innermost, DummyVecEnv):
+        try:
+            unpack_all(innermost.envs, states)
+        except DoesNotFit as error:
+            return [str(error)]
+        return []
+    answers = call(innermost, "unpack", states)
+    if answers is None:
+        return [f"{class_name(innermost)} cannot be reached"]
+    for answer in answers:
+        if answer is not None and answer[0] == "is damaged":
+            raise ValueError(f"the state of an environment is none: {answer[1]}")
+    return [answer[1] for answer in answers if answer is not None]
 
 
 def restore(venv: VecEnv, state: dict[str, Any]) -> list[str]:
@@ -191,22 +249,42 @@ def restore(venv: VecEnv, state: dict[str, Any]) -> list[str]:
     ours, theirs = [class_name(wrapper) for wrapper in wrappers], [saved["class"] for saved in state["wrappers"]]
     if ours != theirs:
         raise DoesNotFit(f"the environment is wrapped in {ours}, the saved one in {theirs}")
-    restorer = Restorer()
+    restorer = Restorer([innermost, *wrappers])
     for wrapper, saved in zip(wrappers, state["wrappers"], strict=True):
-        restorer.attributes(wrapper, saved["attributes"])
+        before = _shapes(wrapper)
+        restorer.attributes(wrapper, saved["attributes"], _SKIPPED)
+        if isinstance(wrapper, VecNormalize):
+            check_normalization(vars(wrapper), "the checkpoint")
+            if _shapes(wrapper) != before:
+                raise DoesNotFit(f"the statistics of VecNormalize are of the shapes {_shapes(wrapper)}, not {before}")
+    restorer.classes(state.get("classes", {}))
     if restorer.kept:
         warnings.warn(
             f"{', '.join(restorer.kept)} of the checkpoint name other files, and stay as they are", stacklevel=5
         )
     if isinstance(innermost, SupervisedSubprocVecEnv) and state.get("last") is not None:
         innermost.last_observations = list(state["last"])
-    innermost._seeds, innermost._options = list(state["seeds"]), list(state["options"])
+    innermost._seeds, innermost._options = _for_the_next_reset(state, innermost.num_envs)
     if state["environments"] is None:
         return ["they are not in the checkpoint"]
-    answers = call(venv, "unpack", state["environments"])
-    if answers is None:
-        return [f"{class_name(innermost)} cannot be reached"]
-    return [answer for answer in answers if answer is not None]
+    return _unpack(innermost, state["environments"])
+
+
+def _shapes(wrapper: VecEnvWrapper) -> list[Any]:
+    """The shapes of the statistics of a VecNormalize; none of another wrapper."""
+    if not isinstance(wrapper, VecNormalize):
+        return []
+    return [shapes_of(getattr(wrapper, name, None), name) for name in ("obs_rms", "ret_rms")]
+
+
+def _for_the_next_reset(state: dict[str, Any], n_envs: int) -> tuple[list[Any], list[Any]]:
+    """Seeds and options that the next reset of each environment gets."""
+    seeds, options = state["seeds"], state["options"]
+    for name, values, kind in (("seeds", seeds, int), ("options", options, dict)):
+        of_kind = isinstance(values, list) and all(value is None or type(value) is kind for value in values)
+        if not of_kind or len(values) != n_envs:
+            raise DoesNotFit(f"the {name} of {n_envs} environments cannot be {values!r:.100}")
+    return list(seeds), list(options)
 
 
 def set_sigint_ignored(venv: VecEnv, ignored: bool) -> None:

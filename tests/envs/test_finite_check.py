@@ -1,9 +1,12 @@
 """The check at the vectorised environment."""
 
+from decimal import Decimal
+from typing import Any
+
 import numpy as np
 import pytest
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from sb3_sample.envs.finite_check import FiniteCheck
 from tests.sac.common import Toy, vec
@@ -49,6 +52,48 @@ def test_names_environment_step_and_value(value: float) -> None:
         env.step(np.zeros((3, 2), np.float32))
     with pytest.raises(ValueError, match=rf"environment 1 gave a reward .*step 9: {value}"):
         env.step(np.zeros((3, 2), np.float32))
+
+
+#: What an environment gives as observation (None: its own) and reward, and what is said of it; nothing if it is fine.
+LARGEST = float(np.finfo(np.float32).max)
+GIVEN: list[tuple[Any, Any, str | None]] = [
+    (None, 0.0, None), (LARGEST, Decimal("1.5"), None), (-LARGEST, 2, None),
+    (1e39, 0.0, r"an observation .*1\.e\+39"), (-1e300, 0.0, r"an observation .*-1\.e\+300"),
+    (np.nan, 0.0, "an observation .*nan"), (None, np.nan, "a reward .*nan"), (None, 1e39, "a reward .*(1e|inf)"),
+    (None, 10**50, "a reward .*(1e|10000|inf)"), (None, None, "a reward .*(None|nan)"),
+    (None, Decimal("NaN"), "a reward .*(NaN|nan)"), (None, Decimal("1e400"), "a reward .*(1E|inf)"),
+]  # fmt: skip
+
+
+class Says(Toy):
+    """Gives what its action says, by its place in the list."""
+
+    def __init__(self) -> None:
+        super().__init__(spaces.Box(-np.inf, np.inf, (3,), np.float64))
+
+    def step(self, action: Any) -> Any:
+        there, _, *rest = super().step(action)
+        observation, reward, _ = GIVEN[int(action[0])]
+        return (there.astype(np.float64) if observation is None else np.full(3, observation)), reward, *rest
+
+
+@pytest.mark.parametrize("kind", [DummyVecEnv, SubprocVecEnv])
+def test_what_no_network_takes_is_said_to_be_the_environments(kind: type[VecEnv]) -> None:
+    """
+    Of the 32 bits of buffers and networks, and whatever a worker sends: arrays of its rewards are of objects if one is
+    no number.
+    """
+    env = checked(kind([Says, Says]))
+    env.reset()
+    with np.errstate(over="ignore"):
+        for place, (_, reward, words) in enumerate(GIVEN):
+            actions = np.array([[0, 0], [place, 0]], np.float32)
+            if words is None:
+                assert float(env.step(actions)[1][1]) == float(reward)
+                continue
+            with pytest.raises(ValueError, match=rf"(?s)environment 1 gave {words}.*Allowed are finite numbers"):
+                env.step(actions)
+    env.close()
 
 
 @pytest.mark.parametrize("space", [spaces.Discrete(5), spaces.MultiDiscrete([3, 4]), spaces.MultiBinary(3)])

@@ -1,5 +1,6 @@
 """States on disk: restored in another environment, or another process, they are exact, bit by bit."""
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from sb3_sample.envs import make_env
 from sb3_sample.envs.portable_states import pack, unpack
 from sb3_sample.envs.states import layers_of, restore_state, save_state, simulator_of
 from sb3_sample.saving import container
-from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, same
+from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name, same
 from sb3_sample.saving.encoding import decode, encode
 from tests.envs.test_states import assert_equal, random_actions, steps
 
@@ -111,6 +112,98 @@ def test_a_view_of_the_simulators_memory_follows_it() -> None:
     expected = steps(env, actions)
     restore_state(env, state)
     assert_equal(steps(env, actions), expected)
+
+
+#: Arrays of the simulator that a state could bring: those that are indices in its memory, which MuJoCo follows without
+#: a check, and those that are saved, as something else.
+HOSTILE = [
+    *(("model", name, value) for value in (10**6, 0) for name in (
+        "jnt_qposadr", "jnt_dofadr", "body_parentid", "body_jntadr", "dof_bodyid", "geom_bodyid", "actuator_trnid",
+        "sensor_adr", "dof_parentid",
+    )),
+    *(("data", name, 10**6) for name in ("efc_J", "M_rownnz", "tree_asleep", "contact")),
+    ("model", "body_mass", "int"), ("model", "body_mass", "long"), ("model", "body_mass", "list"),
+    ("model", "body_mass", "left out"), ("model", "body_mass", np.nan), ("model", "geom_size", np.inf),
+    ("data", "qacc_warmstart", np.nan), ("data", "xpos", "int"), ("data", "qM", "left out"), ("data", "qpos", "long"),
+    (None, "integration", np.nan), (None, "integration", "long"), (None, "integration", "int"),
+    (None, "integration", "list"), (None, "integration", "left out"), (None, "model", "list"), (None, "more", 1),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def simulated() -> tuple[gym.Env, dict[str, Any]]:
+    env = make("dmc/cheetah-run-v0")
+    env.reset(seed=0)
+    steps(env, random_actions(env, 5))
+    return env, pack(env)[0]
+
+
+@pytest.mark.parametrize(("part", "name", "value"), HOSTILE, ids=str)
+def test_the_simulators_memory_is_given_what_is_saved_of_it(
+    part: str | None, name: str, value: Any, simulated: tuple[gym.Env, dict[str, Any]], tmp_path: Path
+) -> None:
+    """Anything else is refused with nothing changed: at the next step it would take the process down."""
+    env, good = simulated
+    model, data = simulator_of(env)  # type: ignore[misc]
+    state = through_a_file(good, tmp_path / "state")
+    arrays = state["simulator"] if part is None else state["simulator"][part]
+    if name in arrays:
+        array = arrays[name]
+    else:
+        own = getattr(model if part == "model" else data, name, None)
+        array = np.array(own) if isinstance(own, np.ndarray) else np.zeros(3, np.int32)
+    changed: Any = {
+        "int": lambda: array.astype(np.int64), "long": lambda: np.zeros((len(array) + 1, *array.shape[1:])),
+        "list": lambda: [1.0], "left out": lambda: None,
+    }.get(value, lambda: np.full_like(array, value))()  # fmt: skip
+    arrays[name] = changed
+    if value == "left out":
+        del arrays[name]
+    state = through_a_file(state, tmp_path / "state")
+    before = data.qpos.copy(), {n: np.array(getattr(model, n)) for n in ("jnt_qposadr", "body_parentid", "body_mass")}
+    with pytest.raises(DoesNotFit):
+        unpack(env, state)
+    np.testing.assert_array_equal(data.qpos, before[0])
+    for each, array in before[1].items():
+        np.testing.assert_array_equal(getattr(model, each), array)
+    unpack(env, good)
+    steps(env, random_actions(env, 2))
+
+
+@pytest.mark.parametrize(
+    ("name", "node"),
+    [
+        ("env", {"value": 3}), ("step", {"value": 3}), ("reset", {"same": 0}), ("_sb3_sample_state", {"value": 3}),
+        ("__class__", {"value": 3}), ("t_start", {"value": 0.0}), ("rewards", {"id": 2**61 - 1, "list": []}),
+        ("rewards", {"id": -1, "list": []}), ("rewards", {"same": [1]}),
+    ],
+)  # fmt: skip
+def test_attributes_that_are_never_saved(name: str, node: Any, simulated: tuple[gym.Env, dict[str, Any]]) -> None:
+    env, good = simulated
+    state = copy.deepcopy(good)
+    state["layers"][0]["attributes"][name] = node
+    with pytest.raises(DoesNotFit):
+        unpack(env, state)
+    unpack(env, good)
+
+
+def test_an_object_that_is_saved_elsewhere_is_not_looked_into(simulated: tuple[gym.Env, dict[str, Any]]) -> None:
+    """The simulator and its task are objects of Python's, too, and have attributes."""
+    env, good = simulated
+    seen = set()
+    for layer, value in zip(layers_of(env), good["layers"], strict=True):
+        for name, own in vars(layer).items():
+            if not hasattr(own, "__dict__") or isinstance(own, gym.Space) or name in value["attributes"]:
+                continue
+            state = copy.deepcopy(good)
+            (described,) = [each for each, there in zip(state["layers"], layers_of(env), strict=True) if there is layer]
+            described["attributes"][name] = {"object": class_name(own), "attributes": {"hostile": {"value": 1}}}
+            with pytest.raises(DoesNotFit):
+                unpack(env, state)
+            assert "hostile" not in vars(own)
+            seen.add(class_name(own))
+    assert any(name.endswith(".Physics") for name in seen), seen
+    unpack(env, good)
 
 
 class Sharing(gym.Env):

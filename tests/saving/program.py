@@ -279,8 +279,9 @@ def outcome(agent: Any, folder: str, callback: Any = None) -> dict[str, str]:
     def note(name: str, value: Any) -> None:
         if isinstance(value, dict):
             for key, item in value.items():
-                # Seconds that an episode took, and a whole run: they are what may differ.
-                if key not in ("t", "episode_times", "id") and not str(key).startswith("time/"):
+                # Seconds that an episode took, and a whole run: they are what may differ; and the generators of workers
+                # are seeded by the system.
+                if key not in ("t", "episode_times", "id", "generators") and not str(key).startswith("time/"):
                     note(f"{name}/{key}", item)
         elif isinstance(value, (list, tuple, collections.deque)):
             found[f"{name}/length"] = str(len(value))
@@ -296,6 +297,8 @@ def outcome(agent: Any, folder: str, callback: Any = None) -> dict[str, str]:
             note(name, value.bit_generator.state)
         elif isinstance(value, np.random.RandomState):
             note(name, value.get_state())
+        elif isinstance(value, random.Random):
+            note(name, value.getstate())
         else:
             found[name] = repr(value)
 

@@ -9,6 +9,7 @@ each, before and after. ``FUZZ`` in the environment says how many the test throw
 
 import contextlib
 import ctypes
+import io
 import json
 import os
 import resource
@@ -19,7 +20,7 @@ import time
 import types
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -28,10 +29,26 @@ import pytest
 import torch
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_sample.saving import container
+from sb3_sample.saving.encoding import decode, encode
 from sb3_sample.saving.run_folder import RunFolder
 from tests.sac.common import differing, sac, state, vec
-from tests.saving.hostile_folders import FAMILIES, FILES, NEXT, Case, folder_case, snapshot, user_files
+from tests.saving import hostile_values
+from tests.saving.hostile import Original, at
+from tests.saving.hostile_folders import (
+    FAMILIES,
+    FILES,
+    NEW,
+    NEXT,
+    ROWS,
+    Case,
+    folder_case,
+    replaced,
+    snapshot,
+    user_files,
+)  # fmt: skip
 from tests.saving.test_hostile import BYTES, HEADROOM, SECONDS, Watch, forget_peak, peak
 
 #: Seconds after which a folder is taken for one that would never end.
@@ -230,6 +247,80 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def test_one_of_each_family(number: int, base: Path) -> None:
     result = throw(folder_case(0, number, original(base)), base, number)
     assert result["wrong"] is None, result
+
+
+def normalised(folder: Path, steps: int) -> Any:
+    """A run whose environment has all that a checkpoint holds of one."""
+    return sac(VecNormalize(vec()), compile=False).learn(steps, checkpoint=folder, checkpoint_freq=10)
+
+
+@pytest.fixture(scope="module")
+def files_of_a_run(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    run = tmp_path_factory.mktemp("normalised") / "run"
+    normalised(run, 30)
+    return {str(path.relative_to(run)): path.read_bytes() for path in run.rglob("*") if path.is_file()}
+
+
+def refused(run: Path, words: str) -> None:
+    """A run that would go on is refused, in these words, within the bounds of all, and before it takes a step."""
+    forget_peak()
+    bytes_before, start = peak(), time.process_time()
+    with pytest.raises(ValueError, match=words) as raised:
+        normalised(run, 40)
+    assert time.process_time() - start < SECONDS and peak() - bytes_before < BYTES
+    assert str(run) in str(raised.value) and not (run / NEXT).exists()
+
+
+def changed(files: dict[str, bytes], run: Path, name: str, kind: str, change: Callable[[Any], Any]) -> None:
+    """Lay a run's files with what one holds changed, behind right checksums everywhere."""
+    lay(run, files)
+    value = decode(*container.read(run / name, kind), kind)
+    change(value)
+    tensors: dict[str, torch.Tensor] = {}
+    file = io.BytesIO()
+    container.write(file, kind, encode(value, kind, tensors), tensors)
+    replaced(run, name, file.getvalue())
+
+
+@pytest.mark.parametrize("row", hostile_values.STATE, ids=lambda row: f"{'.'.join(map(str, row[0]))}-{row[1]!r:.30}")
+def test_a_state_that_no_training_writes(row: Any, files_of_a_run: dict[str, bytes], tmp_path: Path) -> None:
+    place, value, words = row
+    changed(files_of_a_run, tmp_path / "run", f"{NEW}/state.zip", "checkpoint",
+            lambda state: at(state, place[:-1]).__setitem__(place[-1], value))  # fmt: skip
+    refused(tmp_path / "run", words)
+
+
+@pytest.mark.parametrize("row", hostile_values.ROWS, ids=str)
+def test_rows_that_no_training_writes(row: Any, files_of_a_run: dict[str, bytes], tmp_path: Path) -> None:
+    name, value, words = row
+    changed(files_of_a_run, tmp_path / "run", ROWS[1], "replay rows",
+            lambda rows: rows[name].reshape(-1).__setitem__(0, value))  # fmt: skip
+    refused(tmp_path / "run", words)
+
+
+@pytest.mark.parametrize("case", hostile_values.GENERATORS, ids=str)
+def test_generators_of_an_environment(case: Any, files_of_a_run: dict[str, bytes], tmp_path: Path) -> None:
+    """NumPy takes each of them, and draws from what lies beside its numbers, or crashes."""
+    run = tmp_path / "run"
+    lay(run, files_of_a_run)
+    original = Original("state", files_of_a_run[f"{NEW}/state.zip"])
+    attributes = ("dict", "env", "dict", "environments", 0, "dict", "layers", -1, "dict", "attributes", "dict")
+    place = (*attributes, "hostile")
+    at(original.content["tree"], attributes)  # is there
+    replaced(run, f"{NEW}/state.zip", hostile_values.with_generator(original, place, case))
+    refused(run, case[3])
+
+
+@pytest.mark.parametrize("file", ["state.zip", ROWS[1]])
+def test_more_than_the_bytes_say(file: str, files_of_a_run: dict[str, bytes], tmp_path: Path) -> None:
+    name = file if "/" in file else f"{NEW}/{file}"
+    for number, (_, data, words) in enumerate(
+        hostile_values.too_much(Original(name, files_of_a_run[name]), container.MAX_JSON)
+    ):
+        run = tmp_path / f"{number}" / "run"
+        lay(run, files_of_a_run)
+        replaced(run, name, data)
+        refused(run, words)
 
 
 @pytest.mark.slow

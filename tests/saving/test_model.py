@@ -388,10 +388,10 @@ def test_hostile_files(maker: str, change: Any, files: dict[str, Path]) -> None:
     file = changed(files[maker], change)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        start = time.perf_counter()
+        start = time.process_time()
         with pytest.raises(ValueError):
             type(MAKE[maker]()).load(file, device="cpu")
-        assert time.perf_counter() - start < 5
+        assert time.process_time() - start < 2
 
 
 @pytest.mark.parametrize("device", [{"device": "meta"}, "x"])
@@ -456,12 +456,12 @@ def test_models_of_all_sizes_load_unhindered(model_size: tuple[int, int], tmp_pa
         if compact:
             model.learn(10)
         model.save(tmp_path / "m")
-        start = time.perf_counter()
+        start = time.process_time()
         BRO("MlpPolicy", vec(), model_size=model_size, buffer_size=1000, device="cpu")
-        building = time.perf_counter() - start
-        start = time.perf_counter()
+        building = time.process_time() - start
+        start = time.process_time()
         loaded = BRO.load(tmp_path / "m", device="cpu")
-        assert time.perf_counter() - start < 3 * building + 1
+        assert time.process_time() - start < 3 * building + 1
         assert not differing(state(model), state(loaded))
 
 
