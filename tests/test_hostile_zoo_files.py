@@ -2,8 +2,8 @@
 Hostile files in the places of all that the zoo's commands read: each is refused in one line, within a moment and some
 memory, or used; none runs code, writes elsewhere, imports what it names, or hangs.
 
-``python -m tests.test_hostile_zoo_files FOLDER [WORD ...]`` throws the cases that have all the words in them, and prints
-a line of JSON for each.
+``python -m tests.test_hostile_zoo_files FOLDER [WORD ...]`` throws the cases that have all the words in them, and
+prints a line of JSON for each.
 """
 
 import json

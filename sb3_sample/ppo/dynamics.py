@@ -111,7 +111,7 @@ class TransitionBuffer:
         """
         :param state: transitions as ``state_dict`` gives them; of more than the capacity the most recent are taken
         :param strict: there for Stable-Baselines3, which passes it
-        :raises ValueError: if they are no transitions of this buffer, or not finite
+        :raises ValueError: if they are no transitions of this buffer, or none that an environment gives
         """
         self._check(state)
         self.size = 0
@@ -126,8 +126,9 @@ class TransitionBuffer:
             values = state[name]
             if values.shape != (len(state["rewards"]), *own.shape[1:]) or values.dtype != torch.from_numpy(own).dtype:
                 raise ValueError(f"{name} of transitions must be of shape (N, {own.shape[1:]}), not {values.shape}")
-            if not values.isfinite().all():
-                raise ValueError(f"{name} of transitions holds what is not finite")
+            if not values.isfinite().all() or (name == "terminations" and ((values != 0) & (values != 1)).any()):
+                allowed = "0 or 1" if name == "terminations" else "finite"
+                raise ValueError(f"{name} of transitions must be {allowed}")
 
 
 class Standardizer(nn.Module):

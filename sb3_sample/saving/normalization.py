@@ -31,7 +31,7 @@ def save_vec_normalize(venv: VecEnv, path: str | pathlib.Path) -> None:
 
     :param venv: the ``VecNormalize``
     :param path: path, written as it is
-    :raises ValueError: if it is something else
+    :raises ValueError: if it is something else, or has settings or statistics that :func:`load_vec_normalize` refuses
     :raises OSError: if the file cannot be written
     """
     if type(venv) is not VecNormalize:
@@ -39,6 +39,7 @@ def save_vec_normalize(venv: VecEnv, path: str | pathlib.Path) -> None:
     tensors: dict[str, torch.Tensor] = {}
     state = {name: getattr(venv, name) for name in ARGUMENTS}
     state.update(obs_rms=venv.obs_rms if venv.norm_obs else None, ret_rms=venv.ret_rms)
+    check_normalization(state, "venv")
     tree = encode(state, "VecNormalize", tensors)
     container.write(path, KIND, tree, tensors)
 

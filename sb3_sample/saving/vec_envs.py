@@ -161,9 +161,12 @@ def fingerprint(venv: VecEnv) -> dict[str, Any]:
     """
     :param venv: a vectorised environment
     :return: what it is made of, as plain values by name
+    :raises ValueError: if a ``VecNormalize`` has settings with which nobody could go on
     """
     made: dict[str, Any] = {"n_envs": venv.num_envs, "wrappers": [class_name(wrapper) for wrapper in _wrappers(venv)]}
     for wrapper in _wrappers(venv):
+        if isinstance(wrapper, VecNormalize):
+            check_normalization(vars(wrapper), "env")
         if class_name(wrapper).endswith(".VecNormalize"):
             made["VecNormalize"] = {name: getattr(wrapper, name) for name in ARGUMENTS}
     specs = call(venv, "spec")

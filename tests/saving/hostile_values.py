@@ -118,6 +118,8 @@ NUMBERS: tuple[tuple[str, str, float, str], ...] = (
       for target in ("buffer", "her") for name in ("dones", "timeouts") for value in (7, 0.5, math.nan)),
     *(("her", f"replay_buffer.{name}", value, f"{name} must be integers in")
       for name in ("ep_start", "ep_length", "_current_ep_start") for value in (-(10**12), 10**12)),
+    *(("MBMAPPO", f"transitions.{name}", value, f"transitions.{name} .*not finite|{name} of transitions must be")
+      for name, value in (("observations", math.nan), ("rewards", math.inf), ("terminations", 7))),
     ("VecNormalize", "VecNormalize.obs_rms.mean", math.nan, "obs_rms holds no statistics"),
     ("VecNormalize", "VecNormalize.obs_rms.var", math.inf, "obs_rms holds no statistics"),
     ("VecNormalize", "VecNormalize.obs_rms.var", -1.0, "obs_rms holds no statistics"),

@@ -25,16 +25,18 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
-from sb3_sample.saving import container
+from sb3_sample.saving import container, save_vec_normalize, vec_envs
 from sb3_sample.saving.encoding import decode, encode
 from sb3_sample.saving.run_folder import RunFolder
-from tests.sac.common import differing, sac, state, vec
+from tests.sac.common import Toy, differing, sac, state, vec
 from tests.saving import hostile_values
 from tests.saving.hostile import Original, at
 from tests.saving.hostile_folders import (
@@ -309,6 +311,36 @@ def test_generators_of_an_environment(case: Any, files_of_a_run: dict[str, bytes
     at(original.content["tree"], attributes)  # is there
     replaced(run, f"{NEW}/state.zip", hostile_values.with_generator(original, place, case))
     refused(run, case[3])
+
+
+@pytest.mark.parametrize("setting", [{"clip_obs": 0.0}, {"clip_reward": -5.0}, {"epsilon": -1.0}, {"gamma": 7.0}])
+def test_settings_that_would_be_refused_are_not_saved(setting: dict[str, float], tmp_path: Path) -> None:
+    """Rather than at the end of a training, that is said before it begins."""
+    env = VecNormalize(vec(), **setting)
+    (name,) = setting
+    with pytest.raises(ValueError, match=f"env: {name} of a VecNormalize must be"):
+        sac(env).learn(20, checkpoint=tmp_path / "run")
+    with pytest.raises(ValueError, match=f"venv: {name} of a VecNormalize must be"):
+        save_vec_normalize(env, tmp_path / "normalize.zip")
+    assert not (tmp_path / "normalize.zip").exists()
+
+
+def toy() -> Monitor:
+    return Monitor(Toy())
+
+
+def test_a_worker_lives_on() -> None:
+    """What an environment in another process cannot be given is an error here, and not the end of the worker."""
+    env = SubprocVecEnv([toy])
+    env.reset()
+    state, missing = vec_envs.save(env)
+    assert not missing
+    for value in (3, {"layers": [3], "simulator": None}, {"layers": state["environments"][0]["layers"]}):
+        with pytest.raises(ValueError, match="the state of an environment is none: [A-Z][A-Za-z]*Error"):
+            vec_envs.restore(env, {**state, "environments": [value]})
+    assert vec_envs.restore(env, state) == []
+    env.step(np.zeros((1, 2), np.float32))
+    env.close()
 
 
 @pytest.mark.parametrize("file", ["state.zip", ROWS[1]])
