@@ -1,4 +1,4 @@
-# make demo      set up and train BRO on a DeepMind Control task (some minutes on 2 cores)
+# make demo      set up and train BRO on a DeepMind Control task (2 minutes on 2 free cores)
 # make test      set up, lint, types, tests (what CI runs)
 # make test-all  the same with the long tests
 # make clean     remove the virtual environment
