@@ -620,6 +620,9 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         infos: list[dict[str, Any]],
     ) -> None:
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        if self._vec_normalize_env is None:
+            # Set by it all the same; saved, it says that there was a VecNormalize.
+            self._last_original_obs = None
         self.num_transitions += len(dones)
         rewards = reward if self._vec_normalize_env is None else self._vec_normalize_env.get_original_reward()
         for part in self._parts().values():
