@@ -345,6 +345,14 @@ def test_statistics_that_are_missing_are_asked_for(family: str, tmp_path: Path) 
     assert (tmp_path / "policy.onnx").exists()
 
 
+@pytest.mark.parametrize("family", ["sac", "ppo"])
+def test_without_normalisation_no_statistics_are_asked_for(family: str, tmp_path: Path) -> None:
+    model = sac().learn(12) if family == "sac" else tiny(MBMAPPO).learn(16)
+    model.save(tmp_path / "m")
+    type(model).load(tmp_path / "m").export(tmp_path / "policy")
+    assert (tmp_path / "policy.onnx").exists()
+
+
 def test_parameters_that_are_not_finite_are_not_exported(tmp_path: Path) -> None:
     model = sac()
     with torch.no_grad():
