@@ -4,8 +4,9 @@ Gradient steps and actions a second on a GPU, eager and captured as a CUDA graph
     python benchmarks/gpu.py [--seconds 60] [--device cuda]
 
 Rows are printed as they come; what has not begun after ``--seconds`` is left out, with a word. A gradient step includes
-drawing its batch of 128 (BRO) or 256 transitions with 17 observed numbers and 6 actions. "One a call" is ``train(1)``,
-as replay ratio 1 takes it, "many" ``train(100)``; "acting" is ``predict`` of one observation, with noise.
+drawing its batch of 128 (BRO) or 256 transitions with 17 observed numbers and 6 actions, as in ``update_speed.py``.
+"One a call" is ``train(1)``, as replay ratio 1 takes it, "many" ``train(100)``; "acting" is ``predict`` of one
+observation, with noise.
 """
 
 import argparse
@@ -15,14 +16,12 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium import spaces
+from update_speed import OBSERVATION, build, training_step
 
 from sb3_sample.sac import DAC, SAC, VPLSAC, BROFast
 
-WARM_UP = 300
 #: Agents by label: class, arguments.
 AGENTS: dict[str, tuple[type[SAC], dict[str, Any]]] = {
     "BRO 4.92M": (BROFast, {"model_size": "4.92M"}),
@@ -31,23 +30,6 @@ AGENTS: dict[str, tuple[type[SAC], dict[str, Any]]] = {
     "DAC": (DAC, {}),
     "VPL-SAC": (VPLSAC, {}),
 }
-
-
-class Noise(gym.Env):
-    """Random observations: this benchmark is about the update."""
-
-    observation_space = spaces.Box(-1, 1, (17,), np.float32)
-    action_space = spaces.Box(-1, 1, (6,), np.float32)
-
-    def _observation(self) -> np.ndarray:
-        return self.np_random.uniform(-1, 1, 17).astype(np.float32)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        super().reset(seed=seed)
-        return self._observation(), {}
-
-    def step(self, action: np.ndarray) -> Any:
-        return self._observation(), float(action.sum()), False, False, {}
 
 
 def rate(call: Callable[[], Any], n: int, device: torch.device) -> float:
@@ -80,15 +62,12 @@ def main() -> None:
             with warnings.catch_warnings():
                 # An older torch captures the eager step: the label of the row.
                 warnings.filterwarnings("ignore", message="The gradient step is not compiled")
-                model = cls(
-                    "MlpPolicy", Noise(), learning_starts=WARM_UP, compile=compile, device=device, seed=0, **kwargs
-                )  # fmt: skip
-                model.learn(WARM_UP)
+                model = build(cls, compile=compile, device=device, **kwargs)
                 model.train(5, model.batch_size)
             n = 100 if compile else 20
-            one = rate(lambda model=model: model.train(1, model.batch_size), n, device)  # type: ignore[misc]
+            one = rate(training_step(model, model.batch_size), n, device)
             many = n * rate(lambda model=model, n=n: model.train(n, model.batch_size), 1, device)  # type: ignore[misc]
-            observation = np.zeros((1, 17), np.float32)
+            observation = np.zeros((1, OBSERVATION), np.float32)
             acts = rate(lambda model=model, o=observation: model.predict(o), 100, device)  # type: ignore[misc]
             print(f"| {label} | {how} | {one:.0f} | {many:.0f} | {acts:.0f} |", flush=True)
 

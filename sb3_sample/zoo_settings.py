@@ -19,7 +19,7 @@ from sb3_contrib.common.wrappers import TimeFeatureWrapper
 from stable_baselines3.common import atari_wrappers, vec_env
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_sample.saving.classes import resolve
+from sb3_sample.saving.classes import resolve, within
 from sb3_sample.saving.untrusted import BadFile, read_regular
 
 #: Bytes of a file, and values in it, where an alias counts as what it stands for: some hundred times what the zoo
@@ -256,7 +256,7 @@ def _check_wrapper(entry: Any, known: Mapping[type, Arguments], where: str, trus
     if not isinstance(path, str) or not isinstance(arguments, dict) or not all(map(_is_identifier, arguments)):
         raise BadFile(f"{where} is {entry!r:.100}, not the path of a wrapper, or that with its arguments by name")
     module, _, name = path.rpartition(".")
-    if any(module == trusted or module.startswith(f"{trusted}.") for trusted in trusted_modules):
+    if within(module, trusted_modules):
         return
     # Of modules that are there: to import one can do anything.
     found = getattr(sys.modules.get(module), "__dict__", {}).get(name)

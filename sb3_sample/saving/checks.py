@@ -112,10 +112,12 @@ def check_sizes(model: Any, name: str, given: Collection[str]) -> None:
     most = MAX_TRANSITIONS
     if isinstance(buffer_class, type) and issubclass(buffer_class, HerReplayBuffer):
         most = MAX_HER_TRANSITIONS
-    if "buffer_size" not in given and (type(size) is not int or not 1 <= size <= most):
-        raise BadFile(f"{name}: buffer_size must lie in [1, {most}], not be {size!r:.100}: pass buffer_size= to load")
-    if "buffer_size" not in given and getattr(model, "buffer_size", None) is not None:
-        n_bytes = size * _bytes_of(model.observation_space)
+    if "buffer_size" not in given:
+        if type(size) is not int or not 1 <= size <= most:
+            raise BadFile(
+                f"{name}: buffer_size must lie in [1, {most}], not be {size!r:.100}: pass buffer_size= to load"
+            )
+        n_bytes = size * _bytes_of(model.observation_space) if hasattr(model, "buffer_size") else 0
         if n_bytes > MAX_BUFFER_BYTES:
             raise BadFile(
                 f"{name}: a buffer_size of {size} takes {n_bytes} bytes, more than any machine has: pass buffer_size= "

@@ -146,6 +146,14 @@ def _check_known(path: str, module: str, names: Sequence[str]) -> None:
         raise ValueError(f"{path!r:.300} is of a module that is not there, or not imported")
 
 
+def has_state(cls: type) -> bool:
+    """
+    :param cls: any class
+    :return: whether its objects give a state and take it, as torch's modules and optimizers do
+    """
+    return hasattr(cls, "state_dict") and hasattr(cls, "load_state_dict")
+
+
 def may_be_set(cls: type, name: str) -> bool:
     """
     What a file may set on an object, and so what is written of one: never what its class does.

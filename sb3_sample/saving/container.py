@@ -188,6 +188,14 @@ def _say_not_synced(folder: pathlib.Path, error: OSError) -> None:
         )
 
 
+def is_sha256(value: Any) -> bool:
+    """
+    :param value: anything
+    :return: whether it is a checksum as files and manifests have them
+    """
+    return isinstance(value, str) and _SHA256.fullmatch(value) is not None
+
+
 def _max_json(kind: str) -> int:
     return MAX_JSON_OF.get(kind, MAX_JSON)
 
@@ -386,7 +394,7 @@ def _checked(content: Any, kind: str, name: str) -> tuple[Any, dict[str, str]]:
 
 
 def _compare(digest: Any, expected: Any, name: str, entry: str) -> None:
-    if not isinstance(expected, str) or not _SHA256.fullmatch(expected) or digest.hexdigest() != expected:
+    if not is_sha256(expected) or digest.hexdigest() != expected:
         raise BadFile(f"{name} is damaged: the checksum of {entry} is another than the one written with it")
 
 

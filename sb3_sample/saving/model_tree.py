@@ -23,7 +23,7 @@ from sb3_sample.saving.checks import (
     hints_of,
     library_class,
 )
-from sb3_sample.saving.classes import PACKAGES, NotPortable, may_be_set, path_of, within
+from sb3_sample.saving.classes import PACKAGES, NotPortable, has_state, may_be_set, path_of, within
 from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.decoding import NotTrusted, decode
 from sb3_sample.saving.encoding import LEFT_OUT, Encoder, Lenient, is_left_out
@@ -55,7 +55,7 @@ class Description:
         schedules = schedule_names(library_class(type(model)))
         values = {name: value for name, value in vars(model).items() if name not in skipped}
         #: Modules and the like of a subclass's own, which are written by their states.
-        self._own = {name: value for name, value in values.items() if name not in always and _has_state(value)}
+        self._own = {name: value for name, value in values.items() if name not in always and has_state(type(value))}
         self.attributes: dict[str, Any] = {}
         self._tensors: dict[str, list[str]] = {}
         for name, value in values.items():
@@ -311,7 +311,7 @@ class Content:
             check_finite(own, value, f"{self.name}: {name}", "", BadFile)
             if isinstance(own, torch.Tensor) and isinstance(value, torch.Tensor) and own.shape == value.shape:
                 recursive_setattr(model, f"{name}.data", value.to(own))
-            elif _has_state(own) and isinstance(value, dict):
+            elif has_state(type(own)) and isinstance(value, dict):
                 if isinstance(own, torch.optim.Optimizer):
                     check_moments(own, value, f"{self.name}: {name}")
                 own.load_state_dict(value)
@@ -330,10 +330,6 @@ class Content:
             return ""
         wanted = " or ".join(f"{name}=" for name in sorted(names))
         return f"{self.name} lacks {', '.join(sorted(names))}, for which the defaults stand (load takes {wanted}): "
-
-
-def _has_state(value: Any) -> bool:
-    return all(hasattr(type(value), name) for name in ("state_dict", "load_state_dict"))
 
 
 def _agree(theirs: Any, given: Any, name: str) -> bool:

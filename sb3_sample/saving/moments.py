@@ -28,12 +28,12 @@ def check_moments(optimizer: torch.optim.Optimizer, state: Any, name: str) -> No
         if not isinstance(indices, list) or not all(type(i) is int for i in indices):
             raise BadFile(f"{name} does not say which parameters are in group {n}")
         group_of.update(dict.fromkeys(indices, n))
-    order = list(group_of)
+    place = {index: i for i, index in enumerate(group_of)}
     kinds: dict[Any, set[Any]] = {}
     for index, kept in moments.items():
-        if index not in order or order.index(index) >= len(parameters) or not isinstance(kept, dict):
+        if index not in place or place[index] >= len(parameters) or not isinstance(kept, dict):
             raise BadFile(f"{name} keeps something of a parameter {index!r:.50} that is not there")
-        shape = parameters[order.index(index)].shape
+        shape = parameters[place[index]].shape
         for key, value in kept.items():
             wanted = shape if key in _MOMENTS else torch.Size(()) if key == "step" else None
             if wanted is not None and (not isinstance(value, torch.Tensor) or value.shape != wanted):

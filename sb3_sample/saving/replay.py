@@ -13,7 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.saving import container, notice, paths
-from sb3_sample.saving.classes import PACKAGES, check_trusted, may_be_set, path_of, within
+from sb3_sample.saving.classes import PACKAGES, check_trusted, has_state, may_be_set, path_of, within
 from sb3_sample.saving.container import BadFile, PickledFile
 from sb3_sample.saving.decoding import NotTrusted
 from sb3_sample.saving.encoding import Lenient, decode, is_left_out
@@ -124,10 +124,6 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
             raise ValueError(f"{name}: {error}") from error
 
 
-def _has_state(buffer: Any) -> bool:
-    return hasattr(buffer, "state_dict") and hasattr(buffer, "load_state_dict")
-
-
 def encode_buffer(buffer: ReplayBuffer, encoder: Lenient, only_small: bool = False) -> Any:
     """
     :param buffer: a replay buffer
@@ -136,14 +132,14 @@ def encode_buffer(buffer: ReplayBuffer, encoder: Lenient, only_small: bool = Fal
     :return: its tree of JSON
     """
     tree: dict[str, Any] = {"class": encoder.attempt(type(buffer), "replay_buffer").get("import")}
-    if _has_state(buffer):
+    if has_state(type(buffer)):
         tree["arguments"] = {name: getattr(buffer, name) for name in _ARGUMENTS if hasattr(buffer, name)}
         state: Any = {} if only_small else buffer.state_dict()  # type: ignore[attr-defined]
         tree["state"] = {"dict": {key: encoder.attempt(value, f"replay_buffer.{key}") for key, value in state.items()}}
         return tree
     tree["attributes"] = {}
     for name, value in vars(buffer).items():
-        if name in _NOT_SAVED or (only_small and isinstance(value, (np.ndarray, torch.Tensor, dict))):
+        if name in _NOT_SAVED or (only_small and isinstance(value, (*_ARRAYS, dict))):
             continue
         if may_be_set(type(buffer), name):
             tree["attributes"][name] = _encode_attribute(buffer, value, f"replay_buffer.{name}", encoder)
@@ -155,7 +151,7 @@ def encode_buffer(buffer: ReplayBuffer, encoder: Lenient, only_small: bool = Fal
 def _encode_attribute(buffer: ReplayBuffer, value: Any, name: str, encoder: Lenient) -> dict[str, Any]:
     if isinstance(value, dict) and value and all(isinstance(item, np.ndarray) for item in value.values()):
         return {"dict": {k: _encode_attribute(buffer, item, f"{name}.{k}", encoder) for k, item in value.items()}}
-    if not isinstance(value, (np.ndarray, torch.Tensor)) or value.ndim == 0:
+    if not isinstance(value, _ARRAYS) or value.ndim == 0:
         return {"whole": encoder.attempt(value, name)}
     if isinstance(value, np.ndarray) and value.dtype == object and all(isinstance(info, dict) for info in value.flat):
         # HerReplayBuffer's: of the environments if copy_info_dict, else empty.
@@ -214,7 +210,7 @@ def decode_buffer(
         cls = own if is_own else decode({"import": path}, {}, "replay_buffer", trusted)
         if not (isinstance(cls, type) and issubclass(cls, ReplayBuffer)):
             raise BadFile(f"it holds a {cls.__name__}, which is no replay buffer")
-        if _has_state(cls):
+        if has_state(cls):
             return _with_state(cls, tree, tensors, model, trusted)
         return _with_attributes(cls, tree, tensors, model, trusted)
     except (KeyError, TypeError, IndexError, AttributeError, ArithmeticError, MemoryError, RuntimeError) as error:

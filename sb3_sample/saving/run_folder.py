@@ -24,7 +24,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from sb3_sample.saving.container import sync_folder
+from sb3_sample.saving import temporary
+from sb3_sample.saving.container import is_sha256, sync_folder
 from sb3_sample.saving.folders import Folder
 
 MODEL, STATE, MANIFEST = "model.zip", "state.zip", "manifest.json"
@@ -52,7 +53,6 @@ MAX_SEGMENTS = 10_000
 #: Bytes of a manifest, of which a piece of rows takes about 250; and for each value in it, as objects of Python take
 #: more.
 MAX_MANIFEST, MIN_BYTES_PER_VALUE = 8 * 2**20, 24
-_SHA256 = re.compile(r"[0-9a-f]{64}")
 #: Reasons that a message names.
 _SHOWN = 3
 
@@ -149,7 +149,9 @@ class RunFolder:
         root.separate(_LOCK)
         lock = root.descriptor(_LOCK, os.O_RDWR | os.O_CREAT)
         try:
-            held = self._locked(lock)
+            held = temporary.lock(lock)
+            if held is False:
+                raise ValueError(f"checkpoint={str(self.path)!r} is in use: another process trains in this folder")
             # The first thing that a run leaves, before anything of which it could be asked whose it is.
             said = os.pread(lock, len(_MARK) + 1, 0) if hasattr(os, "pread") else _MARK
             if said != _MARK and _MARK.startswith(said):
@@ -164,21 +166,6 @@ class RunFolder:
             return None
         _LOCKED.add(self)
         return lock
-
-    def _locked(self, lock: int) -> bool:
-        try:
-            import fcntl
-        except ImportError:  # not on Windows
-            return False
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ValueError(
-                f"checkpoint={str(self.path)!r} is in use: another process trains in this folder"
-            ) from error
-        except OSError:  # a file system without locks
-            return False
-        return True
 
     def close(self) -> None:
         """Let others have the folder."""
@@ -547,7 +534,7 @@ def _wrong_with(manifest: Any) -> str | None:
     if manifest["files"].keys() != {MODEL, STATE}:
         return f"its files are {sorted(manifest['files'])!r:.200}, not {MODEL} and {STATE}"
     for name, facts in (*manifest["files"].items(), *manifest["segments"].items()):
-        if not isinstance(facts, dict) or not _is_count(facts.get("size")) or not _is_sha256(facts.get("sha256")):
+        if not isinstance(facts, dict) or not _is_count(facts.get("size")) or not is_sha256(facts.get("sha256")):
             return f"it does not say size and checksum of {name!r:.100}"
     for name, facts in manifest["segments"].items():
         ring, first, last = facts.get("ring"), facts.get("first"), facts.get("last")
@@ -562,7 +549,3 @@ def _wrong_with(manifest: Any) -> str | None:
 
 def _is_count(value: Any) -> bool:
     return type(value) is int and 0 <= value < 2**63
-
-
-def _is_sha256(value: Any) -> bool:
-    return isinstance(value, str) and _SHA256.fullmatch(value) is not None

@@ -35,12 +35,7 @@ _ALLOWED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "clip_reward": (_is_limit, "a number above 0"),
     "gamma": (lambda value: _is_number(value) and 0 <= value <= 1, "a number in [0, 1]"),
     "epsilon": (lambda value: _is_number(value) and 0 <= value < math.inf, "a finite number of at least 0"),
-    "norm_obs_keys": (
-        lambda value: (
-            value is None or (isinstance(value, (list, tuple)) and all(isinstance(key, str) for key in value))
-        ),
-        "None or a list of names",
-    ),
+    "norm_obs_keys": (_is_keys, "None or a list of names"),
 }
 #: The arguments of VecNormalize, which are its attributes' names.
 ARGUMENTS = tuple(_ALLOWED)

@@ -35,7 +35,7 @@ def becoming(path: Path) -> Iterator[IO[bytes]]:
         temporary = path.with_name(f".{path.name[:100]}.{secrets.token_hex(6)}.tmp")
         with temporary.open("xb") as file:
             # Before it was locked, another program may have taken it for one that is abandoned.
-            if not _lock(file.fileno()) or os.fstat(file.fileno()).st_nlink == 0:
+            if lock(file.fileno()) is False or os.fstat(file.fileno()).st_nlink == 0:
                 continue
             try:
                 yield file
@@ -53,18 +53,21 @@ def becoming(path: Path) -> Iterator[IO[bytes]]:
             return
 
 
-def _lock(descriptor: int, there: bool = True) -> bool:
+def lock(descriptor: int) -> bool | None:
     """
-    :return: whether this process has the lock now; ``there`` where the file system has none
+    Lock a file, without waiting for whoever has it locked.
+
+    :param descriptor: of the open file
+    :return: whether this process has the lock now; None where the system or the file system has none
     """
     if fcntl is None:
-        return there
+        return None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:
-        return there
+        return None
     return True
 
 
@@ -89,7 +92,7 @@ def _remove_if_abandoned(path: Path) -> None:
         return
     descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        if _lock(descriptor, there=False):
+        if lock(descriptor):
             path.unlink()
     finally:
         os.close(descriptor)

@@ -167,9 +167,8 @@ def test_data_and_name_are_on_the_disk_before_the_call_returns(tmp_path: Path, m
     assert events == ["file", "replace", "folder"]
 
 
-@pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EPERM])
-def test_a_folder_that_cannot_be_synced(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As network shares and some FUSE mounts answer: what is complete is written, which is said once a folder."""
+def fail_to_sync_folders(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the system answer an error to ``fsync`` of a folder, and sync files as ever."""
     fsync = os.fsync
 
     def not_of_folders(descriptor: int) -> None:
@@ -178,6 +177,12 @@ def test_a_folder_that_cannot_be_synced(number: int, tmp_path: Path, monkeypatch
         fsync(descriptor)
 
     monkeypatch.setattr(os, "fsync", not_of_folders)
+
+
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EPERM])
+def test_a_folder_that_cannot_be_synced(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As network shares and some FUSE mounts answer: what is complete is written, which is said once a folder."""
+    fail_to_sync_folders(number, monkeypatch)
     (tmp_path / "inside").mkdir()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -208,14 +213,7 @@ def test_a_folder_that_cannot_be_opened(tmp_path: Path, monkeypatch: pytest.Monk
 def test_a_disk_that_fails_is_no_folder_that_cannot_be_synced(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fsync = os.fsync
-
-    def fails(descriptor: int) -> None:
-        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
-            raise OSError(number, os.strerror(number))
-        fsync(descriptor)
-
-    monkeypatch.setattr(os, "fsync", fails)
+    fail_to_sync_folders(number, monkeypatch)
     with pytest.raises(OSError, match="could not be written"):
         write(tmp_path / "m", "model", TREE, some_tensors())
 

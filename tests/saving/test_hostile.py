@@ -431,22 +431,28 @@ def test_large_json_is_read_as_fast_as_small(empty: Path) -> None:
     assert result["wrong"] is None and result["seconds"] < 0.7, result
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("target", TARGETS)
-def test_thousands_of_files(target: str, tmp_path: Path) -> None:
-    n, seed = 360, 1
-    folder = tmp_path / "a" / "b"
-    folder.mkdir(parents=True)
-    command = [sys.executable, "-m", "tests.saving.test_hostile", target, str(seed), "0", str(n), str(folder)]
+def thrown(module: str, *arguments: str, n: int, **kwargs: Any) -> list[dict[str, Any]]:
+    """Run a test's module as a program that throws n cases; the lines it gives of them, none of which is wrong."""
+    command = [sys.executable, "-m", module, *arguments]
     root = Path(__file__).parents[2]
     env = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(root), *sys.path])}
-    done = subprocess.run(command, capture_output=True, text=True, cwd=root, env=env, timeout=1200)
+    done = subprocess.run(command, capture_output=True, text=True, cwd=root, env=env, **kwargs)
     lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     results = [line for line in lines if "outcome" in line]
     assert done.returncode == 0, (done.returncode, lines[-1:], done.stderr[-2000:])
     assert len(results) == n
     wrong = [(line["number"], line["case"], line["wrong"]) for line in results if line["wrong"]]
     assert not wrong, f"{len(wrong)} of {n}: {wrong[:20]}"
+    return results
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", TARGETS)
+def test_thousands_of_files(target: str, tmp_path: Path) -> None:
+    n, seed = 360, 1
+    folder = tmp_path / "a" / "b"
+    folder.mkdir(parents=True)
+    results = thrown("tests.saving.test_hostile", target, str(seed), "0", str(n), str(folder), n=n, timeout=1200)
     worst = {key: max(line[key] for line in results) for key in ("seconds", "bytes")}
     counts = Counter(line["outcome"].split(",")[0] for line in results)
     print(f"{target}: {counts}, at most {worst}")

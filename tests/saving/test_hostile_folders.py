@@ -51,7 +51,7 @@ from tests.saving.hostile_folders import (
     snapshot,
     user_files,
 )  # fmt: skip
-from tests.saving.test_hostile import BYTES, HEADROOM, SECONDS, Watch, forget_peak, peak
+from tests.saving.test_hostile import BYTES, HEADROOM, SECONDS, Watch, forget_peak, peak, thrown
 
 #: Seconds after which a folder is taken for one that would never end.
 HANGS = 60
@@ -358,16 +358,7 @@ def test_more_than_the_bytes_say(file: str, files_of_a_run: dict[str, bytes], tm
 @pytest.mark.slow
 def test_hundreds_of_folders(tmp_path: Path) -> None:
     n, seed = int(os.environ.get("FUZZ", "400")), 1
-    command = [sys.executable, "-m", "tests.saving.test_hostile_folders", str(seed), "0", str(n), str(tmp_path)]
-    root = Path(__file__).parents[2]
-    env = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(root), *sys.path])}
-    done = subprocess.run(command, capture_output=True, text=True, cwd=root, env=env)
-    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
-    results = [line for line in lines if "outcome" in line]
-    assert done.returncode == 0, (done.returncode, lines[-1:], done.stderr[-2000:])
-    assert len(results) == n
-    wrong = [(line["number"], line["case"], line["wrong"]) for line in results if line["wrong"]]
-    assert not wrong, f"{len(wrong)} of {n}: {wrong[:20]}"
+    results = thrown("tests.saving.test_hostile_folders", str(seed), "0", str(n), str(tmp_path), n=n)
     counts = Counter(line["outcome"] for line in results)
     print(f"{counts}, at most { ({key: max(line[key] for line in results) for key in ('seconds', 'bytes')}) }")
     assert counts["went on"] > n / 10 and counts["went on"] < n * 0.9
