@@ -1,6 +1,7 @@
 """
 Diagnostics of the papers for a run of the off-policy family: overestimation, overfitting and what shows a loss of
-plasticity (P2, section 3; P4, appendix E.2), measured by a callback that leaves the training as it is.
+plasticity (Overestimation, Overfitting and Plasticity, section 3; VPL, appendix E.2), measured by a callback that
+leaves the training as it is.
 
 Shapes use the letters E critics, B batch, K quantiles, N neurons, A action.
 """
@@ -60,7 +61,7 @@ def discounted_return(rewards: np.ndarray, gamma: float, terminated: bool) -> fl
 
 def average_value(rewards: np.ndarray, log_probs: np.ndarray, alpha: float, gamma: float, terminated: bool) -> float:
     """
-    P4, equation 22: ``(mean reward - alpha * mean log pi) / (1 - gamma)``. The factor is the sum of the geometric
+    VPL, equation 22: ``(mean reward - alpha * mean log pi) / (1 - gamma)``. The factor is the sum of the geometric
     series of a task without end; if the episode terminated, the sum of its first n terms takes its place.
 
     :param rewards: (n,)
@@ -130,13 +131,13 @@ class DiagnosticsCallback(BaseCallback):
     before the rollout begins, uniformly from the first half of ``rollout_length`` (of the time limit, if episodes were
     seen to be cut earlier), and counted over the ends of episodes. So how long an episode happens to last says nothing
     about which of its states is taken. What the episode did from there on is the reference: it is unbiased also where
-    episodes end at random. ``overestimation`` compares with the discounted return (P2);
-    ``overestimation_soft`` with P4's equation 22, which also counts the entropy that a soft critic contains. The
-    paper writes the entropy target for the policy's entropy; here it is the one measured in the rollout, which is
-    also right where the temperature is fixed or has not reached its target. As printed in the paper, the first
+    episodes end at random. ``overestimation`` compares with the discounted return (Overestimation, Overfitting and
+    Plasticity); ``overestimation_soft`` with VPL's equation 22, which also counts the entropy that a soft critic
+    contains. The paper writes the entropy target for the policy's entropy; here it is the one measured in the rollout,
+    which is also right where the temperature is fixed or has not reached its target. As printed in the paper, the first
     action's own log-probability counts too. Without entropy (temperature 0, deterministic actor) that part vanishes.
 
-    *Overfitting* is P4's equation 23: the mean squared TD error, of the critics' mean to the target under the
+    *Overfitting* is VPL's equation 23: the mean squared TD error, of the critics' mean to the target under the
     pessimism in force, on transitions of the rollouts that were never trained on, divided by that on transitions of
     the replay buffer. Both are single steps as they were experienced, also if the algorithm learns from n-step returns
     or relabelled goals; transitions that the buffer holds out for validation are left out.
@@ -153,10 +154,10 @@ class DiagnosticsCallback(BaseCallback):
     :param eval_env: environment for the rollouts, a single one, not the training environment; its normalisation, if
         any, has to be as that of the training environment
     :param every: environment steps between two measurements, taken at the first step at or after each multiple
-    :param n_start_states: rollouts a measurement, each with one start pair (5 in P4)
+    :param n_start_states: rollouts a measurement, each with one start pair (5 in VPL's paper)
     :param rollout_length: most steps of a rollout, over several episodes if they are short. Choose it well above the
         length of episodes that terminate, since a rollout that is cut counts as one that never ends. With the default
-        a measurement adds up to 5,000 validation transitions, as in P4
+        a measurement adds up to 5,000 validation transitions, as in VPL's paper
     :param soft: whether to log ``overestimation_soft``
     :param batch_size: transitions from each side, training and validation; fewer if there are not as many
     :param dormant_threshold: up to which score a neuron is called dormant

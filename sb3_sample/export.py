@@ -278,7 +278,7 @@ def _apart(work: Callable[[], Any]) -> Any:
 
 
 def _answer(work: Callable[[], Any]) -> bytes:
-    """What comes of it, and the traceback if that is an exception."""
+    """Pickle the result, or the exception with its traceback."""
     try:
         return pickle.dumps((work(), None))
     except Exception as error:

@@ -27,7 +27,7 @@ MAX_HEADER, MAX_LINE = 1000, 2**16
 MAX_MONITOR, MAX_FIELDS, MAX_COLUMNS = 64 * 2**20, 3_000_000, 64
 #: Columns of Monitor's files that anything is drawn of.
 _COLUMNS = ("r", "l", "t", "is_success")
-#: What Gymnasium's ids consist of.
+#: Pattern of Gymnasium's ids.
 _ENV_ID = re.compile(r"[\w:.-]+(/[\w:.-]+)*")
 _BLOCK = 2**20
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn
 
-#: What is larger is infinite in the single precision of buffers and networks.
+#: The largest number of single precision, in which buffers and networks compute: larger ones are infinite there.
 LARGEST = float(np.finfo(np.float32).max)
 
 

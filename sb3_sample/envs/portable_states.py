@@ -84,7 +84,7 @@ def unpack_all(envs: Sequence[gym.Env], states: Sequence[dict[str, Any]]) -> Non
     for env, state in zip(envs, states, strict=True):
         _unpack(env, state, restorer)
     if restorer.kept:
-        # What they hold may decide what comes next.
+        # Keeping them could change what comes next.
         raise DoesNotFit(f"{', '.join(restorer.kept)} name other files than the saved ones")
 
 
@@ -145,7 +145,7 @@ def _unpack_simulator(model: Any, data: Any, state: dict[str, Any]) -> None:
         raise DoesNotFit("the state of the simulator is not what is saved of one")
     _check_like(np.empty(mujoco.mj_stateSize(model, kind)), state["integration"], "integration")
     for part, (owner, names) in owners.items():
-        # What is an index in MuJoCo's memory is never written, and would not be looked at by MuJoCo.
+        # Indices into MuJoCo's memory are never written: MuJoCo would use them unchecked.
         if not isinstance(state[part], dict) or state[part].keys() != set(names):
             raise DoesNotFit(f"the arrays of the simulator's {part} are not those that are saved of one")
         for name in names:

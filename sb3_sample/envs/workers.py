@@ -99,7 +99,7 @@ class _Failure(NamedTuple):
 
 
 class _Made(NamedTuple):
-    """What a worker says when its environment is made."""
+    """Message of a worker whose environment is made."""
 
 
 class WatchedConnection:
