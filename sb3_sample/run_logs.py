@@ -124,11 +124,13 @@ def monitor_head(path: str | Path) -> dict[str, Any]:
     """
     :param path: a file of Monitor's
     :return: what its first line says: "t_start", seconds, and "env_id", None if that names no environment
-    :raises BadFile: (a ``ValueError``) if it says something else
+    :raises BadFile: (a ``ValueError``) if it says something else, or no columns follow
     :raises OSError: if it cannot be read
     """
     with open_regular(path) as file:
-        return _head(file, path)
+        head = _head(file, path)
+        _columns(file, path)
+        return head
 
 
 def _head(file: IO[bytes], path: str | Path) -> dict[str, Any]:
@@ -175,9 +177,7 @@ def read_monitors(folder: str | Path) -> pd.DataFrame:
 def _read_monitor(path: Path) -> tuple[pd.DataFrame, float]:
     with open_regular(path) as file:
         head = _head(file, path)
-        columns = file.readline(MAX_LINE)
-        if not columns.endswith(b"\n") or columns.count(b",") >= MAX_COLUMNS:
-            raise BadFile(f"{path} is no file of Monitor's: its second line names no columns, or too many")
+        columns = _columns(file, path)
         _check_size(file, path)
         # In pieces: what is taken as a table is many times its bytes.
         parts = [_table(columns, path)]
@@ -191,6 +191,13 @@ def _read_monitor(path: Path) -> tuple[pd.DataFrame, float]:
     if not ((lengths >= 1) & (lengths < 2**31)).all() or not (np.abs(times) < 2**53).all():
         raise BadFile(f"{path} is no file of Monitor's: an episode has no length or no time")
     return frame, head["t_start"]
+
+
+def _columns(file: IO[bytes], path: str | Path) -> bytes:
+    line = file.readline(MAX_LINE)
+    if not line.endswith(b"\n") or line.count(b",") >= MAX_COLUMNS:
+        raise BadFile(f"{path} is no file of Monitor's: its second line names no columns, or too many")
+    return line
 
 
 def _check_size(file: IO[bytes], path: Path) -> None:

@@ -26,7 +26,7 @@ from stable_baselines3.common.monitor import Monitor, get_monitor_files
 from stable_baselines3.common.utils import get_latest_run_id
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.run_logs import monitor_head
+from sb3_sample.run_logs import monitor_files, monitor_head
 from sb3_sample.saving.folders import Folder, is_plain
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.zoo import ALGORITHMS
@@ -35,6 +35,8 @@ from sb3_sample.zoo_files import add_trust, replaced
 RECORD = "run.json"
 #: Bytes of a record.
 MAX_RECORD = 2**18
+#: Endings of the files that a run writes.
+SUFFIXES = (".csv", ".json", ".jsonl", ".npz", ".yml", ".zip")
 #: Environment steps between two checkpoints.
 CHECKPOINT_FREQ = 10_000
 #: Arguments of the zoo that make a run what it is, besides its hyperparameters. How long it is, where it computes, what
@@ -145,11 +147,11 @@ class Start(NamedTuple):
     record: Record | None = None
 
 
-def refuse_links(folder: Path) -> None:
+def check_entries(folder: Path) -> None:
     """
     :param folder: a run's
     :raises RunError: something in it, or in a folder of it, is a link: what a run writes by such a name would be
-        written elsewhere
+        written elsewhere; or a pipe or a device, which may never end; or a folder by the name of a file
     """
     for path in (*folder.glob("*"), *folder.glob("*/*")):
         if path.is_symlink():
@@ -157,6 +159,21 @@ def refuse_links(folder: Path) -> None:
                 f"{path} is a link, and a run follows none in its folder (the folder itself may be one): remove it, or "
                 "name another --run-dir"
             )
+        is_folder = path.is_dir() and path.suffix not in SUFFIXES
+        if not (path.is_file() or is_folder):
+            raise RunError(f"{path} is no file, where a run has one: remove it, or name another --run-dir")
+
+
+def check_monitor_files(folder: Path) -> None:
+    """
+    :param folder: of a run that goes on
+    :raises RunError: what it has for Monitor to append to is no file of Monitor's
+    """
+    for path in monitor_files(folder):
+        try:
+            monitor_head(path)
+        except (OSError, BadFile) as error:
+            raise RunError(f"{error}. The run would append to {path}: remove it, and a new one is begun") from error
 
 
 def checkpoints(folder: Path) -> list[Path]:
@@ -215,7 +232,7 @@ def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
         if not options.resume:
             return Start(list(arguments), freq)
         folder = _latest(arguments)
-    refuse_links(folder)
+    check_entries(folder)
     if not checkpoints(folder):
         if options.resume:
             raise RunError(f"--resume: {folder} has no checkpoint to go on from")
@@ -227,6 +244,7 @@ def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
             )
         return Start(list(arguments), freq or CHECKPOINT_FREQ, folder)
     record = Record.read(folder)
+    check_monitor_files(folder)
     # What the command line says besides replaces these.
     command = ["--seed", str(record.seed), "-n", str(record.n_timesteps), *arguments]
     return Start(command, freq or record.checkpoint_freq, folder, record)
@@ -393,8 +411,14 @@ def _make_vec_env(make: Any, *args: Any, monitor_kwargs: dict[str, Any], wrapper
 
     def wrap(env: Monitor) -> gym.Env:
         if env.results_writer is not None:
-            # Their times count from the beginning in the file's head.
-            env.t_start = monitor_head(env.results_writer.file_handler.name)["t_start"]
+            writer, path = env.results_writer, env.results_writer.file_handler.name
+            if os.path.getsize(path):
+                # Their times count from the beginning in the file's head.
+                env.t_start = monitor_head(path)["t_start"]
+            else:  # one of several that was removed
+                writer.file_handler.write(f"#{json.dumps({'t_start': env.t_start, 'env_id': str(env.spec.id)})}\n")
+                writer.logger.writeheader()
+                writer.file_handler.flush()
         return env if wrapper_class is None else wrapper_class(env)
 
     return make(*args, monitor_kwargs={**monitor_kwargs, "override_existing": False}, wrapper_class=wrap, **kwargs)

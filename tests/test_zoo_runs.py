@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +21,7 @@ pytest.importorskip("rl_zoo3")
 from rl_zoo3 import ALGOS
 
 from sb3_sample import cli, zoo
+from sb3_sample.run_logs import read_monitors
 from sb3_sample.saving import container
 from sb3_sample.saving.decoding import decode
 from sb3_sample.zoo_runs import Record, RunError, RunFiles, plan, train_parser
@@ -291,6 +293,41 @@ def test_a_folder_with_links_is_refused(name: str, run, tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match=f"a/{name} is a link, and a run follows none"):
         run("--run-dir", "a", "-n", "60")
     assert (tmp_path / "there" / "file").read_text() == "the user's"
+
+
+@pytest.mark.parametrize("name", ["0.monitor.csv", "evaluations.npz", "run.json", "Pendulum-v1/args.yml"])
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_a_folder_with_pipes_or_folders_for_files_is_refused(
+    name: str, make: Callable[[Path], None], goes_on: bool, run
+) -> None:
+    Record("sac_sample", "Pendulum-v1", 1, 60, 30, {}).write(Path("a"))
+    if goes_on:
+        Path("a/checkpoint-000000000030").mkdir()
+    Path("a", name).parent.mkdir(exist_ok=True)
+    Path("a", name).unlink(missing_ok=True)
+    make(Path("a", name))
+    with pytest.raises(SystemExit, match=f"a/{name} is no file, where a run has one: remove it"):
+        run("--run-dir", "a", "-n", "60")
+
+
+@pytest.mark.parametrize("text", ["", "r,l,t\n", '#{"t_start": 1.0}\n'])
+def test_a_run_does_not_append_to_what_is_no_file_of_monitor(text: str, run) -> None:
+    run("--run-dir", "a", "--checkpoint-freq", "50", "-n", "60", "--eval-freq", "-1")
+    Path("a/0.monitor.csv").write_text(text)
+    with pytest.raises(SystemExit, match="is no file of Monitor's: .* remove it, and a new one is begun"):
+        run("--run-dir", "a", "--checkpoint-freq", "50", "-n", "120", "--eval-freq", "-1")
+    assert Path("a/0.monitor.csv").read_text() == text
+
+
+def test_one_of_several_monitor_files_may_be_missing(run) -> None:
+    command = [*COMMAND, "--run-dir", "a", "--eval-freq", "-1", "-params", *OFF_POLICY, "n_envs:2"]
+    cli.main([*command, "-n", "500"])
+    Path("a/1.monitor.csv").unlink()
+    with pytest.warns(UserWarning, match=r"1\.monitor\.csv has \d+ bytes, .* episodes are missing"):
+        cli.main([*command, "-n", "900"])
+    assert [len(outcome("a")[f"{k}.monitor.csv"]) for k in (0, 1)] == [2, 1]
+    assert len(read_monitors("a")) == 3
 
 
 def test_help_has_both_kinds_of_options(run, capsys: pytest.CaptureFixture[str]) -> None:
