@@ -416,7 +416,8 @@ def _make_vec_env(make: Any, *args: Any, monitor_kwargs: dict[str, Any], wrapper
                 # Their times count from the beginning in the file's head.
                 env.t_start = monitor_head(path)["t_start"]
             else:  # one of several that was removed
-                writer.file_handler.write(f"#{json.dumps({'t_start': env.t_start, 'env_id': str(env.spec.id)})}\n")
+                head = {"t_start": env.t_start, "env_id": str(env.spec and env.spec.id)}
+                writer.file_handler.write(f"#{json.dumps(head)}\n")
                 writer.logger.writeheader()
                 writer.file_handler.flush()
         return env if wrapper_class is None else wrapper_class(env)

@@ -24,11 +24,15 @@ class BRO(sb3_sample.BRO):
 
 
 class QuantileSAC(sb3_sample.SAC):
-    """SAC with quantile critics, as TQC has. Their number is an argument of the algorithm here, not of the policy."""
+    """
+    SAC with quantile critics, as TQC has. Their number is an argument of the algorithm here, not of the policy. TQC's
+    warm-up, since a test that passes none has updates within 128 steps.
+    """
 
     def __init__(self, *args: Any, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any):
         policy_kwargs = dict(policy_kwargs or {})
         kwargs.setdefault("n_quantiles", policy_kwargs.pop("n_quantiles", 25))
+        kwargs.setdefault("learning_starts", 100)
         super().__init__(*args, policy_kwargs=policy_kwargs, **kwargs)
 
 
