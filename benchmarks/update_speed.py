@@ -32,8 +32,8 @@ from stable_baselines3.common.logger import Logger
 from torch.utils.flop_counter import FlopCounterMode
 
 import sb3_sample
+from sb3_sample.learner.losses import quantile_huber
 from sb3_sample.sac.bro import MODEL_SIZES
-from sb3_sample.sac.losses import quantile_huber
 
 OBSERVATION, ACTION = 17, 6  # cheetah-run
 #: Peers by label: module, class.

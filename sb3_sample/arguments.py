@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import Any, TypeGuard
 
-from sb3_sample.saving.checks import ParametersDoNotFit
+from sb3_sample.errors import ParametersDoNotFit
 
 
 def is_integer(value: Any) -> TypeGuard[int]:

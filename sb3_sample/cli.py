@@ -120,7 +120,7 @@ def _own_options(parser: argparse.ArgumentParser, arguments: list[str]) -> tuple
 @contextlib.contextmanager
 def _errors(command: str) -> Iterator[None]:
     """A run or a file that is refused is told of without a traceback."""
-    from sb3_sample.saving.checks import ParametersDoNotFit
+    from sb3_sample.errors import ParametersDoNotFit
     from sb3_sample.saving.container import BadFile, PickledFile
     from sb3_sample.saving.encoding import NotPortable
     from sb3_sample.zoo_files import Refused

@@ -22,12 +22,13 @@ from stable_baselines3.common.type_aliases import GymEnv, TrainFreq, TrainFreque
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_sample.console import say
+from sb3_sample.learner.batch import Batch
+from sb3_sample.learner.pessimism import epistemic_std
+from sb3_sample.learner.q_values import evaluate
+from sb3_sample.learner.target import bootstrap
 from sb3_sample.networks import neuron_scores
-from sb3_sample.sac import SAC, losses
-from sb3_sample.sac.batch import Batch
+from sb3_sample.sac import SAC
 from sb3_sample.sac.buffers import samples_at
-from sb3_sample.sac.pessimism import epistemic_std
-from sb3_sample.sac.q_values import evaluate
 from sb3_sample.saving.rings import Ring
 
 
@@ -423,13 +424,12 @@ class DiagnosticsCallback(BaseCallback):
     def _td_error(self, batch: Batch) -> float:
         """Mean squared TD error of the critics' mean."""
         model = self.model
-        actions, log_prob = model.policy.next_actions(batch.next_observations, self._noise(len(batch.actions)))
-        next_q = evaluate(model.critic_target, batch.next_observations, actions)
+        subset = None
         if model.target_subset is not None:
-            next_q = next_q[self._rng.permutation(len(next_q))[: model.target_subset]]
-        next_values = model.pessimism_rule.value(next_q)
-        entropy_bonus = -model.temperature() * log_prob
-        target = losses.td_target(batch.rewards, batch.dones, batch.discounts, next_values, entropy_bonus)
+            subset = torch.from_numpy(self._rng.permutation(model.critic.n_critics)[: model.target_subset])
+        noise = self._noise(len(batch.actions))
+        next_q, entropy_bonus = bootstrap(model.learner, batch, model.temperature(), noise, subset)
+        target = model.learner.head.target(batch, next_q, model.pessimism_rule.value, entropy_bonus)
         q = evaluate(model.critic, batch.observations, batch.actions)
         return (q.mean(dim=(0, 2)) - target.mean(dim=1)).square().mean().item()
 

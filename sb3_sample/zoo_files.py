@@ -23,8 +23,8 @@ import torch
 import yaml
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from sb3_sample.errors import ParametersDoNotFit
 from sb3_sample.saving import container
-from sb3_sample.saving.checks import ParametersDoNotFit
 from sb3_sample.saving.container import BadFile, PickledFile
 from sb3_sample.saving.encoding import decode, encode
 from sb3_sample.saving.model import SafeFiles

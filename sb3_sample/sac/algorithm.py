@@ -1,7 +1,7 @@
 """
-The off-policy family: soft actor-critic with exchangeable parts, and its one update.
+The off-policy family as Stable-Baselines3's: acting, storing, when and how often to learn, logging, files.
 
-``SAC._gradient_step`` is the whole gradient step, in the order of BRO's pseudo-code (P5, algorithm 2).
+The update is the learner's (``sb3_sample/learner/learner.py``).
 """
 
 import io
@@ -17,44 +17,44 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv
-from torch import nn
 
 from sb3_sample.arguments import check_known, default_of, naming_changes
 from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.envs.workers import watch_workers
+from sb3_sample.errors import ParametersDoNotFit
 from sb3_sample.export import Exportable
 from sb3_sample.faults import MetricWatch, TrainingDiverged, check_finite_parameters, not_finite
+from sb3_sample.learner.batch import Batch, Noise
+from sb3_sample.learner.execution import (
+    PAYS_FROM,
+    has_foreign_parts,
+    old_torch,
+    warn_not_compiled,
+    why_not_compiled,
+)
+from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
+from sb3_sample.learner.heads import QuantileHead, ValueHead
+from sb3_sample.learner.learner import Learner
+from sb3_sample.learner.parts import Part
+from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
+from sb3_sample.learner.plasticity import ReDo, Resets
+from sb3_sample.learner.scalars import FixedScalar, LogScalar
 from sb3_sample.logged_values import LoggedValues
-from sb3_sample.networks.spectral_norm import SpectralNorm
-from sb3_sample.optim import AdamW, sharpness_aware_gradients
-from sb3_sample.sac import arguments, losses
-from sb3_sample.sac.batch import Batch, CriticStep, Extra, Noise, draw_batches
+from sb3_sample.sac import arguments
 from sb3_sample.sac.buffers import (
-    BatchMemory,
     ValidationDictReplayBuffer,
     ValidationReplayBuffer,
     ValidationSplit,
     store_float_actions,
 )
 from sb3_sample.sac.compact_buffer import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
-from sb3_sample.sac.execution import (
-    PAYS_FROM,
-    Execution,
-    has_foreign_parts,
-    old_torch,
-    warn_not_compiled,
-    why_not_compiled,
-)
-from sb3_sample.sac.exploration import EXPLORATIONS, Exploration
-from sb3_sample.sac.parts import ParametersDoNotFit, Part
-from sb3_sample.sac.pessimism import PESSIMISMS, Pessimism, pessimistic_value
-from sb3_sample.sac.plasticity import ReDo, Resets
-from sb3_sample.sac.policies import Actor, CnnPolicy, CriticEnsemble, MlpPolicy, ModeSwitch, MultiInputPolicy, SACPolicy
-from sb3_sample.sac.q_values import evaluate
+from sb3_sample.sac.model_learner import check_action_space
+from sb3_sample.sac.policies import BACKBONES, CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.sb3_names import SB3Names
-from sb3_sample.sac.scalars import FixedScalar, LogScalar
+from sb3_sample.sac.sources import ReplaySource
 from sb3_sample.saving.checkpoint import Checkpointer
 from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.model import SafeFiles
@@ -68,7 +68,7 @@ Self = TypeVar("Self", bound="SAC")
 MAX_BATCHES_AT_ONCE = 64
 
 
-class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):
+class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]  # actor
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
     SAC that the papers compare with (P2-P5): tanh-Gaussian actor, two critics, clipped double Q-learning.
@@ -147,9 +147,6 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         "MultiInputPolicy": MultiInputPolicy,
     }
     policy: SACPolicy
-    actor: Actor
-    critic: CriticEnsemble
-    critic_target: CriticEnsemble
     #: beta1 of the temperature's Adam.
     temperature_beta1: ClassVar[float] = 0.9
 
@@ -257,12 +254,9 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         self.compile = compile
         #: Whether the gradient step is compiled; None while that is not decided. Saved: a loaded model goes on with it.
         self.compiled: bool | None = None
-        self._execution: Execution | None = None
         #: A callback that wants gradients in ``.grad`` sets this: the last of the next gradient steps is run eagerly.
         self.keep_next_gradients = False
         self._keeps_gradients = False
-        #: Whether ``.grad`` holds the gradients of another gradient step than the last, as a compiled one leaves none.
-        self.gradients_are_stale = False
         #: Transitions stored over the model's life; unlike ``num_timesteps`` never zeroed by ``learn``.
         self.num_transitions = 0
         # Gradient steps owed but not yet taken, the fraction that a replay ratio leaves over.
@@ -289,34 +283,54 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
             # glibc hands freed memory back to the system above a threshold, at first below the size of one gradient,
             # and every update then pays for page faults. The threshold follows the largest block freed so far.
             torch.empty(31 * 2**20, dtype=torch.uint8)
-        self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
-        self._take_target_entropy()
-        self._critic_loss = losses.squared_error if self.n_quantiles is None else losses.quantile_huber
-        self.temperature = self._make_temperature()
-        self.pessimism_rule = self.make_pessimism()
-        self.explorer = self.make_explorer()
-        self.plasticity = Resets(self.resets, self.reset_shrink, self.reset_gradient_steps)
-        self.redo = None if self.redo_period is None else ReDo(self.redo_period, self.redo_threshold)
-        self.temperature_optimizer: AdamW | None = None
-        if isinstance(self.temperature, LogScalar):
-            betas = (self.temperature_beta1, 0.999)
-            self.temperature_optimizer = AdamW(self.temperature.parameters(), lr=self.lr_schedule(1), betas=betas)
         if self.compile != "auto":
             self.compiled = bool(self.compile)
-        self._execution = None
-        self._parts_mode = ModeSwitch(*self._parts().values())
-        self._batch_memory = BatchMemory()
+        self._source = ReplaySource(self)
+        self.learner = self._make_learner(networks=self.policy, counts=self)
+        arguments.check_rule(self)
         self._watch = MetricWatch(self.device)
-        self._set_training_mode(False)
+
+    def _make_learner(self, **kwargs: Any) -> Learner:
+        """
+        :param kwargs: networks, counts and generators of the learner
+        :return: a learner with the parts and the settings of the arguments
+        """
+        self._take_target_entropy()
+        return Learner(
+            self._make_networks,
+            head=ValueHead() if self.n_quantiles is None else QuantileHead(self.n_quantiles),
+            make_temperature=self._make_temperature,
+            make_pessimism=self.make_pessimism,
+            make_explorer=self.make_explorer,
+            plasticity=Resets(self.resets, self.reset_shrink, self.reset_gradient_steps),
+            redo=None if self.redo_period is None else ReDo(self.redo_period, self.redo_threshold),
+            learning_rate=self.lr_schedule(1),
+            temperature_beta1=self.temperature_beta1,
+            target_entropy=self._target_entropy,
+            device=self.device,
+            **{name: getattr(self, name) for name in Learner.SETTINGS},
+            **kwargs,
+        )
+
+    def _make_networks(self) -> SACPolicy:
+        kwargs = self._full_policy_kwargs()
+        return self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)  # type: ignore[return-value]
+
+    def _take_settings(self) -> None:
+        """Have the learner take up what was set since the last gradient step."""
+        self._take_target_entropy()
+        self.learner.target_entropy = self._target_entropy
+        for name in Learner.SETTINGS:
+            setattr(self.learner, name, getattr(self, name))
 
     def _take_target_entropy(self) -> None:
         """Take up what ``target_entropy`` says, which is a number afterwards."""
         arguments.check_target_entropy(self)
         if self.target_entropy == "auto":
-            self._target_entropy = -self.actor.action_dim / 2
+            self._target_entropy = -get_action_dim(self.action_space) / 2
         else:
             self._target_entropy = float(self.target_entropy)
-        if self.actor.has_entropy:
+        if BACKBONES[self.backbone].has_entropy:
             self.target_entropy = self._target_entropy
 
     def _check_arguments(self) -> None:
@@ -361,8 +375,8 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         """
         return dict(self.pessimism_kwargs or {})
 
-    def _make_temperature(self) -> LogScalar | FixedScalar:
-        if not self.actor.has_entropy:
+    def _make_temperature(self, learner: Learner) -> LogScalar | FixedScalar:
+        if not learner.actor.has_entropy:
             return FixedScalar(0.0).to(self.device)
         allowed = "'auto' or 'auto_<start above 0>'"
         if isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto"):
@@ -376,23 +390,25 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
             raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
         return FixedScalar(value).to(self.device)
 
-    def make_explorer(self) -> Exploration:
+    def make_explorer(self, learner: Learner) -> Exploration:
         """
+        :param learner: whose it is
         :return: a freshly initialised explorer
         """
         make, kwargs = EXPLORATIONS[self.exploration], self._full_exploration_kwargs()
-        arguments.check_names("exploration", self.exploration, make.__init__, kwargs)
-        return make(self, **kwargs).to(self.device)
+        arguments.check_names("exploration", self.exploration, make, kwargs)
+        return make(learner, **kwargs)
 
-    def make_pessimism(self) -> Pessimism:
+    def make_pessimism(self, learner: Learner) -> Pessimism:
         """
+        :param learner: whose it is
         :return: a freshly initialised rule of pessimism
         """
         if not isinstance(self.pessimism, str):
             return Pessimism(self.pessimism)
         make, kwargs = PESSIMISMS[self.pessimism], self._full_pessimism_kwargs()
         arguments.check_names("pessimism", self.pessimism, make, kwargs)
-        return make(self, **kwargs).to(self.device)
+        return make(learner, **kwargs)  # type: ignore[no-any-return]
 
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
         if policy_name not in self.policy_aliases:
@@ -490,40 +506,18 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        space = env.action_space
-        if not isinstance(space, spaces.Box):
-            raise ValueError(f"env must have a bounded Box action space, not {space}")
-        if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
-            raise ValueError(f"env must have a bounded action space: the bounds of {space} are not finite")
-        if not (space.low < space.high).all():
-            raise ValueError(f"env must have an action space with low < high in every dimension, not {space}")
+        check_action_space(env.action_space)
         venv = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         FiniteCheck.install(venv)
         watch_workers(venv)
         return venv
 
-    def make_optimizer(self, parameters: Any) -> torch.optim.Optimizer:
-        """
-        :param parameters: what to optimise
-        :return: an optimizer with the settings of actor and critics
-        """
-        return self.policy.make_optimizer(parameters, self.lr_schedule)
-
     def _parts(self) -> dict[str, Part]:
-        # ReDo has no state and hears of gradient steps only.
-        return {"explorer": self.explorer, "pessimism_rule": self.pessimism_rule, "plasticity": self.plasticity}
+        return {name: part for name, part in self.learner.parts().items() if part.has_state}
 
     def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Every optimizer by its path from the algorithm."""
-        optimizers: dict[str, torch.optim.Optimizer] = {
-            "actor.optimizer": self.actor.optimizer,
-            "critic.optimizer": self.critic.optimizer,
-        }
-        if self.temperature_optimizer is not None:
-            optimizers["temperature_optimizer"] = self.temperature_optimizer
-        for name, part in self._parts().items():
-            optimizers.update({f"{name}.{key}": optimizer for key, optimizer in part.optimizers().items()})
-        return optimizers
+        return self.learner.optimizers()
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "temperature", *self._parts(), *self._optimizers()], []
@@ -531,15 +525,9 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
     def _excluded_save_params(self) -> list[str]:
         return [
             *super()._excluded_save_params(),
-            "actor",
-            "critic",
-            "critic_target",
+            "_learner",
             "_metrics",
-            "_critic_loss",
-            "redo",
-            "_execution",
-            "_parts_mode",
-            "_batch_memory",
+            "_source",
             "_watch",
         ]
 
@@ -549,39 +537,7 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
 
         :param shrink: share of the old parameters that stays
         """
-        fresh = self.policy_class(
-            self.observation_space, self.action_space, self.lr_schedule, **self._full_policy_kwargs()
-        )
-        self.restart(self.policy, fresh, shrink)
-        self.restart(self.temperature, self._make_temperature(), shrink)
-        # The explorer's start may depend on the pessimism in force.
-        self.restart(self.pessimism_rule, self.make_pessimism(), shrink)
-        self.restart(self.explorer, self.make_explorer(), shrink)
-        for optimizer in self._optimizers().values():
-            optimizer.state.clear()
-
-    @staticmethod
-    def restart(module: nn.Module, fresh: nn.Module, shrink: float = 0.0) -> None:
-        """
-        Give a module the values of a fresh one, in place, and start the optimizers of a part anew.
-
-        :param module: the module
-        :param fresh: a module of the same kind
-        :param shrink: share of the old parameters that stays
-        """
-        state = fresh.state_dict()
-        if shrink > 0:
-            for name, parameter in module.named_parameters():
-                state[name] = torch.lerp(state[name].to(parameter.device), parameter.detach(), shrink)
-        module.load_state_dict(state)
-        if shrink > 0:
-            # The directions along which kernels are normalised are neither the old nor the fresh ones.
-            for layer in module.modules():
-                if isinstance(layer, SpectralNorm):
-                    layer.find_direction()
-        if isinstance(module, Part):
-            for optimizer in module.optimizers().values():
-                optimizer.state.clear()
+        self.learner.reinitialize(shrink)
 
     # ---------------------------------------------------------------- acting
 
@@ -596,7 +552,7 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
             assert self._last_obs is not None
             with torch.inference_mode():
                 observations, _ = self.policy.obs_to_tensor(self._last_obs)
-                actions = self.explorer.act(self, observations)
+                actions = self.explorer.act(self.learner, observations)
             scaled = actions.cpu().numpy().reshape((n_envs, *self.action_space.shape))
             if not np.isfinite(scaled).all():
                 self._stop_diverged(scaled)
@@ -623,13 +579,9 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         if self._vec_normalize_env is None:
             # Set by it all the same; saved, it says that there was a VecNormalize.
             self._last_original_obs = None
-        self.num_transitions += len(dones)
+        self.learner.learning_starts = self.learning_starts
         rewards = reward if self._vec_normalize_env is None else self._vec_normalize_env.get_original_reward()
-        for part in self._parts().values():
-            part.on_step(self, rewards, dones, infos)
-            for index in np.flatnonzero(dones):
-                if "episode" in infos[index]:  # Monitor's entry; absent if the environment is not monitored
-                    part.on_episode_end(self, int(index), infos[index]["episode"]["r"])
+        self.learner.on_step(rewards, dones, infos)
 
     def load_replay_buffer(
         self,
@@ -729,8 +681,7 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
 
     def _on_environment_reset(self) -> None:
         """The environments were reset in the midst of their episodes."""
-        for part in self._parts().values():
-            part.on_environment_reset(self)
+        self.learner.on_environment_reset()
 
     def _decide_compilation(self, n_steps: int) -> None:
         """With ``compile="auto"``, once and for all: whether the coming environment steps pay it back."""
@@ -747,12 +698,12 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
             n_updates = n_steps if self.gradient_steps < 0 else self.gradient_steps * n_calls
         # What keeps the step from being compiled is worth a warning only where it was asked for, but for an old torch,
         # which is easily renewed.
-        pays = n_updates >= PAYS_FROM and not has_foreign_parts(self)
-        reason = why_not_compiled(self) if pays else None
+        pays = n_updates >= PAYS_FROM and not has_foreign_parts(self.learner)
+        reason = why_not_compiled(self.learner) if pays else None
         self.compiled = pays and reason is None
         if reason is not None and reason == old_torch():
-            warn_not_compiled(self, reason)
-        self._execution = None
+            warn_not_compiled(self.learner, reason)
+        self.learner.forget_execution()
 
     def _updates_due(self, n_collected: int) -> int:
         """
@@ -787,20 +738,17 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         """
         assert self.replay_buffer is not None
         batch_size = self.batch_size if batch_size is None else batch_size
-        self._take_target_entropy()
+        self._take_settings()
         self._set_training_mode(True)
-        rate = self.lr_schedule(self._current_progress_remaining)
-        for optimizer in self._optimizers().values():
-            for group in optimizer.param_groups:
-                if group.get("scheduled", True):
-                    group["lr"] = rate
-        for part in self._parts().values():
-            part.before_updates(self)
+        self.learner.set_learning_rate(self.lr_schedule(self._current_progress_remaining))
+        self.learner.before_updates()
         taken = 0
         while taken < gradient_steps:
-            n_batches = self.plasticity.before_gradient_steps(self, min(MAX_BATCHES_AT_ONCE, gradient_steps - taken))
-            self._prepared_execution()
-            for i, batch in enumerate(self._draw_batches(n_batches, batch_size), taken + 1):
+            n_batches = self.plasticity.before_gradient_steps(
+                self.learner, min(MAX_BATCHES_AT_ONCE, gradient_steps - taken)
+            )
+            self.learner.prepared_execution()
+            for i, batch in enumerate(self._source.sample(n_batches, batch_size), taken + 1):
                 self._keeps_gradients = self.keep_next_gradients and i == gradient_steps
                 metrics = self._update(batch)
                 self._watch.note(metrics, self._n_updates, self.num_timesteps)
@@ -837,169 +785,22 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
     def _record_counts(self) -> None:
         self.logger.record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        if self._execution is not None and self._execution.seconds_compiling > 0:
-            self.logger.record("time/seconds_compiling", self._execution.seconds_compiling)
+        if self.learner.seconds_compiling > 0:
+            self.logger.record("time/seconds_compiling", self.learner.seconds_compiling)
         self.logger.record("plasticity/reset", self.plasticity.n_done)
         if isinstance(self.replay_buffer, ValidationSplit):
             self.logger.record("validation/size", self.replay_buffer.n_validation)
 
     def _set_training_mode(self, mode: bool) -> None:
         """Dropout and power iterations: on during gradient steps, off whoever acts."""
-        self.policy.set_training_mode(mode)
-        self._parts_mode(mode)
-
-    def _draw_batches(self, n_batches: int, batch_size: int) -> list[Batch]:
-        assert self.replay_buffer is not None
-        return draw_batches(
-            self.replay_buffer, n_batches, batch_size, self.gamma, self._vec_normalize_env, self._batch_memory
-        )
-
-    def _prepared_execution(self) -> Execution:
-        if self._execution is None or not self._execution.serves(self):
-            self._execution = Execution.of(self)
-        self._execution.prepare(self)
-        return self._execution
+        self.learner.set_training_mode(mode)
 
     def _update(self, batch: Batch, noise: Noise | None = None) -> dict[str, torch.Tensor]:
-        """
-        One gradient step: what is drawn and counted around it, and the step.
-
-        :param batch: transitions
-        :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly.
-        :return: what to log, by name, scalars on the model's device, computed with the parameters from before
-            the update of the module in question
-        """
-        execution = self._execution or self._prepared_execution()
-        extra = self.pessimism_rule.draw(self)
-        subset = None if self.target_subset is None else (self.target_subset, self.critic.n_critics)
-        noise = (noise or Noise()).completed(batch, extra, subset)
-        self._n_updates += 1
-        moves_targets = self._n_updates % (self.target_update_interval or self.policy_delay) == 0
-        moves_actor = self._n_updates % self.policy_delay == 0
-        metrics = execution(self, batch, noise, extra, moves_targets, moves_actor, eager=self._keeps_gradients)
-        self.gradients_are_stale = not (self._keeps_gradients or execution.leaves_gradients)
-        if self._keeps_gradients:
-            self._keeps_gradients = self.keep_next_gradients = False
-        if self.redo is not None:
-            metrics.update(self.redo.after_update(self, batch))
-        return metrics
-
-    def _gradient_step(
-        self, batch: Batch, noise: Noise, extra: Extra | None, moves_targets: bool, moves_actor: bool
-    ) -> dict[str, torch.Tensor]:
-        """
-        The gradient step (P5, algorithm 2), of tensors only: it is what is compiled and captured.
-
-        :param batch: transitions
-        :param noise: all that is random
-        :param extra: further transitions for the rule of pessimism
-        :param moves_targets: whether the target critics follow in this step
-        :param moves_actor: whether actors and temperature learn in this step
-        :return: what to log, by name, scalars
-        """
-        alpha = self.temperature()
-        fixed_alpha = alpha.detach()
-
-        # Critics, towards the targets' value of the actor's next action.
-        with torch.no_grad():
-            next_actions, next_log_prob = self.policy.next_actions(batch.next_observations, noise.critic)
-            next_q = evaluate(self.critic_target, batch.next_observations, next_actions)
-            if noise.subset is not None:
-                next_q = next_q[noise.subset]
-            entropy_bonus = -fixed_alpha * next_log_prob
-            next_values = self.pessimism_rule.value(next_q)
-            target = losses.td_target(batch.rewards, batch.dones, batch.discounts, next_values, entropy_bonus)
-        q = evaluate(self.critic, batch.observations, batch.actions)
-        critic_loss = self._critic_loss(q, target)
-        if self.sam_radius is None:
-            self.minimize(self.critic.optimizer, critic_loss)
-        else:
-            self._sharpness_aware_step(critic_loss, batch, target)
-        metrics = {"train/critic_loss": critic_loss, "train/q_mean": q.mean()}
-
-        # Targets, by Polyak averaging.
-        if moves_targets:
-            self._follow(self.critic_target, self.critic)
-
-        if moves_actor:
-            # Actor, on the new critics.
-            actions, log_prob = self.actor.sample(batch.observations, noise.actor)
-            value = self._actor_value(evaluate(self.critic, batch.observations, actions))
-            actor_loss = losses.actor_loss(log_prob, value, fixed_alpha)
-            self.minimize(self.actor.optimizer, actor_loss)
-            metrics["train/actor_loss"] = actor_loss
-            if self.policy.actor_target is not None:
-                self._follow(self.policy.actor_target, self.actor)
-
-            # Whoever explores, on the new critics and the new actor.
-            metrics.update(self.explorer.update(self, batch, noise.exploration))
-
-            # Temperature.
-            if self.actor.has_entropy:
-                entropy = -log_prob.detach().mean()
-                metrics.update({"train/entropy": entropy, "train/ent_coef": alpha})
-                if self.temperature_optimizer is not None:
-                    temperature_loss = losses.temperature_loss(alpha, entropy, self._target_entropy)
-                    self.minimize(self.temperature_optimizer, temperature_loss)
-                    metrics["train/ent_coef_loss"] = temperature_loss
-
-        # Pessimism.
-        step = CriticStep(q.detach(), next_q, entropy_bonus, noise.subset)
-        metrics.update(self.pessimism_rule.update(self, batch, step, noise.pessimism, extra))
-        return {name: value.detach() for name, value in metrics.items()}
-
-    def _actor_value(self, q: torch.Tensor) -> torch.Tensor:
-        """The ensemble's value for the actor's objective, (E, B, K) to (B, K)."""
-        if self.actor_pessimism is None:
-            return self.pessimism_rule.value(q)
-        return pessimistic_value(q, float(self.actor_pessimism))
-
-    def _follow(self, target: Actor | CriticEnsemble, online: Actor | CriticEnsemble) -> None:
-        """One step of Polyak averaging; with ``tau=1`` the target is the online network."""
-        with torch.no_grad():
-            torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), weight=self.tau)
-            # Running statistics of a features extractor, as in Stable-Baselines3.
-            assert target.features_extractor is not None and online.features_extractor is not None
-            statistics = zip(target.features_extractor.buffers(), online.features_extractor.buffers(), strict=True)
-            for ours, theirs in statistics:
-                ours.copy_(theirs)
-
-    def _sharpness_aware_step(self, loss: torch.Tensor, batch: Batch, target: torch.Tensor) -> None:
-        """One step of the critics' optimizer with the gradient from ``sam_radius`` uphill."""
-        assert self.sam_radius is not None
-        parameters = list(self.critic.parameters())
-        copied = {id(p) for p in self.critic.copied_parameters()}
-        gradients = sharpness_aware_gradients(
-            loss,
-            lambda: self._critic_loss(evaluate(self.critic, batch.observations, batch.actions), target),
-            parameters,
-            self.sam_radius,
-            [len(p) if id(p) in copied else None for p in parameters],
-        )
-        self._descend(self.critic.optimizer, gradients)
-
-    @staticmethod
-    def minimize(optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:
-        """
-        One step of an optimizer. Only its own parameters get a gradient, whatever else the loss passed through.
-
-        :param optimizer: the optimizer
-        :param loss: scalar
-        """
-        parameters = [p for group in optimizer.param_groups for p in group["params"]]
-        SAC._descend(optimizer, torch.autograd.grad(loss, parameters, allow_unused=True))
-
-    @staticmethod
-    def _descend(optimizer: torch.optim.Optimizer, gradients: Sequence[torch.Tensor | None]) -> None:
-        """One step of an optimizer with gradients in the order of its parameters."""
-        if torch.compiler.is_compiling():
-            assert isinstance(optimizer, AdamW)
-            optimizer.apply(gradients)
-            return
-        parameters = [p for group in optimizer.param_groups for p in group["params"]]
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            parameter.grad = gradient
-        optimizer.step()
+        """One gradient step of the learner, with what its rule of pessimism judges besides; see ``Learner.step``."""
+        eager, self._keeps_gradients = self._keeps_gradients, False
+        if eager:
+            self.keep_next_gradients = False
+        return self.learner.step(batch, noise, self.pessimism_rule.draw(self._source), eager)
 
     def dump_logs(self) -> None:
         """

@@ -11,10 +11,10 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.type_aliases import TrainFreq
 
 from sb3_sample.arguments import check_unused
+from sb3_sample.learner.exploration import EXPLORATIONS
+from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, check_beta
 from sb3_sample.sac.buffers import DeviceReplayBuffer
 from sb3_sample.sac.compact_buffer import CompactReplay
-from sb3_sample.sac.exploration import EXPLORATIONS
-from sb3_sample.sac.pessimism import PESSIMISMS, check_beta
 
 if TYPE_CHECKING:
     from sb3_sample.sac.algorithm import SAC
@@ -216,15 +216,45 @@ def _check_train_freq(agent: "SAC") -> None:
             )
 
 
+def check_rule(agent: "SAC") -> None:
+    """
+    :param agent: an algorithm with its rule of pessimism
+    :raises ValueError: if the transitions that the rule learns from are none that the algorithm has
+    """
+    rule = agent.pessimism_rule
+    if not isinstance(rule, LearnedPessimism):
+        return
+    source, segment_length = rule.source, rule.segment_length
+    if source in ("recent", "on_policy") and segment_length > max(agent.buffer_size // agent.n_envs, 1):
+        raise ValueError(
+            f"segment_length={segment_length} is more than a replay buffer of buffer_size={agent.buffer_size} "
+            f"holds of each of {agent.n_envs} environments"
+        )
+    if source == "validation" and agent.validation_proportion == 0:
+        raise ValueError(
+            "pessimism='vpl' learns from transitions held out, and validation_proportion=0 holds none out: "
+            "pass validation_proportion=1/32, or another source of its transitions"
+        )
+    if source == "on_policy":
+        if agent.exploration != "actor":
+            raise ValueError(
+                f"the segments of pessimism='opl' must be on-policy, but exploration={agent.exploration!r}: "
+                "it goes with exploration='actor' only"
+            )
+        if agent.action_noise is not None:
+            raise ValueError("the segments of pessimism='opl' must be on-policy: leave action_noise out")
+
+
 def check_names(argument: str, choice: str, make: Callable[..., Any], kwargs: dict[str, Any]) -> None:
     """
     :param argument: name of the argument that chose a part
     :param choice: its value
-    :param make: what builds the part, from the algorithm and these arguments
+    :param make: what builds the part, from the learner and these arguments
     :param kwargs: arguments for it
     :raises ValueError: if one of them is none that it takes
     """
-    allowed = [name for name in inspect.signature(make).parameters if name not in ("self", "agent")]
+    # The first is the learner.
+    allowed = list(inspect.signature(make).parameters)[1:]
     for name in kwargs:
         if name not in allowed:
             raise ValueError(f"{argument}_kwargs has {name!r}, but {argument}={choice!r} takes {allowed or 'none'}")

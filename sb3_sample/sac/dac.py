@@ -31,7 +31,7 @@ class DAC(SAC):
     divergence between the two are learned.
 
     Where the paper's text and the published code differ, the update follows the code, whose every number it
-    reproduces; :class:`~sb3_sample.sac.exploration.OptimisticActor` names the differences. The networks follow the
+    reproduces; :class:`~sb3_sample.learner.exploration.OptimisticActor` names the differences. The networks follow the
     paper, two hidden layers of 256 without layer norm, which is what P3 to P5 compare with; the published code has
     ``policy_kwargs=dict(net_arch=[256] * 3, critic_network_kwargs=dict(layer_norm=True))``.
 

@@ -23,41 +23,14 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
+from sb3_sample.learner.q_values import QValues
 from sb3_sample.networks import NETWORKS, Network, linear
+from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.optim import AdamW
-from sb3_sample.sac.losses import gaussian_kl, tanh_gaussian_log_prob
-from sb3_sample.sac.q_values import QValues
 
 # The log standard deviation is squashed into this interval by a tanh.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
-
-
-class ModeSwitch:
-    """
-    Training and evaluation mode of modules and all that is in them, without the detours of
-    ``nn.Module.train``, which takes as long as a small network's forward pass.
-
-    :param roots: the modules; what they hold must not change afterwards
-    """
-
-    def __init__(self, *roots: nn.Module):
-        # A module with a train of its own is asked (one that keeps its batch norm in evaluation mode, say), and so is
-        # one whose attributes are not Python's.
-        def is_special(m: nn.Module) -> bool:
-            return type(m).train is not nn.Module.train or isinstance(m, torch.jit.ScriptModule)
-
-        self._own = [root for root in roots if any(map(is_special, root.modules()))]
-        self._plain = [m for root in roots if root not in self._own for m in root.modules()]
-
-    def __call__(self, mode: bool) -> None:
-        """
-        :param mode: training (True) or evaluation mode
-        """
-        for module in self._plain:
-            # What nn.Module's own setattr comes to for this attribute, after looking for much else.
-            module.__dict__["training"] = mode
-        for root in self._own:
-            root.train(mode)
 
 
 class Actor(BasePolicy):
@@ -118,6 +91,13 @@ class Actor(BasePolicy):
         """
         assert isinstance(self.features_extractor, BaseFeaturesExtractor)
         return self.extract_features(obs, self.features_extractor)
+
+    def statistics(self) -> list[torch.Tensor]:
+        """
+        :return: running statistics that a target actor takes over: those of the features extractor
+        """
+        assert self.features_extractor is not None
+        return list(self.features_extractor.buffers())
 
     def gaussian(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """
@@ -410,6 +390,13 @@ class CriticEnsemble(BaseModel):
 
         return [functools.partial(network, index) for index in range(self.n_critics)]
 
+    def statistics(self) -> list[torch.Tensor]:
+        """
+        :return: running statistics that the target critics take over: those of the features extractor
+        """
+        assert self.features_extractor is not None
+        return list(self.features_extractor.buffers())
+
     def copied_parameters(self) -> list[nn.Parameter]:
         """
         :return: the parameters that each critic has a copy of, (E, ...) each: all but the features extractor's
@@ -531,9 +518,9 @@ class SACPolicy(BasePolicy):
         self.critic_target.load_state_dict(self.critic.state_dict())
         self.critic_target.requires_grad_(False)
         self.critic_target.set_training_mode(False)
-        self.actor.optimizer = self.make_optimizer(self.actor.parameters(), lr_schedule)
+        self.actor.optimizer = self.make_optimizer(self.actor.parameters(), lr_schedule(1))
         self.critic.optimizer = self.make_optimizer(
-            self.critic.parameters(), lr_schedule, **(critic_optimizer_kwargs or {})
+            self.critic.parameters(), lr_schedule(1), **(critic_optimizer_kwargs or {})
         )
         self._mode_switch = ModeSwitch(self.actor, self.critic, self.critic_target.trunk)
         self._constructor_args: dict[str, Any] = dict(
@@ -569,15 +556,15 @@ class SACPolicy(BasePolicy):
             **kwargs,
         )
 
-    def make_optimizer(self, parameters: Any, lr_schedule: Schedule, **kwargs: Any) -> torch.optim.Optimizer:
+    def make_optimizer(self, parameters: Any, learning_rate: float, **kwargs: Any) -> torch.optim.Optimizer:
         """
         :param parameters: what to optimise
-        :param lr_schedule: learning rate schedule
+        :param learning_rate: at the start
         :param kwargs: settings over the policy's
         :return: an optimizer of the policy's class and settings
         """
         settings = {**self.optimizer_kwargs, **kwargs}
-        return self.optimizer_class(parameters, lr=lr_schedule(1), **settings)  # type: ignore[call-arg]
+        return self.optimizer_class(parameters, lr=learning_rate, **settings)  # type: ignore[call-arg]
 
     def next_actions(self, obs: PyTorchObs, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """

@@ -49,7 +49,7 @@ class _RuleSAC(SAC):
 class TOPSAC(_RuleSAC):
     """
     Soft actor-critic with tactical optimism and pessimism (Moskovitz et al. 2021): a bandit chooses the pessimism of
-    each episode. With P2's and P4's settings; :class:`~sb3_sample.sac.pessimism.TOP` has the details.
+    each episode. With P2's and P4's settings; :class:`~sb3_sample.learner.pessimism.TOP` has the details.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
@@ -82,7 +82,7 @@ class GPLSAC(_RuleSAC):
     """
     Soft actor-critic with generalized pessimism learning (Cetin and Celiktutan 2023): the dual step on replay
     transitions.
-    :class:`~sb3_sample.sac.pessimism.LearnedPessimism` has the details.
+    :class:`~sb3_sample.learner.pessimism.LearnedPessimism` has the details.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
@@ -117,7 +117,7 @@ class GPLSAC(_RuleSAC):
 class OPLSAC(_RuleSAC):
     """
     Soft actor-critic with on-policy pessimism learning (Kuznetsov et al. 2021): the dual step against the TD(lambda)
-    returns of the latest steps. :class:`~sb3_sample.sac.pessimism.LearnedPessimism` has the details.
+    returns of the latest steps. :class:`~sb3_sample.learner.pessimism.LearnedPessimism` has the details.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
@@ -161,7 +161,7 @@ class OAC(SAC):
     """
     Optimistic actor-critic (Ciosek et al. 2019): soft actor-critic that explores with its actor's mean shifted along
     the gradient of an upper bound. With the settings of P3's comparison;
-    :class:`~sb3_sample.sac.exploration.OptimisticGradient` has the details.
+    :class:`~sb3_sample.learner.exploration.OptimisticGradient` has the details.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box

@@ -6,22 +6,16 @@ from typing import Any
 import torch
 from stable_baselines3.common.utils import get_parameters_by_name
 
+from sb3_sample.learner.scalars import LogScalar
 from sb3_sample.optim import AdamW
-from sb3_sample.sac.policies import Actor, CriticEnsemble
-from sb3_sample.sac.scalars import FixedScalar, LogScalar
+from sb3_sample.sac.model_learner import HasLearner
 
 
-class SB3Names:
+class SB3Names(HasLearner):
     """
     Attributes as ``stable_baselines3.SAC`` has them. A temperature that is set is put in the place of the old one, so
     that it counts from the next gradient step on, however that is run.
     """
-
-    actor: Actor
-    critic: CriticEnsemble
-    critic_target: CriticEnsemble
-    temperature: LogScalar | FixedScalar
-    temperature_optimizer: AdamW | None
 
     @property
     def log_ent_coef(self) -> torch.Tensor | None:

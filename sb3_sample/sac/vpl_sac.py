@@ -19,7 +19,7 @@ class VPLSAC(SAC):
     moves to where the targets' error is least on data that the critics have not seen. With ``replay_ratio=16,
     resets=160_000`` it is the paper's SR-SAC-VPL.
 
-    :class:`~sb3_sample.sac.pessimism.LearnedPessimism` says what the paper leaves open and how it is decided. The
+    :class:`~sb3_sample.learner.pessimism.LearnedPessimism` says what the paper leaves open and how it is decided. The
     paper's variants are arguments: ``pessimism_source="replay"`` or ``"recent"``, ``pessimism_loss="dual"``,
     ``validation_proportion``, and ``pessimism=1.0`` for the "regret" run, which holds the transitions out and leaves
     the pessimism fixed.

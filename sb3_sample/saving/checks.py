@@ -17,6 +17,7 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.her import HerReplayBuffer
 
+from sb3_sample.errors import ParametersDoNotFit as ParametersDoNotFit
 from sb3_sample.saving.classes import PACKAGES, may_be_set, within
 from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.replay import MAX_HER_TRANSITIONS, MAX_TRANSITIONS
@@ -46,13 +47,6 @@ NEVER = (
     "policy", "env", "replay_buffer", "rollout_buffer", "_vec_normalize_env", "_logger", "_custom_logger",
     "_trusted_modules", "_told",
 )  # fmt: skip
-
-
-class ParametersDoNotFit(ValueError, RuntimeError):
-    """
-    Parameters that are loaded are not those of this model. Also a ``RuntimeError``, as torch's own, since
-    Stable-Baselines3's ``load`` takes a mere ``ValueError`` for a file of an old version of its own.
-    """
 
 
 def _tensors_in(value: Any, name: str) -> Iterator[tuple[str, torch.Tensor]]:

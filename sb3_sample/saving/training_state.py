@@ -25,10 +25,10 @@ from sb3_sample.version import __version__
 #: Attributes of an algorithm that its file leaves out and that the future of the run depends on nevertheless.
 KEPT = ("_metrics", "action_noise")
 #: Attributes that follow from the arguments, from what is restored besides, or from the present ``learn``; clocks.
-#: ``_execution``, ``_watch``, ``_batch_memory`` and ``rollout_buffer`` are filled anew before they are used.
+#: ``_watch``, ``_source`` and ``rollout_buffer`` are filled anew before they are used. What the learner has is saved by
+#: its parts.
 DERIVED = (
-    "start_time", "_total_timesteps", "lr_schedule", "_execution", "_watch", "_batch_memory", "_parts_mode", "_seconds",
-    "rollout_buffer", "redo",
+    "start_time", "_total_timesteps", "lr_schedule", "_watch", "_source", "_learner", "_seconds", "rollout_buffer",
     "env", "_vec_normalize_env", "_logger", "_custom_logger", "replay_buffer", "device",
 )  # fmt: skip
 #: Arguments that may differ between the parts of a run: where it computes, and what it prints.

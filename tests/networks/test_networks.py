@@ -10,8 +10,8 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_sample import BRO
+from sb3_sample.learner.exploration import OptimisticShift
 from sb3_sample.networks import MLP, BroNet, EnsembleLayerNorm, EnsembleLinear, init_orthogonal, linear
-from sb3_sample.sac.exploration import OptimisticShift
 from tests.networks.common import randomize
 from tests.sac.common import Toy
 

@@ -13,6 +13,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_sample import BRO
+from sb3_sample.learner.execution import old_torch
 from sb3_sample.sac import (
     BROTD3,
     DAC,
@@ -26,7 +27,6 @@ from sb3_sample.sac import (
     BROFast,
     RegularizedSAC,
 )
-from sb3_sample.sac.execution import old_torch
 
 #: Of tests whose gradient step is compiled.
 COMPILES = pytest.mark.skipif(old_torch() is not None, reason="compiling needs a newer torch")
@@ -185,7 +185,7 @@ def taken_or_refused(load: Callable[[], Any], words: str) -> Any:
 
 def random_batch(model: SAC, n: int = 8, seed: int = 0) -> Any:
     """A batch of random transitions for a model with flat observations."""
-    from sb3_sample.sac.batch import Batch
+    from sb3_sample.learner.batch import Batch
 
     g = torch.Generator().manual_seed(seed)
     assert model.observation_space.shape is not None

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from sb3_sample import DAC, VPLSAC
-from sb3_sample.sac.batch import Noise
-from sb3_sample.sac.exploration import Exploration, OptimisticActor, spread
+from sb3_sample.learner.batch import Noise
+from sb3_sample.learner.exploration import Exploration, OptimisticActor, spread
 from tests.sac.common import differing, random_batch, sac, state, vec
 
 

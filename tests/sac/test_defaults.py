@@ -8,9 +8,9 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_sample import BRO
+from sb3_sample.learner.exploration import Exploration, OptimisticShift
 from sb3_sample.networks import BroNet, EnsembleLayerNorm
 from sb3_sample.sac import SAC, BROFast
-from sb3_sample.sac.exploration import Exploration, OptimisticShift
 from tests.sac.common import Toy
 
 N_ACTIONS = 3

@@ -15,8 +15,8 @@ from stable_baselines3.common.logger import KVWriter, Logger, configure
 from torch.nn import functional
 
 from sb3_sample import TrainingDiverged
+from sb3_sample.learner.q_values import QValues
 from sb3_sample.sac import SAC
-from sb3_sample.sac.q_values import QValues
 from tests.sac.common import MAKERS, Toy, bro, random_batch, sac, state, vec
 from tests.sac.test_execution import captured, pair
 from tests.test_logged_values import Fetches

@@ -13,8 +13,8 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
+from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.sac import BROTD3, SAC
-from sb3_sample.sac.batch import Batch, Noise
 from tests.sac.common import MAKERS, bro, differing, random_batch, sac, state, taken_or_refused, vec
 from tests.sac.test_spaces_and_wrappers import Reach
 from tests.sac.test_update import NoSynchronisation

@@ -20,11 +20,11 @@ from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_sample import BRO, DiagnosticsCallback
+from sb3_sample.learner.batch import draw_batches
+from sb3_sample.learner.execution import Execution, old_torch, why_not_compiled
+from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
 from sb3_sample.sac import SAC, algorithm, execution
-from sb3_sample.sac.batch import draw_batches
 from sb3_sample.sac.buffers import PLAIN_BUFFERS, BatchMemory, DeviceReplayBuffer
-from sb3_sample.sac.execution import Execution, old_torch, why_not_compiled
-from sb3_sample.sac.pessimism import PESSIMISMS, Pessimism
 from tests.sac.common import COMPILES, MAKERS, Toy, bro, differing, sac, state, vec
 
 #: Largest difference of a parameter after 50 updates, each of which moves it by up to 3e-4. The same arithmetic in

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sb3_sample.sac.exploration import Exploration, OptimisticShift
+from sb3_sample.learner.exploration import Exploration, OptimisticShift
 from tests.sac.common import bro, random_batch, sac, vec
 
 

@@ -18,10 +18,10 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_sample import BRO, DAC
+from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.networks import MLP, BroNet
 from sb3_sample.networks.ensemble import EnsembleLayerNorm, EnsembleLinear
 from sb3_sample.sac import SAC
-from sb3_sample.sac.batch import Batch, Noise
 from tests.sac.common import COMPILES
 from tests.sac.test_execution import captured
 

@@ -12,9 +12,9 @@ import torch
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import NormalActionNoise
 
+from sb3_sample.learner.batch import Batch, CriticStep, Noise
+from sb3_sample.learner.pessimism import TOP, LearnedPessimism, pessimistic_value
 from sb3_sample.sac import BRO, GPLSAC, OPLSAC, SAC, TOPSAC, VPLSAC, buffers
-from sb3_sample.sac.batch import Batch, CriticStep, Noise
-from sb3_sample.sac.pessimism import TOP, LearnedPessimism, pessimistic_value
 from tests.sac.common import COMPILES, TINY_BRO, TINY_SAC, differing, random_batch, sac, state, vec
 from tests.sac.test_execution import captured
 from tests.sac.test_update import NoSynchronisation

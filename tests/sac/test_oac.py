@@ -10,8 +10,8 @@ import torch
 from gymnasium import spaces
 
 from sb3_sample import OAC
-from sb3_sample.sac.exploration import OptimisticGradient
-from sb3_sample.sac.losses import gaussian_kl
+from sb3_sample.learner.exploration import OptimisticGradient
+from sb3_sample.learner.losses import gaussian_kl
 from tests.sac.common import differing, sac, state, vec
 
 DICT = spaces.Dict({"a": spaces.Box(-10, 10, (3,), np.float32), "b": spaces.Box(-5, 5, (2, 2), np.float64)})

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from sb3_sample.learner.batch import Noise
+from sb3_sample.learner.pessimism import Pessimism, epistemic_std, pessimistic_value
 from sb3_sample.sac import VPLSAC
-from sb3_sample.sac.batch import Noise
-from sb3_sample.sac.pessimism import Pessimism, epistemic_std, pessimistic_value
 from tests.sac.common import TINY_SAC, bro, differing, random_batch, sac, state, vec
 
 Q = torch.tensor([[[1.0, 2.0], [3.0, 0.0]], [[3.0, -2.0], [3.0, 4.0]]])  # (E, B, K) = (2, 2, 2)

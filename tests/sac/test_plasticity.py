@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from sb3_sample import BRO, BROTD3, DAC, SRSAC, BROFast
+from sb3_sample.learner.plasticity import Resets
 from sb3_sample.sac.bro import BRO_FAST_RESETS, BRO_RESETS
-from sb3_sample.sac.plasticity import Resets
 from tests.sac.common import MAKERS, bro, sac, vec
 
 

@@ -12,9 +12,9 @@ import torch
 from torch import nn
 
 from sb3_sample import RegularizedSAC
+from sb3_sample.learner.pessimism import TOP, LearnedPessimism
 from sb3_sample.networks import CReLU, EnsembleLayerNorm, SpectralEnsembleLinear
 from sb3_sample.networks.spectral_norm import SpectralNorm
-from sb3_sample.sac.pessimism import TOP, LearnedPessimism
 from tests.sac.common import differing, random_batch, sac, state, taken_or_refused, vec
 
 CRITIC = ("none", "cdq", "gpl", "top")

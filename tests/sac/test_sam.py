@@ -10,7 +10,7 @@ import torch
 from gymnasium import spaces
 
 from sb3_sample import SAC
-from sb3_sample.sac.batch import Batch, Noise
+from sb3_sample.learner.batch import Batch, Noise
 from tests.sac.common import bro, differing, random_batch, sac, state, vec
 from tests.sac.test_update import NoSynchronisation
 

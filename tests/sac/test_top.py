@@ -10,8 +10,8 @@ import pytest
 import torch
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_sample.learner.pessimism import TOP
 from sb3_sample.sac import TOPSAC
-from sb3_sample.sac.pessimism import TOP
 from tests.sac.common import TINY_SAC, differing, random_batch, sac, state, vec
 from tests.sac.test_validation_split import tagged
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from sb3_sample.learner.batch import Noise
 from sb3_sample.sac import SAC
-from sb3_sample.sac.batch import Noise
 from tests.sac.common import MAKERS, bro, differing, random_batch, sac, state
 
 #: Operations whose result the host must have: on a GPU each is a wait for the device.

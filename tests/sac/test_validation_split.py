@@ -14,6 +14,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_sample.learner.pessimism import LearnedPessimism
 from sb3_sample.sac import BRO, SAC, VPLSAC
 from sb3_sample.sac.buffers import (
     ValidationDictReplayBuffer,
@@ -23,7 +24,6 @@ from sb3_sample.sac.buffers import (
     samples_at,
 )
 from sb3_sample.sac.compact_buffer import CompactReplayBuffer
-from sb3_sample.sac.pessimism import LearnedPessimism
 from tests.sac.common import TINY_BRO, TINY_SAC, differing, sac, state, vec
 
 

@@ -160,7 +160,7 @@ def hostile_value(rng: random.Random, original: Original) -> Any:
             "stable_baselines3.common.utils:ConstantSchedule", "os:system", "subprocess:Popen", 3,
             "stable_baselines3.common.noise:VectorizedActionNoise"]), "attributes": rng.choice([{}, 3, {"val": "x"}, {
                 "n_envs": 10**9, "_base_noise": None, "_noises": []}])},
-        lambda: {"instance": rng.choice([*DANGEROUS, 3, "sb3_sample.sac.plasticity:ReDo", "threading:Thread"]),
+        lambda: {"instance": rng.choice([*DANGEROUS, 3, "sb3_sample.learner.plasticity:ReDo", "threading:Thread"]),
                  "attributes": rng.choice([{}, 3, {"run": 1}, {"__class__": 1}])},
         lambda: {"left_out": rng.choice(["", "x" * 5000, 3, None, {}])}, lambda: {"path": rng.choice(["", "../x", 3])},
         lambda: {"numbers": tensor}, lambda: {"own": {"critic": {"dict": {}}}},

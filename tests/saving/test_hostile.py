@@ -28,10 +28,10 @@ import torch
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.save_util import recursive_getattr
 
+from sb3_sample.learner.parts import ParametersDoNotFit
 from sb3_sample.ppo import MBMAPPO
 from sb3_sample.sac import SAC
 from sb3_sample.sac.bro import BRO
-from sb3_sample.sac.parts import ParametersDoNotFit
 from sb3_sample.saving import BadFile, container, load_vec_normalize, save_vec_normalize
 from tests.ppo.common import tiny
 from tests.sac.common import bro, differing, sac, state, vec

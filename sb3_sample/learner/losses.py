@@ -10,7 +10,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 
-from sb3_sample.sac.q_values import QValues
+from sb3_sample.learner.q_values import QValues
 
 
 def td_target(

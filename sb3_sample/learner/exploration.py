@@ -1,50 +1,47 @@
 """
-Exploration: who acts while the agent trains. ``predict`` and evaluation are the pessimistic actor's alone.
+Exploration: who acts while the learner trains. ``predict`` and evaluation are the pessimistic actor's alone.
 """
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch.optim import Optimizer
 
+from sb3_sample.learner import losses
+from sb3_sample.learner.batch import Batch
+from sb3_sample.learner.parts import Learning, Part
+from sb3_sample.learner.pessimism import epistemic_std
+from sb3_sample.learner.q_values import evaluate
+from sb3_sample.learner.scalars import BoundedLogScalar, LogScalar
 from sb3_sample.networks import NETWORKS, linear
 from sb3_sample.optim import AdamW
-from sb3_sample.sac import losses
-from sb3_sample.sac.parts import Part
-from sb3_sample.sac.pessimism import epistemic_std
-from sb3_sample.sac.q_values import evaluate
-from sb3_sample.sac.scalars import BoundedLogScalar, LogScalar
-
-if TYPE_CHECKING:
-    from sb3_sample.sac.algorithm import SAC
-    from sb3_sample.sac.batch import Batch
 
 
 class Exploration(Part):
     """
     Base class, and the plain choice: the actor itself, a sample of it or, if it is deterministic, with noise added.
 
-    :param agent: the algorithm, whose policy exists already
+    :param learner: the learner, whose networks exist already
     """
 
-    def __init__(self, agent: "SAC"):
+    def __init__(self, learner: Learning):
         super().__init__()
 
-    def act(self, agent: "SAC", observations: Any) -> torch.Tensor:
+    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
         """
-        :param agent: the algorithm
+        :param learner: the learner
         :param observations: tensors on the device of the model, (B, O) or a dict of them
         :return: actions in [-1, 1], (B, A)
         """
-        mean, log_std = agent.actor.gaussian(agent.actor.features(observations))
-        return agent.actor.act(mean, log_std.exp(), torch.randn_like(mean))
+        mean, log_std = learner.actor.gaussian(learner.actor.features(observations))
+        return learner.actor.act(mean, log_std.exp(), torch.randn_like(mean))
 
-    def update(self, agent: "SAC", batch: "Batch", noise: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    def update(self, learner: Learning, batch: Batch, noise: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         """
         Learn from the step's batch; called after the critics and the actor were updated.
 
-        :param agent: the algorithm
+        :param learner: the learner
         :param batch: the step's batch
         :param noise: standard normal noise of the sampled actions, (B, A); drawn if None
         :return: what to log, by name, scalars
@@ -82,7 +79,7 @@ class OptimisticExploration(Exploration):
     optimism * Q_std`` under a penalty on the KL divergence to the pessimistic actor; optimism and the penalty's
     weight are learned so that the divergence per action dimension meets ``kl_target``.
 
-    :param agent: the algorithm, whose policy exists already
+    :param learner: the learner, whose networks exist already
     :param kl_target: KL divergence per action dimension to be met, above 0
     :param std_multiplier: factor on the standard deviation while exploring, above 0; taken out before the divergence
     :param uncertainty: what Q_std is: "epistemic", "aleatoric" or "both"; see :func:`spread`
@@ -95,13 +92,13 @@ class OptimisticExploration(Exploration):
 
     def __init__(
         self,
-        agent: "SAC",
+        learner: Learning,
         kl_target: float,
         std_multiplier: float,
         uncertainty: str,
         adjustment_learning_rate: float,
     ):
-        super().__init__(agent)
+        super().__init__(learner)
         for name, value in (("kl_target", kl_target), ("std_multiplier", std_multiplier)):
             if not 0 < value < math.inf:
                 raise ValueError(f"{name} must be above 0 and finite, not {value}")
@@ -109,19 +106,19 @@ class OptimisticExploration(Exploration):
             raise ValueError(f"adjustment_learning_rate must be at least 0 and finite, not {adjustment_learning_rate}")
         if uncertainty not in UNCERTAINTIES:
             raise ValueError(f"uncertainty must be one of {UNCERTAINTIES}, not {uncertainty!r}")
-        if uncertainty != "epistemic" and (agent.n_quantiles or 1) < 2:
+        if uncertainty != "epistemic" and learner.head.n_outputs < 2:
             raise ValueError(
-                f"uncertainty={uncertainty!r} needs critics with at least two quantiles, "
-                f"not n_quantiles={agent.n_quantiles}"
+                f"uncertainty={uncertainty!r} needs critics with at least two quantiles (n_quantiles), not "
+                f"{learner.head.n_outputs} output each"
             )
         self.kl_target = kl_target
         self.std_multiplier = std_multiplier
         self.uncertainty = uncertainty
         self._adjustment_learning_rate = adjustment_learning_rate
 
-    def _make_optimizers(self, agent: "SAC", actor: Any, optimism: Any, kl_weight: Any) -> None:
+    def _make_optimizers(self, learner: Learning, actor: Any, optimism: Any, kl_weight: Any) -> None:
         """For the parameters of the optimistic actor and of the two numbers."""
-        self.actor_optimizer = agent.make_optimizer(actor)
+        self.actor_optimizer = learner.make_optimizer(actor)
         # Their learning rate is their own, whatever the schedule of the others.
         scalars = {"params": [*optimism, *kl_weight], "scheduled": False}
         self.scalar_optimizer = AdamW([scalars], lr=self._adjustment_learning_rate, betas=(0.5, 0.999))
@@ -141,15 +138,15 @@ class OptimisticExploration(Exploration):
         """
         raise NotImplementedError
 
-    def _kl(self, agent: "SAC", optimistic: Any, pessimistic: Any) -> torch.Tensor:
+    def _kl(self, learner: Learning, optimistic: Any, pessimistic: Any) -> torch.Tensor:
         """Divergence of the two Gaussians, (B, 1)."""
-        return agent.actor.kl(*optimistic, *pessimistic)
+        return learner.actor.kl(*optimistic, *pessimistic)
 
-    def _optimism(self, agent: "SAC") -> torch.Tensor:
+    def _optimism(self, learner: Learning) -> torch.Tensor:
         """Optimism, a scalar with gradient."""
         raise NotImplementedError
 
-    def _optimism_loss(self, agent: "SAC", optimism: torch.Tensor, kl_gap: torch.Tensor) -> torch.Tensor:
+    def _optimism_loss(self, learner: Learning, optimism: torch.Tensor, kl_gap: torch.Tensor) -> torch.Tensor:
         raise NotImplementedError
 
     def _kl_weight(self) -> torch.Tensor:
@@ -160,33 +157,33 @@ class OptimisticExploration(Exploration):
         """The weight as the actor's loss uses it."""
         return kl_weight
 
-    def act(self, agent: "SAC", observations: Any) -> torch.Tensor:
-        features = agent.actor.features(observations)
-        mean, log_std = agent.actor.gaussian(features)
+    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
+        features = learner.actor.features(observations)
+        mean, log_std = learner.actor.gaussian(features)
         mean, std = self._gaussian(observations, features, mean, log_std.exp())
-        return agent.actor.act(mean, self.std_multiplier * std, torch.randn_like(std))
+        return learner.actor.act(mean, self.std_multiplier * std, torch.randn_like(std))
 
-    def update(self, agent: "SAC", batch: "Batch", noise: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    def update(self, learner: Learning, batch: Batch, noise: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         with torch.no_grad():
-            features = agent.actor.features(batch.observations)
-            mean, log_std = agent.actor.gaussian(features)
+            features = learner.actor.features(batch.observations)
+            mean, log_std = learner.actor.gaussian(features)
             std = log_std.exp()
         noise = torch.randn_like(mean) if noise is None else noise
-        optimism, kl_weight = self._optimism(agent), self._kl_weight()
+        optimism, kl_weight = self._optimism(learner), self._kl_weight()
 
         optimistic_mean, optimistic_std = self._gaussian(batch.observations, features, mean, std)
-        action = agent.actor.learned_action(optimistic_mean, self.std_multiplier * optimistic_std, noise)
-        q = evaluate(agent.critic, batch.observations, action)
+        action = learner.actor.learned_action(optimistic_mean, self.std_multiplier * optimistic_std, noise)
+        q = evaluate(learner.critic, batch.observations, action)
         q_mean, q_std = q.mean(dim=0), spread(q, self.uncertainty)
-        kl = self._kl(agent, (optimistic_mean, optimistic_std), (mean, std))
+        kl = self._kl(learner, (optimistic_mean, optimistic_std), (mean, std))
         upper_value = q_mean + optimism.detach() * q_std
         actor_loss = losses.optimistic_actor_loss(upper_value, kl, self._penalty(kl_weight))
-        agent.minimize(self.actor_optimizer, actor_loss)
+        learner.minimize(self.actor_optimizer, actor_loss)
 
         kl_gap = kl.detach().mean() / mean.shape[1] - self.kl_target
-        optimism_loss = self._optimism_loss(agent, optimism, kl_gap)
+        optimism_loss = self._optimism_loss(learner, optimism, kl_gap)
         kl_weight_loss = losses.kl_weight_loss(kl_weight, kl_gap)
-        agent.minimize(self.scalar_optimizer, optimism_loss + kl_weight_loss)
+        learner.minimize(self.scalar_optimizer, optimism_loss + kl_weight_loss)
         return {
             "exploration/actor_loss": actor_loss,
             "exploration/kl": kl_gap + self.kl_target,
@@ -209,7 +206,7 @@ class OptimisticShift(OptimisticExploration):
     divergence goes from the optimistic to the pessimistic Gaussian, with the multiplier removed from the
     optimistic standard deviation, so that only the squared shift of the mean remains.
 
-    :param agent: the algorithm, whose policy exists already
+    :param learner: the learner, whose networks exist already
     :param kl_target: KL divergence per action dimension to be met, above 0
     :param std_multiplier: factor on the pessimistic standard deviation, above 0
     :param uncertainty: what Q_std is: "epistemic", "aleatoric" or "both"; see :func:`spread`
@@ -223,7 +220,7 @@ class OptimisticShift(OptimisticExploration):
 
     def __init__(
         self,
-        agent: "SAC",
+        learner: Learning,
         kl_target: float = 0.05,
         std_multiplier: float = 0.75,
         uncertainty: str = "epistemic",
@@ -233,10 +230,10 @@ class OptimisticShift(OptimisticExploration):
         network: str = "bronet",
         network_kwargs: dict[str, Any] | None = None,
     ):
-        super().__init__(agent, kl_target, std_multiplier, uncertainty, adjustment_learning_rate)
+        super().__init__(learner, kl_target, std_multiplier, uncertainty, adjustment_learning_rate)
         if network not in NETWORKS:
             raise ValueError(f"network must be one of {sorted(NETWORKS)}, not {network!r}")
-        actor = agent.actor
+        actor = learner.actor
         action_dim = actor.action_dim
         if network_kwargs is None:
             network_kwargs = {"width": 256, "n_blocks": 1} if network == "bronet" else {}
@@ -246,7 +243,7 @@ class OptimisticShift(OptimisticExploration):
         self.optimism = BoundedLogScalar("initial_optimism", initial_optimism)
         self.kl_weight = BoundedLogScalar("initial_kl_weight", initial_kl_weight)
         self._make_optimizers(
-            agent,
+            learner,
             [*self.trunk.parameters(), *self.shift.parameters()],
             self.optimism.parameters(),
             self.kl_weight.parameters(),
@@ -257,11 +254,11 @@ class OptimisticShift(OptimisticExploration):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         return mean + self.shift(self.trunk(torch.cat((features, mean), dim=1))), std
 
-    def _optimism(self, agent: "SAC") -> torch.Tensor:
+    def _optimism(self, learner: Learning) -> torch.Tensor:
         return self.optimism()
 
-    def _optimism_loss(self, agent: "SAC", optimism: torch.Tensor, kl_gap: torch.Tensor) -> torch.Tensor:
-        return losses.optimism_loss(optimism, agent.pessimism_rule.beta(), kl_gap)
+    def _optimism_loss(self, learner: Learning, optimism: torch.Tensor, kl_gap: torch.Tensor) -> torch.Tensor:
+        return losses.optimism_loss(optimism, learner.pessimism_rule.beta(), kl_gap)
 
     def _kl_weight(self) -> torch.Tensor:
         return self.kl_weight()
@@ -283,7 +280,7 @@ class OptimisticActor(OptimisticExploration):
     steps, which the text does not mention (``reinitialize_every=None`` turns it off). At a full reset it starts anew
     as everything does.
 
-    :param agent: the algorithm, whose policy exists already
+    :param learner: the learner, whose networks exist already
     :param kl_target: KL divergence per action dimension to be met, above 0
     :param std_multiplier: m, factor on its standard deviation while exploring, above 0
     :param uncertainty: what Q_std is: "epistemic", "aleatoric" or "both"; see :func:`spread`
@@ -302,7 +299,7 @@ class OptimisticActor(OptimisticExploration):
 
     def __init__(
         self,
-        agent: "SAC",
+        learner: Learning,
         kl_target: float = 0.5,
         std_multiplier: float = 1.25,
         uncertainty: str = "epistemic",
@@ -312,10 +309,10 @@ class OptimisticActor(OptimisticExploration):
         kl_direction: str = "optimistic_to_pessimistic",
         reinitialize_every: int | None = 25_000,
     ):
-        super().__init__(agent, kl_target, std_multiplier, uncertainty, adjustment_learning_rate)
-        beta = float(agent.pessimism_rule.beta())
+        super().__init__(learner, kl_target, std_multiplier, uncertainty, adjustment_learning_rate)
+        beta = float(learner.pessimism_rule.beta())
         distance = 0.5 if initial_optimism is None else initial_optimism + beta
-        if agent.num_transitions > 0:
+        if learner.num_transitions > 0:
             # A start in the midst of training, when a pessimism that moves may have come below initial_optimism.
             distance = max(distance, self.BARRIER)
         if not 0 < distance < math.inf:
@@ -328,20 +325,20 @@ class OptimisticActor(OptimisticExploration):
             raise ValueError(f"reinitialize_every must be at least 1, or None for never, not {reinitialize_every}")
         self.kl_direction = kl_direction
         self.reinitialize_every = reinitialize_every
-        self.actor = agent.policy.make_actor()
+        self.actor = learner.make_actor()
         #: How far optimism lies above minus the pessimism.
         self.optimism_distance = LogScalar(distance)
         self.kl_weight = LogScalar(initial_kl_weight)
         self._make_optimizers(
-            agent, self.actor.parameters(), self.optimism_distance.parameters(), self.kl_weight.parameters()
+            learner, self.actor.parameters(), self.optimism_distance.parameters(), self.kl_weight.parameters()
         )
-        self._reached = agent.num_transitions
+        self._reached = learner.num_transitions
 
-    def before_updates(self, agent: "SAC") -> None:
-        every, before, now = self.reinitialize_every, self._reached, agent.num_transitions
+    def before_updates(self, learner: Learning) -> None:
+        every, before, now = self.reinitialize_every, self._reached, learner.num_transitions
         self._reached = now
         if every is not None and now // every > before // every:
-            agent.restart(self, agent.make_explorer())
+            learner.restart(self, learner.make_explorer())
 
     def get_extra_state(self) -> dict[str, Any]:
         return {"reached": self._reached}
@@ -355,20 +352,20 @@ class OptimisticActor(OptimisticExploration):
         mean, log_std = self.actor.gaussian(self.actor.features(observations))
         return mean, log_std.exp()
 
-    def act(self, agent: "SAC", observations: Any) -> torch.Tensor:
+    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
         mean, log_std = self.actor.gaussian(self.actor.features(observations))
         return self.actor.act(mean, self.std_multiplier * log_std.exp(), torch.randn_like(mean))
 
-    def _kl(self, agent: "SAC", optimistic: Any, pessimistic: Any) -> torch.Tensor:
+    def _kl(self, learner: Learning, optimistic: Any, pessimistic: Any) -> torch.Tensor:
         if self.kl_direction == "pessimistic_to_optimistic":
-            return agent.actor.kl(*pessimistic, *optimistic)
-        return agent.actor.kl(*optimistic, *pessimistic)
+            return learner.actor.kl(*pessimistic, *optimistic)
+        return learner.actor.kl(*optimistic, *pessimistic)
 
-    def _optimism(self, agent: "SAC") -> torch.Tensor:
-        return self.optimism_distance() - agent.pessimism_rule.beta()
+    def _optimism(self, learner: Learning) -> torch.Tensor:
+        return self.optimism_distance() - learner.pessimism_rule.beta()
 
-    def _optimism_loss(self, agent: "SAC", optimism: torch.Tensor, kl_gap: torch.Tensor) -> torch.Tensor:
-        lowest = -agent.pessimism_rule.beta()
+    def _optimism_loss(self, learner: Learning, optimism: torch.Tensor, kl_gap: torch.Tensor) -> torch.Tensor:
+        lowest = -learner.pessimism_rule.beta()
         barrier = torch.clamp(optimism, max=self.BARRIER + lowest)
         return losses.optimism_loss(optimism, lowest, kl_gap) - barrier
 
@@ -392,44 +389,44 @@ class OptimisticGradient(Exploration):
     The defaults are those of the comparison in P3 as published with its code (optimism 4.36, ``sqrt(2 * kl_radius)``
     = 3.69).
 
-    :param agent: the algorithm, whose policy exists already
+    :param learner: the learner, whose networks exist already
     :param optimism: weight of the critics' spread in the upper bound, at least 0
     :param kl_radius: KL divergence to the actor's Gaussian, summed over the action's dimensions, at least 0
     :raises ValueError: if an argument is out of range, or if the actor is deterministic
     """
 
-    def __init__(self, agent: "SAC", optimism: float = 4.36, kl_radius: float = 3.69**2 / 2):
-        super().__init__(agent)
+    def __init__(self, learner: Learning, optimism: float = 4.36, kl_radius: float = 3.69**2 / 2):
+        super().__init__(learner)
         for name, value in (("optimism", optimism), ("kl_radius", kl_radius)):
             if not 0 <= value < math.inf:
                 raise ValueError(f"{name} must be at least 0 and finite, not {value}")
-        if not agent.actor.has_entropy:
+        if not learner.actor.has_entropy:
             raise ValueError("exploration='oac' shifts a Gaussian: it needs backbone='sac', not 'td3'")
         self.optimism = optimism
         self.kl_radius = kl_radius
 
-    def shifted_mean(self, agent: "SAC", observations: Any) -> tuple[torch.Tensor, torch.Tensor]:
+    def shifted_mean(self, learner: Learning, observations: Any) -> tuple[torch.Tensor, torch.Tensor]:
         """
-        :param agent: the algorithm
+        :param learner: the learner
         :param observations: (B, O) or a dict of them
         :return: the shifted pre-tanh mean and the standard deviation, (B, A) each
         """
         with torch.no_grad():
-            mean, log_std = agent.actor.gaussian(agent.actor.features(observations))
+            mean, log_std = learner.actor.gaussian(learner.actor.features(observations))
         std = log_std.exp()
         # Acting runs in inference mode, which knows no gradients.
         with torch.inference_mode(False), torch.enable_grad():
             at = mean.clone().requires_grad_()
-            q = evaluate(agent.critic, _cloned(observations), torch.tanh(at))
+            q = evaluate(learner.critic, _cloned(observations), torch.tanh(at))
             upper_value = q.mean(dim=(0, 2)) + self.optimism * epistemic_std(q).mean(dim=1)
             (gradient,) = torch.autograd.grad(upper_value.sum(), at)
         scaled = std.square() * gradient
         length = (scaled * gradient).sum(dim=1, keepdim=True).sqrt()
         return mean + math.sqrt(2 * self.kl_radius) * scaled / (length + 1e-6), std
 
-    def act(self, agent: "SAC", observations: Any) -> torch.Tensor:
-        mean, std = self.shifted_mean(agent, observations)
-        return agent.actor.act(mean, std, torch.randn_like(std))
+    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
+        mean, std = self.shifted_mean(learner, observations)
+        return learner.actor.act(mean, std, torch.randn_like(std))
 
 
 def _cloned(observations: Any) -> Any:

@@ -8,7 +8,7 @@ Q-learning (the minimum) and 0 the mean.
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,14 +16,12 @@ from torch import nn
 from torch.optim import Optimizer
 
 from sb3_sample.arguments import is_integer, is_number
+from sb3_sample.errors import ParametersDoNotFit
+from sb3_sample.learner.batch import Batch, CriticStep, Extra, Source
+from sb3_sample.learner.parts import Learning, Part
+from sb3_sample.learner.q_values import evaluate
+from sb3_sample.learner.target import bootstrap, td_target
 from sb3_sample.optim import AdamW
-from sb3_sample.sac import buffers, losses
-from sb3_sample.sac.batch import Batch, CriticStep, Extra
-from sb3_sample.sac.parts import ParametersDoNotFit, Part
-from sb3_sample.sac.q_values import evaluate
-
-if TYPE_CHECKING:
-    from sb3_sample.sac.algorithm import SAC
 
 
 def epistemic_std(q: torch.Tensor) -> torch.Tensor:
@@ -84,18 +82,18 @@ class Pessimism(Part):
         """
         return pessimistic_value(q, self.beta())
 
-    def draw(self, agent: "SAC") -> Extra | None:
+    def draw(self, source: Source) -> Extra | None:
         """
         Draw the transitions that the next update needs besides the step's batch; called before the step.
 
-        :param agent: the algorithm
+        :param source: where the batches come from
         :return: the transitions, None if there are none
         """
         return None
 
     def update(
         self,
-        agent: "SAC",
+        learner: Learning,
         batch: Batch,
         step: CriticStep,
         noise: torch.Tensor | None = None,
@@ -104,7 +102,7 @@ class Pessimism(Part):
         """
         Move the weight; called last in every gradient step, and part of what is compiled.
 
-        :param agent: the algorithm, its networks already updated
+        :param learner: the learner, its networks already updated
         :param batch: the step's batch
         :param step: what the critics' step computed of it
         :param noise: standard normal noise of the actions sampled for ``extra``, one row each; drawn if None
@@ -141,7 +139,7 @@ class LearnedPessimism(Pessimism):
 
     At a reset beta and its optimizer start anew, as every learned number does.
 
-    :param agent: the algorithm
+    :param learner: the learner
     :param loss: "squared" or "dual"
     :param source: "replay", "validation", "recent" or "on_policy"; the last with "dual" only
     :param initial_pessimism: beta at the start and after a reset
@@ -153,7 +151,7 @@ class LearnedPessimism(Pessimism):
 
     def __init__(
         self,
-        agent: "SAC",
+        learner: Learning,
         loss: str,
         source: str,
         initial_pessimism: float = 1.0,
@@ -172,31 +170,12 @@ class LearnedPessimism(Pessimism):
             raise ValueError(f"learning_rate of the pessimism must be at least 0 and finite, not {learning_rate!r}")
         if not is_integer(segment_length) or segment_length < 1:
             raise ValueError(f"segment_length must be an integer of at least 1, not {segment_length!r}")
-        if source in ("recent", "on_policy") and segment_length > max(agent.buffer_size // agent.n_envs, 1):
-            raise ValueError(
-                f"segment_length={segment_length} is more than a replay buffer of buffer_size={agent.buffer_size} "
-                f"holds of each of {agent.n_envs} environments"
-            )
         if not is_number(td_lambda) or not 0 <= td_lambda <= 1:
             raise ValueError(f"td_lambda must lie in [0, 1], not {td_lambda!r}")
-        if source == "validation" and agent.validation_proportion == 0:
-            raise ValueError(
-                "pessimism='vpl' learns from transitions held out, and validation_proportion=0 holds none out: "
-                "pass validation_proportion=1/32, or another source of its transitions"
-            )
-        if source == "on_policy":
-            if loss != "dual":
-                raise ValueError(f"source='on_policy' goes with loss='dual' only, not {loss!r}")
-            if agent.exploration != "actor":
-                raise ValueError(
-                    f"the segments of pessimism='opl' must be on-policy, but exploration={agent.exploration!r}: "
-                    "it goes with exploration='actor' only"
-                )
-            if agent.action_noise is not None:
-                raise ValueError("the segments of pessimism='opl' must be on-policy: leave action_noise out")
+        if source == "on_policy" and loss != "dual":
+            raise ValueError(f"source='on_policy' goes with loss='dual' only, not {loss!r}")
         self.loss, self.source = loss, source
         self.segment_length, self.td_lambda = segment_length, td_lambda
-        self.n_validation = max(1, round(agent.validation_proportion * agent.batch_size))
         self.weight = nn.Parameter(torch.tensor(float(initial_pessimism)))
         # Its learning rate is its own, whatever the schedule of the others.
         self.optimizer = AdamW([{"params": [self.weight], "scheduled": False}], lr=learning_rate)
@@ -209,11 +188,11 @@ class LearnedPessimism(Pessimism):
     def beta(self) -> torch.Tensor:
         return self.weight.detach()
 
-    def on_step(self, agent: "SAC", rewards: Any, dones: Any, infos: list[dict[str, Any]]) -> None:
+    def on_step(self, learner: Learning, rewards: Any, dones: Any, infos: list[dict[str, Any]]) -> None:
         # The actions of the warm-up are random.
-        self._n_steps = self._n_steps + 1 if agent.num_transitions - len(dones) >= agent.learning_starts else 0
+        self._n_steps = self._n_steps + 1 if learner.num_transitions - len(dones) >= learner.learning_starts else 0
 
-    def on_environment_reset(self, agent: "SAC") -> None:
+    def on_environment_reset(self, learner: Learning) -> None:
         # The step before belongs to an episode that was broken off, which the buffer does not show.
         self._n_steps = 0
 
@@ -223,31 +202,23 @@ class LearnedPessimism(Pessimism):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self._n_steps = state["n_steps"]
 
-    def draw(self, agent: "SAC") -> Extra | None:
+    def draw(self, source: Source) -> Extra | None:
         """
-        :param agent: the algorithm
+        :param source: where the batches come from
         :return: the transitions of "validation", "recent" and "on_policy"; None if there are too few yet
         """
         if self.source == "replay":
             return None
-        assert agent.replay_buffer is not None
-        normalize = agent.get_vec_normalize_env()
         if self.source == "validation":
-            split = agent.replay_buffer
-            assert isinstance(split, buffers.ValidationSplit)
-            if split.n_validation < self.n_validation:
-                return None
-            return Extra(Batch.of(split.sample_validation(self.n_validation, env=normalize), agent.gamma))
-        if agent.replay_buffer.size() < self.segment_length or (
-            self.source == "on_policy" and self._n_steps < self.segment_length
-        ):
+            held_out = source.held_out()
+            return None if held_out is None else Extra(held_out)
+        if self.source == "on_policy" and self._n_steps < self.segment_length:
             return None
-        samples, ends = buffers.latest(agent.replay_buffer, self.segment_length, normalize)
-        return Extra(Batch.of(samples, agent.gamma), ends)
+        return source.latest(self.segment_length)
 
     def update(
         self,
-        agent: "SAC",
+        learner: Learning,
         batch: Batch,
         step: CriticStep,
         noise: torch.Tensor | None = None,
@@ -259,24 +230,22 @@ class LearnedPessimism(Pessimism):
         elif extra is None:
             return metrics
         else:
-            error = self._error(agent, extra, noise, step.subset)
+            error = self._error(learner, extra, noise, step.subset)
         loss = error.square().mean() if self.loss == "squared" else self.weight * error.detach().mean()
-        agent.minimize(self.optimizer, loss)
+        learner.minimize(self.optimizer, loss)
         with torch.no_grad():
             self.weight.clamp_(min=0)
         return {**metrics, "pessimism/loss": loss, "pessimism/error": error.mean()}
 
     def _error(
-        self, agent: "SAC", extra: Extra, noise: torch.Tensor | None, subset: torch.Tensor | None
+        self, learner: Learning, extra: Extra, noise: torch.Tensor | None, subset: torch.Tensor | None
     ) -> torch.Tensor:
         """
         :return: error of the lower bound on transitions other than the step's, (B,), its gradient through beta
         """
         batch = extra.batch
-        judged = self._judge(agent, batch, noise)
-        if subset is not None:
-            # The spread of the critics that beta is applied to: that of a few of them is not that of all.
-            judged = judged._replace(next_q=judged.next_q[subset])
+        # The spread of the critics that beta is applied to: that of a few of them is not that of all.
+        judged = self._judge(learner, batch, noise, subset)
         if self.source != "on_policy":
             return self._td_error(batch, judged)
         assert extra.ends is not None
@@ -287,25 +256,26 @@ class LearnedPessimism(Pessimism):
             extra.ends,
             self.value(judged.next_q).mean(dim=1).view(shape),
             judged.entropy_bonus.view(shape),
-            agent.gamma,
+            learner.gamma,
             self.td_lambda,
         )
         return returns.view(-1) - self.value(judged.q).mean(dim=1)
 
     @staticmethod
-    def _judge(agent: "SAC", batch: Batch, noise: torch.Tensor | None) -> CriticStep:
+    def _judge(
+        learner: Learning, batch: Batch, noise: torch.Tensor | None, subset: torch.Tensor | None = None
+    ) -> CriticStep:
         """What the critics' step computes, of other transitions."""
         with torch.no_grad():
-            actions, log_prob = agent.policy.next_actions(batch.next_observations, noise)
-            next_q = evaluate(agent.critic_target, batch.next_observations, actions)
-            q = evaluate(agent.critic, batch.observations, batch.actions)
-            return CriticStep(q, next_q, -agent.temperature() * log_prob)
+            next_q, entropy_bonus = bootstrap(learner, batch, learner.temperature(), noise, subset)
+            return CriticStep(
+                evaluate(learner.critic, batch.observations, batch.actions), next_q, entropy_bonus, subset
+            )
 
     def _td_error(self, batch: Batch, step: CriticStep) -> torch.Tensor:
         """``Q_mean(s, a) - r - gamma V_lb(s')``, (B,)."""
         next_value = pessimistic_value(step.next_q, self.weight).mean(dim=1, keepdim=True)
-        target = losses.td_target(batch.rewards, batch.dones, batch.discounts, next_value, step.entropy_bonus)
-        return step.q.mean(dim=(0, 2)) - target.squeeze(1)
+        return step.q.mean(dim=(0, 2)) - td_target(batch, next_value, step.entropy_bonus).squeeze(1)
 
     @staticmethod
     def lambda_returns(
@@ -364,7 +334,7 @@ class TOP(Pessimism):
 
     At a reset the bandit starts anew too, so that the arm in force is not blamed for the drop.
 
-    :param agent: the algorithm
+    :param learner: the learner
     :param arms: the values of beta
     :param learning_rate: of the bandit
     :raises ValueError: if an argument is out of range
@@ -375,7 +345,7 @@ class TOP(Pessimism):
 
     weight: torch.Tensor
 
-    def __init__(self, agent: "SAC", arms: Sequence[float] = (0.0, 1.0), learning_rate: float = 0.1):
+    def __init__(self, learner: Learning, arms: Sequence[float] = (0.0, 1.0), learning_rate: float = 0.1):
         if isinstance(arms, str) or not isinstance(arms, (Sequence, np.ndarray)) or len(arms) < 2:
             raise ValueError(f"arms must be at least two values of the pessimism, not {arms!r}")
         for beta in arms:
@@ -389,6 +359,7 @@ class TOP(Pessimism):
         self.log_weights = [0.0] * len(self.arms)
         self.arm = 0
         self.register_buffer("weight", torch.tensor(0.0), persistent=False)
+        self._n_envs = 1
         # By environment: the last episode's return, and the improvements under the arm in force.
         self._previous: dict[int, float] = {}
         self._improvements: dict[int, list[float]] = {}
@@ -411,7 +382,8 @@ class TOP(Pessimism):
     def beta(self) -> torch.Tensor:
         return self.weight
 
-    def on_step(self, agent: "SAC", rewards: Any, dones: Any, infos: list[dict[str, Any]]) -> None:
+    def on_step(self, learner: Learning, rewards: Any, dones: Any, infos: list[dict[str, Any]]) -> None:
+        self._n_envs = len(dones)
         for index in np.flatnonzero(dones):
             if "episode" not in infos[index]:
                 raise ValueError(
@@ -419,15 +391,15 @@ class TOP(Pessimism):
                     "stable_baselines3.common.monitor.Monitor, as make_vec_env does"
                 )
 
-    def on_episode_end(self, agent: "SAC", env_index: int, episode_return: float) -> None:
+    def on_episode_end(self, learner: Learning, env_index: int, episode_return: float) -> None:
         # A loaded model may have had more environments.
-        for gone in [index for index in self._improvements if index >= agent.n_envs]:
+        for gone in [index for index in self._improvements if index >= self._n_envs]:
             del self._improvements[gone]
         improvements = self._improvements.setdefault(env_index, [])
         if env_index in self._previous:
             improvements.append(episode_return - self._previous[env_index])
         self._previous[env_index] = episode_return
-        if len(self._improvements) < agent.n_envs:
+        if len(self._improvements) < self._n_envs:
             return
         all_improvements = [x for of_env in self._improvements.values() for x in of_env]
         if all_improvements:
@@ -456,7 +428,7 @@ class TOP(Pessimism):
 
     def update(
         self,
-        agent: "SAC",
+        learner: Learning,
         batch: Batch,
         step: CriticStep,
         noise: torch.Tensor | None = None,
@@ -475,20 +447,20 @@ def check_beta(name: str, beta: Any) -> None:
         raise ValueError(f"{name} must be at least 0 and finite (0 is the mean, 1 the minimum of two), not {beta!r}")
 
 
-def gpl(agent: "SAC", initial_pessimism: float = 1.0, learning_rate: float = 5e-5) -> LearnedPessimism:
+def gpl(learner: Learning, initial_pessimism: float = 1.0, learning_rate: float = 5e-5) -> LearnedPessimism:
     """
     Generalized pessimism learning (Cetin and Celiktutan 2023; P4, eq. 6): the dual loss on replay.
 
-    :param agent: the algorithm
+    :param learner: the learner
     :param initial_pessimism: beta at the start
     :param learning_rate: of beta; 5e-5 in P4, 1e-5 in P2
     :return: the rule
     """
-    return LearnedPessimism(agent, "dual", "replay", initial_pessimism, learning_rate)
+    return LearnedPessimism(learner, "dual", "replay", initial_pessimism, learning_rate)
 
 
 def opl(
-    agent: "SAC",
+    learner: Learning,
     initial_pessimism: float = 1.0,
     learning_rate: float = 5e-5,
     segment_length: int = 8,
@@ -498,18 +470,18 @@ def opl(
     On-policy pessimism learning (Kuznetsov et al. 2021; P4, tables 2 and 5): the dual loss against the TD(lambda)
     returns of the latest steps.
 
-    :param agent: the algorithm
+    :param learner: the learner
     :param initial_pessimism: beta at the start
     :param learning_rate: of beta
     :param segment_length: steps of every environment
     :param td_lambda: lambda of the returns
     :return: the rule
     """
-    return LearnedPessimism(agent, "dual", "on_policy", initial_pessimism, learning_rate, segment_length, td_lambda)
+    return LearnedPessimism(learner, "dual", "on_policy", initial_pessimism, learning_rate, segment_length, td_lambda)
 
 
 def vpl(
-    agent: "SAC",
+    learner: Learning,
     initial_pessimism: float = 1.0,
     learning_rate: float = 5e-5,
     loss: str = "squared",
@@ -518,7 +490,7 @@ def vpl(
     """
     Validation pessimism learning (P4, eq. 12 and algorithm 1), and its variants.
 
-    :param agent: the algorithm
+    :param learner: the learner
     :param initial_pessimism: beta at the start
     :param learning_rate: of beta
     :param loss: "squared" or "dual"
@@ -528,7 +500,7 @@ def vpl(
     """
     if source == "on_policy":
         raise ValueError("source must be 'validation', 'replay' or 'recent', not 'on_policy', which is OPL's")
-    return LearnedPessimism(agent, loss, source, initial_pessimism, learning_rate)
+    return LearnedPessimism(learner, loss, source, initial_pessimism, learning_rate)
 
 
 #: Rules that move pessimism, by the name that the algorithm's ``pessimism`` argument takes; a number is constant.

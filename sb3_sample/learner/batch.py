@@ -1,12 +1,8 @@
 """What one gradient step learns from."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.vec_env import VecNormalize
-
-from sb3_sample.sac.buffers import BatchMemory, samples_as_its_class
 
 
 class Batch(NamedTuple):
@@ -15,7 +11,7 @@ class Batch(NamedTuple):
 
     ``observations`` and ``next_observations`` are (B, O) or dicts of tensors; ``actions``, in [-1, 1], (B, A);
     ``dones``, 1 where the episode terminated (a time limit is 0), and ``rewards``, (B, 1); ``discounts`` a
-    number or (B, 1).
+    number or (B, 1), None for the learner's own.
     """
 
     observations: Any
@@ -23,7 +19,7 @@ class Batch(NamedTuple):
     next_observations: Any
     dones: torch.Tensor
     rewards: torch.Tensor
-    discounts: torch.Tensor | float
+    discounts: torch.Tensor | float | None = None
 
     @classmethod
     def of(cls, samples: Any, gamma: float) -> "Batch":
@@ -53,6 +49,21 @@ class Extra(NamedTuple):
 
     batch: Batch
     ends: torch.Tensor | None = None
+
+
+class Source(Protocol):
+    """Where batches come from, as a rule of pessimism sees it."""
+
+    def held_out(self) -> Batch | None:
+        """
+        :return: transitions that are held out of training, as many as a step judges; None while there are fewer
+        """
+
+    def latest(self, n_steps: int) -> Extra | None:
+        """
+        :param n_steps: T
+        :return: the latest T steps of every environment, the oldest first; None while there are fewer
+        """
 
 
 class Noise(NamedTuple):
@@ -103,43 +114,3 @@ class CriticStep(NamedTuple):
     next_q: torch.Tensor
     entropy_bonus: torch.Tensor
     subset: torch.Tensor | None = None
-
-
-def draw_batches(
-    buffer: ReplayBuffer,
-    n_batches: int,
-    batch_size: int,
-    gamma: float,
-    vec_normalize: VecNormalize | None,
-    memory: BatchMemory | None = None,
-) -> list[Batch]:
-    """
-    The batches of several gradient steps, drawn at once where that gives the same distribution.
-
-    :param buffer: replay buffer
-    :param n_batches: number of gradient steps
-    :param batch_size: transitions a step
-    :param gamma: discount factor, where the buffer has none of its own
-    :param vec_normalize: normalises observations and rewards as they are drawn
-    :param memory: what the transitions are gathered into where that is possible
-    :return: the batches; with ``memory``, they hold until it is used again
-    """
-    if memory is not None and memory.serves(buffer, vec_normalize):
-        return _cut(Batch.of(memory.gather(buffer, n_batches * batch_size), gamma), n_batches, batch_size)
-    if n_batches > 1 and not samples_as_its_class(buffer):
-        return [draw_batches(buffer, 1, batch_size, gamma, vec_normalize)[0] for _ in range(n_batches)]
-    return _cut(Batch.of(buffer.sample(n_batches * batch_size, env=vec_normalize), gamma), n_batches, batch_size)
-
-
-def _cut(data: Batch, n_batches: int, batch_size: int) -> list[Batch]:
-    """One large batch as several."""
-
-    def cut(x: Any) -> list[Any]:
-        if isinstance(x, (int, float)):
-            return [x] * n_batches
-        if isinstance(x, dict):
-            pieces = {key: value.split(batch_size) for key, value in x.items()}
-            return [{key: value[i] for key, value in pieces.items()} for i in range(n_batches)]
-        return list(x.split(batch_size))
-
-    return [Batch(*row) for row in zip(*map(cut, data), strict=True)]

@@ -2,19 +2,16 @@
 
 import itertools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
 from sb3_sample.arguments import is_integer
 from sb3_sample.console import say
+from sb3_sample.learner.batch import Batch
+from sb3_sample.learner.parts import Learning, Part
 from sb3_sample.networks.dormant import recycle
-from sb3_sample.sac.parts import Part
-
-if TYPE_CHECKING:
-    from sb3_sample.sac.algorithm import SAC
-    from sb3_sample.sac.batch import Batch
 
 
 class Resets(Part):
@@ -69,35 +66,35 @@ class Resets(Part):
         if any(late <= early for early, late in itertools.pairwise(self.steps)):
             raise ValueError(f"resets must be strictly ascending environment steps, not {self.steps}")
 
-    def before_updates(self, agent: "SAC") -> None:
-        now = agent.num_transitions
+    def before_updates(self, learner: Learning) -> None:
+        now = learner.num_transitions
         if self.period is None:
             due = any(self._reached < step <= now for step in self.steps)
         else:
             due = now // self.period > self._reached // self.period
         self._reached = now
         if due:
-            self._reset(agent, f"at {now} environment steps")
+            self._reset(learner, f"at {now} environment steps")
 
-    def before_gradient_steps(self, agent: "SAC", n: int) -> int:
+    def before_gradient_steps(self, learner: Learning, n: int) -> int:
         """
         Reset now, if one is due by the gradient steps taken.
 
-        :param agent: the algorithm
+        :param learner: the learner
         :param n: gradient steps that are to be taken, at least 1
         :return: how many of them may be taken before this is called again
         """
         if self.gradient_steps is None:
             return n
-        taken = agent._n_updates
+        taken = learner.n_updates
         if taken > 0 and taken % self.gradient_steps == 0:
-            self._reset(agent, f"after {taken} gradient steps")
+            self._reset(learner, f"after {taken} gradient steps")
         return min(n, self.gradient_steps - taken % self.gradient_steps)
 
-    def _reset(self, agent: "SAC", when: str) -> None:
-        agent.reinitialize(self.shrink)
+    def _reset(self, learner: Learning, when: str) -> None:
+        learner.reinitialize(self.shrink)
         self.n_done += 1
-        if agent.verbose >= 1:
+        if learner.verbose >= 1:
             say(f"Reset of all parameters {when}")
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -120,6 +117,8 @@ class ReDo(Part):
     :raises ValueError: if an argument is out of range
     """
 
+    has_state = False
+
     def __init__(self, period: int = 1_000, threshold: float = 0.025):
         super().__init__()
         if not is_integer(period) or period < 1:
@@ -128,19 +127,12 @@ class ReDo(Part):
             raise ValueError(f"redo_threshold must be at least 0, not {threshold}")
         self.period, self.threshold = period, threshold
 
-    def after_update(self, agent: "SAC", batch: "Batch") -> dict[str, torch.Tensor]:
-        """
-        Called after every gradient step.
-
-        :param agent: the algorithm
-        :param batch: the step's batch, on which the neurons are judged
-        :return: what to log, by name, scalars
-        """
-        if agent._n_updates % self.period:
+    def after_update(self, learner: Learning, batch: Batch) -> dict[str, torch.Tensor]:
+        if learner.n_updates % self.period:
             return {}
         with torch.no_grad():
-            inputs = agent.critic.inputs(batch.observations, batch.actions)
-            critic = agent.critic
+            inputs = learner.critic.inputs(batch.observations, batch.actions)
+            critic = learner.critic
             return {
                 "plasticity/n_recycled": recycle(critic.trunk, critic.head, inputs, self.threshold, critic.optimizer)
             }

@@ -1,27 +1,21 @@
 """
 How the gradient step is run: operation by operation, compiled by ``torch.compile``, or captured as a CUDA graph.
 
-All three run the same function, ``SAC._gradient_step``, which knows nothing of them: it takes the batch and all the
+All three run the same function, ``Learner.gradient_step``, which knows nothing of them: it takes the batch and all the
 noise as tensors, chooses nothing by the value of a tensor, and counts nothing outside of tensors.
 """
 
-import functools
-import inspect
 import re
 import time
 import types
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from sb3_sample.console import say
 from sb3_sample.optim import AdamW
-
-if TYPE_CHECKING:
-    from sb3_sample.sac.algorithm import SAC
-
 
 #: With ``compile="auto"``, gradient steps in one ``learn`` from which on compiling pays: it takes the time of some
 #: thousand steps (docs/performance.md). A number of steps, not a measurement, so that a seed fixes the whole run.
@@ -60,35 +54,35 @@ def old_torch() -> str | None:
 _told: set[bool | str] = set()
 
 
-def warn_not_compiled(agent: "SAC", reason: str) -> None:
+def warn_not_compiled(learner: Any, reason: str) -> None:
     """
     Warn that the gradient step is not compiled; of a torch that is too old once a process and way of asking, since that
     holds for every model.
 
-    :param agent: the algorithm
+    :param learner: the learner
     :param reason: what keeps it from being compiled
     """
     if reason == old_torch():
-        if agent.compile in _told:
+        if learner.compile in _told:
             return
-        _told.add(agent.compile)
+        _told.add(learner.compile)
     warnings.warn(f"The gradient step is not compiled: {reason}", stacklevel=3)
 
 
-def why_not_compiled(agent: "SAC") -> str | None:
+def why_not_compiled(learner: Any) -> str | None:
     """
-    :param agent: the algorithm
+    :param learner: the learner
     :return: what keeps its gradient step from being compiled here; None if nothing does
     """
-    foreign = _foreign_optimizers(agent)
+    foreign = _foreign_optimizers(learner)
     if foreign:
         return f"it knows the steps of sb3_sample.optim.AdamW only, not of {foreign}"
-    if agent.device.type not in ("cpu", "cuda"):
-        return f"it is not supported on the device {str(agent.device)!r}"
+    if learner.device.type not in ("cpu", "cuda"):
+        return f"it is not supported on the device {str(learner.device)!r}"
     old = old_torch()
     if old is not None:
         return old
-    if agent.device.type == "cpu":
+    if learner.device.type == "cpu":
         from torch._inductor.cpp_builder import get_cpp_compiler
         from torch._inductor.exc import InvalidCxxCompiler
 
@@ -104,35 +98,35 @@ def why_not_compiled(agent: "SAC") -> str | None:
     return None
 
 
-def has_foreign_parts(agent: "SAC") -> bool:
+def has_foreign_parts(learner: Any) -> bool:
     """
-    :param agent: the algorithm
+    :param learner: the learner
     :return: whether it has parts, or a gradient step, from outside of this package, which may not be written to be
         compiled: a number that they change at every step, say, would have the step compiled anew at every step
     """
-    parts = (type(agent.explorer), type(agent.pessimism_rule), type(agent)._gradient_step)
+    parts = (type(learner.explorer), type(learner.pessimism_rule), type(learner).gradient_step)
     return any(part.__module__.split(".")[0] != __name__.split(".")[0] for part in parts)
 
 
-def _foreign_optimizers(agent: "SAC") -> str:
-    return ", ".join(sorted({type(o).__name__ for o in agent._optimizers().values() if type(o) is not AdamW}))
+def _foreign_optimizers(learner: Any) -> str:
+    return ", ".join(sorted({type(o).__name__ for o in learner.optimizers().values() if type(o) is not AdamW}))
 
 
 class Execution:
     """
     Runs the gradient steps of one model.
 
-    :param agent: the algorithm, its networks and parts built
+    :param learner: the learner, its networks and parts built
     :param compiled: whether to compile
     :param fall_back: whether what cannot be compiled is run uncompiled, with a warning, instead of an error
     :param recorder: what captures; a CUDA graph on a GPU, None elsewhere: no capture
     """
 
-    def __init__(self, agent: "SAC", compiled: bool, fall_back: bool, recorder: Recorder | None = None):
+    def __init__(self, learner: Any, compiled: bool, fall_back: bool, recorder: Recorder | None = None):
         self.compiled, self.fall_back = compiled, fall_back
         #: Seconds spent on compiling, over all inputs and settings that the step was compiled for.
         self.seconds_compiling = 0.0
-        self._step: Callable[..., Metrics] = type(agent)._gradient_step
+        self._step: Callable[..., Metrics] = type(learner).gradient_step
         if compiled:
             # The compiler keeps what it made by the code object. With one for each model, models neither use each
             # other's nor reach the limit of compilations together.
@@ -144,73 +138,73 @@ class Execution:
                 own, fullgraph=True, dynamic=False, options={"guard_filter_fn": _settings_and_inputs}
             )
         self._captured = None if recorder is None else Captured(recorder)
-        self._modules = _modules(agent)
+        self._modules = _modules(learner)
 
-    def serves(self, agent: "SAC") -> bool:
+    def serves(self, learner: Any) -> bool:
         """
-        :param agent: the algorithm
+        :param learner: the learner
         :return: whether it still has the networks, parts, optimizers and loss that this was made for
         """
-        return self._modules == _modules(agent)
+        return self._modules == _modules(learner)
 
     @classmethod
-    def of(cls, agent: "SAC") -> "Execution":
+    def of(cls, learner: Any) -> "Execution":
         """
-        :param agent: an algorithm whose ``compiled`` is decided
+        :param learner: a learner whose ``compiled`` is decided
         :return: what runs its gradient steps
         """
-        if agent.compiled:
-            reason = why_not_compiled(agent)
+        if learner.compiled:
+            reason = why_not_compiled(learner)
             if reason is not None:
-                warn_not_compiled(agent, reason)
-                agent.compiled = False
+                warn_not_compiled(learner, reason)
+                learner.compiled = False
         # Parts of one's own may look at values on the host: captured only when asked for.
-        asked = agent.compile is True or (agent.compile == "auto" and not has_foreign_parts(agent))
-        captures = agent.device.type == "cuda" and asked and not _foreign_optimizers(agent)
-        return cls(agent, bool(agent.compiled), agent.compile == "auto", cuda_graph if captures else None)
+        asked = learner.compile is True or (learner.compile == "auto" and not has_foreign_parts(learner))
+        captures = learner.device.type == "cuda" and asked and not _foreign_optimizers(learner)
+        return cls(learner, bool(learner.compiled), learner.compile == "auto", cuda_graph if captures else None)
 
     @property
     def leaves_gradients(self) -> bool:
         """Whether a gradient step that is not asked to be eager leaves its gradients in ``.grad``."""
         return not self.compiled and self._captured is None
 
-    def prepare(self, agent: "SAC") -> None:
+    def prepare(self, learner: Any) -> None:
         """
         Called before the gradient steps that follow an environment step, when everything else is done.
 
-        :param agent: the algorithm
+        :param learner: the learner
         """
-        for optimizer in agent._optimizers().values():
+        for optimizer in learner.optimizers().values():
             if isinstance(optimizer, AdamW):
                 optimizer.capturable = self._captured is not None
                 optimizer.prepare()
         if self._captured is not None:
-            self._captured.forget_if_stale(agent)
+            self._captured.forget_if_stale(learner)
 
-    def __call__(self, agent: "SAC", *inputs: Any, eager: bool = False) -> Metrics:
+    def __call__(self, learner: Any, *inputs: Any, eager: bool = False) -> Metrics:
         """
         One gradient step.
 
-        :param agent: the algorithm
-        :param inputs: the arguments of ``SAC._gradient_step``
+        :param learner: the learner
+        :param inputs: the arguments of ``Learner.gradient_step``
         :param eager: neither compiled nor captured this time, which leaves the gradients in ``.grad``
         :return: its result; what a captured step gives holds until the next one
         """
         if eager:
-            return type(agent)._gradient_step(agent, *inputs)
+            return type(learner).gradient_step(learner, *inputs)
         if self._captured is not None:
-            return self._captured(self._run, agent, inputs)
-        return self._run(agent, *inputs)
+            return self._captured(self._run, learner, inputs)
+        return self._run(learner, *inputs)
 
-    def _run(self, agent: "SAC", *inputs: Any) -> Metrics:
+    def _run(self, learner: Any, *inputs: Any) -> Metrics:
         if not self.compiled:
-            return self._step(agent, *inputs)
+            return self._step(learner, *inputs)
         try:
             try:
-                return self._step(agent, *inputs)
+                return self._step(learner, *inputs)
             except _compilation_errors()[0]:
                 # Not compiled yet for these inputs or settings: to trace gradients needs a switch.
-                return self._compile(agent, *inputs)
+                return self._compile(learner, *inputs)
         except _compilation_errors() as error:
             # Raised before anything of the step has been run.
             reason = str(error).strip().splitlines()[0]
@@ -221,19 +215,19 @@ class Execution:
                     f"compile=True, but the gradient step cannot be compiled: {reason}. Pass compile=False, or 'auto'"
                 ) from error
             warnings.warn(f"The gradient step is not compiled, as it cannot be: {reason}", stacklevel=2)
-            self.compiled = agent.compiled = False
-            self._step = type(agent)._gradient_step
-            return self._step(agent, *inputs)
+            self.compiled = learner.compiled = False
+            self._step = type(learner).gradient_step
+            return self._step(learner, *inputs)
 
-    def _compile(self, agent: "SAC", *inputs: Any) -> Metrics:
-        if agent.verbose >= 1:
+    def _compile(self, learner: Any, *inputs: Any) -> Metrics:
+        if learner.verbose >= 1:
             say("Compiling the gradient step ...")
         start = time.perf_counter()
         with torch._dynamo.config.patch(trace_autograd_ops=True):
-            metrics = self._step(agent, *inputs)
+            metrics = self._step(learner, *inputs)
         seconds = time.perf_counter() - start
         self.seconds_compiling += seconds
-        if agent.verbose >= 1:
+        if learner.verbose >= 1:
             say(f"Compiled in {seconds:.1f} s")
         return metrics
 
@@ -319,33 +313,33 @@ class Captured:
         self._recorded: dict[Any, tuple[Any, Callable[[], None], Metrics]] = {}
         self._held: Any = None
 
-    def forget_if_stale(self, agent: "SAC") -> None:
+    def forget_if_stale(self, learner: Any) -> None:
         """
         Drop what was captured of a model that has other tensors or other settings now.
 
-        :param agent: the algorithm
+        :param learner: the learner
         """
-        now = _places(agent), _settings(agent)
+        now = _places(learner), _settings(learner)
         if now != self._held:
             self._recorded.clear()
             self._held = now
 
-    def __call__(self, step: Callable[..., Metrics], agent: "SAC", inputs: tuple[Any, ...]) -> Metrics:
+    def __call__(self, step: Callable[..., Metrics], learner: Any, inputs: tuple[Any, ...]) -> Metrics:
         """
         One gradient step, repeated if one of its kind is captured.
 
         :param step: the step
-        :param agent: its first argument
+        :param learner: its first argument
         :param inputs: its other arguments
         :return: its result, which holds until the next step
         """
         kind = _kind(inputs)
         runs = self._runs[kind] = self._runs.get(kind, 0) + 1
         if runs <= self.WARM_UP:
-            return _aside(lambda: step(agent, *inputs)) if agent.device.type == "cuda" else step(agent, *inputs)
+            return _aside(lambda: step(learner, *inputs)) if learner.device.type == "cuda" else step(learner, *inputs)
         if kind not in self._recorded:
             own = _like(inputs, torch.clone)
-            self._recorded[kind] = (own, *self._recorder(lambda: step(agent, *own)))
+            self._recorded[kind] = (own, *self._recorder(lambda: step(learner, *own)))
         own, repeat, metrics = self._recorded[kind]
         torch._foreach_copy_(_tensors(own), _tensors(inputs))
         repeat()
@@ -363,48 +357,43 @@ def _aside(run: Callable[[], Metrics]) -> Metrics:
     return metrics
 
 
-def _modules(agent: "SAC") -> tuple[Any, ...]:
+def _modules(learner: Any) -> tuple[Any, ...]:
     """What a compiled or captured step takes for granted, by identity."""
-    critics = (agent.critic, agent.critic.trunk, agent.critic_target, agent.critic_target.trunk)
-    networks = (agent.actor, agent.actor.trunk, *critics, agent.temperature)
-    parts = (agent.explorer, agent.pessimism_rule, *agent._optimizers().values())
-    groups = [len(group["params"]) for optimizer in agent._optimizers().values() for group in optimizer.param_groups]
-    return (*map(id, (*networks, *parts)), agent._critic_loss, *groups)
+    critics = (learner.critic, learner.critic.trunk, learner.critic_target, learner.critic_target.trunk)
+    networks = (learner.actor, learner.actor.trunk, *critics, learner.temperature)
+    parts = (learner.explorer, learner.pessimism_rule, *learner.optimizers().values())
+    groups = [len(group["params"]) for optimizer in learner.optimizers().values() for group in optimizer.param_groups]
+    return (*map(id, (*networks, *parts, learner.head)), *groups)
 
 
-def _places(agent: "SAC") -> tuple[int, ...]:
+def _places(learner: Any) -> tuple[int, ...]:
     """Addresses of every tensor that a gradient step reads or writes, but its inputs."""
-    modules = (agent.policy, agent.temperature, agent.explorer, agent.pessimism_rule)
+    modules = (learner.networks, learner.temperature, learner.explorer, learner.pessimism_rule)
     tensors = [t for module in modules for t in (*module.parameters(), *module.buffers())]
-    for optimizer in agent._optimizers().values():
+    for optimizer in learner.optimizers().values():
         tensors += [t for state in optimizer.state.values() for t in state.values() if isinstance(t, torch.Tensor)]
         if isinstance(optimizer, AdamW):
             tensors += optimizer.read_tensors()
     return tuple(t.data_ptr() for t in tensors)
 
 
-#: Public numbers of a part that are no settings: they move with the run, and the gradient step does not read them.
-NO_SETTINGS = {"arm", "training"}
+#: Public numbers of a part or of the learner that are no settings: they move with the run, and the gradient step does
+#: not read them.
+NO_SETTINGS = {"arm", "training", "gradients_are_stale"}
 
 
-def _settings(agent: "SAC") -> list[Any]:
-    """Numbers and words that a gradient step may read: the model's arguments, its modules' and its optimizers'."""
+def _settings(learner: Any) -> list[Any]:
+    """Numbers and words that a gradient step may read: the learner's own, its modules' and its optimizers'."""
 
     def plain(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
         return {name: value for name, value in values if isinstance(value, (int, float, str, type(None)))}
 
-    settings: list[Any] = [plain((name, getattr(agent, name, None)) for name in _arguments(type(agent)))]
-    for root in (agent.policy, agent.explorer, agent.pessimism_rule):
-        for module in root.modules():
-            public = ((k, v) for k, v in vars(module).items() if not k.startswith("_") and k not in NO_SETTINGS)
-            settings.append(plain(public))
-    for optimizer in agent._optimizers().values():
+    modules = [m for root in (learner.networks, learner.explorer, learner.pessimism_rule) for m in root.modules()]
+    settings: list[Any] = []
+    for owner in (learner, *modules):
+        public = ((k, v) for k, v in vars(owner).items() if not k.startswith("_") and k not in NO_SETTINGS)
+        settings.append(plain(public))
+    for optimizer in learner.optimizers().values():
         for group in optimizer.param_groups:
             settings.append({k: v for k, v in group.items() if k not in ("params", "lr")})
     return settings
-
-
-@functools.cache
-def _arguments(cls: type["SAC"]) -> tuple[str, ...]:
-    """Names of a class's arguments, its bases' included."""
-    return tuple({name for c in cls.__mro__ if "__init__" in vars(c) for name in inspect.signature(c).parameters})

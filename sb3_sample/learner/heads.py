@@ -1,0 +1,57 @@
+"""Value heads: what the outputs of critics mean, what they are drawn to, and by which loss."""
+
+from collections.abc import Callable
+
+import torch
+
+from sb3_sample.learner import losses
+from sb3_sample.learner.batch import Batch
+from sb3_sample.learner.target import td_target
+
+
+class ValueHead:
+    """
+    Scalar critics, trained by the squared error; and the base class of other heads.
+
+    ``n_outputs`` is K, the outputs a critic.
+    """
+
+    n_outputs = 1
+
+    def target(
+        self,
+        batch: Batch,
+        next_q: torch.Tensor,
+        value: Callable[[torch.Tensor], torch.Tensor],
+        entropy_bonus: torch.Tensor,
+    ) -> torch.Tensor:
+        """
+        :param batch: transitions
+        :param next_q: outputs of the target critics for the next state and action, (E, B, K)
+        :param value: the rule of pessimism's, (E, B, K) to (B, K)
+        :param entropy_bonus: ``-alpha * log pi`` of that action, (B, 1)
+        :return: what every critic is drawn to, (B, K)
+        """
+        return td_target(batch, value(next_q), entropy_bonus)
+
+    def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """
+        :param q: outputs of the critics, (E, B, K)
+        :param target: from :meth:`target`, without gradient
+        :return: scalar
+        """
+        return losses.squared_error(q, target)
+
+
+class QuantileHead(ValueHead):
+    """
+    Quantiles of the return, trained by the quantile Huber loss (BRO, algorithm 2, line 8).
+
+    :param n_quantiles: K, at least 1
+    """
+
+    def __init__(self, n_quantiles: int):
+        self.n_outputs = n_quantiles
+
+    def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        return losses.quantile_huber(q, target)

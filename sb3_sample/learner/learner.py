@@ -1,0 +1,571 @@
+"""
+The learner of the off-policy family: networks, targets, learned numbers, optimizers and parts, and their one update.
+
+``Learner.gradient_step`` is the whole gradient step, in the order of BRO's pseudo-code (BRO, algorithm 2).
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import nn
+from torch.optim import Optimizer
+
+from sb3_sample.learner import losses
+from sb3_sample.learner.batch import Batch, CriticStep, Extra, Noise
+from sb3_sample.learner.execution import Execution
+from sb3_sample.learner.exploration import Exploration
+from sb3_sample.learner.heads import ValueHead
+from sb3_sample.learner.parts import Part
+from sb3_sample.learner.pessimism import Pessimism, pessimistic_value
+from sb3_sample.learner.plasticity import ReDo, Resets
+from sb3_sample.learner.q_values import evaluate
+from sb3_sample.learner.randomness import OwnGenerators
+from sb3_sample.learner.scalars import FixedScalar, LogScalar
+from sb3_sample.learner.target import bootstrap
+from sb3_sample.networks.modes import ModeSwitch
+from sb3_sample.networks.spectral_norm import SpectralNorm
+from sb3_sample.optim import AdamW, sharpness_aware_gradients
+
+
+class Networks(Protocol):
+    """
+    Actor, critics and their targets, an ``nn.Module``.
+
+    ``actor.optimizer`` and ``critic.optimizer`` are theirs; ``actor_target`` is the actor of the TD targets if it is
+    not the actor itself.
+    """
+
+    actor: Any
+    critic: Any
+    critic_target: Any
+    actor_target: Any
+
+    def next_actions(self, obs: Any, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]: ...
+
+    def make_actor(self) -> Any: ...
+
+    def make_optimizer(self, parameters: Any, learning_rate: float) -> Optimizer: ...
+
+    def set_training_mode(self, mode: bool) -> None: ...
+
+    def state_dict(self) -> Any: ...
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any: ...
+
+
+class Counts:
+    """What a learner counts over its life, and what was decided of how it runs."""
+
+    def __init__(self) -> None:
+        #: Gradient steps taken.
+        self._n_updates = 0
+        #: Transitions heard of.
+        self.num_transitions = 0
+        #: Whether the gradient step is compiled; None while that is not decided.
+        self.compiled: bool | None = None
+
+
+class Learner:
+    """
+    Soft actor-critic with exchangeable parts, without an environment, a file or a replay buffer around it.
+
+    :param make_networks: makes freshly initialised networks
+    :param head: what the critics' outputs mean
+    :param make_temperature: makes a freshly initialised temperature
+    :param make_pessimism: makes a freshly initialised rule of pessimism for the learner
+    :param make_explorer: makes a freshly initialised explorer for the learner
+    :param plasticity: when everything starts anew
+    :param redo: recycling of dormant neurons; None for none
+    :param learning_rate: of actor, critics and temperature, at the start
+    :param temperature_beta1: beta1 of the temperature's Adam
+    :param gamma: discount factor of batches that have none of their own
+    :param tau: weight of the new critics in the Polyak average of the targets
+    :param target_entropy: entropy that the learned temperature aims at
+    :param target_update_interval: gradient steps between two updates of the targets; None: ``policy_delay``
+    :param policy_delay: gradient steps between two of the actors' and of the temperature
+    :param target_subset: how many critics, drawn at random, make the TD target; None: all
+    :param actor_pessimism: a weight of pessimism for the actor's objective alone; None: the rule's
+    :param sam_radius: radius of sharpness-aware minimisation of the critics' loss; None for none
+    :param learning_starts: transitions, of those that it hears of, whose actions are random
+    :param compile: whether the gradient step is compiled; "auto": as ``counts.compiled`` says, else not
+    :param device: where the learner computes
+    :param verbose: 0 nothing, 1 info
+    :param networks: the first networks; made if None
+    :param counts: who keeps the learner's counts, with the attributes of :class:`Counts`; the learner itself by default
+    :param generators: generators of its own, from which everything random of the learner is drawn; None: torch's global
+        ones
+    """
+
+    #: What may be set between two gradient steps, and counts from the next one on.
+    SETTINGS = (
+        "gamma", "tau", "target_update_interval", "policy_delay", "target_subset", "actor_pessimism", "sam_radius",
+        "learning_starts", "verbose", "compile",
+    )  # fmt: skip
+
+    pessimism_rule: Pessimism
+    explorer: Exploration
+
+    def __init__(
+        self,
+        make_networks: Callable[[], Any],
+        *,
+        head: ValueHead,
+        make_temperature: Callable[[Any], LogScalar | FixedScalar],
+        make_pessimism: Callable[[Any], Pessimism],
+        make_explorer: Callable[[Any], Exploration],
+        plasticity: Resets,
+        redo: ReDo | None = None,
+        learning_rate: float = 3e-4,
+        temperature_beta1: float = 0.9,
+        gamma: float = 0.99,
+        tau: float = 0.005,
+        target_entropy: float | None = None,
+        target_update_interval: int | None = 1,
+        policy_delay: int = 1,
+        target_subset: int | None = None,
+        actor_pessimism: float | None = None,
+        sam_radius: float | None = None,
+        learning_starts: int = 0,
+        compile: bool | str = False,
+        device: torch.device | str = "cpu",
+        verbose: int = 0,
+        networks: Any = None,
+        counts: Any = None,
+        generators: OwnGenerators | None = None,
+    ):
+        self._make_networks, self._make_temperature = make_networks, make_temperature
+        self._make_pessimism, self._make_explorer = make_pessimism, make_explorer
+        self.device, self.verbose, self.learning_rate = torch.device(device), verbose, learning_rate
+        self.gamma, self.tau = gamma, tau
+        self.target_update_interval, self.policy_delay = target_update_interval, policy_delay
+        self.target_subset, self.actor_pessimism, self.sam_radius = target_subset, actor_pessimism, sam_radius
+        self.learning_starts, self.compile = learning_starts, compile
+        self._counts = Counts() if counts is None else counts
+        self._generators, self.head = generators, head
+        with self._random():
+            self.networks = make_networks().to(self.device) if networks is None else networks
+            self.target_entropy = -self.actor.action_dim / 2 if target_entropy is None else target_entropy
+            self.temperature = make_temperature(self)
+            self.pessimism_rule = self.make_pessimism()
+            self.explorer = self.make_explorer()
+        self.plasticity, self.redo = plasticity, redo
+        self.temperature_optimizer: AdamW | None = None
+        if isinstance(self.temperature, LogScalar):
+            betas = (temperature_beta1, 0.999)
+            self.temperature_optimizer = AdamW(self.temperature.parameters(), lr=learning_rate, betas=betas)
+        self._parts_mode = ModeSwitch(*self.parts().values())
+        self._execution: Execution | None = None
+        #: Whether ``.grad`` holds the gradients of another gradient step than the last, as a compiled one leaves none.
+        self.gradients_are_stale = False
+        # Whether it heard of a step since the last gradient step.
+        self._heard = False
+        self.set_training_mode(False)
+
+    def _random(self) -> AbstractContextManager[None]:
+        return nullcontext() if self._generators is None else self._generators.in_force()
+
+    # ---------------------------------------------------------------- what it consists of
+
+    @property
+    def actor(self) -> Any:
+        """The actor, which acts in evaluation and is learned from the pessimistic value."""
+        return self.networks.actor
+
+    @property
+    def critic(self) -> Any:
+        """The critics, E at once."""
+        return self.networks.critic
+
+    @property
+    def critic_target(self) -> Any:
+        """The target critics."""
+        return self.networks.critic_target
+
+    @property
+    def n_updates(self) -> int:
+        """Gradient steps taken over the learner's life."""
+        return int(self._counts._n_updates)
+
+    @property
+    def num_transitions(self) -> int:
+        """Transitions heard of by :meth:`on_step` over the learner's life."""
+        return int(self._counts.num_transitions)
+
+    @property
+    def compiled(self) -> bool | None:
+        """Whether the gradient step is compiled; None while that is not decided."""
+        return self._counts.compiled  # type: ignore[no-any-return]
+
+    @compiled.setter
+    def compiled(self, value: bool | None) -> None:
+        self._counts.compiled = value
+
+    def make_explorer(self) -> Exploration:
+        """
+        :return: a freshly initialised explorer
+        """
+        return self._make_explorer(self).to(self.device)
+
+    def make_pessimism(self) -> Pessimism:
+        """
+        :return: a freshly initialised rule of pessimism
+        """
+        return self._make_pessimism(self).to(self.device)
+
+    def make_actor(self) -> Any:
+        """
+        :return: an actor like the learner's, with parameters of its own
+        """
+        return self.networks.make_actor()
+
+    def make_optimizer(self, parameters: Iterable[nn.Parameter]) -> Optimizer:
+        """
+        :param parameters: what to optimise
+        :return: an optimizer with the settings of actor and critics
+        """
+        return self.networks.make_optimizer(parameters, self.learning_rate)  # type: ignore[no-any-return]
+
+    def next_actions(self, observations: Any, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        :param observations: next observations, (B, O), or a dict of them
+        :param noise: standard normal noise, (B, A); drawn if None
+        :return: actions of a TD target in [-1, 1], (B, A), and their log-probability, (B, 1)
+        """
+        return self.networks.next_actions(observations, noise)  # type: ignore[no-any-return]
+
+    def parts(self) -> dict[str, Part]:
+        """
+        :return: the parts, by the name of the attribute that holds them
+        """
+        parts: dict[str, Part] = {
+            "explorer": self.explorer,
+            "pessimism_rule": self.pessimism_rule,
+            "plasticity": self.plasticity,
+        }
+        return parts if self.redo is None else {**parts, "redo": self.redo}
+
+    def optimizers(self) -> dict[str, Optimizer]:
+        """
+        :return: every optimizer by its path from the learner
+        """
+        optimizers: dict[str, Optimizer] = {
+            "actor.optimizer": self.actor.optimizer,
+            "critic.optimizer": self.critic.optimizer,
+        }
+        if self.temperature_optimizer is not None:
+            optimizers["temperature_optimizer"] = self.temperature_optimizer
+        for name, part in self.parts().items():
+            optimizers.update({f"{name}.{key}": optimizer for key, optimizer in part.optimizers().items()})
+        return optimizers
+
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        :param mode: whether dropout and power iterations are on, as during gradient steps, or off, as when acting
+        """
+        self.networks.set_training_mode(mode)
+        self._parts_mode(mode)
+
+    def set_learning_rate(self, rate: float) -> None:
+        """
+        :param rate: of every optimizer that has none of its own
+        """
+        for optimizer in self.optimizers().values():
+            for group in optimizer.param_groups:
+                if group.get("scheduled", True):
+                    group["lr"] = rate
+
+    # ---------------------------------------------------------------- what it hears
+
+    def on_step(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """
+        Hear of one step of all environments.
+
+        :param rewards: unnormalised rewards, (n_envs,)
+        :param dones: whether each environment's episode ended, for whatever reason, (n_envs,)
+        :param infos: each environment's info, with Monitor's "episode" at an end
+        """
+        self._heard = True
+        self._counts.num_transitions += len(dones)
+        for part in self.parts().values():
+            part.on_step(self, rewards, dones, infos)
+            for index in np.flatnonzero(dones):
+                if "episode" in infos[index]:  # Monitor's entry; absent if the environment is not monitored
+                    part.on_episode_end(self, int(index), infos[index]["episode"]["r"])
+
+    def on_environment_reset(self) -> None:
+        """Hear that the environments were reset in the midst of their episodes."""
+        for part in self.parts().values():
+            part.on_environment_reset(self)
+
+    def before_updates(self) -> None:
+        """Have the parts do what they do before the gradient steps that follow an environment step."""
+        self._heard = False
+        for part in self.parts().values():
+            part.before_updates(self)
+
+    # ---------------------------------------------------------------- the update
+
+    @property
+    def seconds_compiling(self) -> float:
+        """Seconds spent on compiling the gradient step."""
+        return 0.0 if self._execution is None else self._execution.seconds_compiling
+
+    def forget_execution(self) -> None:
+        """Have it decided anew how the gradient steps are run."""
+        self._execution = None
+
+    def prepared_execution(self) -> Execution:
+        """
+        :return: what runs the gradient steps, ready for those that follow
+        """
+        if self._execution is None or not self._execution.serves(self):
+            self._execution = Execution.of(self)
+        self._execution.prepare(self)
+        return self._execution
+
+    def update(self, batch: Batch, noise: Noise | None = None, extra: Extra | None = None) -> dict[str, torch.Tensor]:
+        """
+        One gradient step, and what is due before it: resets, and what follows from the steps heard of.
+
+        :param batch: transitions, on the learner's device
+        :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly.
+        :param extra: further transitions for a rule of pessimism that learns from some, from its ``draw``
+        :return: what to log, by name, scalars on the learner's device
+        """
+        with self._random():
+            if self._heard:
+                self.before_updates()
+            self.plasticity.before_gradient_steps(self, 1)
+            self.set_training_mode(True)
+            try:
+                return self.step(batch, noise, extra)
+            finally:
+                self.set_training_mode(False)
+
+    def act(self, observations: Any, deterministic: bool = False) -> torch.Tensor:
+        """
+        Actions as the learner takes them.
+
+        :param observations: tensors on the learner's device, (B, O), or a dict of them
+        :param deterministic: the actor's mean action, as in evaluation, instead of what the explorer draws
+        :return: actions in [-1, 1], (B, A)
+        """
+        with self._random(), torch.inference_mode():
+            if deterministic:
+                return self.actor(observations, deterministic=True)  # type: ignore[no-any-return]
+            return self.explorer.act(self, observations)
+
+    def step(
+        self, batch: Batch, noise: Noise | None = None, extra: Extra | None = None, eager: bool = False
+    ) -> dict[str, torch.Tensor]:
+        """
+        One gradient step: what is drawn and counted around it, and the step.
+
+        :param batch: transitions
+        :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly.
+        :param extra: further transitions for the rule of pessimism
+        :param eager: neither compiled nor captured this time, which leaves the gradients in ``.grad``
+        :return: what to log, by name, scalars on the learner's device, computed with the parameters from before
+            the update of the module in question
+        """
+        execution = self._execution or self.prepared_execution()
+        if batch.discounts is None:
+            batch = batch._replace(discounts=self.gamma)
+        subset = None if self.target_subset is None else (self.target_subset, self.critic.n_critics)
+        noise = (noise or Noise()).completed(batch, extra, subset)
+        self._counts._n_updates += 1
+        moves_targets = self.n_updates % (self.target_update_interval or self.policy_delay) == 0
+        moves_actor = self.n_updates % self.policy_delay == 0
+        metrics = execution(self, batch, noise, extra, moves_targets, moves_actor, eager=eager)
+        self.gradients_are_stale = not (eager or execution.leaves_gradients)
+        for part in self.parts().values():
+            metrics.update(part.after_update(self, batch))
+        return metrics
+
+    def gradient_step(
+        self, batch: Batch, noise: Noise, extra: Extra | None, moves_targets: bool, moves_actor: bool
+    ) -> dict[str, torch.Tensor]:
+        """
+        The gradient step (BRO, algorithm 2), of tensors only: it is what is compiled and captured.
+
+        :param batch: transitions
+        :param noise: all that is random
+        :param extra: further transitions for the rule of pessimism
+        :param moves_targets: whether the target critics follow in this step
+        :param moves_actor: whether actors and temperature learn in this step
+        :return: what to log, by name, scalars
+        """
+        alpha = self.temperature()
+
+        # Critics, towards the targets' value of the actor's next action.
+        next_q, entropy_bonus = bootstrap(self, batch, alpha, noise.critic, noise.subset)
+        with torch.no_grad():
+            target = self.head.target(batch, next_q, self.pessimism_rule.value, entropy_bonus)
+        q = evaluate(self.critic, batch.observations, batch.actions)
+        critic_loss = self.head.loss(q, target)
+        if self.sam_radius is None:
+            self.minimize(self.critic.optimizer, critic_loss)
+        else:
+            self._sharpness_aware_step(critic_loss, batch, target)
+        metrics = {"train/critic_loss": critic_loss, "train/q_mean": q.mean()}
+
+        # Targets, by Polyak averaging.
+        if moves_targets:
+            self._follow(self.critic_target, self.critic)
+
+        if moves_actor:
+            # Actor, on the new critics.
+            actions, log_prob = self.actor.sample(batch.observations, noise.actor)
+            value = self._actor_value(evaluate(self.critic, batch.observations, actions))
+            actor_loss = losses.actor_loss(log_prob, value, alpha.detach())
+            self.minimize(self.actor.optimizer, actor_loss)
+            metrics["train/actor_loss"] = actor_loss
+            if self.networks.actor_target is not None:
+                self._follow(self.networks.actor_target, self.actor)
+
+            # Whoever explores, on the new critics and the new actor.
+            metrics.update(self.explorer.update(self, batch, noise.exploration))
+
+            # Temperature.
+            if self.actor.has_entropy:
+                entropy = -log_prob.detach().mean()
+                metrics.update({"train/entropy": entropy, "train/ent_coef": alpha})
+                if self.temperature_optimizer is not None:
+                    temperature_loss = losses.temperature_loss(alpha, entropy, self.target_entropy)
+                    self.minimize(self.temperature_optimizer, temperature_loss)
+                    metrics["train/ent_coef_loss"] = temperature_loss
+
+        # Pessimism.
+        step = CriticStep(q.detach(), next_q, entropy_bonus, noise.subset)
+        metrics.update(self.pessimism_rule.update(self, batch, step, noise.pessimism, extra))
+        return {name: value.detach() for name, value in metrics.items()}
+
+    def _actor_value(self, q: torch.Tensor) -> torch.Tensor:
+        """The ensemble's value for the actor's objective, (E, B, K) to (B, K)."""
+        if self.actor_pessimism is None:
+            return self.pessimism_rule.value(q)
+        return pessimistic_value(q, float(self.actor_pessimism))
+
+    def _follow(self, target: Any, online: Any) -> None:
+        """One step of Polyak averaging; with ``tau=1`` the target is the online network."""
+        with torch.no_grad():
+            torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), weight=self.tau)
+            # Running statistics, as in Stable-Baselines3.
+            statistics = zip(target.statistics(), online.statistics(), strict=True)
+            for ours, theirs in statistics:
+                ours.copy_(theirs)
+
+    def _sharpness_aware_step(self, loss: torch.Tensor, batch: Batch, target: torch.Tensor) -> None:
+        """One step of the critics' optimizer with the gradient from ``sam_radius`` uphill."""
+        assert self.sam_radius is not None
+        parameters = list(self.critic.parameters())
+        copied = {id(p) for p in self.critic.copied_parameters()}
+        gradients = sharpness_aware_gradients(
+            loss,
+            lambda: self.head.loss(evaluate(self.critic, batch.observations, batch.actions), target),
+            parameters,
+            self.sam_radius,
+            [len(p) if id(p) in copied else None for p in parameters],
+        )
+        self._descend(self.critic.optimizer, gradients)
+
+    @staticmethod
+    def minimize(optimizer: Optimizer, loss: torch.Tensor) -> None:
+        """
+        One step of an optimizer. Only its own parameters get a gradient, whatever else the loss passed through.
+
+        :param optimizer: the optimizer
+        :param loss: scalar
+        """
+        parameters = [p for group in optimizer.param_groups for p in group["params"]]
+        Learner._descend(optimizer, torch.autograd.grad(loss, parameters, allow_unused=True))
+
+    @staticmethod
+    def _descend(optimizer: Optimizer, gradients: Sequence[torch.Tensor | None]) -> None:
+        """One step of an optimizer with gradients in the order of its parameters."""
+        if torch.compiler.is_compiling():
+            assert isinstance(optimizer, AdamW)
+            optimizer.apply(gradients)
+            return
+        parameters = [p for group in optimizer.param_groups for p in group["params"]]
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        optimizer.step()
+
+    # ---------------------------------------------------------------- its state
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: everything that later steps depend on, besides the arguments
+        """
+        modules = {"networks": self.networks, "temperature": self.temperature, **self._parts_with_state()}
+        state = {name: module.state_dict() for name, module in modules.items()}
+        state |= {name: optimizer.state_dict() for name, optimizer in self.optimizers().items()}
+        counts = {"n_updates": self.n_updates, "num_transitions": self.num_transitions, "heard": self._heard}
+        generators = {} if self._generators is None else {"generators": self._generators.state_dict()}
+        return {**state, "counts": counts, **generators}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """
+        :param state: from ``state_dict`` of a learner with the same arguments
+        :raises ValueError: if it has other entries
+        """
+        own = self.state_dict()
+        if own.keys() != state.keys():
+            raise ValueError(f"state must have the entries {sorted(own)}, not {sorted(state)}")
+        for name, module in {"networks": self.networks, "temperature": self.temperature}.items():
+            module.load_state_dict(state[name])
+        for name, part in self._parts_with_state().items():
+            part.load_state_dict(state[name])
+        for name, optimizer in self.optimizers().items():
+            optimizer.load_state_dict(state[name])
+        counts = state["counts"]
+        self._counts._n_updates, self._counts.num_transitions = counts["n_updates"], counts["num_transitions"]
+        self._heard = counts["heard"]
+        if self._generators is not None:
+            self._generators.load_state_dict(state["generators"])
+
+    def _parts_with_state(self) -> dict[str, Part]:
+        return {name: part for name, part in self.parts().items() if part.has_state}
+
+    # ---------------------------------------------------------------- starting anew
+
+    def reinitialize(self, shrink: float = 0.0) -> None:
+        """
+        Start every network, optimizer and learned number anew, in place.
+
+        :param shrink: share of the old parameters that stays
+        """
+        self.restart(self.networks, self._make_networks(), shrink)
+        self.restart(self.temperature, self._make_temperature(self), shrink)
+        # The explorer's start may depend on the pessimism in force.
+        self.restart(self.pessimism_rule, self.make_pessimism(), shrink)
+        self.restart(self.explorer, self.make_explorer(), shrink)
+        for optimizer in self.optimizers().values():
+            optimizer.state.clear()
+
+    @staticmethod
+    def restart(module: Any, fresh: Any, shrink: float = 0.0) -> None:
+        """
+        Give a module the values of a fresh one, in place, and start the optimizers of a part anew.
+
+        :param module: the module
+        :param fresh: a module of the same kind
+        :param shrink: share of the old parameters that stays
+        """
+        state = fresh.state_dict()
+        if shrink > 0:
+            for name, parameter in module.named_parameters():
+                state[name] = torch.lerp(state[name].to(parameter.device), parameter.detach(), shrink)
+        module.load_state_dict(state)
+        if shrink > 0:
+            # The directions along which kernels are normalised are neither the old nor the fresh ones.
+            for layer in module.modules():
+                if isinstance(layer, SpectralNorm):
+                    layer.find_direction()
+        if isinstance(module, Part):
+            for optimizer in module.optimizers().values():
+                optimizer.state.clear()

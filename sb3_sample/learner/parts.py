@@ -1,0 +1,175 @@
+"""
+Exchangeable parts of an off-policy learner, and what they may ask of it.
+
+A part is a ``torch.nn.Module``, so that its networks, learned numbers and buffers move with the learner's device and
+are saved with it (``state_dict``; numbers that are not tensors go into ``get_extra_state``). It hears of the
+environment and of the gradient steps through the methods of :class:`Part`, and through those of its own base class
+(``Pessimism.update``, ``Exploration.update``).
+"""
+
+from collections.abc import Iterable
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+import torch
+from torch import nn
+from torch.optim import Optimizer
+
+from sb3_sample.learner.batch import Batch
+
+
+class Rule(Protocol):
+    """A rule of pessimism as the other parts see it."""
+
+    def beta(self) -> torch.Tensor | float:
+        """
+        :return: the weight in force, at least 0, a number or a scalar tensor without gradient
+        """
+
+
+class Learning(Protocol):
+    """
+    The learner as its parts see it.
+
+    ``actor``, ``critic`` and ``critic_target`` are the networks, ``temperature()`` the entropy's weight, a scalar,
+    ``head`` says what the critics' outputs are, ``gamma`` is the discount factor. ``n_updates`` counts gradient steps;
+    ``num_transitions`` the transitions heard of, over the learner's life, of which the first ``learning_starts`` have
+    random actions.
+    """
+
+    @property
+    def actor(self) -> Any: ...
+
+    @property
+    def critic(self) -> Any: ...
+
+    @property
+    def critic_target(self) -> Any: ...
+
+    @property
+    def temperature(self) -> Any: ...
+
+    @property
+    def pessimism_rule(self) -> Any: ...
+
+    @property
+    def head(self) -> Any: ...
+
+    @property
+    def gamma(self) -> float: ...
+
+    @property
+    def learning_starts(self) -> int: ...
+
+    @property
+    def verbose(self) -> int: ...
+
+    @property
+    def n_updates(self) -> int: ...
+
+    @property
+    def num_transitions(self) -> int: ...
+
+    def next_actions(self, observations: Any, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        :param observations: next observations, (B, O), or a dict of them
+        :param noise: standard normal noise, (B, A); drawn if None
+        :return: actions of a TD target in [-1, 1], (B, A), and their log-probability, (B, 1)
+        """
+
+    def make_actor(self) -> Any:
+        """
+        :return: an actor like the learner's, with parameters of its own
+        """
+
+    def make_optimizer(self, parameters: Iterable[nn.Parameter]) -> Optimizer:
+        """
+        :param parameters: what to optimise
+        :return: an optimizer with the settings of actor and critics
+        """
+
+    def minimize(self, optimizer: Optimizer, loss: torch.Tensor) -> None:
+        """
+        One step of an optimizer. Only its own parameters get a gradient, whatever else the loss passed through.
+
+        :param optimizer: the optimizer
+        :param loss: scalar
+        """
+
+    def make_explorer(self) -> Any:
+        """
+        :return: a freshly initialised explorer
+        """
+
+    def restart(self, module: nn.Module, fresh: nn.Module, shrink: float = 0.0) -> None:
+        """
+        Give a module the values of a fresh one, in place, and start the optimizers of a part anew.
+
+        :param module: the module
+        :param fresh: a module of the same kind
+        :param shrink: share of the old parameters that stays
+        """
+
+    def reinitialize(self, shrink: float = 0.0) -> None:
+        """
+        Start every network, optimizer and learned number anew, in place.
+
+        :param shrink: share of the old parameters that stays
+        """
+
+
+class Part(nn.Module):
+    """A part of an off-policy learner; its subclasses override what they need."""
+
+    #: Whether it has parameters, numbers or optimizers that are saved.
+    has_state: ClassVar[bool] = True
+
+    def optimizers(self) -> dict[str, Optimizer]:
+        """
+        The part's optimizers by the name of the attribute that holds them. The learner saves them and clears their
+        state at a reset.
+        """
+        return {}
+
+    def before_updates(self, learner: Learning) -> None:
+        """
+        Called before the gradient steps that follow an environment step.
+
+        :param learner: the learner
+        """
+
+    def after_update(self, learner: Learning, batch: Batch) -> dict[str, torch.Tensor]:
+        """
+        Called after every gradient step; not compiled.
+
+        :param learner: the learner
+        :param batch: the step's batch
+        :return: what to log, by name, scalars
+        """
+        return {}
+
+    def on_environment_reset(self, learner: Learning) -> None:
+        """
+        Called when the environments were reset, whose episodes so far have no end in the replay buffer.
+
+        :param learner: the learner
+        """
+
+    def on_step(self, learner: Learning, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """
+        Called when the transitions of one step of all environments are in the replay buffer.
+
+        :param learner: the learner
+        :param rewards: unnormalised rewards, (n_envs,)
+        :param dones: whether each environment's episode ended, for whatever reason, (n_envs,)
+        :param infos: each environment's info; ``TimeLimit.truncated`` tells a time limit from a termination
+        """
+
+    def on_episode_end(self, learner: Learning, env_index: int, episode_return: float) -> None:
+        """
+        Called when an episode ended, after ``on_step``.
+
+        :param learner: the learner
+        :param env_index: which environment's episode
+        :param episode_return: undiscounted, unnormalised return
+        """

@@ -1,0 +1,159 @@
+"""The learner of a model's own: ``BRO.learner(...)`` makes one, ``model.learner`` is the one inside a model."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.utils import get_device
+
+from sb3_sample.learner.exploration import Exploration
+from sb3_sample.learner.learner import Counts, Learner
+from sb3_sample.learner.pessimism import Pessimism
+from sb3_sample.learner.plasticity import ReDo, Resets
+from sb3_sample.learner.randomness import OwnGenerators
+from sb3_sample.learner.scalars import FixedScalar, LogScalar
+from sb3_sample.optim import AdamW
+from sb3_sample.sac.policies import Actor, CriticEnsemble
+
+#: Arguments that say how transitions are collected, stored and drawn, or what is told of it: a learner has none of it.
+OF_TRAINING = (
+    "policy", "env", "buffer_size", "learning_starts", "batch_size", "train_freq", "gradient_steps", "action_noise",
+    "replay_buffer_class", "replay_buffer_kwargs", "optimize_memory_usage", "n_steps", "replay_ratio",
+    "validation_proportion", "use_sde", "sde_sample_freq", "use_sde_at_warmup", "stats_window_size", "tensorboard_log",
+    "_init_setup_model",
+)  # fmt: skip
+
+
+class LearnerOf:
+    """Descriptor: on a class a function that makes a learner, on a model the model's own."""
+
+    def __get__(self, model: Any, cls: Any) -> Any:
+        if model is None:
+            return _maker(cls)
+        try:
+            return vars(model)["_learner"]
+        except KeyError:
+            raise AttributeError(f"this {cls.__name__} has no learner yet: its networks are not made") from None
+
+    def __set__(self, model: Any, learner: Learner) -> None:
+        vars(model)["_learner"] = learner
+
+
+def _maker(cls: Any) -> Callable[..., Learner]:
+    def learner(
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        seed: int = 0,
+        *,
+        policy: Any = None,
+        device: torch.device | str = "auto",
+        **arguments: Any,
+    ) -> Learner:
+        """
+        Make a learner with the parts of this algorithm, without an environment, a replay buffer or a file.
+
+        What counts environment steps (``resets``, the episodes of "top") does nothing unless ``on_step`` is called;
+        ``reset_gradient_steps`` counts what the learner does itself. A learning rate that is a function stays at its
+        first value until ``set_learning_rate``. ``compile="auto"`` compiles nothing, since how many steps will follow
+        is not known.
+
+        :param observation_space: observation space
+        :param action_space: action space, a bounded Box; batches have actions in [-1, 1]
+        :param seed: seed of the learner's own generators: initial weights, noise, acting
+        :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class; None: by the observation space
+        :param device: "auto", "cpu", "cuda", ...
+        :param arguments: arguments of the class that say what is learned and how
+        :return: the learner
+        :raises ValueError: if an argument is one of training, is out of range or contradicts another
+        """
+        of_training = sorted(set(OF_TRAINING) & arguments.keys())
+        if of_training:
+            raise ValueError(
+                f"{', '.join(of_training)}: a learner takes no arguments of training; what it learns from is up to its "
+                "caller"
+            )
+        if policy is None:
+            policy = "MultiInputPolicy" if isinstance(observation_space, spaces.Dict) else "MlpPolicy"
+        generators = OwnGenerators(seed, get_device(device))
+        model = cls(policy, None, device=device, _init_setup_model=False, **arguments)
+        check_action_space(action_space)
+        model.observation_space, model.action_space, model.n_envs = observation_space, action_space, 1
+        model._check_arguments()
+        model._setup_lr_schedule()
+        counts = Counts()
+        counts.compiled = None if model.compile == "auto" else bool(model.compile)
+        return model._make_learner(counts=counts, generators=generators)  # type: ignore[no-any-return]
+
+    learner.__qualname__ = f"{cls.__name__}.learner"
+    return learner
+
+
+def check_action_space(space: spaces.Space) -> None:
+    """
+    :param space: of actions
+    :raises ValueError: if it is not a Box with finite bounds, low below high
+    """
+    if not isinstance(space, spaces.Box):
+        raise ValueError(f"env must have a bounded Box action space, not {space}")
+    if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        raise ValueError(f"env must have a bounded action space: the bounds of {space} are not finite")
+    if not (space.low < space.high).all():
+        raise ValueError(f"env must have an action space with low < high in every dimension, not {space}")
+
+
+class HasLearner:
+    """A model's names for what its learner has."""
+
+    learner = LearnerOf()
+
+    @property
+    def actor(self) -> Actor:
+        """The actor, which acts in evaluation."""
+        return self.learner.actor  # type: ignore[no-any-return]
+
+    @property
+    def critic(self) -> CriticEnsemble:
+        """The critics."""
+        return self.learner.critic  # type: ignore[no-any-return]
+
+    @property
+    def critic_target(self) -> CriticEnsemble:
+        """The target critics."""
+        return self.learner.critic_target  # type: ignore[no-any-return]
+
+    @property
+    def temperature(self) -> LogScalar | FixedScalar:
+        """The entropy's weight."""
+        return self.learner.temperature  # type: ignore[no-any-return]
+
+    @property
+    def temperature_optimizer(self) -> AdamW | None:
+        """Optimizer of the temperature; None if it is fixed."""
+        return self.learner.temperature_optimizer  # type: ignore[no-any-return]
+
+    @property
+    def pessimism_rule(self) -> Pessimism:
+        """The rule of pessimism."""
+        return self.learner.pessimism_rule  # type: ignore[no-any-return]
+
+    @property
+    def explorer(self) -> Exploration:
+        """Whoever acts while training."""
+        return self.learner.explorer  # type: ignore[no-any-return]
+
+    @property
+    def plasticity(self) -> Resets:
+        """When everything starts anew."""
+        return self.learner.plasticity  # type: ignore[no-any-return]
+
+    @property
+    def redo(self) -> ReDo | None:
+        """Recycling of dormant neurons; None for none."""
+        return self.learner.redo  # type: ignore[no-any-return]
+
+    @property
+    def gradients_are_stale(self) -> bool:
+        """Whether ``.grad`` holds the gradients of another gradient step than the last."""
+        return self.learner.gradients_are_stale  # type: ignore[no-any-return]

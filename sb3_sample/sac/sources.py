@@ -1,0 +1,96 @@
+"""Sources of batches: what a model's replay buffer gives to its learner."""
+
+from typing import Any
+
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_sample.learner.batch import Batch, Extra
+from sb3_sample.sac.buffers import BatchMemory, ValidationSplit, latest, samples_as_its_class
+
+
+class ReplaySource:
+    """
+    Batches of a model's replay buffer, normalised as its environment is.
+
+    :param model: the algorithm; its ``replay_buffer``, ``gamma``, ``batch_size`` and ``validation_proportion`` are
+        those in force when something is drawn
+    """
+
+    def __init__(self, model: Any):
+        self._model = model
+        self._memory = BatchMemory()
+
+    def sample(self, n_batches: int, batch_size: int) -> list[Batch]:
+        """
+        :param n_batches: number of gradient steps
+        :param batch_size: transitions a step
+        :return: the batches, which hold until this is called again
+        """
+        model = self._model
+        return draw_batches(
+            model.replay_buffer, n_batches, batch_size, model.gamma, model.get_vec_normalize_env(), self._memory
+        )
+
+    def held_out(self) -> Batch | None:
+        """
+        :return: ``round(validation_proportion * batch_size)`` transitions that are held out of training, at least one;
+            None while there are fewer
+        """
+        model, split = self._model, self._model.replay_buffer
+        assert isinstance(split, ValidationSplit)
+        n = max(1, round(model.validation_proportion * model.batch_size))
+        if split.n_validation < n:
+            return None
+        return Batch.of(split.sample_validation(n, env=model.get_vec_normalize_env()), model.gamma)
+
+    def latest(self, n_steps: int) -> Extra | None:
+        """
+        :param n_steps: T
+        :return: the latest T steps of every environment, the oldest first; None while there are fewer
+        """
+        model = self._model
+        if model.replay_buffer.size() < n_steps:
+            return None
+        samples, ends = latest(model.replay_buffer, n_steps, model.get_vec_normalize_env())
+        return Extra(Batch.of(samples, model.gamma), ends)
+
+
+def draw_batches(
+    buffer: ReplayBuffer,
+    n_batches: int,
+    batch_size: int,
+    gamma: float,
+    vec_normalize: VecNormalize | None,
+    memory: BatchMemory | None = None,
+) -> list[Batch]:
+    """
+    The batches of several gradient steps, drawn at once where that gives the same distribution.
+
+    :param buffer: replay buffer
+    :param n_batches: number of gradient steps
+    :param batch_size: transitions a step
+    :param gamma: discount factor, where the buffer has none of its own
+    :param vec_normalize: normalises observations and rewards as they are drawn
+    :param memory: what the transitions are gathered into where that is possible
+    :return: the batches; with ``memory``, they hold until it is used again
+    """
+    if memory is not None and memory.serves(buffer, vec_normalize):
+        return _cut(Batch.of(memory.gather(buffer, n_batches * batch_size), gamma), n_batches, batch_size)
+    if n_batches > 1 and not samples_as_its_class(buffer):
+        return [draw_batches(buffer, 1, batch_size, gamma, vec_normalize)[0] for _ in range(n_batches)]
+    return _cut(Batch.of(buffer.sample(n_batches * batch_size, env=vec_normalize), gamma), n_batches, batch_size)
+
+
+def _cut(data: Batch, n_batches: int, batch_size: int) -> list[Batch]:
+    """One large batch as several."""
+
+    def cut(x: Any) -> list[Any]:
+        if isinstance(x, (int, float)):
+            return [x] * n_batches
+        if isinstance(x, dict):
+            pieces = {key: value.split(batch_size) for key, value in x.items()}
+            return [{key: value[i] for key, value in pieces.items()} for i in range(n_batches)]
+        return list(x.split(batch_size))
+
+    return [Batch(*row) for row in zip(*map(cut, data), strict=True)]
