@@ -273,8 +273,9 @@ class Checkpointer:
             raise ValueError(f"checkpoint={str(self._name)!r} cannot be written to: {error}") from error
 
     def _warn_of_losses(self) -> None:
-        missing = vec_envs.save(self._env)[1]
-        if missing:
+        missing = self._missing = vec_envs.save(self._env)[1]
+        # Where a run goes on without the episodes in progress, that they start anew is said then.
+        if missing and (self._resumed is None or self._resumed["env"].get("environments") is not None):
             warnings.warn(
                 "The state of the environment cannot be saved, so that the episodes in progress start anew when the "
                 f"run goes on: {'; '.join(missing)}",
@@ -291,7 +292,8 @@ class Checkpointer:
             except DoesNotFit as error:
                 raise ValueError(f"env: {error}") from error
         if reasons:
-            self._start_episodes_anew(reasons)
+            missing = self._missing if state["env"]["environments"] is None else []
+            self._start_episodes_anew([*reasons, *missing])
         with self._restoring(state):
             self._states.restore(state["callbacks"])
             self._progress.restore(state["progress"])

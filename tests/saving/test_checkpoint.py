@@ -712,8 +712,9 @@ def test_an_episode_that_cannot_be_held_starts_anew(n_steps: int, tmp_path: Path
 
     with pytest.warns(UserWarning, match=r"environment cannot be saved.*Secret: counter \(builtins.range_iterator\)"):
         first = model().learn(25, checkpoint=tmp_path)
-    with pytest.warns(UserWarning, match="episodes in progress start anew"):
+    with pytest.warns(UserWarning, match=r"episodes in progress start anew: .*Secret: counter") as caught:
         again = model().learn(40, checkpoint=tmp_path)
+    assert "; ".join(str(warning.message) for warning in caught).count("start anew") == 1
     buffer = again.replay_buffer
     # The old episode was cut, as by a time limit, and the new one starts with a reset of its own.
     assert buffer.dones[24] == buffer.timeouts[24] == 1 and buffer.dones[23] == 0
