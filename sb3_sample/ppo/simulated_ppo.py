@@ -35,7 +35,7 @@ from sb3_sample.faults import TrainingDiverged, check_finite_parameters, not_fin
 from sb3_sample.ppo import arguments
 from sb3_sample.ppo.dynamics import minibatches
 from sb3_sample.ppo.spaces import FlatObservations, ModelActions
-from sb3_sample.saving.checkpoint import Checkpointer
+from sb3_sample.saving.checkpoint import Checkpointer, refuse_second_call
 from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.model_tree import Description
 from sb3_sample.saving.notice import say_once
@@ -368,13 +368,14 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         :param tb_log_name: name of the run in the TensorBoard log; the class's name if None
         :param reset_num_timesteps: whether ``num_timesteps`` starts at zero again
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
-        :param checkpoint: folder of the run, for one call of ``learn``; None for no checkpoints
+        :param checkpoint: folder of the run; None for no checkpoints. Each call of ``learn`` needs a folder of its own
         :param checkpoint_freq: environment steps between two checkpoints, each at the end of an iteration
         :return: the trained model
-        :raises ValueError: if the folder is of another run (the message names what differs), cannot be used, or has
-            checkpoints that are all damaged
+        :raises ValueError: if the folder is of another run (the message names what differs) or of an earlier call of
+            ``learn``, cannot be used, or has checkpoints that are all damaged
         :raises TrainingDiverged: if a loss or a parameter is NaN or infinite
         """
+        refuse_second_call(self, checkpoint)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )

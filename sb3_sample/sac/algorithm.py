@@ -55,7 +55,7 @@ from sb3_sample.sac.policies import Actor, CnnPolicy, CriticEnsemble, MlpPolicy,
 from sb3_sample.sac.q_values import evaluate
 from sb3_sample.sac.sb3_names import SB3Names
 from sb3_sample.sac.scalars import FixedScalar, LogScalar
-from sb3_sample.saving.checkpoint import Checkpointer
+from sb3_sample.saving.checkpoint import Checkpointer, refuse_second_call
 from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.model_tree import Description
@@ -684,13 +684,14 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         :param tb_log_name: name of the run in the TensorBoard log; the class's name if None
         :param reset_num_timesteps: whether ``num_timesteps`` starts at zero again
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
-        :param checkpoint: folder of the run, for one call of ``learn``; None for no checkpoints
+        :param checkpoint: folder of the run; None for no checkpoints. Each call of ``learn`` needs a folder of its own
         :param checkpoint_freq: environment steps between two checkpoints
         :return: the trained model
-        :raises ValueError: if the folder is of another run (the message names what differs), cannot be used, or has
-            checkpoints that are all damaged
+        :raises ValueError: if the folder is of another run (the message names what differs) or of an earlier call of
+            ``learn``, cannot be used, or has checkpoints that are all damaged
         :raises TrainingDiverged: if a loss, another metric or a parameter is NaN or infinite
         """
+        refuse_second_call(self, checkpoint)
         resets_environment = reset_num_timesteps or self._last_obs is None
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
