@@ -69,6 +69,12 @@ _OFF_POLICY = (
         "test_spaces::test_sde_multi_dim",
     ),
     *_excluded("Defaults", "Mean reward below threshold", "test_identity::test_continuous[*]"),
+    *_excluded(
+        "Defaults",
+        "assert 1 == 0",
+        "test_her::test_save_load_replay_buffer[False-*]",
+        "test_her::test_save_load_replay_buffer[True-*]",
+    ),
     *_excluded("Initial weights", "assert", "test_gae::test_infinite_horizon[True-*]", by_chance=True),
     *_excluded("Errors", "ValueError: env must have a bounded Box", "test_spaces::test_action_spaces[CartPole-v1-*]"),
     *_excluded(
