@@ -40,6 +40,8 @@ from sb3_sample.saving.progress import ProgressFile
 from sb3_sample.saving.rings import Ring
 from sb3_sample.saving.run_folder import MODEL, STATE, RunFolder, Segment
 
+#: Environment steps between two checkpoints, unless ``learn`` is told otherwise.
+CHECKPOINT_FREQ = 10_000
 KIND, SEGMENT_KIND = "checkpoint", "replay rows"
 #: The kinds of what the state of a checkpoint consists of.
 _PARTS: dict[str, type] = {
@@ -82,6 +84,11 @@ class Checkpointer:
     def __init__(self, model: SafeFiles, callback: BaseCallback, folder: str | Path | None, every: int):
         if isinstance(every, bool) or not isinstance(every, (int, np.integer)) or every < 1:
             raise ValueError(f"checkpoint_freq must be an integer of at least 1, in environment steps, not {every!r}")
+        if folder is None and every != CHECKPOINT_FREQ:
+            raise ValueError(
+                f"checkpoint_freq={every} means nothing without checkpoint, the folder of the run: pass it too, or "
+                "leave checkpoint_freq out"
+            )
         self._model, self._callback, self._every = model, callback, int(every)
         self._name = folder
         self._held: HoldBack | None = None
@@ -171,8 +178,9 @@ class Checkpointer:
 
     def _check_identity(self, theirs: dict[str, list[str]]) -> None:
         ours = self._identity
+        # The class first, whose arguments have other defaults.
         # An argument that only one of the two has is one of another version, of which the circumstances tell.
-        for name in sorted(ours.keys() & theirs.keys()):
+        for name in sorted(ours.keys() & theirs.keys(), key=lambda name: (name != "class", name)):
             present, saved = ours[name], theirs[name]
             if present[0] != saved[0]:
                 raise ValueError(

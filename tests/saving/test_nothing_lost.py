@@ -299,7 +299,7 @@ def test_a_policy_class_of_ones_own(maker: str, tmp_path: Path) -> None:
     for kwargs in given:
         loaded = type(model).load(tmp_path / "m", **kwargs)
         assert type(loaded.policy) is policy and not differing(state(model), state(loaded))
-    with pytest.raises(ValueError, match="policy must be one of .* or a policy class, not 'Nothing'"):
+    with pytest.raises(ValueError, match="policy must be one of .* or a policy class derived from .*, not 'Nothing'"):
         type(model).load(tmp_path / "m", policy="Nothing")
 
 
