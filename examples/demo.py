@@ -93,6 +93,10 @@ class Evaluation(EvalCallback):
                 again = fresh_returns(self.model, seed=self.num_timesteps).mean()
                 self.show(f"evaluation return {self.last_mean_reward:.0f} of 1000, ten fresh episodes {again:.0f}")
                 self.solved = bool(again >= SOLVED)
+        if self.num_timesteps == AGENT["learning_starts"] and self.model.compiled:
+            # The first gradient step comes next, and nothing else is printed meanwhile.
+            tqdm.write("Compiling the update (torch.compile): a minute on free cores, several on busy ones ...")
+            sys.stdout.flush()
         return not self.solved
 
     def _on_training_end(self) -> None:

@@ -1,28 +1,210 @@
-"""Arguments of the algorithms' constructors, of both families."""
+"""Arguments of the algorithms' constructors and of ``learn``, of both families."""
 
 import inspect
-from collections.abc import Iterator, Sequence
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from numbers import Integral, Real
-from typing import Any, TypeGuard
+from typing import Any
+
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.utils import get_device
+from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
 
 from sb3_sample.errors import ParametersDoNotFit
+from sb3_sample.kinds import AT_LEAST_0, DICT, VERBOSE, Kind, check_value, integer, maker
 
 
-def is_integer(value: Any) -> TypeGuard[int]:
-    """
-    :param value: any value
-    :return: whether it is an integer, Python's or NumPy's
-    """
-    return isinstance(value, Integral) and not isinstance(value, bool)
+class NotAllowed(ValueError, AssertionError):
+    """What is refused here as everywhere, with a ``ValueError``, and by Stable-Baselines3 with an assertion."""
 
 
-def is_number(value: Any) -> bool:
+class NoPolicy(ValueError):
+    """A policy is none of this family."""
+
+
+#: Arguments of Stable-Baselines3's ``BaseAlgorithm``, by the attribute that holds them.
+EVERY_ALGORITHM: dict[str, Kind] = {
+    "learning_rate": AT_LEAST_0.otherwise("a schedule", callable),
+    "policy_kwargs": DICT,
+    "_stats_window_size": integer(1),
+    "tensorboard_log": Kind("be the path of a folder", lambda value: isinstance(value, (str, os.PathLike))).or_none(),
+    "verbose": VERBOSE,
+    # The seeds that NumPy takes.
+    "seed": integer(0, 2**32 - 1).or_none(),
+    "sde_sample_freq": integer(-1),
+}
+#: Entries of ``policy_kwargs`` that Stable-Baselines3's policies and those here have in common.
+EVERY_POLICY: dict[str, Kind] = {
+    "optimizer_class": maker(torch.optim.Optimizer, "torch.optim.Adam"),
+    "optimizer_kwargs": DICT,
+    "features_extractor_class": maker(BaseFeaturesExtractor, "NatureCNN"),
+    "features_extractor_kwargs": DICT,
+    "activation_fn": maker(nn.Module, "torch.nn.ReLU").or_none(),
+}
+_ENVIRONMENT = Kind(
+    "be an environment, a vectorised environment or the id of one",
+    lambda value: isinstance(value, (str, VecEnv)) or (hasattr(value, "action_space") and hasattr(value, "step")),
+)
+#: Arguments of ``learn`` in both families.
+_LEARN: dict[str, Kind] = {
+    "total_timesteps": AT_LEAST_0,
+    "callback": Kind(
+        "be a callback, a list of callbacks or a function",
+        lambda value: callable(value) or isinstance(value, (list, BaseCallback)),
+    ).or_none(),
+    "log_interval": integer(1).or_none(),
+    "tb_log_name": Kind("be a name", lambda value: isinstance(value, str)).or_none(),
+}
+
+
+def check_table(agent: Any, table: Mapping[str, Kind]) -> None:
     """
-    :param value: any value
-    :return: whether it is a real number, Python's or NumPy's
+    :param agent: an algorithm that has its arguments as attributes
+    :param table: by attribute, what it must be
+    :raises ValueError: if one of them is something else
     """
-    return isinstance(value, Real) and not isinstance(value, bool)
+    for name, kind in table.items():
+        setattr(agent, name, check_value(name.removeprefix("_"), getattr(agent, name), kind))
+
+
+def check_every(agent: Any) -> None:
+    """
+    Check what all algorithms and policies take. There are spaces unless a model is made without an environment.
+
+    :param agent: an algorithm whose arguments are stored and whose networks do not exist yet
+    :raises ValueError: if one of them is of another kind, or the policy is not one for the observations
+    """
+    if not hasattr(agent, "observation_space"):
+        raise ValueError(f"env must {_ENVIRONMENT.words}, not None")
+    check_table(agent, EVERY_ALGORITHM)
+    kwargs, space = agent.policy_kwargs, agent.observation_space
+    for name, kind in EVERY_POLICY.items():
+        if name in kwargs:
+            check_value(f"policy_kwargs[{name!r}]", kwargs[name], kind)
+    policy = named_policy(agent)
+    if policy is None or "features_extractor_class" in kwargs:
+        return
+    if policy == "MultiInputPolicy" and not isinstance(space, spaces.Dict):
+        raise ValueError(f"policy='MultiInputPolicy' needs Dict observations, not {space}: use 'MlpPolicy'")
+    extractor = kwargs.get("features_extractor_kwargs") or {}
+    normalized = not kwargs.get("normalize_images", True) or extractor.get("normalized_image", False)
+    if policy == "CnnPolicy" and not is_image_space(space, check_channels=False, normalized_image=normalized):
+        raise NotAllowed(
+            "policy='CnnPolicy' needs images, of integers in [0, 255] (with policy_kwargs={'normalize_images': False} "
+            f"of any numbers), not {space}: use 'MlpPolicy' for vectors"
+        )
+
+
+def named_policy(agent: Any) -> str | None:
+    """
+    :param agent: an algorithm
+    :return: the name of its policy; None for a class of the user's own, which may do with its arguments what it likes
+    """
+    return next((name for name, cls in agent.policy_aliases.items() if cls is agent.policy_class), None)
+
+
+def check_net_arch(net_arch: Any, keys: tuple[str, str], both: bool) -> None:
+    """
+    :param net_arch: the policy's argument
+    :param keys: of a dict, for the actor and the critic
+    :param both: whether a dict must have both
+    :raises ValueError: if it is neither a list of widths nor a dict of such lists with these keys
+    """
+    width = integer(1)
+
+    def is_list(value: Any) -> bool:
+        return isinstance(value, Sequence) and not isinstance(value, str) and all(map(width.fits, value))
+
+    if isinstance(net_arch, Mapping):
+        known = net_arch.keys() == set(keys) if both else net_arch.keys() <= set(keys)
+        fits = known and all(map(is_list, net_arch.values()))
+    else:
+        fits = net_arch is None or is_list(net_arch)
+    if not fits:
+        raise ValueError(
+            f"net_arch must be a list of widths, integers of at least 1, or a dict of such lists, {keys[0]!r} for the "
+            f"actor and {keys[1]!r} for the critic, not {net_arch!r}"
+        )
+
+
+def check_policy_class(cls: Any, policy: Any) -> None:
+    """
+    :param cls: class of an algorithm
+    :param policy: the argument of its constructor
+    :raises NoPolicy: (a ``ValueError``) if it is no policy of this family
+    """
+    aliases, base = cls.policy_aliases, cls.policy_base
+    if isinstance(policy, str) and policy in aliases:
+        return
+    if not (isinstance(policy, type) and issubclass(policy, base)):
+        shown = f"{policy.__module__}.{policy.__qualname__}" if isinstance(policy, type) else repr(policy)
+        raise NoPolicy(
+            f"policy must be one of {list(aliases)}, or a policy class derived from {base.__module__}."
+            f"{base.__qualname__}, not {shown}"
+        )
+
+
+def check_device(device: Any) -> None:
+    """
+    :param device: the argument
+    :raises ValueError: if torch has no device of this name
+    """
+    try:
+        get_device(device)
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise ValueError(f"device must be 'auto', 'cpu', 'cuda' or another of torch's, not {device!r}") from error
+
+
+def check_program(cls: type, policy: Any, env: Any, device: Any, verbose: Any) -> None:
+    """
+    Check what Stable-Baselines3's constructor makes use of.
+
+    :param cls: class of an algorithm
+    :param policy: the argument
+    :param env: the argument; None where a model is loaded
+    :param device: the argument
+    :param verbose: the argument
+    :raises ValueError: if one of them is of another kind
+    """
+    check_policy_class(cls, policy)
+    check_value("env", env, _ENVIRONMENT.or_none())
+    check_device(device)
+    check_value("verbose", verbose, VERBOSE)
+
+
+def check_learn(agent: Any, learn: Mapping[str, Any]) -> int:
+    """
+    :param agent: an algorithm
+    :param learn: the arguments of its ``learn``, by name
+    :return: ``total_timesteps`` as an integer, with which the same steps are taken
+    :raises ValueError: if one of them is of another kind, or there is no environment
+    """
+    if agent.env is None:
+        raise NotAllowed("env: the model was loaded without one: pass env= to load, or call set_env, before learn")
+    for name, kind in _LEARN.items():
+        check_value(name, learn[name], kind)
+    return math.ceil(learn["total_timesteps"])
+
+
+def check_n_envs(agent: Any, env: GymEnv) -> None:
+    """
+    :param agent: an algorithm
+    :param env: the environment that it is to go on with
+    :raises ValueError: if it has another number of environments
+    """
+    n_envs = env.num_envs if isinstance(env, VecEnv) else 1
+    if n_envs != agent.n_envs:
+        raise NotAllowed(
+            f"env has {n_envs} environments, but set_env takes as many as the model was made with, {agent.n_envs}: "
+            f"use {type(agent).__name__}.load(path, env) for another number"
+        )
 
 
 def names_for_load(cls: type, base: type) -> set[str]:
@@ -36,13 +218,19 @@ def names_for_load(cls: type, base: type) -> set[str]:
     return (names | {"policy_class"}) - {"env", "kwargs", "_init_setup_model"}
 
 
-def check_known(cls: type, base: type, kwargs: dict[str, Any]) -> None:
+def check_load(cls: type, base: type, env: Any, device: Any, kwargs: dict[str, Any]) -> None:
     """
     :param cls: class of an algorithm
     :param base: its family's first class
+    :param env: with which it is to be loaded
+    :param device: where it is to be loaded
     :param kwargs: what ``load`` is to change
-    :raises ValueError: if one of them is no argument of the class
+    :raises ValueError: if one of them is no argument of the class, or of another kind where that is not found later
     """
+    check_value("env", env, _ENVIRONMENT.or_none())
+    check_device(device)
+    if "verbose" in kwargs:
+        check_value("verbose", kwargs["verbose"], VERBOSE)
     unknown = sorted(kwargs.keys() - names_for_load(cls, base))
     if unknown:
         raise ValueError(f"{', '.join(unknown)}: not an argument of {cls.__name__}, so load cannot change it")

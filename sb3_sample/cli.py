@@ -7,12 +7,14 @@ import contextlib
 import importlib
 import runpy
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType, SimpleNamespace
 from typing import NamedTuple
 
 from sb3_sample.envs.base import select_gl_backend
-from sb3_sample.exits import refuse
+from sb3_sample.exits import interrupt, refuse
+from sb3_sample.extras import install
 from sb3_sample.version import __version__
 
 
@@ -37,7 +39,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     elif name == "--version":
         print(__version__)
     elif name in COMMANDS:
-        COMMANDS[name].run(arguments[1:])
+        try:
+            COMMANDS[name].run(arguments[1:])
+        except KeyboardInterrupt as error:
+            interrupt(name, str(error) or "interrupted")
     else:
         refuse("", f"command must be one of {', '.join(COMMANDS)}, not {name!r}")
 
@@ -58,7 +63,7 @@ def _zoo_module(name: str) -> ModuleType:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
         # Of the zoo itself all is there; what its plots need is an extra of it.
-        sys.exit(f'sb3-sample: {error}. Install it with: pip install "sb3_sample[zoo,plots]"')
+        sys.exit(f"sb3-sample: {error}. Install it with: {install('zoo', 'plots')}")
 
 
 def _register() -> None:
@@ -91,21 +96,19 @@ def _train(arguments: list[str]) -> None:
     from sb3_sample.zoo_files import reading
 
     options, rest = _own_options(zoo_runs.train_parser(), arguments)
-    with _errors("train"), reading(options.allow_pickle, options.trusted_modules):
+    with _errors("train"), _arguments("train"), reading(options.allow_pickle, options.trusted_modules):
         start = zoo_runs.plan(options, rest)
-        if start is None:
-            _zoo_function("rl_zoo3.train", "train")(rest)
-        else:
-            _set_command_line("train", start.arguments)
-            zoo_runs.train(start)
+        _set_command_line("train", rest if start is None else start.arguments)
+        zoo_runs.train(start)
 
 
 def _enjoy(arguments: list[str]) -> None:
     module = _zoo_module("rl_zoo3.enjoy")
     from sb3_sample import zoo_watch
+    from sb3_sample.zoo_files import pairs_checked
 
     options, rest = _own_options(zoo_watch.watch_parser("enjoy"), arguments)
-    with _errors("enjoy"), zoo_watch.watching(options, rest, module) as command:
+    with _errors("enjoy"), pairs_checked(module), zoo_watch.watching(options, rest, module) as command:
         _set_command_line("enjoy", command)
         module.enjoy()
 
@@ -131,6 +134,25 @@ def _errors(command: str) -> Iterator[None]:
     except PickledFile as error:
         refuse(command, f"{error}. Here it is the option --allow-pickle")
     except (BadFile, NotPortable, ParametersDoNotFit, Refused, RunError) as error:
+        refuse(command, error)
+
+
+@contextlib.contextmanager
+def _arguments(command: str) -> Iterator[None]:
+    """
+    What this package or the zoo says of an argument is told of without a traceback. An error of anything else, an
+    environment for one, keeps it, and so does a training that diverges.
+    """
+    from sb3_sample.faults import TrainingDiverged
+
+    try:
+        yield
+    except TrainingDiverged:
+        raise
+    except ValueError as error:
+        *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+        if frame.f_globals.get("__name__", "").split(".")[0] not in ("sb3_sample", "rl_zoo3"):
+            raise
         refuse(command, error)
 
 
@@ -188,13 +210,14 @@ def _record_video(arguments: list[str]) -> None:
     select_gl_backend()
     utils = _zoo_module("rl_zoo3.utils")
     from sb3_sample import zoo_watch
+    from sb3_sample.zoo_files import pairs_checked
 
     parser = zoo_watch.watch_parser("record_video")
     parser.add_argument("--gym-packages", nargs="+", default=[], help="Packages to import, as for enjoy")
     options, rest = _own_options(parser, arguments)
     for package in options.gym_packages:
         importlib.import_module(package)
-    with _errors("record_video"), zoo_watch.watching(options, rest, utils) as command:
+    with _errors("record_video"), pairs_checked(utils), zoo_watch.watching(options, rest, utils) as command:
         _set_command_line("record_video", command)
         runpy.run_module("rl_zoo3.record_video", run_name="__main__")  # it has no function to call
 

@@ -26,6 +26,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
+from sb3_sample.extras import install
 from sb3_sample.faults import check_finite_parameters
 from sb3_sample.saving.container import replacing
 from sb3_sample.saving.normalization import lacks_vec_normalize
@@ -67,7 +68,7 @@ class Exportable:
         assert isinstance(self, BaseAlgorithm)
         for package in ("onnx", "onnxscript"):
             if importlib.util.find_spec(package) is None:
-                raise ImportError(f"export needs {package}: pip install 'sb3_sample[export]'")
+                raise ImportError(f"export needs {package}. Install it with: {install('export')}")
         if "dynamic_shapes" not in inspect.signature(torch.onnx.export).parameters:
             raise ImportError(
                 f"export needs a newer torch than {torch.__version__}, one whose torch.onnx.export has dynamic_shapes"

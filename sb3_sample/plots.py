@@ -21,6 +21,7 @@ import pandas as pd
 
 from sb3_sample.envs import published_key
 from sb3_sample.exits import refuse
+from sb3_sample.extras import install
 from sb3_sample.run_logs import EVALUATIONS, monitor_files, monitor_head, read_evaluations, read_monitors
 
 if TYPE_CHECKING:
@@ -218,6 +219,24 @@ def _episodes(folder: Path, metric: str) -> tuple[np.ndarray, np.ndarray]:
     return episodes["l"].cumsum().to_numpy(), episodes[key].to_numpy(float)
 
 
+def _with_episodes(labelled: Sequence[tuple[str, Path]]) -> list[tuple[str, Path]]:
+    """
+    :param labelled: labels and folders of runs
+    :return: those that have evaluations or a finished training episode; each of the others, which have just begun, is
+        a line on stderr
+    :raises ValueError: there are none
+    """
+    found = []
+    for label, folder in labelled:
+        if (folder / EVALUATIONS).exists() or len(read_monitors(folder)):
+            found.append((label, folder))
+        else:
+            print(f"{folder} has no finished episode yet, and is left out", file=sys.stderr)
+    if not found:
+        raise ValueError("runs must have at least one finished episode; none of them has")
+    return found
+
+
 def _default_bin(folders: Sequence[Path]) -> int:
     """The published curves' 25,000 steps; for short runs about a twentieth of the shortest, as a round number."""
     lengths = [read_monitors(folder)["l"].sum() for folder in folders]
@@ -274,9 +293,7 @@ def needing_matplotlib() -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise ImportError(
-            f'plots need matplotlib ({error}). Install it with: pip install "sb3_sample[plots]"'
-        ) from error
+        raise ImportError(f"plots need matplotlib ({error}). Install it with: {install('plots')}") from error
 
 
 def draw(env_id: str, curves: Sequence[Curve], metric: str, xlim: tuple[float, float] | None = None) -> "Figure":
@@ -433,6 +450,7 @@ def _plot(args: argparse.Namespace) -> None:
     published = published_curves(env_id)
     metric = args.metric or (published["metric"].iloc[0] if len(published) else "return")
 
+    labelled = _with_episodes(labelled)
     without_evaluations = [folder for _, folder in labelled if not (folder / EVALUATIONS).exists()]
     for folder in without_evaluations:
         print(f"{folder} has no evaluations.npz: its training episodes are shown, which explore", file=sys.stderr)

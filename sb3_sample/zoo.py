@@ -16,14 +16,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sb3_sample.extras import install
+
 try:
     import optuna
     import rl_zoo3.hyperparams_opt
     import rl_zoo3.utils
 except ModuleNotFoundError as error:
-    raise ImportError(
-        f'The zoo\'s commands need rl_zoo3 ({error}). Install it with: pip install "sb3_sample[zoo]"'
-    ) from error
+    raise ImportError(f"The zoo's commands need rl_zoo3 ({error}). Install it with: {install('zoo')}") from error
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_sample import zoo_files, zoo_trials

@@ -66,6 +66,32 @@ def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def pairs_checked(module: types.ModuleType) -> Iterator[None]:
+    """
+    Options of a zoo's command that are names and values (``-params``, ``--env-kwargs``) refuse what is none of these.
+
+    :param module: the command's, which makes a dict of them with the zoo's ``StoreDict``
+    """
+
+    class Pairs(rl_zoo3.utils.StoreDict):
+        def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
+            found: dict[str, Any] = {}
+            for value in values:
+                try:
+                    super().__call__(parser, one := argparse.Namespace(), [value], option_string)
+                except Exception as error:  # the zoo evaluates the value as Python, which can raise anything
+                    raise Refused(
+                        f"{option_string} must be NAME:VALUE, the value in Python and a text in quotes of its own "
+                        f"(NAME:\"'text'\"), not {value!r} ({type(error).__name__}: {error})"
+                    ) from error
+                found |= vars(one)[self.dest]
+            setattr(namespace, self.dest, found)
+
+    with replaced(module, "StoreDict", Pairs):
+        yield
+
+
+@contextlib.contextmanager
 def reading(allow_pickle: bool = False, trusted_modules: Sequence[str] = ()) -> Iterator[None]:
     """
     What the zoo may read meanwhile of our algorithms.

@@ -6,6 +6,7 @@ The folder of such a run has, besides the zoo's files and the checkpoints, a rec
 
 import argparse
 import contextlib
+import difflib
 import functools
 import json
 import os
@@ -19,6 +20,7 @@ import gymnasium as gym
 import rl_zoo3.exp_manager
 import rl_zoo3.train
 from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat, configure
@@ -28,9 +30,10 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.run_logs import monitor_files, monitor_head
 from sb3_sample.saving.folders import Folder, is_plain
+from sb3_sample.saving.training_state import argument_names
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.zoo import ALGORITHMS
-from sb3_sample.zoo_files import add_trust, replaced
+from sb3_sample.zoo_files import add_trust, pairs_checked, replaced
 
 RECORD = "run.json"
 #: Bytes of a record.
@@ -45,6 +48,10 @@ COMPARED = (
     "algo", "env", "seed", "trained_agent", "truncate_last_trajectory", "vec_env", "env_kwargs", "eval_env_kwargs",
     "eval_freq", "eval_episodes", "n_eval_envs", "save_freq",
 )  # fmt: skip
+#: Hyperparameters that the zoo makes ``action_noise`` of.
+_OF_NOISE = {"noise_type", "noise_std"}
+#: Arguments that the zoo's options give.
+_OF_OPTIONS = {"env", "seed", "verbose", "device", "tensorboard_log"}
 
 
 class RunError(ValueError):
@@ -282,18 +289,56 @@ def _latest(arguments: Sequence[str]) -> Path:
     return max(found)[1]
 
 
-def train(start: Start) -> None:
+def train(start: Start | None) -> None:
     """
-    The zoo's ``train`` for a run with checkpoints. It reads ``sys.argv``.
+    The zoo's ``train``. It reads ``sys.argv``.
 
-    :param start: how the run starts
+    :param start: how a run with checkpoints starts; None for one without
     :raises RunError: if it cannot start or go on so
+    :raises Refused: if an argument is no Python
+    :raises KeyboardInterrupt: after Ctrl-C, when the zoo has saved the model
     """
-    with replaced(rl_zoo3.train, "ExperimentManager", functools.partial(RunManager, start)):
+    manager = Manager if start is None else functools.partial(RunManager, start)
+    with pairs_checked(rl_zoo3.train), replaced(rl_zoo3.train, "ExperimentManager", manager):
         rl_zoo3.train.train()
 
 
-class RunManager(ExperimentManager):
+class Manager(ExperimentManager):
+    """
+    The zoo's manager, which names hyperparameters that there are not, and does not take an interrupted run for a
+    finished one.
+    """
+
+    #: Arguments of ``learn`` that the zoo does not know.
+    _arguments: dict[str, Any] = {}
+    #: What is said of an interrupted run.
+    _interrupted = "interrupted; the model was saved as it was"
+
+    def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+        try:
+            found = super()._preprocess_hyperparams(hyperparams)
+        except (SyntaxError, NameError) as error:
+            raise RunError(f"a hyperparameter that is a text of Python is none: {error}") from error
+        known = (argument_names(ALGOS[self.algo]) | _OF_NOISE) - _OF_OPTIONS
+        for name in found[0].keys() - known:
+            near = difflib.get_close_matches(name, known, 1)
+            raise RunError(
+                f"{name} is no hyperparameter of {self.algo}"
+                + (f", you maybe meant {near[0]}" if near else f", which has {', '.join(sorted(known))}")
+            )
+        return found
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        self._watched = _Watched(model, self._arguments)
+        super().learn(self._watched)  # type: ignore[arg-type]  # all that the zoo's learn uses
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        super().save_trained_model(model)
+        if self._watched.interrupted:
+            raise KeyboardInterrupt(self._interrupted)
+
+
+class RunManager(Manager):
     """
     The zoo's manager for a run with checkpoints.
 
@@ -380,17 +425,19 @@ class RunManager(ExperimentManager):
         if self._record.tensorboard is not None:
             formats = ["stdout", "tensorboard"] if self.verbose >= 1 else ["tensorboard"]
             model.set_logger(configure(self._record.tensorboard, formats))
-        arguments = {
+        self._arguments = {
             "checkpoint": self._folder,
             "checkpoint_freq": self._start.checkpoint_freq,
             "progress_bar": self._progress_bar,
         }
-        super().learn(_WithArguments(model, arguments))  # type: ignore[arg-type]  # all that the zoo's learn uses
+        self._interrupted = f"interrupted; the same command with --run-dir {self._folder} goes on"
+        super().learn(model)
 
 
-class _WithArguments:
+class _Watched:
     """
-    A model whose ``learn`` has arguments that the zoo does not know.
+    A model whose ``learn`` has arguments that the zoo does not know, and tells whether it was interrupted, which the
+    zoo keeps to itself.
 
     :param model: the model
     :param arguments: the arguments
@@ -398,9 +445,14 @@ class _WithArguments:
 
     def __init__(self, model: Any, arguments: dict[str, Any]):
         self._model, self._arguments = model, arguments
+        self.interrupted = False
 
     def learn(self, *args: Any, **kwargs: Any) -> BaseAlgorithm:
-        return self._model.learn(*args, **kwargs, **self._arguments)
+        try:
+            return self._model.learn(*args, **kwargs, **self._arguments)
+        except KeyboardInterrupt:
+            self.interrupted = True
+            raise
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._model, name)

@@ -46,6 +46,43 @@ def test_an_unknown_command_is_refused(run) -> None:
         run("trian")
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "-params", "modelsize:'0.55M'"], "modelsize is no hyper.* of bro, you maybe meant model_size"),
+        (["train", "-params", "seed:3"], "seed is no hyperparameter of bro, which has .*learning_rate"),
+        (["train", "-params", "model_size:0.55M"], "-params must be NAME:VALUE.*, not 'model_size:0.55M' .SyntaxError"),
+        (["train", "-params", "gamma:0.9", "resets"], "-params must be NAME:VALUE.*, not 'resets'"),
+        (["train", "--env-kwargs", "g:x"], "--env-kwargs must be NAME:VALUE.*, not 'g:x' .NameError"),
+        (["enjoy", "--env-kwargs", "g:x"], "--env-kwargs must be NAME:VALUE.*, not 'g:x' .NameError"),
+        (["record_video", "--env-kwargs", "g:x"], "--env-kwargs must be NAME:VALUE.*, not 'g:x' .NameError"),
+        (["train", "-params", "policy_kwargs:'dict('"], "a hyperparameter that is a text of Python is none"),
+        (["train", "-params", "replay_ratio:-1"], "replay_ratio must be at least 0 and finite, not -1"),
+        (["train", "--env", "Pendulum-v9"], "Pendulum-v9 not found in gym registry"),
+    ],
+)
+def test_a_wrong_argument_is_one_line(
+    zoo_run, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    command, *rest = arguments
+    with pytest.raises(SystemExit, match=message) as caught:
+        zoo_run(command, "--algo", "bro", "--env", "Pendulum-v1", *rest)
+    assert caught.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"sb3-sample {command}: ")
+
+
+def test_an_error_of_anything_else_keeps_its_traceback(zoo_run, monkeypatch: pytest.MonkeyPatch) -> None:
+    from gymnasium.envs.classic_control import PendulumEnv
+
+    def broken(self: object, **_: object) -> None:
+        raise ValueError("of the environment's own")
+
+    monkeypatch.setattr(PendulumEnv, "reset", broken)
+    with pytest.raises(ValueError, match="of the environment's own"):
+        zoo_run("train", "--algo", "bro", "--env", "Pendulum-v1", "-n", "20", *TINY)
+
+
 def test_train_shows_the_options_of_the_zoo(zoo_run, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:
         zoo_run("train", "--help")
@@ -273,7 +310,7 @@ def test_a_missing_zoo_is_named(tmp_path: Path) -> None:
     code = "import sys; sys.modules['rl_zoo3'] = None; from sb3_sample.cli import main; main(['train'])"
     result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert result.returncode == 1
-    assert 'pip install "sb3_sample[zoo]"' in result.stderr
+    assert 'pip install -e ".[zoo]"' in result.stderr
     assert "Traceback" not in result.stderr
 
 

@@ -55,6 +55,19 @@ def test_training_ends_when_fresh_episodes_confirm_it(
     assert "\r" not in out + err and out.count("of 80 steps") == 4
 
 
+def test_compiling_is_told_of_before_it_begins(
+    demo: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(demo.AGENT, "compile", True)
+    monkeypatch.setattr(demo.BRO, "train", lambda model, *_: print(f"step {model.num_timesteps}", flush=True))
+    monkeypatch.setattr(demo, "SOLVED", 0)
+    returns(demo, monkeypatch, -3000, -1500)
+    demo.main(["--folder", str(tmp_path)])
+    before, _, after = capfd.readouterr().out.partition("Compiling the update")
+    assert "60 of 80 steps" in before and "step 71" not in before and "step 71" in after
+    assert "Compiling" not in after
+
+
 def test_what_is_not_solved_is_called_so(
     demo: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -46,6 +46,16 @@ def test_the_lock_has_everything_that_setup_asks_for(python: str) -> None:
     assert ("labmaze" in pins(python)) == (python in ("3.11", "3.12"))
 
 
+def test_what_is_said_of_installing_works_in_the_checkout() -> None:
+    """The package is on no index, so that its name alone installs nothing."""
+    files = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "sb3_sample").rglob("*.py")]
+    text = "\n".join(file.read_text() for file in files)
+    assert not re.findall(r"install [^\n]*sb3_sample\[", text)
+    named = [*re.findall(r'pip install -e "\.\[([\w,]+)\]"', text), *re.findall(r"install\('([^)]*)'\)", text)]
+    extras = {extra for group in named for extra in re.findall(r"\w+", group)}
+    assert {"dmc", "metaworld", "zoo", "export", "plots"} <= extras <= set(setup_cfg()["options.extras_require"])
+
+
 @pytest.mark.parametrize("python", PYTHONS[1:])
 def test_the_pythons_have_the_same_versions_of_what_runs(python: str) -> None:
     first, other = pins(PYTHONS[0]), pins(python)

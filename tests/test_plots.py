@@ -173,6 +173,21 @@ def test_plot_groups_runs_by_algorithm_beside_the_published(tmp_path: Path, caps
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_run_that_has_just_begun_is_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_monitor(tmp_path / "bro/x_1", [1000, 1000], [1.0, 3.0])
+    write_monitor(tmp_path / "bro/x_2", [], [])
+    write_monitor(tmp_path / "sac/x_1", [], [])
+    write_run(tmp_path / "sac/x_2", [1000, 2000], [5, 7])
+    picture = tmp_path / "picture.png"
+    plots.main([str(tmp_path), "-o", str(picture), "--published", "none"])
+    output, errors = capsys.readouterr()
+    assert "| 2,000 | bro | 1 | 3 |" in output and "| 2,000 | sac | 1 | 7 |" in output
+    for run in ("bro/x_2", "sac/x_1"):
+        assert f"{tmp_path / run} has no finished episode yet, and is left out" in errors
+    with pytest.raises(SystemExit, match="at least one finished episode; none of them has"):
+        plots.main([str(tmp_path / "bro/x_2"), "-o", str(picture)])
+
+
 def test_plot_takes_labels_and_infers_the_environment(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = write_run(tmp_path / "bro/1", [10], [1], "metaworld/push-v3", successes=True)
     second = write_run(tmp_path / "bro/2", [10], [0], "metaworld/push-v3", successes=True)

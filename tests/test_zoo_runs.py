@@ -330,6 +330,29 @@ def test_one_of_several_monitor_files_may_be_missing(run) -> None:
     assert len(read_monitors("a")) == 3
 
 
+@pytest.mark.parametrize("arguments", [["--run-dir", "a"], []])
+def test_ctrl_c_is_one_line_and_130(
+    arguments: list[str], run, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(self: Any, *_: Any) -> None:
+        if self.num_timesteps == 50:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ALGOS["sac_sample"], "train", interrupted)
+        with pytest.raises(SystemExit) as caught:
+            run("-n", "200", *arguments)
+    assert caught.value.code == 128 + signal.SIGINT
+    *before, last = capfd.readouterr().err.splitlines()
+    assert last.startswith("sb3-sample train: interrupted; ")
+    assert ("--run-dir a goes on" in last) == bool(arguments) == any("finishing the turn" in line for line in before)
+    assert not [line for line in before if "Traceback" in line]
+    assert ALGOS["sac_sample"].load(next(Path().rglob("Pendulum-v1.zip"))).num_timesteps == 50
+    if arguments:
+        run("-n", "60", *arguments)
+        assert steps("a") == [50, 60]
+
+
 def test_help_has_both_kinds_of_options(run, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_:
         cli.main(["train", "--help"])
@@ -383,14 +406,14 @@ def test_a_killed_run_is_started_again_and_ends_as_one_that_never_was(
 @pytest.mark.slow
 def test_a_run_that_is_interrupted_saves_and_leaves(tmp_path: Path) -> None:
     arguments = ["--run-dir", "a", "--checkpoint-freq", "400", "--eval-freq", "-1"]
-    for sign, code in ((signal.SIGTERM, 128 + signal.SIGTERM), (signal.SIGINT, 0)):
+    for sign, code in ((signal.SIGTERM, 128 + signal.SIGTERM), (signal.SIGINT, 128 + signal.SIGINT)):
         before = max(steps(tmp_path / "a"), default=0)
         process = start(tmp_path, *arguments, "-n", "1000000", "-params", *OFF_POLICY)
         until = time.monotonic() + 120
         while max(steps(tmp_path / "a"), default=0) < before + 800 and time.monotonic() < until:
             time.sleep(0.01)
         process.send_signal(sign)
-        # The zoo takes a KeyboardInterrupt for the end, and saves the model.
+        # The zoo saves the model after a KeyboardInterrupt.
         assert process.wait(60) == code
         assert max(steps(tmp_path / "a")) % 400 != 0 or before > 0
         assert (tmp_path / "a/Pendulum-v1.zip").exists() == (sign == signal.SIGINT)

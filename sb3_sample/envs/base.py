@@ -10,6 +10,8 @@ from types import ModuleType
 import numpy as np
 from gymnasium import spaces
 
+from sb3_sample.extras import install
+
 
 def import_library(module: str, extra: str, then: str = "") -> ModuleType:
     """
@@ -26,7 +28,7 @@ def import_library(module: str, extra: str, then: str = "") -> ModuleType:
     except ModuleNotFoundError as error:
         raise ImportError(
             f"The {extra}/ environments need {module.split('.')[0]} ({error}). "
-            f'Install it with: pip install "sb3_sample[{extra}]"{then and f", then: {then}"}'
+            f"Install it with: {install(extra)}{then and f', then: {then}'}"
         ) from error
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch.optim import Optimizer
 
+from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, check_value, integer
 from sb3_sample.learner import losses
 from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.parts import Learning, Part
@@ -99,11 +100,9 @@ class OptimisticExploration(Exploration):
         adjustment_learning_rate: float,
     ):
         super().__init__(learner)
-        for name, value in (("kl_target", kl_target), ("std_multiplier", std_multiplier)):
-            if not 0 < value < math.inf:
-                raise ValueError(f"{name} must be above 0 and finite, not {value}")
-        if not 0 <= adjustment_learning_rate < math.inf:
-            raise ValueError(f"adjustment_learning_rate must be at least 0 and finite, not {adjustment_learning_rate}")
+        check_value("kl_target", kl_target, ABOVE_0)
+        check_value("std_multiplier", std_multiplier, ABOVE_0)
+        check_value("adjustment_learning_rate", adjustment_learning_rate, AT_LEAST_0)
         if uncertainty not in UNCERTAINTIES:
             raise ValueError(f"uncertainty must be one of {UNCERTAINTIES}, not {uncertainty!r}")
         if uncertainty != "epistemic" and learner.head.n_outputs < 2:
@@ -317,12 +316,10 @@ class OptimisticActor(OptimisticExploration):
             distance = max(distance, self.BARRIER)
         if not 0 < distance < math.inf:
             raise ValueError(f"initial_optimism must be above minus the pessimism, {-beta}, not {initial_optimism}")
-        if not 0 < initial_kl_weight < math.inf:
-            raise ValueError(f"initial_kl_weight must be above 0 and finite, not {initial_kl_weight}")
+        check_value("initial_kl_weight", initial_kl_weight, ABOVE_0)
         if kl_direction not in self.KL_DIRECTIONS:
             raise ValueError(f"kl_direction must be one of {self.KL_DIRECTIONS}, not {kl_direction!r}")
-        if reinitialize_every is not None and not reinitialize_every >= 1:
-            raise ValueError(f"reinitialize_every must be at least 1, or None for never, not {reinitialize_every}")
+        check_value("reinitialize_every", reinitialize_every, integer(1).or_none("never"))
         self.kl_direction = kl_direction
         self.reinitialize_every = reinitialize_every
         self.actor = learner.make_actor()
@@ -397,9 +394,8 @@ class OptimisticGradient(Exploration):
 
     def __init__(self, learner: Learning, optimism: float = 4.36, kl_radius: float = 3.69**2 / 2):
         super().__init__(learner)
-        for name, value in (("optimism", optimism), ("kl_radius", kl_radius)):
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name} must be at least 0 and finite, not {value}")
+        check_value("optimism", optimism, AT_LEAST_0)
+        check_value("kl_radius", kl_radius, AT_LEAST_0)
         if not learner.actor.has_entropy:
             raise ValueError("exploration='oac' shifts a Gaussian: it needs backbone='sac', not 'td3'")
         self.optimism = optimism

@@ -15,8 +15,8 @@ import torch
 from torch import nn
 from torch.optim import Optimizer
 
-from sb3_sample.arguments import is_integer, is_number
 from sb3_sample.errors import ParametersDoNotFit
+from sb3_sample.kinds import is_integer, is_number
 from sb3_sample.learner.batch import Batch, CriticStep, Extra, Source
 from sb3_sample.learner.parts import Learning, Part
 from sb3_sample.learner.q_values import evaluate

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from sb3_sample.arguments import is_integer
 from sb3_sample.console import say
+from sb3_sample.kinds import is_integer
 from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.parts import Learning, Part
 from sb3_sample.networks.dormant import recycle

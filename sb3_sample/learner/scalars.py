@@ -5,6 +5,8 @@ import math
 import torch
 from torch import nn
 
+from sb3_sample.kinds import check_value, number
+
 
 class LogScalar(nn.Module):
     """
@@ -38,8 +40,8 @@ class BoundedLogScalar(nn.Module):
 
     def __init__(self, name: str, initial: float, low: float = -10.0, high: float = 7.5):
         super().__init__()
-        if not math.exp(low) < initial < math.exp(high):
-            raise ValueError(f"{name} must lie between exp({low}) and exp({high}), exclusive, not {initial}")
+        words = f"lie between exp({low}) and exp({high}), exclusive"
+        check_value(name, initial, number(words, lambda value: math.exp(low) < value < math.exp(high)))
         self.low, self.half_range = low, (high - low) / 2
         self.raw_value = nn.Parameter(torch.tensor(math.atanh((math.log(initial) - low) / self.half_range - 1)))
 

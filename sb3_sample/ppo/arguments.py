@@ -1,17 +1,57 @@
 """Checks of the on-policy family's arguments."""
 
-import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 
-from sb3_sample.arguments import check_unused, is_integer, is_number
+from sb3_sample.arguments import check_every, check_net_arch, check_table, check_unused, named_policy
+from sb3_sample.kinds import (
+    ABOVE_0,
+    AT_LEAST_0,
+    DICT,
+    FINITE,
+    TRUE_OR_FALSE,
+    UNIT,
+    Kind,
+    check_value,
+    integer,
+    is_number,
+    number,
+    subclass,
+)
 
 if TYPE_CHECKING:
     from sb3_sample.ppo.simulated_ppo import SimulatedPPO
+
+
+_CLIPPING = ABOVE_0.otherwise("a schedule", callable)
+#: By argument, what it must be.
+ARGUMENTS: dict[str, Kind] = {
+    "n_steps": integer(1),
+    "batch_size": integer(1),
+    "n_epochs": integer(1),
+    "gamma": UNIT,
+    "gae_lambda": UNIT,
+    "clip_range": _CLIPPING,
+    "clip_range_vf": _CLIPPING.or_none(),
+    "normalize_advantage": TRUE_OR_FALSE,
+    "ent_coef": FINITE,
+    "vf_coef": AT_LEAST_0,
+    "max_grad_norm": number("be above 0 (float('inf') for no limit)", lambda value: value > 0),
+    "rollout_buffer_class": subclass(RolloutBuffer).or_none(),
+    "rollout_buffer_kwargs": DICT,
+    "target_kl": number("be above 0", lambda value: value > 0).or_none("no limit"),
+    "n_simulated": integer(0),
+    "anneal_until": Kind(
+        "lie in (0, 1], a share of the training, or be None",
+        lambda value: value is None or (is_number(value) and 0 < value <= 1),
+    ),
+    "warm_up_until": Kind(
+        "lie in [0, 1], a share of the training, or be None", lambda value: value is None or UNIT.fits(value)
+    ),
+}
 
 
 def check(agent: "SimulatedPPO") -> None:
@@ -19,9 +59,12 @@ def check(agent: "SimulatedPPO") -> None:
     :param agent: an algorithm whose arguments are stored and whose networks do not exist yet
     :raises ValueError: if an argument is out of range or contradicts another
     """
-    check_counts(agent.n_steps, agent.batch_size, agent.n_epochs, agent.normalize_advantage)
-    _check_numbers(agent)
-    check_integer("n_simulated", agent.n_simulated, 0)
+    check_every(agent)
+    check_table(agent, ARGUMENTS)
+    _check_minibatches(agent.batch_size, agent.normalize_advantage)
+    if named_policy(agent) is not None:
+        _check_net_arch(agent.policy_kwargs.get("net_arch"))
+    _check_buffer_class(agent)
     _check_schedule(agent)
     if agent.n_simulated == 0:
         check_unused(agent, agent.simulation_arguments, "n_simulated=0")
@@ -35,45 +78,36 @@ def check_counts(n_steps: Any, batch_size: Any, n_epochs: Any, normalize_advanta
 
     :raises ValueError: if one of them is out of range
     """
-    for name, value in (("n_steps", n_steps), ("batch_size", batch_size), ("n_epochs", n_epochs)):
-        check_integer(name, value, 1)
-    if not isinstance(normalize_advantage, (bool, np.bool_)):
-        raise ValueError(f"normalize_advantage must be True or False, not {normalize_advantage!r}")
+    given = {"n_steps": n_steps, "batch_size": batch_size, "n_epochs": n_epochs}
+    for name, value in {**given, "normalize_advantage": normalize_advantage}.items():
+        check_value(name, value, ARGUMENTS[name])
+    _check_minibatches(batch_size, normalize_advantage)
+
+
+def _check_minibatches(batch_size: int, normalize_advantage: bool) -> None:
     if normalize_advantage and batch_size == 1:
         raise ValueError("batch_size must be at least 2 with normalize_advantage=True, not 1")
 
 
-def _check_numbers(agent: "SimulatedPPO") -> None:
-    for name in ("gamma", "gae_lambda"):
-        value = getattr(agent, name)
-        if not is_number(value) or not 0 <= value <= 1:
-            raise ValueError(f"{name} must lie in [0, 1], not {value!r}")
-    value = agent.learning_rate
-    if not callable(value) and (not is_number(value) or not 0 <= value < math.inf):
-        raise ValueError(f"learning_rate must be at least 0 and finite, or a schedule, not {value!r}")
-    for name, otherwise in (("clip_range", ""), ("clip_range_vf", ", or None")):
-        value = getattr(agent, name)
-        if value is None and otherwise:
-            continue
-        if not callable(value) and (not is_number(value) or not 0 < value < math.inf):
-            raise ValueError(f"{name} must be above 0 and finite, or a schedule{otherwise}, not {value!r}")
-    if not is_number(agent.ent_coef) or not math.isfinite(agent.ent_coef):
-        raise ValueError(f"ent_coef must be a finite number, not {agent.ent_coef!r}")
-    if not is_number(agent.vf_coef) or not 0 <= agent.vf_coef < math.inf:
-        raise ValueError(f"vf_coef must be at least 0 and finite, not {agent.vf_coef!r}")
-    if not is_number(agent.max_grad_norm) or not agent.max_grad_norm > 0:
-        raise ValueError(f"max_grad_norm must be above 0 (float('inf') for no limit), not {agent.max_grad_norm!r}")
-    if agent.target_kl is not None and (not is_number(agent.target_kl) or not agent.target_kl > 0):
-        raise ValueError(f"target_kl must be above 0, or None for no limit, not {agent.target_kl!r}")
+def _check_net_arch(net_arch: Any) -> None:
+    if isinstance(net_arch, list) and len(net_arch) == 1 and isinstance(net_arch[0], dict):
+        net_arch = net_arch[0]  # As of old; Stable-Baselines3 warns of it.
+    check_net_arch(net_arch, ("pi", "vf"), both=False)
+
+
+def _check_buffer_class(agent: "SimulatedPPO") -> None:
+    cls, space = agent.rollout_buffer_class, agent.observation_space
+    if cls is not None and issubclass(cls, DictRolloutBuffer) and not isinstance(space, spaces.Dict):
+        raise ValueError(
+            f"rollout_buffer_class={cls.__name__} needs a Dict observation space, not {space}: leave it out"
+        )
+    if cls is RolloutBuffer and isinstance(space, spaces.Dict):
+        raise ValueError(f"rollout_buffer_class={cls.__name__} cannot hold the observations of {space}: leave it out")
 
 
 def _check_schedule(agent: "SimulatedPPO") -> None:
     """When there are how many simulated samples."""
     anneal, warm_up = agent.anneal_until, agent.warm_up_until
-    if anneal is not None and (not is_number(anneal) or not 0 < anneal <= 1):
-        raise ValueError(f"anneal_until must lie in (0, 1], a share of the training, or be None, not {anneal!r}")
-    if warm_up is not None and (not is_number(warm_up) or not 0 <= warm_up <= 1):
-        raise ValueError(f"warm_up_until must lie in [0, 1], a share of the training, or be None, not {warm_up!r}")
     if anneal is not None and (warm_up or 0) >= anneal:
         raise ValueError(f"warm_up_until must be below anneal_until={anneal}, not {warm_up}")
 
@@ -101,17 +135,6 @@ def _check_simulation(agent: "SimulatedPPO") -> None:
         )
 
 
-def check_integer(name: str, value: Any, low: int) -> None:
-    """
-    :param name: name of an argument
-    :param value: its value
-    :param low: the smallest allowed
-    :raises ValueError: if it is no integer, or below that
-    """
-    if not is_integer(value) or value < low:
-        raise ValueError(f"{name} must be an integer of at least {low}, not {value!r}")
-
-
 def check_network_kwargs(name: str, kwargs: dict[str, Any] | None, allowed: Mapping[str, Any]) -> dict[str, Any]:
     """
     :param name: name of the argument
@@ -124,17 +147,15 @@ def check_network_kwargs(name: str, kwargs: dict[str, Any] | None, allowed: Mapp
         return dict(allowed)
     if not isinstance(kwargs, Mapping):
         raise ValueError(f"{name} must be a dict with some of {list(allowed)}, or None, not {kwargs!r}")
+    plain: dict[str, Any] = {}
     for key, value in kwargs.items():
         if key not in allowed:
             raise ValueError(f"{name} has {key!r}, but takes {list(allowed)}")
         if isinstance(allowed[key], bool):
-            if not isinstance(value, bool):
-                raise ValueError(f"{name}[{key!r}] must be True or False, not {value!r}")
+            kind = TRUE_OR_FALSE
         elif key == "learning_rate":
-            if not is_number(value) or not 0 <= value < math.inf:
-                raise ValueError(f"{name}['learning_rate'] must be at least 0 and finite, not {value!r}")
-        elif not (key == "epochs" and value is None):
-            check_integer(f"{name}[{key!r}]", value, 1)
-    # torch does not take NumPy's numbers everywhere.
-    plain = {key: value.item() if isinstance(value, np.generic) else value for key, value in kwargs.items()}
+            kind = AT_LEAST_0
+        else:
+            kind = integer(1).or_none() if key == "epochs" else integer(1)
+        plain[key] = check_value(f"{name}[{key!r}]", value, kind)
     return {**allowed, **plain}

@@ -12,7 +12,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.ppo.arguments import check_integer, check_network_kwargs
+from sb3_sample.kinds import check_value, integer
+from sb3_sample.ppo.arguments import check_network_kwargs
 from sb3_sample.ppo.dynamics import Dynamics, TransitionBuffer, Transitions
 from sb3_sample.ppo.simulated_ppo import SimulatedPPO
 
@@ -133,7 +134,7 @@ class ModelBasedPPO(SimulatedPPO):
     def _check_arguments(self) -> None:
         super()._check_arguments()
         for name in ("simulation_horizon", "dynamics_buffer_size", "dynamics_batch_size"):
-            check_integer(name, getattr(self, name), 1)
+            check_value(name, getattr(self, name), integer(1))
         check_network_kwargs("dynamics_kwargs", self.dynamics_kwargs, DYNAMICS_DEFAULTS)
         if self.predict_termination is not None and not isinstance(self.predict_termination, bool):
             raise ValueError(f"predict_termination must be True, False or None, not {self.predict_termination!r}")

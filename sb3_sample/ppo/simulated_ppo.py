@@ -26,16 +26,17 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.arguments import check_known, default_of, naming_changes
+from sb3_sample.arguments import check_learn, check_load, check_n_envs, check_program, default_of, naming_changes
 from sb3_sample.console import say
 from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.envs.workers import watch_workers
 from sb3_sample.export import Exportable
 from sb3_sample.faults import TrainingDiverged, check_finite_parameters, not_finite
+from sb3_sample.kinds import check_value, integer
 from sb3_sample.ppo import arguments
 from sb3_sample.ppo.dynamics import minibatches
 from sb3_sample.ppo.spaces import FlatObservations, ModelActions
-from sb3_sample.saving.checkpoint import Checkpointer
+from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ, Checkpointer, refuse_second_call
 from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.model_tree import Description
 from sb3_sample.saving.notice import say_once
@@ -141,6 +142,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
+    policy_base = ActorCriticPolicy
     #: Arguments that mean nothing without simulated samples.
     simulation_arguments: ClassVar[tuple[str, ...]] = ("anneal_until", "warm_up_until")
 
@@ -177,6 +179,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         anneal_until: float | None = None,
         warm_up_until: float | None = None,
     ):
+        check_program(type(self), policy, env, device, verbose)
         arguments.check_counts(n_steps, batch_size, n_epochs, normalize_advantage)
         super().__init__(
             policy,
@@ -284,6 +287,17 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         watch_workers(venv)
         return venv
 
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        Go on with another environment, as in Stable-Baselines3.
+
+        :param env: the environment, of the same spaces and as many as the model was made with
+        :param force_reset: whether it is reset before training goes on
+        :raises ValueError: if it is not
+        """
+        check_n_envs(self, env)
+        super().set_env(env, force_reset)
+
     # ---------------------------------------------------------------- saving and loading
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -326,7 +340,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
         :raises ValueError: if ``kwargs`` holds something else, or values with which the file's parameters do not fit
         """
-        check_known(cls, PPO, kwargs)
+        check_load(cls, PPO, env, device, kwargs)
         changes = dict(kwargs)
         if kwargs.get("n_simulated") == 0:
             # What the file says of simulated samples is not what the caller has asked for.
@@ -355,7 +369,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
         checkpoint: str | pathlib.Path | None = None,
-        checkpoint_freq: int = 10_000,
+        checkpoint_freq: int = CHECKPOINT_FREQ,
     ) -> Self:
         """
         Train, as in Stable-Baselines3; with ``checkpoint``, so that nothing is lost when the program ends before it is
@@ -368,13 +382,15 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         :param tb_log_name: name of the run in the TensorBoard log; the class's name if None
         :param reset_num_timesteps: whether ``num_timesteps`` starts at zero again
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
-        :param checkpoint: folder of the run, for one call of ``learn``; None for no checkpoints
+        :param checkpoint: folder of the run; None for no checkpoints. Each call of ``learn`` needs a folder of its own
         :param checkpoint_freq: environment steps between two checkpoints, each at the end of an iteration
         :return: the trained model
-        :raises ValueError: if the folder is of another run (the message names what differs), cannot be used, or has
-            checkpoints that are all damaged
+        :raises ValueError: if an argument is out of range, or the folder is of another run (the message names what
+            differs) or of an earlier call of ``learn``, cannot be used, or has checkpoints that are all damaged
         :raises TrainingDiverged: if a loss or a parameter is NaN or infinite
         """
+        total_timesteps = check_learn(self, locals())
+        refuse_second_call(self, checkpoint)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
@@ -583,7 +599,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         """
         self._check_simulates()
         n = self.current_n_simulated() if n_simulated is None else n_simulated
-        arguments.check_integer("n_simulated", n, 1)
+        check_value("n_simulated", n, integer(1))
         self.policy.set_training_mode(False)
         with torch.no_grad():
             if values is None:

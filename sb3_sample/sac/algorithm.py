@@ -6,6 +6,7 @@ The update is the learner's (``sb3_sample/learner/learner.py``).
 
 import io
 import pathlib
+import warnings
 from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar
 
@@ -21,7 +22,7 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.arguments import check_known, default_of, naming_changes
+from sb3_sample.arguments import check_learn, check_load, check_n_envs, check_program, default_of, naming_changes
 from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.envs.workers import watch_workers
 from sb3_sample.errors import ParametersDoNotFit
@@ -55,7 +56,7 @@ from sb3_sample.sac.model_learner import check_action_space
 from sb3_sample.sac.policies import BACKBONES, CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.sb3_names import SB3Names
 from sb3_sample.sac.sources import ReplaySource
-from sb3_sample.saving.checkpoint import Checkpointer
+from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ, Checkpointer, refuse_second_call
 from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.model_tree import Description
@@ -146,6 +147,7 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
+    policy_base = SACPolicy
     policy: SACPolicy
     #: beta1 of the temperature's Adam.
     temperature_beta1: ClassVar[float] = 0.9
@@ -199,6 +201,7 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         compile: bool | str = "auto",
         _init_setup_model: bool = True,
     ):
+        check_program(type(self), policy, env, device, verbose)
         arguments.check_use_sde(use_sde)
         super().__init__(
             policy,
@@ -381,11 +384,11 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         allowed = "'auto' or 'auto_<start above 0>'"
         if isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto"):
             start = self.ent_coef.removeprefix("auto").removeprefix("_") or "1"
-            value = arguments.number("ent_coef", start, allowed, shown=self.ent_coef)
+            value = arguments.as_number("ent_coef", start, allowed, shown=self.ent_coef)
             if not 0 < value < np.inf:
                 raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
             return LogScalar(value).to(self.device)
-        value = arguments.number("ent_coef", self.ent_coef, allowed)
+        value = arguments.as_number("ent_coef", self.ent_coef, allowed)
         if not 0 <= value < np.inf:
             raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
         return FixedScalar(value).to(self.device)
@@ -409,13 +412,6 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         make, kwargs = PESSIMISMS[self.pessimism], self._full_pessimism_kwargs()
         arguments.check_names("pessimism", self.pessimism, make, kwargs)
         return make(learner, **kwargs)  # type: ignore[no-any-return]
-
-    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
-        if policy_name not in self.policy_aliases:
-            raise ValueError(
-                f"policy must be one of {list(self.policy_aliases)} or a policy class, not {policy_name!r}"
-            )
-        return self.policy_aliases[policy_name]
 
     @classmethod
     def load(
@@ -451,7 +447,7 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
         :raises ValueError: if ``kwargs`` holds something else, or values that are not allowed
         """
-        check_known(cls, SAC, kwargs)
+        check_load(cls, SAC, env, device, kwargs)
         if "compile" in kwargs:
             kwargs["compiled"] = None
         if "train_freq" in kwargs or "gradient_steps" in kwargs:
@@ -511,6 +507,17 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         FiniteCheck.install(venv)
         watch_workers(venv)
         return venv
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        Go on with another environment, as in Stable-Baselines3.
+
+        :param env: the environment, of the same spaces and as many as the model was made with
+        :param force_reset: whether it is reset before training goes on
+        :raises ValueError: if it is not
+        """
+        check_n_envs(self, env)
+        super().set_env(env, force_reset)
 
     def _parts(self) -> dict[str, Part]:
         return {name: part for name, part in self.learner.parts().items() if part.has_state}
@@ -623,7 +630,7 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
         checkpoint: str | pathlib.Path | None = None,
-        checkpoint_freq: int = 10_000,
+        checkpoint_freq: int = CHECKPOINT_FREQ,
     ) -> Self:
         """
         Train, as in Stable-Baselines3; with ``checkpoint``, so that nothing is lost when the program ends before it is
@@ -636,13 +643,15 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         :param tb_log_name: name of the run in the TensorBoard log; the class's name if None
         :param reset_num_timesteps: whether ``num_timesteps`` starts at zero again
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
-        :param checkpoint: folder of the run, for one call of ``learn``; None for no checkpoints
+        :param checkpoint: folder of the run; None for no checkpoints. Each call of ``learn`` needs a folder of its own
         :param checkpoint_freq: environment steps between two checkpoints
         :return: the trained model
-        :raises ValueError: if the folder is of another run (the message names what differs), cannot be used, or has
-            checkpoints that are all damaged
+        :raises ValueError: if an argument is out of range, or the folder is of another run (the message names what
+            differs) or of an earlier call of ``learn``, cannot be used, or has checkpoints that are all damaged
         :raises TrainingDiverged: if a loss, another metric or a parameter is NaN or infinite
         """
+        total_timesteps = check_learn(self, locals())
+        refuse_second_call(self, checkpoint)
         resets_environment = reset_num_timesteps or self._last_obs is None
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
@@ -675,6 +684,8 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
                 if n_updates > 0:
                     self.train(n_updates, self.batch_size)
                 checkpointer.after_turn()
+            else:
+                self._warn_of_warm_up()
             check_finite_parameters(self)
             checkpointer.finish()
         return self
@@ -705,19 +716,37 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
             warn_not_compiled(self.learner, reason)
         self.learner.forget_execution()
 
+    def _warn_of_warm_up(self) -> None:
+        """Say at the end of a training, which no callback has ended, that nothing was learned for want of steps."""
+        wanted = self.gradient_steps if self.replay_ratio is None else self.replay_ratio
+        if self._n_updates > 0 or self.num_transitions == 0 or wanted == 0 or not self._is_warming_up():
+            return
+        assert self.replay_buffer is not None
+        warnings.warn(
+            f"learn ended without a single gradient step: learning_starts={self.learning_starts} transitions come "
+            f"before the first, and the replay buffer has {self.replay_buffer.size() * self.n_envs} of the "
+            f"{self.num_transitions} of this model's life. Train for more than {self.learning_starts} steps, or pass a "
+            "smaller learning_starts= to the constructor or to load (Stable-Baselines3's SAC has 100)",
+            stacklevel=3,
+        )
+
+    def _is_warming_up(self) -> bool:
+        """Whether there are too few transitions for a gradient step."""
+        assert self.replay_buffer is not None
+        if self.num_transitions <= self.learning_starts:
+            return True
+        # A model that was loaded without its buffer fills it first, acting with what it has learned.
+        capacity = self.replay_buffer.buffer_size * self.n_envs
+        return self.replay_buffer.size() * self.n_envs < min(self.learning_starts, capacity)
+
     def _updates_due(self, n_collected: int) -> int:
         """
         :param n_collected: transitions just collected
         :return: gradient steps to take now
         """
-        assert self.replay_buffer is not None
-        if self.num_transitions <= self.learning_starts:
+        if self._is_warming_up():
             return 0
         if isinstance(self.replay_buffer, ValidationSplit) and self.replay_buffer.n_training == 0:
-            return 0
-        # A model that was loaded without its buffer fills it first, acting with what it has learned.
-        capacity = self.replay_buffer.buffer_size * self.n_envs
-        if self.replay_buffer.size() * self.n_envs < min(self.learning_starts, capacity):
             return 0
         if self.replay_ratio is None:
             return self.gradient_steps if self.gradient_steps >= 0 else n_collected

@@ -3,14 +3,17 @@
 import inspect
 import math
 from collections.abc import Callable, Sequence
-from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import TrainFreq
+from stable_baselines3.her import HerReplayBuffer
 
-from sb3_sample.arguments import check_unused
+from sb3_sample.arguments import NotAllowed, check_every, check_table, check_unused
+from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, DICT, UNIT, Kind, check_value, instance, integer, number, subclass
 from sb3_sample.learner.exploration import EXPLORATIONS
 from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, check_beta
 from sb3_sample.sac.buffers import DeviceReplayBuffer
@@ -20,42 +23,46 @@ if TYPE_CHECKING:
     from sb3_sample.sac.algorithm import SAC
 
 
+#: By argument, what it must be.
+ARGUMENTS: dict[str, Kind] = {
+    "buffer_size": integer(1),
+    "learning_starts": integer(0),
+    "batch_size": integer(1),
+    "tau": number("lie in (0, 1]", lambda value: 0 < value <= 1),
+    "gamma": UNIT,
+    "gradient_steps": Kind("be an integer of at least 0, or -1 for as many as transitions", integer(-1).fits),
+    "action_noise": instance(ActionNoise).or_none(),
+    "replay_buffer_class": subclass(ReplayBuffer).or_none(),
+    "replay_buffer_kwargs": DICT,
+    "n_steps": integer(1),
+    "target_update_interval": integer(1).or_none("policy_delay"),
+    "replay_ratio": AT_LEAST_0.or_none(),
+    "n_quantiles": integer(1).or_none("scalar critics"),
+    "pessimism_kwargs": DICT,
+    "validation_proportion": number("lie in [0, 1)", lambda value: 0 <= value < 1),
+    "exploration": Kind(
+        f"be one of {sorted(EXPLORATIONS)}", lambda value: isinstance(value, str) and value in EXPLORATIONS
+    ),
+    "exploration_kwargs": DICT,
+    "policy_delay": integer(1),
+    "reset_shrink": number("lie in [0, 1)", lambda value: 0 <= value < 1),
+    "reset_gradient_steps": integer(1).or_none("no such resets"),
+    "redo_period": integer(1).or_none("no recycling"),
+    "redo_threshold": number("be at least 0", lambda value: value >= 0),
+    "sam_radius": ABOVE_0.or_none("no SAM"),
+}
+
+
 def check(agent: "SAC") -> None:
     """
     :param agent: an algorithm whose arguments are stored and whose networks do not exist yet
     :raises ValueError: if an argument is out of range or contradicts another
     """
-    for name, low in (
-        ("buffer_size", 1),
-        ("learning_starts", 0),
-        ("batch_size", 1),
-        ("target_update_interval", 1),
-        ("policy_delay", 1),
-        ("n_steps", 1),
-    ):
-        value = getattr(agent, name)
-        if name == "batch_size" and not isinstance(value, Integral):
-            raise ValueError(f"batch_size must be an integer, not {value!r}")
-        if name == "target_update_interval" and value is None:
-            continue
-        if not value >= low or (name == "policy_delay" and value != int(value)):
-            raise ValueError(f"{name} must be at least {low}, not {value}")
-    if (
-        not callable(agent.learning_rate)
-        and not 0 <= number("learning_rate", agent.learning_rate, "a schedule") < math.inf
-    ):
-        raise ValueError(f"learning_rate must be at least 0 and finite, or a schedule, not {agent.learning_rate}")
-    if isinstance(agent.replay_ratio, str) or not (agent.replay_ratio is None or 0 <= agent.replay_ratio < math.inf):
-        raise ValueError(f"replay_ratio must be at least 0 and finite, not {agent.replay_ratio!r}")
-    if not 0 < agent.tau <= 1:
-        raise ValueError(f"tau must lie in (0, 1], not {agent.tau}")
-    if not 0 <= agent.gamma <= 1:
-        raise ValueError(f"gamma must lie in [0, 1], not {agent.gamma}")
+    check_every(agent)
+    check_table(agent, ARGUMENTS)
+    n_critics = check_value("n_critics", agent.policy_kwargs.get("n_critics", 2), integer(1))
     check_target_entropy(agent)
     check_use_sde(agent.use_sde)
-    if agent.exploration not in EXPLORATIONS:
-        raise ValueError(f"exploration must be one of {sorted(EXPLORATIONS)}, not {agent.exploration!r}")
-    n_critics = agent.policy_kwargs.get("n_critics", 2)
     if n_critics == 1 and (isinstance(agent.pessimism, str) or agent.exploration == "oac"):
         what = f"pessimism={agent.pessimism!r}" if isinstance(agent.pessimism, str) else "exploration='oac'"
         raise ValueError(f"{what} weighs the critics' spread, which n_critics=1 has not")
@@ -68,8 +75,6 @@ def check(agent: "SAC") -> None:
         )
     if agent.reset_gradient_steps is None and not has_resets(agent.resets):
         check_unused(agent, ["reset_shrink"], "no resets")
-    if agent.sam_radius is not None and not 0 < agent.sam_radius < math.inf:
-        raise ValueError(f"sam_radius must be above 0 and finite, or None for no SAM, not {agent.sam_radius}")
     if agent.compile not in (True, False, "auto") or not isinstance(agent.compile, (bool, str)):
         raise ValueError(f"compile must be True, False or 'auto', not {agent.compile!r}")
     for name in ("n_quantiles", "backbone"):
@@ -78,6 +83,7 @@ def check(agent: "SAC") -> None:
     if agent.backbone == "td3":
         _check_no_entropy(agent, "ent_coef")
     _check_pessimism(agent)
+    _check_buffer_class(agent)
     _check_replay(agent)
     _check_n_steps(agent)
     _check_memory_map(agent)
@@ -101,7 +107,7 @@ def check_target_entropy(agent: "SAC") -> None:
     if agent.backbone == "td3":
         _check_no_entropy(agent, "target_entropy")
     value = agent.target_entropy
-    if value != "auto" and not math.isfinite(number("target_entropy", value, "'auto'")):
+    if value != "auto" and not math.isfinite(as_number("target_entropy", value, "'auto'")):
         raise ValueError(f"target_entropy must be finite, or 'auto', not {value}")
 
 
@@ -144,16 +150,35 @@ def _check_pessimism(agent: "SAC") -> None:
         )
     if agent.target_subset is not None:
         n_critics = agent.policy_kwargs.get("n_critics", 2)
-        if not 1 <= agent.target_subset <= n_critics or agent.target_subset != int(agent.target_subset):
+        if not integer(1, n_critics).fits(agent.target_subset):
             raise ValueError(
                 f"target_subset must lie between 1 and the number of critics, {n_critics} "
-                f"(policy_kwargs['n_critics']), or be None for all, not {agent.target_subset}"
+                f"(policy_kwargs['n_critics']), or be None for all, not {agent.target_subset!r}"
             )
 
 
+def _check_buffer_class(agent: "SAC") -> None:
+    """Whether the buffer is one for the observations."""
+    cls, space = agent.replay_buffer_class, agent.observation_space
+    is_dict = isinstance(space, spaces.Dict)
+    if cls is None:
+        if agent.n_steps > 1 and is_dict:
+            raise NotAllowed(f"n_steps={agent.n_steps} is not supported with Dict observation spaces: pass n_steps=1")
+        return
+    if issubclass(cls, DictReplayBuffer) and not is_dict:
+        raise ValueError(
+            f"replay_buffer_class={cls.__name__} needs a Dict observation space, not {space}: leave it out"
+        )
+    if is_dict and cls in (ReplayBuffer, NStepReplayBuffer):
+        raise ValueError(f"replay_buffer_class={cls.__name__} cannot hold the observations of {space}: leave it out")
+    goals = {"observation", "achieved_goal", "desired_goal"}
+    if issubclass(cls, HerReplayBuffer) and isinstance(space, spaces.Dict) and not goals <= space.spaces.keys():
+        raise ValueError(
+            f"replay_buffer_class={cls.__name__} needs an observation space with {sorted(goals)}, not {space}"
+        )
+
+
 def _check_replay(agent: "SAC") -> None:
-    if not 0 <= number("validation_proportion", agent.validation_proportion, "None in VPLSAC") < 1:
-        raise ValueError(f"validation_proportion must lie in [0, 1), not {agent.validation_proportion}")
     if agent.validation_proportion > 0:
         cls = agent.replay_buffer_class
         if cls is not None and cls not in (ReplayBuffer, DictReplayBuffer) and not issubclass(cls, CompactReplay):
@@ -272,7 +297,7 @@ def check_once(kwargs_name: str, kwargs: dict[str, Any] | None, arguments: dict[
             raise ValueError(f"{kwargs_name} has {key!r}, which is the argument {arguments[key]} here: pass that")
 
 
-def number(name: str, value: Any, otherwise: str, shown: Any = None) -> float:
+def as_number(name: str, value: Any, otherwise: str, shown: Any = None) -> float:
     """
     :param name: name of an argument
     :param value: its value

@@ -1,6 +1,5 @@
 """BRO, BRO Fast, and BRO on TD3."""
 
-import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -10,6 +9,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_sample.arguments import check_unused
+from sb3_sample.kinds import AT_LEAST_0, check_value
 from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
@@ -201,8 +201,7 @@ class BRO(SAC):
             arguments.check_once("exploration_kwargs", self.exploration_kwargs, same)
         else:
             check_unused(self, OPTIMISTIC_SHIFT_SETTINGS, f"exploration={self.exploration!r}")
-        if not 0 <= self.weight_decay < math.inf:
-            raise ValueError(f"weight_decay must be at least 0 and finite, not {self.weight_decay}")
+        check_value("weight_decay", self.weight_decay, AT_LEAST_0)
         described = sorted({"critic_network", "critic_network_kwargs"} & self.policy_kwargs.keys())
         if described and self.model_size is not None:
             raise ValueError(

@@ -5,6 +5,7 @@ from typing import Any
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_sample.arguments import check_unused
+from sb3_sample.kinds import FINITE, check_value
 from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
@@ -85,7 +86,7 @@ class DAC(SAC):
         if self.exploration == "optimistic_actor":
             same = {name: name for name in OPTIMISTIC_ACTOR_SETTINGS}
             arguments.check_once("exploration_kwargs", self.exploration_kwargs, same)
-        start, beta = self.initial_optimism, self.pessimism
+        start, beta = check_value("initial_optimism", self.initial_optimism, FINITE.or_none()), self.pessimism
         if start is not None and not isinstance(beta, str) and not start > -beta:
             raise ValueError(f"initial_optimism must be above minus the pessimism, {-beta}, not {start}")
         if self.exploration != "optimistic_actor":

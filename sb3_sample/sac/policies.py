@@ -23,6 +23,8 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_sample.arguments import check_net_arch
+from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, DICT, check_value, integer
 from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
 from sb3_sample.learner.q_values import QValues
 from sb3_sample.networks import NETWORKS, Network, linear
@@ -215,11 +217,9 @@ class DeterministicActor(Actor):
         **kwargs: Any,
     ):
         super().__init__(*args, **kwargs)
-        if not 0 < exploration_noise < math.inf:
-            raise ValueError(f"exploration_noise must be above 0 and finite, not {exploration_noise}")
-        for name, value in (("target_noise", target_noise), ("target_noise_clip", target_noise_clip)):
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name} must be at least 0 and finite, not {value}")
+        check_value("exploration_noise", exploration_noise, ABOVE_0)
+        check_value("target_noise", target_noise, AT_LEAST_0)
+        check_value("target_noise_clip", target_noise_clip, AT_LEAST_0)
         self.log_exploration_noise = math.log(exploration_noise)
         self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
         self._noise_args = {
@@ -477,10 +477,9 @@ class SACPolicy(BasePolicy):
             squash_output=True,
             normalize_images=normalize_images,
         )
-        if n_critics < 1:
-            raise ValueError(f"n_critics must be at least 1, not {n_critics}")
-        if n_quantiles is not None and n_quantiles < 1:
-            raise ValueError(f"n_quantiles must be at least 1, or None for scalar critics, not {n_quantiles}")
+        check_value("n_critics", n_critics, integer(1))
+        check_value("n_quantiles", n_quantiles, integer(1).or_none("scalar critics"))
+        check_net_arch(net_arch, ("pi", "qf"), both=True)
         pi_arch: list[int] | None = None
         qf_arch: list[int] | None = None
         if net_arch is not None:
@@ -499,8 +498,10 @@ class SACPolicy(BasePolicy):
                 normalize_images=normalize_images,
             )
 
-        if backbone not in BACKBONES:
+        if not isinstance(backbone, str) or backbone not in BACKBONES:
             raise ValueError(f"backbone must be one of {sorted(BACKBONES)}, not {backbone!r}")
+        check_value("actor_kwargs", actor_kwargs, DICT)
+        check_value("critic_optimizer_kwargs", critic_optimizer_kwargs, DICT)
         actor_kwargs = dict(actor_kwargs or {})
         allowed = ("exploration_noise", "target_noise", "target_noise_clip") if backbone == "td3" else ()
         for name in actor_kwargs:
@@ -668,7 +669,8 @@ def _network_args(
     activation_fn: type[nn.Module] | None,
 ) -> tuple[type[Network], dict[str, Any]]:
     """Class and arguments of a trunk, from its name and from Stable-Baselines3's shorthand."""
-    if network not in NETWORKS:
+    check_value(f"{who}_network_kwargs", kwargs, DICT)
+    if not isinstance(network, str) or network not in NETWORKS:
         raise ValueError(f"{who}_network must be one of {sorted(NETWORKS)}, not {network!r}")
     kwargs = dict(kwargs or {})
     for name, key, value in (("net_arch", "hidden_sizes", net_arch), ("activation_fn", "activation_fn", activation_fn)):

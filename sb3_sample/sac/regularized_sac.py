@@ -1,11 +1,11 @@
 """The regularized agents of P2."""
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
+from sb3_sample.kinds import AT_LEAST_0, DICT, check_value
 from sb3_sample.networks import CReLU
 from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
@@ -86,6 +86,7 @@ class RegularizedSAC(SAC):
                 raise ValueError(f"{name}={given!r} is a setting of {of!r}, which is not among the regularizations")
             return None
 
+        check_value("pessimism_kwargs", pessimism_kwargs, DICT)
         gpl = {"learning_rate": 1e-5} if critic_regularization == "gpl" else {}
         self.weight_decay = setting("weight_decay", weight_decay, 0.01, "weight_decay", network)
         reset_gradient_steps = setting("reset_gradient_steps", reset_gradient_steps, None, "resets", chosen)
@@ -123,8 +124,7 @@ class RegularizedSAC(SAC):
                     f"{name}={getattr(self, name)!r} is not what the other arguments say: load cannot change the "
                     "regularizations of a model, and an argument of one needs its name among them"
                 )
-        if self.weight_decay is not None and not 0 <= self.weight_decay < math.inf:
-            raise ValueError(f"weight_decay must be at least 0 and finite, not {self.weight_decay}")
+        check_value("weight_decay", self.weight_decay, AT_LEAST_0.or_none())
         if "crelu" in chosen and "activation_fn" in self.policy_kwargs:
             raise ValueError(
                 "plasticity_regularization names 'crelu', the activation of actor and critics, and policy_kwargs have "
@@ -171,8 +171,12 @@ def _pessimism(critic_regularization: str) -> float | str:
 
 def _check_group(name: str, chosen: str | Sequence[str], allowed: Sequence[str]) -> tuple[str, ...]:
     """The members chosen from a group, "none" left out."""
-    members = (chosen,) if isinstance(chosen, str) else tuple(chosen)
-    if len(set(members)) != len(members) or not set(members) <= set(allowed):
+    members = tuple(chosen) if isinstance(chosen, Sequence) and not isinstance(chosen, str) else (chosen,)
+    if (
+        not all(isinstance(member, str) for member in members)
+        or len(set(members)) != len(members)
+        or not set(members) <= set(allowed)
+    ):
         raise ValueError(f"{name} must be of {list(allowed)}, each at most once, not {chosen!r}")
     if "none" in members and len(members) > 1:
         raise ValueError(f"{name}={chosen!r} names 'none' beside others")

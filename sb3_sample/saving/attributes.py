@@ -419,7 +419,8 @@ class Restorer:
         self._made: dict[int, Any] = {}
         self._blocks: dict[int, np.ndarray] = {}
         self._classes: dict[str, type] = {}
-        #: Attributes that stayed as they are, since the tree names other files in them.
+        #: Attributes that stayed as they are, since the tree names other files in them; each once, however many
+        #: objects of a class have it.
         self.kept: list[str] = []
 
     def enter(self, inert: Collection[Any], origin: int | None) -> None:
@@ -457,7 +458,7 @@ class Restorer:
             present = own.get(name)
             if not is_elsewhere(name, node, present):
                 yield name, self.restore(node, present, part_name(place, f".{name}"))
-            elif not is_moved(node, present):
+            elif not is_moved(node, present) and f"{place}.{name}" not in self.kept:
                 self.kept.append(f"{place}.{name}")
 
     def classes(self, described: dict[str, dict[str, Node]]) -> None:

@@ -8,9 +8,11 @@ update yet.
 """
 
 import contextlib
+import os
 import sys
 import time
 import warnings
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -38,12 +40,33 @@ from sb3_sample.saving.progress import ProgressFile
 from sb3_sample.saving.rings import Ring
 from sb3_sample.saving.run_folder import MODEL, STATE, RunFolder, Segment
 
+#: Environment steps between two checkpoints, unless ``learn`` is told otherwise.
+CHECKPOINT_FREQ = 10_000
 KIND, SEGMENT_KIND = "checkpoint", "replay rows"
 #: The kinds of what the state of a checkpoint consists of.
 _PARTS: dict[str, type] = {
     "identity": dict, "attributes": dict, "elapsed_ns": int, "rings": dict, "env": dict, "callbacks": dict,
     "progress": dict, "logger": dict, "generators": dict,
 }  # fmt: skip
+#: The folders into which a model has been trained in this process, by calls of ``learn`` that have ended.
+_TRAINED: weakref.WeakKeyDictionary[Any, set[str]] = weakref.WeakKeyDictionary()
+
+
+def refuse_second_call(model: SafeFiles, folder: str | Path | None) -> None:
+    """
+    Refuse a folder that an earlier ``learn`` of the same model has trained into. The program, started again after a
+    kill, would go on within the first call from what the second one has saved, and end elsewhere.
+
+    :param model: the algorithm, before anything of the call has changed it
+    :param folder: the run's folder; None for no checkpoints
+    :raises ValueError: an earlier call of ``learn`` of this model has ended with the folder
+    """
+    if folder is not None and os.path.realpath(folder) in _TRAINED.get(model, ()):
+        raise ValueError(
+            f"checkpoint={str(folder)!r} must be another folder for each call of learn: an earlier call has trained "
+            "this model there, and the program, started again, could not tell whose checkpoints they are. Pass "
+            "another folder, or ask for all the steps in one call. Nothing was changed."
+        )
 
 
 class Checkpointer:
@@ -61,6 +84,11 @@ class Checkpointer:
     def __init__(self, model: SafeFiles, callback: BaseCallback, folder: str | Path | None, every: int):
         if isinstance(every, bool) or not isinstance(every, (int, np.integer)) or every < 1:
             raise ValueError(f"checkpoint_freq must be an integer of at least 1, in environment steps, not {every!r}")
+        if folder is None and every != CHECKPOINT_FREQ:
+            raise ValueError(
+                f"checkpoint_freq={every} means nothing without checkpoint, the folder of the run: pass it too, or "
+                "leave checkpoint_freq out"
+            )
         self._model, self._callback, self._every = model, callback, int(every)
         self._name = folder
         self._held: HoldBack | None = None
@@ -107,7 +135,9 @@ class Checkpointer:
         for path, each in self._callbacks():
             for name, ring in getattr(each, "checkpoint_rings", dict)().items():
                 self._rings[f"{path}.{name}"] = ring
-        self._identity = identity_of(model)
+        # The step count at which this call begins is part of what the run is: a further call begins at another one.
+        begin = str(model.num_timesteps)
+        self._identity = {**identity_of(model), "num_timesteps": [begin, begin]}
         found = self._folder.newest_good()
         if found is not None:
             folder, self._manifest = found
@@ -125,6 +155,7 @@ class Checkpointer:
         try:
             if kind is None:
                 self._save_if_whole()
+                _TRAINED.setdefault(self._model, set()).add(os.path.realpath(self._folder.path))
         finally:
             self._close(orderly=kind is None)
 
@@ -147,8 +178,9 @@ class Checkpointer:
 
     def _check_identity(self, theirs: dict[str, list[str]]) -> None:
         ours = self._identity
+        # The class first, whose arguments have other defaults.
         # An argument that only one of the two has is one of another version, of which the circumstances tell.
-        for name in sorted(ours.keys() & theirs.keys()):
+        for name in sorted(ours.keys() & theirs.keys(), key=lambda name: (name != "class", name)):
             present, saved = ours[name], theirs[name]
             if present[0] != saved[0]:
                 raise ValueError(
@@ -249,8 +281,9 @@ class Checkpointer:
             raise ValueError(f"checkpoint={str(self._name)!r} cannot be written to: {error}") from error
 
     def _warn_of_losses(self) -> None:
-        missing = vec_envs.save(self._env)[1]
-        if missing:
+        missing = self._missing = vec_envs.save(self._env)[1]
+        # Where a run goes on without the episodes in progress, that they start anew is said then.
+        if missing and (self._resumed is None or self._resumed["env"].get("environments") is not None):
             warnings.warn(
                 "The state of the environment cannot be saved, so that the episodes in progress start anew when the "
                 f"run goes on: {'; '.join(missing)}",
@@ -267,7 +300,8 @@ class Checkpointer:
             except DoesNotFit as error:
                 raise ValueError(f"env: {error}") from error
         if reasons:
-            self._start_episodes_anew(reasons)
+            missing = self._missing if state["env"]["environments"] is None else []
+            self._start_episodes_anew([*reasons, *missing])
         with self._restoring(state):
             self._states.restore(state["callbacks"])
             self._progress.restore(state["progress"])

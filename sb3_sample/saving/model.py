@@ -4,14 +4,16 @@ import io
 import pathlib
 import warnings
 from collections.abc import Iterable, Sequence
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 
+from sb3_sample.arguments import NoPolicy, check_policy_class
 from sb3_sample.saving import container, notice, paths
 from sb3_sample.saving.budget import Budget
 from sb3_sample.saving.checks import (
@@ -35,6 +37,8 @@ class SafeFiles(BaseAlgorithm):
     ``set_parameters`` with files that hold JSON and tensors, and run no code. See docs/saving.md.
     """
 
+    #: From which the policies of these algorithms are derived.
+    policy_base: ClassVar[type] = BasePolicy
     #: Modules that whoever loaded the model vouches for. A file never says so.
     _trusted_modules: tuple[str, ...] = ()
     #: What was said of the model's files.
@@ -114,6 +118,8 @@ class SafeFiles(BaseAlgorithm):
         trusted, custom_objects = check_trusted(trusted_modules), custom_objects or {}
         for name in {"policy", "policy_class"} & kwargs.keys():
             kwargs["policy_class"] = cls._policy_class(kwargs.pop(name))
+        if "stats_window_size" in kwargs:
+            kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
         if "policy_kwargs" in kwargs:
             kwargs["policy_kwargs"] = kwargs["policy_kwargs"] or {}
         try:
@@ -125,7 +131,7 @@ class SafeFiles(BaseAlgorithm):
             try:
                 made = None if env is None else maybe_make_env(env, 0)
                 model = super().load(path, made, device, custom_objects, print_system_info, force_reset, **kwargs)
-            except TypeError as error:
+            except (TypeError, NoPolicy) as error:
                 raise ValueError(
                     f"{path} holds no model of {cls.__name__} ({error}): a model of one of Stable-Baselines3's own "
                     "algorithms has other networks, and is loaded by its own class"
@@ -177,7 +183,7 @@ class SafeFiles(BaseAlgorithm):
         try:
             with Budget(content.tensors, content.name):
                 model = cls(policy=policy_class, env=env, device=device, _init_setup_model=False)  # type: ignore[call-arg]
-                lacks = content.lacking(model, given)
+                lacks = content.another_class() or content.lacking(model, given)
                 check_names(model, attributes, content.name)
                 library: Any = library_class(cls)
                 plain = model if library is cls else library(policy_class, None, device=device, _init_setup_model=False)
@@ -199,8 +205,8 @@ class SafeFiles(BaseAlgorithm):
             kind = BadFile if isinstance(error, BadFile) else ParametersDoNotFit
             raise kind(f"{lacks}{error}") from error
         except Exception as error:
-            # With arguments that the file does not have, its content need not be to blame.
-            if given:
+            # With arguments that the file does not have, its content need not be to blame; that of another class is.
+            if given and not content.another_class():
                 raise
             why = f"{type(error).__name__}: {error}"
             if isinstance(error, MemoryError):
@@ -210,11 +216,8 @@ class SafeFiles(BaseAlgorithm):
 
     @classmethod
     def _policy_class(cls, policy: Any) -> Any:
-        if isinstance(policy, str) and policy in cls.policy_aliases:
-            return cls.policy_aliases[policy]
-        if not isinstance(policy, type):
-            raise ValueError(f"policy must be one of {list(cls.policy_aliases)} or a policy class, not {policy!r}")
-        return policy
+        check_policy_class(cls, policy)
+        return cls.policy_aliases.get(policy, policy)
 
     def set_parameters(
         self,

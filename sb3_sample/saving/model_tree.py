@@ -166,6 +166,17 @@ class Content:
                 "it: load it with its own class"
             )
 
+    def another_class(self) -> str:
+        """
+        :return: what to say if the file turns out not to fit, since it is of another class than is loaded; empty if it
+            is of that one
+        """
+        theirs = self.tree["classes"][0]
+        if theirs == path_of(self._cls):
+            return ""
+        name = theirs.rpartition(":")[2]
+        return f"{self.name} holds a model of {name}, not of {self._cls.__name__}: load it with {name}.load. "
+
     def attributes(self, given: Collection[str], custom_objects: dict[str, Any]) -> dict[str, Any]:
         """
         :param given: attributes that the caller has for it, so that the file's are not read
@@ -210,8 +221,27 @@ class Content:
         :raises ValueError: if they are others, as far as that can be said without asking for trust
         """
         theirs = self.tree["attributes"].get("policy_kwargs")
-        if theirs is not None and not is_left_out(theirs) and not _agree(theirs, given, "policy_kwargs"):
-            raise ValueError(f"policy_kwargs must be those of the file, {theirs}, or be left out, not {given}")
+        if theirs is None or is_left_out(theirs) or _agree(theirs, given, "policy_kwargs"):
+            return
+        entries = theirs.get("dict") if isinstance(theirs, dict) else None
+        if not isinstance(entries, dict) or not isinstance(given, dict):
+            raise ValueError(f"policy_kwargs must be those of the file, or be left out, not {given!r}")
+        differences = []
+        for key in [*entries, *(key for key in given if key not in entries)]:
+            if key in entries and key in given and _agree(entries[key], given[key], key):
+                continue
+            in_file = f"is {self._shown(entries[key], key)}" if key in entries else "is not there"
+            differences.append(f"{key} {in_file} and {f'here {given[key]!r}' if key in given else 'here left out'}")
+        raise ValueError(
+            f"policy_kwargs must be those of the file, or be left out; in the file, {'; '.join(differences)}"
+        )
+
+    def _shown(self, tree: Any, name: str) -> str:
+        """A value of the file in words, for a message; a class that is not trusted by its path."""
+        try:
+            return repr(self._decoded(tree, name))
+        except NotTrusted as error:
+            return error.path
 
     def parameters(self, model: BaseAlgorithm) -> dict[str, Any]:
         """

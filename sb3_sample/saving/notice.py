@@ -50,7 +50,9 @@ def say_once(model: Any, encoder: Lenient, trusted: Sequence[str] = ()) -> None:
     said: dict[str, str] = {}
     for name, path in encoder.foreign.items():
         if "<locals>" in path or not within(path.partition(":")[0], vouched):
-            said[f"{name} {path}"] = f"{name} is {path}, for which {need(cls, name, path)}"
+            # What an argument has several of, such as the noise of each environment, needs the same once.
+            wanted = need(cls, name, path)
+            said.setdefault(f"{path} {wanted}", f"{name} is {path}, for which {wanted}")
     for name, reason in encoder.left_out.items():
         argument = argument_for(cls, name)
         wanted = "" if argument is None or argument.startswith("custom_objects") else f", and load needs {argument}"

@@ -235,7 +235,8 @@ def _unpack(innermost: VecEnv, states: list[dict[str, Any]]) -> list[str]:
     for answer in answers:
         if answer is not None and answer[0] == "is damaged":
             raise ValueError(f"the state of an environment is none: {answer[1]}")
-    return [answer[1] for answer in answers if answer is not None]
+    # Workers mostly have the same to say.
+    return list(dict.fromkeys(answer[1] for answer in answers if answer is not None))
 
 
 def restore(venv: VecEnv, state: dict[str, Any]) -> list[str]:

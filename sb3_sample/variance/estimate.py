@@ -17,8 +17,8 @@ import torch
 from scipy import stats
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_sample.arguments import is_integer
 from sb3_sample.envs.states import check_restorable, save_state
+from sb3_sample.kinds import is_integer
 from sb3_sample.variance.decomposition import Components
 from sb3_sample.variance.returns import Agent, sample_returns
 from sb3_sample.variance.scores import Scores

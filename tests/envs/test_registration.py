@@ -73,7 +73,7 @@ def test_a_missing_library_names_its_extra(
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     then = ", then: pip install --no-deps dm-control" if extra == "dmc" and sys.version_info >= (3, 13) else ""
-    with pytest.raises(ImportError, match=rf'pip install "sb3_sample\[{extra}\]"{then}$'):
+    with pytest.raises(ImportError, match=rf'pip install -e "\.\[{extra}\]" in the checkout of sb3_sample{then}$'):
         gym.make(env_id)
 
 

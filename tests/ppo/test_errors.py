@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium import spaces
-from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from torch import nn
 
 from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO
 from tests.ppo.common import ALGORITHMS, quiet, tiny
-from tests.sac.common import Toy, vec
+from tests.sac.common import WRONG_ARGUMENTS, WRONG_ARGUMENTS_OF_LEARN, Toy, vec
 
 
 class OwnBuffer(RolloutBuffer):
@@ -39,7 +39,10 @@ class OwnBuffer(RolloutBuffer):
         ({"dynamics_kwargs": "abc"}, r"dynamics_kwargs must be a dict with some of \['width', .*, or None, not 'abc'"),
         ({"dynamics_kwargs": []}, r"dynamics_kwargs must be a dict .* not \[\]"),
         ({"dynamics_kwargs": {"width": 0}}, r"dynamics_kwargs\['width'\] must be an integer of at least 1, not 0"),
-        ({"dynamics_kwargs": {"epochs": 0}}, r"dynamics_kwargs\['epochs'\] must be an integer of at least 1, not 0"),
+        (
+            {"dynamics_kwargs": {"epochs": 0}},
+            r"dynamics_kwargs\['epochs'\] must be an integer of at least 1, or None, not",
+        ),
         ({"dynamics_kwargs": {"learning_rate": -1}}, r"dynamics_kwargs\['learning_rate'\] must be at least 0"),
         ({"dynamics_kwargs": {"normalize": 1}}, r"dynamics_kwargs\['normalize'\] must be True or False, not 1"),
         ({"predict_termination": "auto"}, "predict_termination must be True, False or None, not 'auto'"),
@@ -84,6 +87,46 @@ def test_ppos_own_arguments_out_of_range(n_simulated: int, kwargs: dict[str, Any
         MBMAPPO("MlpPolicy", vec(), **arguments)
 
 
+@pytest.mark.parametrize("n_simulated", [0, 3])
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        *WRONG_ARGUMENTS,
+        ("clip_range", "0.2", "clip_range must be above 0 and finite, or a schedule, not '0.2'"),
+        ("rollout_buffer_class", dict, "rollout_buffer_class must be RolloutBuffer or derived from it, or None, not <"),
+        ("rollout_buffer_class", DictRolloutBuffer, r"rollout_buffer_class=DictRolloutBuffer needs a Dict .* not Box"),
+        ("rollout_buffer_kwargs", [1], r"rollout_buffer_kwargs must be a dict, or None, not \[1\]"),
+        ("sde_sample_freq", -2, "sde_sample_freq must be an integer of at least -1, not -2"),
+        ("policy_kwargs", {"net_arch": {"pi": [8], "qf": [8]}}, "net_arch must be .*'vf' for the critic, not .*'qf'"),
+    ],
+)
+def test_arguments_of_another_kind(n_simulated: int, name: str, value: Any, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        tiny(n_simulated=n_simulated, **{name: value})
+
+
+@pytest.mark.parametrize(("kwargs", "words"), WRONG_ARGUMENTS_OF_LEARN)
+def test_arguments_of_learn(kwargs: dict[str, Any], words: str) -> None:
+    model = tiny()
+    with pytest.raises(ValueError, match=words):
+        model.learn(**{"total_timesteps": 10, **kwargs})
+    assert model.num_timesteps == 0
+
+
+def test_another_number_of_environments() -> None:
+    model = tiny(env=vec(2))
+    with pytest.raises(ValueError, match=r"env has 3 environments, .* made with, 2: use MBMAPPO.load"):
+        model.set_env(vec(3))
+    model.set_env(vec(2))
+
+
+def test_networks_that_stable_baselines3_takes() -> None:
+    for net_arch in ({"pi": [8]}, {}, [], {"pi": (8,), "vf": [np.int64(8)]}):
+        tiny(policy_kwargs={"net_arch": net_arch})
+    with pytest.warns(UserWarning, match="shared layers"):
+        tiny(policy_kwargs={"net_arch": [{"pi": [8], "vf": [8]}]})
+
+
 def test_numbers_of_numpy_and_schedules_will_do() -> None:
     model = tiny(
         n_steps=np.int64(8),
@@ -93,7 +136,8 @@ def test_numbers_of_numpy_and_schedules_will_do() -> None:
         gamma=np.float32(0.9),
         clip_range=lambda left: 0.2 * left,
         clip_range_vf=np.float64(0.2),
-        learning_rate=lambda left: 1e-3 * left,
+        learning_rate=np.float32(1e-3),
+        seed=np.int64(1),
         max_grad_norm=float("inf"),
         ent_coef=-0.01,
         dynamics_kwargs={"width": np.int64(8), "depth": 1, "learning_rate": np.float32(1e-3)},

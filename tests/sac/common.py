@@ -11,6 +11,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_sample import BRO
 from sb3_sample.learner.execution import old_torch
@@ -50,6 +51,61 @@ TINY_SAC: dict[str, Any] = dict(
     policy_kwargs={"net_arch": [8, 8]},
     device="cpu",
 )
+
+
+#: Arguments of every algorithm that are of another kind than it takes: name, value, and what the error says.
+WRONG_ARGUMENTS: list[tuple[str, Any, str]] = [
+    ("policy", "FooPolicy", "policy must be one of .*'MlpPolicy'.* derived from .*, not 'FooPolicy'"),
+    ("policy", 1, "policy must be one of .*, not 1"),
+    ("policy", TD3Policy, "policy must be one of .*, not stable_baselines3.td3.policies.TD3Policy"),
+    ("policy", "CnnPolicy", r"policy='CnnPolicy' needs images, .* not Box\(.*use 'MlpPolicy'"),
+    ("policy", "MultiInputPolicy", r"policy='MultiInputPolicy' needs Dict observations, not Box\(.*use 'MlpPolicy'"),
+    ("env", 1, "env must be an environment, a vectorised environment or the id of one, or None, not 1"),
+    ("learning_rate", "3e-4", "learning_rate must be at least 0 and finite, or a schedule, not '3e-4'"),
+    ("learning_rate", None, "learning_rate must .*, not None"),
+    ("learning_rate", True, "learning_rate must .*, not True"),
+    ("gamma", "0.9", r"gamma must lie in \[0, 1\], not '0.9'"),
+    ("batch_size", 16.0, "batch_size must be an integer of at least 1, not 16.0"),
+    ("n_steps", "8", "n_steps must be an integer of at least 1, not '8'"),
+    ("stats_window_size", 0, "stats_window_size must be an integer of at least 1, not 0"),
+    ("stats_window_size", 2.5, "stats_window_size must be an integer of at least 1, not 2.5"),
+    ("verbose", "info", "verbose must be an integer of at least 0, not 'info'"),
+    ("verbose", -1, "verbose must be an integer of at least 0, not -1"),
+    ("seed", "7", r"seed must be an integer of at least 0 and at most \d+, or None, not '7'"),
+    ("seed", -1, "seed must be .*, not -1"),
+    ("seed", 1.0, "seed must be .*, not 1.0"),
+    ("device", "gpu", "device must be 'auto', 'cpu', 'cuda' .*, not 'gpu'"),
+    ("device", 1.5, "device must be .*, not 1.5"),
+    ("device", None, "device must be .*, not None"),
+    ("tensorboard_log", 1, "tensorboard_log must be the path of a folder, or None, not 1"),
+    ("policy_kwargs", [("net_arch", [8])], r"policy_kwargs must be a dict, or None, not \[\("),
+    ("policy_kwargs", "net_arch", "policy_kwargs must be a dict, or None, not 'net_arch'"),
+    ("policy_kwargs", {"net_arch": "64"}, "net_arch must be a list of widths, .*, not '64'"),
+    ("policy_kwargs", {"net_arch": 64}, "net_arch must be .*, not 64"),
+    ("policy_kwargs", {"net_arch": [8.0]}, r"net_arch must be .*, not \[8.0\]"),
+    ("policy_kwargs", {"net_arch": {"pi": [8], "xf": [8]}}, "net_arch must be .* 'pi' for the actor and '.f' for the"),
+    (
+        "policy_kwargs",
+        {"optimizer_class": "adam"},
+        r"\['optimizer_class'\] must be a class of Optimizer, .*, not 'adam'",
+    ),
+    ("policy_kwargs", {"optimizer_class": dict}, r"\['optimizer_class'\] must be .*, not <class 'dict'>"),
+    ("policy_kwargs", {"optimizer_kwargs": 3}, r"\['optimizer_kwargs'\] must be a dict, or None, not 3"),
+    ("policy_kwargs", {"activation_fn": "relu"}, r"\['activation_fn'\] must be a class of Module, .*, not 'relu'"),
+    ("policy_kwargs", {"features_extractor_class": 1}, r"\['features_extractor_class'\] must be .*, not 1"),
+]
+#: Arguments of ``learn`` in the same way.
+WRONG_ARGUMENTS_OF_LEARN: list[tuple[dict[str, Any], str]] = [
+    ({"total_timesteps": -1}, "total_timesteps must be at least 0 and finite, not -1"),
+    ({"total_timesteps": "100"}, "total_timesteps must be at least 0 and finite, not '100'"),
+    ({"total_timesteps": float("nan")}, "total_timesteps must be at least 0 and finite, not nan"),
+    ({"total_timesteps": float("inf")}, "total_timesteps must be at least 0 and finite, not inf"),
+    ({"total_timesteps": None}, "total_timesteps must be at least 0 and finite, not None"),
+    ({"log_interval": 0}, "log_interval must be an integer of at least 1, or None, not 0"),
+    ({"tb_log_name": 1}, "tb_log_name must be a name, or None, not 1"),
+    ({"callback": 1}, "callback must be a callback, a list of callbacks or a function, or None, not 1"),
+    ({"checkpoint_freq": 500}, "checkpoint_freq=500 means nothing without checkpoint, the folder of the run"),
+]
 
 
 class Toy(gym.Env):

@@ -1,6 +1,7 @@
 """Every wrong argument is a ValueError where it comes in; nothing that is not finite reaches the buffer."""
 
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.her import HerReplayBuffer
+from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
-from sb3_sample.sac import BROTD3, DAC, GPLSAC, OAC, SAC, TOPSAC, VPLSAC, RegularizedSAC
-from tests.sac.common import MAKERS, Toy, bro, sac, vec
+from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, SAC, TOPSAC, VPLSAC, RegularizedSAC
+from tests.sac.common import MAKERS, WRONG_ARGUMENTS, WRONG_ARGUMENTS_OF_LEARN, Toy, bro, sac, vec
 
 NAN, INF = float("nan"), float("inf")
 
@@ -83,6 +88,173 @@ def test_values_out_of_range(maker: str, name: str, value: Any, allowed: str) ->
     refused(lambda: MAKERS[maker](**{name: value}), name, value_in_message, allowed)
 
 
+@pytest.mark.parametrize("maker", ["SAC", "BRO"])
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        *WRONG_ARGUMENTS,
+        ("buffer_size", 1e6, "buffer_size must be an integer of at least 1, not 1000000.0"),
+        ("learning_starts", 100.0, "learning_starts must be an integer of at least 0, not 100.0"),
+        ("learning_starts", "100", "learning_starts must be an integer of at least 0, not '100'"),
+        ("tau", "0.1", r"tau must lie in \(0, 1\], not '0.1'"),
+        ("gradient_steps", -2, "gradient_steps must be an integer of at least 0, or -1 for .*, not -2"),
+        ("gradient_steps", 1.5, "gradient_steps must be .*, not 1.5"),
+        ("train_freq", "1", "train_freq must be .*, not '1'"),
+        ("action_noise", 0.1, "action_noise must be of ActionNoise, or None, not 0.1"),
+        (
+            "replay_buffer_class",
+            dict,
+            "replay_buffer_class must be ReplayBuffer or derived from it, or None, not <class",
+        ),
+        ("replay_buffer_class", "her", "replay_buffer_class must be .*, not 'her'"),
+        ("replay_buffer_class", HerReplayBuffer, r"replay_buffer_class=HerReplayBuffer needs a Dict .* not Box\("),
+        ("replay_buffer_kwargs", [1], r"replay_buffer_kwargs must be a dict, or None, not \[1\]"),
+        ("target_update_interval", 1.5, "target_update_interval must be an integer of at least 1, or None .*, not 1.5"),
+        ("replay_ratio", [1], r"replay_ratio must be at least 0 and finite, .*, not \[1\]"),
+        ("n_quantiles", 2.5, "n_quantiles must be an integer of at least 1, or None for scalar critics, not 2.5"),
+        ("pessimism", [1], r"pessimism must be .*, not \[1\]"),
+        ("pessimism_kwargs", 3, "pessimism_kwargs must be a dict, or None, not 3"),
+        ("target_subset", "2", "target_subset must lie between 1 and .* not '2'"),
+        ("validation_proportion", "0.1", r"validation_proportion must lie in \[0, 1\), not '0.1'"),
+        ("exploration", ["actor"], r"exploration must be one of .*, not \['actor'\]"),
+        ("policy_delay", 1.5, "policy_delay must be an integer of at least 1, not 1.5"),
+        ("reset_shrink", "0.1", r"reset_shrink must lie in \[0, 1\), not '0.1'"),
+        ("redo_period", 1.5, "redo_period must be an integer of at least 1, or None for no recycling, not 1.5"),
+        ("redo_threshold", "0.1", "redo_threshold must be at least 0, not '0.1'"),
+        ("sam_radius", "0.1", "sam_radius must be above 0 and finite, or None for no SAM, not '0.1'"),
+        ("policy_kwargs", {"n_critics": 2.5}, "n_critics must be an integer of at least 1, not 2.5"),
+        ("policy_kwargs", {"net_arch": {"pi": [8], "vf": [8]}}, "net_arch must be .*'qf' for the critic, not .*'vf'"),
+        ("backbone", ["td3"], r"backbone must be one of .*, not \['td3'\]"),
+        ("compile", 1, "compile must be True, False or 'auto', not 1"),
+    ],
+)
+def test_arguments_of_another_kind(maker: str, name: str, value: Any, words: str) -> None:
+    # Networks of its own, which BRO takes with model_size=None.
+    mlp = {"critic_network": "mlp", "actor_network": "mlp"} if maker == "BRO" else {}
+    if name == "policy_kwargs" and isinstance(value, dict) and mlp:
+        refused(lambda: MAKERS[maker](model_size=None, policy_kwargs={**mlp, **value}), words)
+    else:
+        refused(lambda: MAKERS[maker](**{name: value}), words)
+
+
+@pytest.mark.parametrize(("kwargs", "words"), WRONG_ARGUMENTS_OF_LEARN)
+def test_arguments_of_learn(kwargs: dict[str, Any], words: str) -> None:
+    model = sac()
+    refused(lambda: model.learn(**{"total_timesteps": 10, **kwargs}), words)
+    assert model.num_timesteps == 0
+
+
+def test_buffers_of_other_observations() -> None:
+    refused(lambda: sac(vec(obs_space=OBS_DICT), policy="MultiInputPolicy", replay_buffer_class=ReplayBuffer),
+            "replay_buffer_class=ReplayBuffer cannot hold the observations of Dict")  # fmt: skip
+    refused(lambda: sac(vec(obs_space=OBS_DICT), policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer),
+            "replay_buffer_class=HerReplayBuffer needs an observation space with .*'desired_goal'")  # fmt: skip
+    refused(lambda: sac(vec(obs_space=OBS_DICT), policy="MultiInputPolicy", n_steps=3), "n_steps=3 is not supported")
+
+
+def test_another_number_of_environments() -> None:
+    model = sac(vec(2))
+    for env in (vec(3), Toy()):
+        refused(lambda env=env: model.set_env(env), r"env has [13] environments, .* made with, 2: use SAC.load")
+    model.set_env(vec(2))
+
+
+def test_numbers_of_numpy_will_do(tmp_path: Path) -> None:
+    """As in Stable-Baselines3, and in places where it does not take them; a file has Python's numbers."""
+    model = sac(
+        seed=np.int64(3), batch_size=np.int64(8), buffer_size=np.int32(100), learning_starts=np.int64(5),
+        learning_rate=np.float32(1e-3), gamma=np.float32(0.9), tau=np.float64(0.01), n_quantiles=np.int64(3),
+        replay_ratio=np.float32(0.5), verbose=np.int64(0), stats_window_size=np.int64(5),
+    )  # fmt: skip
+    assert model.learn(np.int64(20)).num_timesteps == 20
+    assert model.learn(20.0).num_timesteps == 20
+    model.save(tmp_path / "m")
+    loaded = SAC.load(tmp_path / "m", env=vec())
+    assert (loaded.seed, loaded.buffer_size, type(loaded.gamma)) == (3, 100, float)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "words"),
+    [
+        ({"device": "gpu"}, "^device must be .*, not 'gpu'"),
+        ({"verbose": "info"}, "^verbose must be .*, not 'info'"),
+        ({"learning_rate": "3e-4"}, "^learning_rate must be .*, not '3e-4'"),
+        ({"buffer_size": 1e6}, "^buffer_size must be .*, not 1000000.0"),
+        ({"action_noise": 0.1}, "^action_noise must be .*, not 0.1"),
+        ({"stats_window_size": 0}, "^stats_window_size must be an integer of at least 1, not 0"),
+        ({"policy": TD3Policy}, "^policy must be one of .*, not stable_baselines3.td3.policies.TD3Policy"),
+        ({"policy_kwargs": {"net_arch": [9], "n_critics": 3}}, r"^policy_kwargs must be those of the file.*; in the "
+         r"file, net_arch is \[8, 8\] and here \[9\]; n_critics is not there and here 3$"),
+        ({"policy_kwargs": None}, r"in the file, net_arch is \[8, 8\] and here left out$"),
+        ({"policy_kwargs": [8]}, r"^policy_kwargs must be those of the file, or be left out, not \[8\]"),
+    ],
+)  # fmt: skip
+def test_arguments_of_another_kind_to_load(kwargs: dict[str, Any], words: str, tmp_path: Path) -> None:
+    sac().save(tmp_path / "m")
+    refused(lambda: SAC.load(tmp_path / "m", env=vec(), **kwargs), words)
+
+
+def test_load_with_another_window(tmp_path: Path) -> None:
+    sac().save(tmp_path / "m")
+    model = SAC.load(tmp_path / "m", env=vec(), stats_window_size=3).learn(40)
+    assert model.ep_info_buffer.maxlen == 3
+
+
+@pytest.mark.parametrize(("made", "loaded"), [("SAC", BRO), ("BRO", SAC), ("SAC", BROTD3)])
+def test_files_of_another_class(made: str, loaded: Any, tmp_path: Path) -> None:
+    MAKERS[made]().save(tmp_path / "m")
+    words = f"holds a model of {made}, not of {loaded.__name__}: load it with {made}.load"
+    refused(lambda: loaded.load(tmp_path / "m"), words)
+    refused(lambda: loaded.load(tmp_path / "m", env=vec(), learning_rate=1e-3), words)
+
+
+def test_a_run_of_another_class(tmp_path: Path) -> None:
+    sac().learn(20, checkpoint=tmp_path)
+    refused(lambda: bro().learn(20, checkpoint=tmp_path), "^class='.*BRO': .* was made with class='.*SAC'")
+
+
+# ---------------------------------------------------------------- a training without a gradient step
+
+
+class Stops(BaseCallback):
+    def _on_step(self) -> bool:
+        return self.num_timesteps < 5
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_a_training_within_the_warm_up_says_so(n_envs: int, tmp_path: Path) -> None:
+    words = "learning_starts=20 transitions come before the first, .* has {0} of the {0} of this model's life.* pass a "
+    with pytest.warns(UserWarning, match=words.format(10)) as caught:
+        sac(vec(n_envs), learning_starts=20).learn(10).save(tmp_path / "m")
+    assert len(caught) == 1 and caught[0].filename == __file__
+    model = SAC.load(tmp_path / "m", env=vec(n_envs))
+    with pytest.warns(UserWarning, match="has 6 of the 16 of"):
+        model.learn(6)
+    # Its buffer is not in the file, and is filled first.
+    with pytest.warns(UserWarning, match="has 18 of the 28 of"):
+        model.learn(12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert model.learn(12)._n_updates > 0
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "learn"),
+    [
+        ({}, {"total_timesteps": 0}),
+        ({"replay_ratio": 0}, {}),
+        ({"gradient_steps": 0}, {}),
+        ({}, {"callback": Stops()}),
+        ({"learning_starts": 9}, {}),
+        ({"learning_starts": 0, "replay_ratio": 0.01}, {}),
+    ],
+)
+def test_a_training_without_gradient_steps_that_is_meant(kwargs: dict[str, Any], learn: dict[str, Any]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sac(**{"learning_starts": 20, **kwargs}).learn(**{"total_timesteps": 10, **learn})
+
+
 @pytest.mark.parametrize(
     ("kwargs", "words"),
     [
@@ -101,6 +273,17 @@ def test_values_out_of_range(maker: str, name: str, value: Any, allowed: str) ->
         (dict(weight_decay=-1.0), ["weight_decay", "-1.0"]),
         (dict(kl_target=0.0), ["kl_target", "0"]),
         (dict(std_multiplier=-1.0), ["std_multiplier", "-1"]),
+        *(
+            ({name: "1"}, [f"{name} must .*, not '1'"])
+            for name in (
+                "weight_decay",
+                "kl_target",
+                "std_multiplier",
+                "initial_optimism",
+                "initial_kl_weight",
+                "adjustment_learning_rate",
+            )
+        ),
     ],
 )
 def test_bro_arguments(kwargs: dict[str, Any], words: list[str]) -> None:
@@ -112,6 +295,10 @@ def test_bro_arguments(kwargs: dict[str, Any], words: list[str]) -> None:
     [
         ({"critic_network": "foo"}, ["critic_network", "foo", "bronet"]),
         ({"actor_network": "foo"}, ["actor_network", "foo", "mlp"]),
+        ({"actor_network": ["mlp"]}, ["actor_network", r"\['mlp'\]", "bronet"]),
+        ({"critic_network_kwargs": [1]}, [r"critic_network_kwargs must be a dict, or None, not \[1\]"]),
+        ({"actor_kwargs": 3}, ["actor_kwargs must be a dict, or None, not 3"]),
+        ({"critic_optimizer_kwargs": 3}, ["critic_optimizer_kwargs must be a dict, or None, not 3"]),
         ({"n_critics": 0}, ["n_critics", "0", "at least 1"]),
         ({"net_arch": [8, 0]}, ["hidden_sizes|net_arch", "0"]),
         ({"net_arch": [8], "critic_network": "bronet"}, ["net_arch", "bronet"]),
@@ -122,13 +309,33 @@ def test_policy_arguments(policy_kwargs: dict[str, Any], words: list[str]) -> No
     refused(lambda: sac(policy_kwargs=policy_kwargs), *words)
 
 
+@pytest.mark.parametrize(
+    ("maker", "name"),
+    [
+        *(("DAC", name) for name in ("kl_target", "initial_optimism", "initial_kl_weight", "reinitialize_every")),
+        *(("OAC", name) for name in ("optimism", "kl_radius")),
+        *(("BROTD3", name) for name in ("exploration_noise", "target_noise", "target_noise_clip")),
+        *(("RegularizedSAC", name) for name in ("weight_decay", "network_regularization", "pessimism_kwargs")),
+        *((name, "policy_kwargs") for name in MAKERS),
+    ],
+)
+def test_arguments_of_one_class_of_another_kind(maker: str, name: str) -> None:
+    refused(lambda: MAKERS[maker](**{name: [1]}), rf"{name} must .*, not \[1\]")
+
+
+def test_no_environment(tmp_path: Path) -> None:
+    refused(lambda: SAC("MlpPolicy", None), "env must be an environment, .* not None")
+    sac().save(tmp_path / "m")
+    refused(lambda: SAC.load(tmp_path / "m", env=1), "env must be an environment, .* not 1")
+    refused(lambda: SAC.load(tmp_path / "m").learn(10), "env: the model was loaded without one: pass env= to load")
+
+
 def test_use_sde() -> None:
     for make in MAKERS.values():
         refused(lambda make=make: make(use_sde=True), "use_sde", "True", "action_noise|exploration")
 
 
 def test_wrong_policy() -> None:
-    refused(lambda: sac(policy="FooPolicy"), "[Pp]olicy", "FooPolicy", "MlpPolicy")
     dict_env = Toy(spaces.Dict({"a": spaces.Box(-1, 1, (2,))}))
     refused(lambda: sac(dict_env, policy="MlpPolicy"), "MultiInputPolicy")
 
@@ -340,12 +547,6 @@ def test_no_spread_of_one_critic(kwargs: dict[str, Any]) -> None:
 def test_no_spread_of_one_target() -> None:
     with pytest.raises(ValueError, match="target_subset=1 leaves none"):
         sac(pessimism="gpl", target_subset=1)
-
-
-@pytest.mark.parametrize("batch_size", [None, 16.5, "16"])
-def test_batch_size_is_an_integer(batch_size: Any) -> None:
-    with pytest.raises(ValueError, match="batch_size must be an integer"):
-        sac(batch_size=batch_size)
 
 
 def test_dac_starts_above_the_bound_also_when_loaded(tmp_path: Path) -> None:

@@ -123,6 +123,56 @@ def test_a_finished_run_returns_at_once_with_its_state(tmp_path: Path) -> None:
     assert steps_of(tmp_path) == [40, 45]
 
 
+@pytest.mark.parametrize("make", [sac, tiny])
+def test_a_folder_is_for_one_call_of_learn(make: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    model = make().learn(40, checkpoint="a", checkpoint_freq=20)
+    steps, files = model.num_timesteps, {path: path.stat().st_mtime_ns for path in Path("a").rglob("*")}
+    for folder, reset in (("a", True), (tmp_path / "b" / ".." / "a", False)):
+        with pytest.raises(ValueError, match="another folder for each call of learn"):
+            model.learn(40, checkpoint=folder, reset_num_timesteps=reset)
+    # One that goes on with the first one's model is a second call, too, whatever object it is.
+    model.save("model")
+    loaded = type(model).load("model", env=make().env)
+    with pytest.raises(ValueError, match=rf"num_timesteps={steps}: the run of checkpoint='a' was made with .*=0"):
+        loaded.learn(40, checkpoint="a", reset_num_timesteps=False)
+    assert loaded.num_timesteps == model.num_timesteps == steps
+    assert {path: path.stat().st_mtime_ns for path in Path("a").rglob("*")} == files
+    model.learn(40, checkpoint="b", reset_num_timesteps=False)
+    assert model.num_timesteps == 2 * steps
+
+
+class StopAt(BaseCallback):
+    """Interrupts the training, in one call of it."""
+
+    def __init__(self, step: int):
+        super().__init__()
+        self.step = step
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.step:
+            raise KeyboardInterrupt
+        return True
+
+
+def test_a_program_of_two_calls_ends_where_it_would_have_ended(tmp_path: Path) -> None:
+    def program(folder: Path, callback: Any = None) -> Any:
+        model = sac().learn(30, checkpoint=folder / "first", **STEPS)
+        return model.learn(30, callback, reset_num_timesteps=False, checkpoint=folder / "second", **STEPS)
+
+    with pytest.raises(KeyboardInterrupt):
+        program(tmp_path / "killed", StopAt(45))
+    assert not differing(state(program(tmp_path / "whole")), state(program(tmp_path / "killed")))
+
+
+def test_a_call_that_was_interrupted_goes_on_with_the_same_model(tmp_path: Path) -> None:
+    """As when the cell of a notebook is run once more."""
+    model = sac()
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(40, StopAt(25), checkpoint=tmp_path, **STEPS)
+    assert not differing(state(sac().learn(40)), state(model.learn(40, checkpoint=tmp_path, **STEPS)))
+
+
 def test_the_training_is_the_same_with_checkpoints_and_without(tmp_path: Path) -> None:
     assert not differing(state(bro().learn(40)), state(bro().learn(40, checkpoint=tmp_path, **STEPS)))
 
@@ -662,8 +712,9 @@ def test_an_episode_that_cannot_be_held_starts_anew(n_steps: int, tmp_path: Path
 
     with pytest.warns(UserWarning, match=r"environment cannot be saved.*Secret: counter \(builtins.range_iterator\)"):
         first = model().learn(25, checkpoint=tmp_path)
-    with pytest.warns(UserWarning, match="episodes in progress start anew"):
+    with pytest.warns(UserWarning, match=r"episodes in progress start anew: .*Secret: counter") as caught:
         again = model().learn(40, checkpoint=tmp_path)
+    assert "; ".join(str(warning.message) for warning in caught).count("start anew") == 1
     buffer = again.replay_buffer
     # The old episode was cut, as by a time limit, and the new one starts with a reset of its own.
     assert buffer.dones[24] == buffer.timeouts[24] == 1 and buffer.dones[23] == 0

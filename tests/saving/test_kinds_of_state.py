@@ -79,12 +79,15 @@ def test_what_is_named_is_a_warning(tmp_path: Path) -> None:
         sac(kinds.environments(kinds.ClosureOverIterator, "dummy")).learn(4, checkpoint=tmp_path)
 
 
-def test_an_attribute_that_is_another_function_now(tmp_path: Path) -> None:
-    """A file does not say what is called, so that the episodes start anew, and it is said."""
-    sac(kinds.environments(kinds.ChangesItsMethod, "dummy")).learn(8, checkpoint=tmp_path)
+@pytest.mark.parametrize("workers", ["dummy", "workers"])
+def test_an_attribute_that_is_another_function_now(workers: str, tmp_path: Path) -> None:
+    """A file does not say what is called, so that the episodes start anew, and it is said, once of all environments."""
+    sac(kinds.environments(kinds.ChangesItsMethod, workers)).learn(8, checkpoint=tmp_path)
     match = r"episodes in progress start anew: ChangesItsMethod.mode is .*, but was the function 'ChangesItsMethod.run'"
-    with pytest.warns(UserWarning, match=match):
-        sac(kinds.environments(kinds.ChangesItsMethod, "dummy")).learn(10, checkpoint=tmp_path)
+    with pytest.warns(UserWarning, match=match) as caught:
+        sac(kinds.environments(kinds.ChangesItsMethod, workers)).learn(10, checkpoint=tmp_path)
+    said = "; ".join(str(warning.message) for warning in caught)
+    assert said.count("start anew") == said.count("ChangesItsMethod.run") == 1
 
 
 def test_constants_of_a_class_are_the_programs(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
-from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
@@ -299,7 +299,7 @@ def test_a_policy_class_of_ones_own(maker: str, tmp_path: Path) -> None:
     for kwargs in given:
         loaded = type(model).load(tmp_path / "m", **kwargs)
         assert type(loaded.policy) is policy and not differing(state(model), state(loaded))
-    with pytest.raises(ValueError, match="policy must be one of .* or a policy class, not 'Nothing'"):
+    with pytest.raises(ValueError, match="policy must be one of .* or a policy class derived from .*, not 'Nothing'"):
         type(model).load(tmp_path / "m", policy="Nothing")
 
 
@@ -840,6 +840,13 @@ class Unseeded(Pink):
 
 def test_own_noise_without_a_seed_is_not_another_run(tmp_path: Path) -> None:
     assert interrupted(lambda: sac(action_noise=Unseeded()), tmp_path).num_timesteps == 96
+
+
+def test_a_class_of_several_objects_is_named_once() -> None:
+    with pytest.warns(UserWarning, match="What is saved of this SAC") as caught:
+        sac(vec(3), action_noise=VectorizedActionNoise(Pink(), 3)).learn(3)
+    (said,) = (str(warning.message) for warning in caught)
+    assert said.count(f"{__name__}:Pink") == said.count("load needs") == 1
 
 
 def test_another_schedule_is_another_run(tmp_path: Path) -> None:

@@ -41,6 +41,7 @@ REASONS = (
     "State-dependent exploration",
     "Defaults",
     "Initial weights",
+    "Quantiles",
     "Errors",
     "`n_steps` with a buffer of one's own",
     "Memory of the replay buffer",
@@ -69,6 +70,12 @@ _OFF_POLICY = (
         "test_spaces::test_sde_multi_dim",
     ),
     *_excluded("Defaults", "Mean reward below threshold", "test_identity::test_continuous[*]"),
+    *_excluded(
+        "Defaults",
+        "assert 1 == 0",
+        "test_her::test_save_load_replay_buffer[False-*]",
+        "test_her::test_save_load_replay_buffer[True-*]",
+    ),
     *_excluded("Initial weights", "assert", "test_gae::test_infinite_horizon[True-*]", by_chance=True),
     *_excluded("Errors", "ValueError: env must have a bounded Box", "test_spaces::test_action_spaces[CartPole-v1-*]"),
     *_excluded(
@@ -98,6 +105,7 @@ _BRO = (
         "weight_decay is an argument of the algorithm",
         "test_custom_policy::test_custom_optimizer[optimizer_kwargs1-*]",
     ),
+    *_excluded("Quantiles", "cannot be converted to Scalar", "test_gae::test_infinite_horizon[*]"),
     *_excluded("The test", "SAC_1", "test_tensorboard::test_tensorboard[sac]"),
 )
 _PPO = (
@@ -136,7 +144,9 @@ _MBMA = (
     ),
     *_excluded("Defaults", "Mean reward below threshold", "test_identity::test_continuous[*]", by_chance=True),
     *_excluded("Advantages", "DID NOT RAISE AssertionError", "test_run::test_ppo_warnings"),
+    *_excluded("The test", "terminations of transitions must be 0 or 1", "test_save_load::test_save_load[*]"),
 )
+_PLAIN = _excluded("The test", "trying to run PPO on the GPU", "test_run::test_ppo_warnings")
 _TQC = (
     *_excluded("State-dependent exploration", "use_sde=True is not supported", "test_run::test_sde[*]"),
     *_excluded(
@@ -157,7 +167,7 @@ SUITES: dict[Suite, tuple[Exclusion, ...]] = {
     Suite("stable_baselines3", "SAC", "SAC", SB3_FILES): _OFF_POLICY,
     Suite("stable_baselines3", "SAC", "BRO", SB3_FILES): _OFF_POLICY + _BRO,
     Suite("stable_baselines3", "PPO", "MBMAPPO", SB3_FILES): _PPO + _MBMA,
-    Suite("stable_baselines3", "PPO", "PlainMBMAPPO", SB3_FILES): _PPO,
+    Suite("stable_baselines3", "PPO", "PlainMBMAPPO", SB3_FILES): _PPO + _PLAIN,
     Suite("sb3_contrib", "TQC", "QuantileSAC", CONTRIB_FILES): _TQC,
     Suite("sb3_contrib", "CrossQ", "BRO", CONTRIB_FILES): _CROSSQ,
 }

@@ -1,0 +1,123 @@
+"""Kinds of values that arguments take, and the one check of a value against its kind."""
+
+import math
+from collections.abc import Callable
+from numbers import Integral, Real
+from typing import Any, NamedTuple, TypeGuard
+
+import numpy as np
+
+
+def is_integer(value: Any) -> TypeGuard[int]:
+    """
+    :param value: any value
+    :return: whether it is an integer, Python's or NumPy's
+    """
+    return isinstance(value, Integral) and not isinstance(value, bool)
+
+
+def is_number(value: Any) -> bool:
+    """
+    :param value: any value
+    :return: whether it is a real number, Python's or NumPy's
+    """
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+class Kind(NamedTuple):
+    """
+    Kind of value that an argument takes.
+
+    :param words: the kind after "must", for the error
+    :param fits: whether a value is of it
+    """
+
+    words: str
+    fits: Callable[[Any], bool]
+
+    def otherwise(self, words: str, fits: Callable[[Any], bool]) -> "Kind":
+        """
+        :param words: another kind, after "or"
+        :param fits: whether a value is of that one
+        :return: the kind of what is of either
+        """
+        return Kind(f"{self.words}, or {words}", lambda value: self.fits(value) or fits(value))
+
+    def or_none(self, meaning: str = "") -> "Kind":
+        """
+        :param meaning: of None, for the error
+        :return: the same, or None
+        """
+        return self.otherwise(f"None{meaning and ' for '}{meaning}", lambda value: value is None)
+
+
+def integer(low: int, high: int | None = None) -> Kind:
+    """
+    :param low: the smallest allowed
+    :param high: the largest allowed; None for no limit
+    :return: the kind of integers, Python's or NumPy's
+    """
+    words = f"be an integer of at least {low}" + ("" if high is None else f" and at most {high}")
+    highest = math.inf if high is None else high
+    return Kind(words, lambda value: is_integer(value) and low <= value <= highest)
+
+
+def number(words: str, fits: Callable[[float], bool]) -> Kind:
+    """
+    :param words: the range, after "must"
+    :param fits: whether a number is in it
+    :return: the kind of real numbers, Python's or NumPy's
+    """
+    return Kind(words, lambda value: is_number(value) and fits(value))
+
+
+def subclass(of: type) -> Kind:
+    """
+    :param of: a class
+    :return: the kind of that class and those derived from it
+    """
+    return Kind(f"be {of.__name__} or derived from it", lambda value: isinstance(value, type) and issubclass(value, of))
+
+
+def instance(of: type) -> Kind:
+    """
+    :param of: a class
+    :return: the kind of its objects
+    """
+    return Kind(f"be of {of.__name__}", lambda value: isinstance(value, of))
+
+
+def maker(of: type, example: str) -> Kind:
+    """
+    :param of: a class
+    :param example: one derived from it, for the error
+    :return: the kind of whatever can be called for its objects
+    """
+
+    def fits(value: Any) -> bool:
+        return issubclass(value, of) if isinstance(value, type) else callable(value)
+
+    return Kind(f"be a class of {of.__name__}, such as {example}", fits)
+
+
+UNIT = number("lie in [0, 1]", lambda value: 0 <= value <= 1)
+AT_LEAST_0 = number("be at least 0 and finite", lambda value: 0 <= value < math.inf)
+ABOVE_0 = number("be above 0 and finite", lambda value: 0 < value < math.inf)
+FINITE = number("be a finite number", math.isfinite)
+DICT = Kind("be a dict", lambda value: isinstance(value, dict)).or_none()
+TRUE_OR_FALSE = Kind("be True or False", lambda value: isinstance(value, (bool, np.bool_)))
+# True and False are 1 and 0, as Stable-Baselines3 takes them.
+VERBOSE = Kind("be an integer of at least 0", lambda value: isinstance(value, (Integral, np.bool_)) and int(value) >= 0)
+
+
+def check_value(name: str, value: Any, kind: Kind) -> Any:
+    """
+    :param name: name of an argument
+    :param value: its value
+    :param kind: what it must be
+    :return: the value; a number of NumPy's as Python's, since torch, Gymnasium and files do not take them everywhere
+    :raises ValueError: if it is something else
+    """
+    if not kind.fits(value):
+        raise ValueError(f"{name} must {kind.words}, not {value!r}")
+    return value.item() if isinstance(value, np.generic) else value
