@@ -105,10 +105,10 @@ class OptimisticExploration(Exploration):
         check_value("adjustment_learning_rate", adjustment_learning_rate, AT_LEAST_0)
         if uncertainty not in UNCERTAINTIES:
             raise ValueError(f"uncertainty must be one of {UNCERTAINTIES}, not {uncertainty!r}")
-        if uncertainty != "epistemic" and learner.head.n_outputs < 2:
+        if uncertainty != "epistemic" and (learner.head.n_quantiles or 1) < 2:
             raise ValueError(
-                f"uncertainty={uncertainty!r} needs critics with at least two quantiles (n_quantiles), not "
-                f"{learner.head.n_outputs} output each"
+                f"uncertainty={uncertainty!r} needs critics with at least two quantiles, "
+                f"not n_quantiles={learner.head.n_quantiles}"
             )
         self.kl_target = kl_target
         self.std_multiplier = std_multiplier

@@ -13,10 +13,11 @@ class ValueHead:
     """
     Scalar critics, trained by the squared error; and the base class of other heads.
 
-    ``n_outputs`` is K, the outputs a critic.
+    ``n_outputs`` is K, the outputs a critic; ``n_quantiles`` the same if they are quantiles, else None.
     """
 
-    n_outputs = 1
+    n_outputs: int = 1
+    n_quantiles: int | None = None
 
     def target(
         self,
@@ -51,7 +52,7 @@ class QuantileHead(ValueHead):
     """
 
     def __init__(self, n_quantiles: int):
-        self.n_outputs = n_quantiles
+        self.n_outputs = self.n_quantiles = n_quantiles
 
     def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         return losses.quantile_huber(q, target)

@@ -149,6 +149,8 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
     }
     policy_base = SACPolicy
     policy: SACPolicy
+    #: The class of the learner.
+    learner_class: ClassVar[type[Learner]] = Learner
     #: beta1 of the temperature's Adam.
     temperature_beta1: ClassVar[float] = 0.9
 
@@ -299,7 +301,7 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         :return: a learner with the parts and the settings of the arguments
         """
         self._take_target_entropy()
-        return Learner(
+        return self.learner_class(
             self._make_networks,
             head=ValueHead() if self.n_quantiles is None else QuantileHead(self.n_quantiles),
             make_temperature=self._make_temperature,

@@ -77,7 +77,7 @@ def test_exploration_noise(exploration: str, exploration_noise: float, std_multi
         constant_action(model.actor, action)
         torch.manual_seed(0)
         with torch.no_grad():
-            actions = model.explorer.act(model, observations)
+            actions = model.explorer.act(model.learner, observations)
         if action == 0.3:
             np.testing.assert_allclose(actions.mean(dim=0), 0.3, atol=0.01)
             np.testing.assert_allclose(actions.std(dim=0), expected, rtol=0.05)
@@ -95,7 +95,7 @@ def test_exploration_adds_the_shift(monkeypatch: pytest.MonkeyPatch) -> None:
 
     model.explorer.shift = Constant()
     monkeypatch.setattr(torch, "randn_like", torch.ones_like)
-    actions = model.explorer.act(model, torch.randn(4, 3))
+    actions = model.explorer.act(model.learner, torch.randn(4, 3))
     np.testing.assert_allclose(actions.detach(), math.tanh(math.atanh(0.3) + 0.5) + 0.1, rtol=1e-5)
 
 
@@ -178,7 +178,9 @@ def test_divergence_by_hand(multiplier: float) -> None:
 
     model.explorer.shift = Constant()
     model.explorer.actor_optimizer = torch.optim.SGD(model.explorer.shift.parameters(), lr=0.0)
-    assert model.explorer.update(model, random_batch(model))["exploration/kl"].item() == pytest.approx(2, rel=1e-3)
+    assert model.explorer.update(model.learner, random_batch(model))["exploration/kl"].item() == pytest.approx(
+        2, rel=1e-3
+    )
 
 
 @pytest.mark.parametrize(

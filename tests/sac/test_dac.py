@@ -53,7 +53,7 @@ def copies(module: torch.nn.Module) -> dict[str, torch.Tensor]:
 )
 def test_optimism_at_the_start(pessimism: float, initial: float | None, expected: float) -> None:
     model = dac(pessimism=pessimism, initial_optimism=initial)
-    assert model.explorer._optimism(model).item() == pytest.approx(expected, rel=1e-5)
+    assert model.explorer._optimism(model.learner).item() == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize(("pessimism", "initial"), [(1.0, -1.0), (1.0, -2.0), (0.0, 0.0), (0.5, -0.5)])
@@ -75,7 +75,7 @@ def test_optimism_must_lie_above_minus_the_pessimism(pessimism: float, initial: 
 def test_barrier_by_hand(distance: float, loss: float, gradient: float) -> None:
     model = dac()
     optimism = torch.tensor(distance - 1.0, requires_grad=True)
-    value = model.explorer._optimism_loss(model, optimism, torch.tensor(0.2))
+    value = model.explorer._optimism_loss(model.learner, optimism, torch.tensor(0.2))
     assert value.item() == pytest.approx(loss, rel=1e-5, abs=1e-6)
     value.backward()
     assert optimism.grad is not None and optimism.grad.item() == pytest.approx(gradient, rel=1e-5, abs=1e-6)
@@ -83,7 +83,7 @@ def test_barrier_by_hand(distance: float, loss: float, gradient: float) -> None:
 
 def test_weight_of_the_divergence_is_clipped_in_the_actors_loss_alone() -> None:
     model = dac(initial_kl_weight=50.0, kl_target=1e-3, adjustment_learning_rate=1e-2, initial_optimism=0.75)
-    metrics = model.explorer.update(model, random_batch(model), torch.zeros(8, 2))
+    metrics = model.explorer.update(model.learner, random_batch(model), torch.zeros(8, 2))
     kl = 2 * metrics["exploration/kl"]  # logged per dimension, penalised as a sum
     upper = metrics["exploration/q_mean"] + 0.75 * metrics["exploration/q_std"]
     assert metrics["exploration/actor_loss"].item() == pytest.approx((20 * kl - upper).item(), rel=1e-4)
@@ -106,7 +106,7 @@ def test_direction_of_the_divergence(direction: str, expected: float, multiplier
     model = dac(kl_direction=direction, std_multiplier=multiplier)
     constant_gaussian(model.explorer.actor, 1.0, 2.0)
     constant_gaussian(model.actor, 0.0, 1.0)
-    metrics = model.explorer.update(model, random_batch(model))
+    metrics = model.explorer.update(model.learner, random_batch(model))
     assert metrics["exploration/kl"].item() == pytest.approx(expected, abs=1e-4)
 
 
@@ -125,7 +125,7 @@ def test_acting_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     constant_gaussian(model.explorer.actor, 0.2, 0.4)
     for noise in (0.0, 1.0, -2.0):
         monkeypatch.setattr(torch, "randn_like", lambda x, noise=noise: torch.full_like(x, noise))
-        action = model.explorer.act(model, torch.randn(5, 3))
+        action = model.explorer.act(model.learner, torch.randn(5, 3))
         np.testing.assert_allclose(action.detach(), math.tanh(0.2 + 0.5 * noise), rtol=1e-5)
 
 
@@ -134,7 +134,7 @@ def test_statistics_of_acting() -> None:
     constant_gaussian(model.explorer.actor, 0.2, 0.4)
     torch.manual_seed(0)
     with torch.no_grad():
-        x = torch.atanh(model.explorer.act(model, torch.zeros(10_000, 3)).double())
+        x = torch.atanh(model.explorer.act(model.learner, torch.zeros(10_000, 3)).double())
     np.testing.assert_allclose(x.mean(dim=0), 0.2, atol=0.02)
     np.testing.assert_allclose(x.std(dim=0), 0.5, rtol=0.03)
 
@@ -145,7 +145,7 @@ def test_learning_samples_as_acting_does() -> None:
     seen: list[torch.Tensor] = []
     model.critic.register_forward_pre_hook(lambda module, args: seen.append(args[1].detach()))
     noise = torch.randn(8, 2)
-    model.explorer.update(model, random_batch(model), noise)
+    model.explorer.update(model.learner, random_batch(model), noise)
     torch.testing.assert_close(seen[0], torch.tanh(0.2 + 0.5 * noise))
 
 
@@ -169,7 +169,7 @@ def test_dropout_is_off_while_acting(monkeypatch: pytest.MonkeyPatch) -> None:
     model.policy.set_training_mode(False)
     monkeypatch.setattr(torch, "randn_like", torch.zeros_like)
     observations = torch.randn(4, 3)
-    assert torch.equal(model.explorer.act(model, observations), model.explorer.act(model, observations))
+    assert torch.equal(model.explorer.act(model.learner, observations), model.explorer.act(model.learner, observations))
 
 
 # ---------------------------------------------------------------- what optimism adds
@@ -224,7 +224,7 @@ def test_quantiles_and_layer_norm(uncertainty: str) -> None:
             assert not torch.equal(before[name], after[name]), name
     seen: list[torch.Tensor] = []
     hook = model.critic.register_forward_hook(lambda module, args, q: seen.append(q.detach()))
-    metrics = model.explorer.update(model, batch, noise)
+    metrics = model.explorer.update(model.learner, batch, noise)
     hook.remove()
     assert metrics["exploration/q_std"].item() == pytest.approx(spread(seen[0], uncertainty).mean().item(), rel=1e-5)
 
@@ -254,7 +254,7 @@ def test_with_validation_pessimism() -> None:
     assert min(optimisms[i] + betas[i] for i in range(40)) < 0.1, "optimism hardly moved towards its bound"
     beta = model.pessimism_rule.beta()
     expected = model.explorer.optimism_distance().item() - beta.item()
-    assert model.explorer._optimism(model).item() == pytest.approx(expected)
+    assert model.explorer._optimism(model.learner).item() == pytest.approx(expected)
 
 
 # ---------------------------------------------------------------- starting anew
@@ -266,8 +266,8 @@ def test_with_validation_pessimism() -> None:
 def test_starts_anew_once_an_interval(n_envs: int, expected: list[int]) -> None:
     model = without_updates(dac(vec(n_envs), reinitialize_every=20))
     at: list[int] = []
-    make_explorer = model.make_explorer
-    model.make_explorer = lambda: at.append(model.num_transitions) or make_explorer()
+    make_explorer = model.learner.make_explorer
+    model.learner.make_explorer = lambda: at.append(model.num_transitions) or make_explorer()
     model.learn(70)
     assert at == expected
 
@@ -291,15 +291,15 @@ def test_what_starts_anew() -> None:
     model.learn(24)
     explorer = model.explorer
     trained, others = copies(explorer), state(model)
-    assert explorer._optimism(model).item() != pytest.approx(-0.5, abs=1e-4)
+    assert explorer._optimism(model.learner).item() != pytest.approx(-0.5, abs=1e-4)
     assert explorer.kl_weight().item() != pytest.approx(1.0, abs=1e-4)
     assert all(optimizer.state for optimizer in explorer.optimizers().values())
     model.num_transitions = 25
-    explorer.before_updates(model)
+    explorer.before_updates(model.learner)
     started = copies(explorer)
     for name, value in started.items():
         assert not torch.equal(value, trained[name]), f"{name} was kept"
-    assert explorer._optimism(model).item() == pytest.approx(-0.5, rel=1e-5)
+    assert explorer._optimism(model.learner).item() == pytest.approx(-0.5, rel=1e-5)
     assert explorer.kl_weight().item() == pytest.approx(1.0, rel=1e-5)
     assert not any(optimizer.state for optimizer in explorer.optimizers().values())
     # The kernel is orthogonal again, gain sqrt(2).
@@ -307,7 +307,7 @@ def test_what_starts_anew() -> None:
     torch.testing.assert_close(kernel @ kernel.T, 2 * torch.eye(8), atol=1e-5, rtol=1e-5)
     # Nothing else does.
     assert all(name.startswith("explorer") for name in differing(others, state(model)))
-    explorer.before_updates(model)
+    explorer.before_updates(model.learner)
     assert all(torch.equal(started[name], value) for name, value in copies(explorer).items()), "twice"
 
 
@@ -320,8 +320,8 @@ def loaded_at_45(path: Path, **kwargs: Any) -> tuple[Any, list[int]]:
     loaded = without_updates(DAC.load(path / "m", env=vec(), **kwargs))
     loaded.load_replay_buffer(path / "b")
     at: list[int] = []
-    make_explorer = loaded.make_explorer
-    loaded.make_explorer = lambda: at.append(loaded.num_transitions) or make_explorer()
+    make_explorer = loaded.learner.make_explorer
+    loaded.learner.make_explorer = lambda: at.append(loaded.num_transitions) or make_explorer()
     return loaded, at
 
 
@@ -345,8 +345,8 @@ def test_start_below_zero_with_a_pessimism_that_moves() -> None:
     with torch.no_grad():
         model.pessimism_rule.weight.fill_(0.3)
     model.num_transitions = 25
-    model.explorer.before_updates(model)
-    assert model.explorer._optimism(model).item() > -0.3
+    model.explorer.before_updates(model.learner)
+    assert model.explorer._optimism(model.learner).item() > -0.3
 
 
 # ---------------------------------------------------------------- as another algorithm

@@ -489,7 +489,7 @@ def test_own_parts_may_ask_critics_as_before(maker: str) -> None:
         for _ in range(6):
             model.train(1)
         if how == "compiled":
-            assert model._execution.compiled
+            assert model.learner._execution.compiled
         states.append({name: value.item() for name, value in model._metrics.items()})
     for other in states[1:]:
         assert other == pytest.approx(states[0], rel=1e-2, abs=1e-3)

@@ -20,11 +20,14 @@ from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_sample import BRO, DiagnosticsCallback
-from sb3_sample.learner.batch import draw_batches
+from sb3_sample.learner import execution
 from sb3_sample.learner.execution import Execution, old_torch, why_not_compiled
+from sb3_sample.learner.heads import ValueHead
+from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
-from sb3_sample.sac import SAC, algorithm, execution
+from sb3_sample.sac import SAC, algorithm
 from sb3_sample.sac.buffers import PLAIN_BUFFERS, BatchMemory, DeviceReplayBuffer
+from sb3_sample.sac.sources import draw_batches
 from tests.sac.common import COMPILES, MAKERS, Toy, bro, differing, sac, state, vec
 
 #: Largest difference of a parameter after 50 updates, each of which moves it by up to 3e-4. The same arithmetic in
@@ -88,9 +91,9 @@ class Recorder:
 def captured(model: SAC, warm_up: int = 3) -> Recorder:
     """Let a model's gradient steps be captured by a recorder, after some that are run as they are."""
     recorder = Recorder(model)
-    model._execution = Execution(model, False, False, recorder)
-    assert model._execution._captured is not None and model._execution._captured.WARM_UP == 3
-    model._execution._captured.WARM_UP = warm_up
+    model.learner._execution = Execution(model.learner, False, False, recorder)
+    assert model.learner._execution._captured is not None and model.learner._execution._captured.WARM_UP == 3
+    model.learner._execution._captured.WARM_UP = warm_up
     return recorder
 
 
@@ -138,8 +141,8 @@ def test_compiled_is_eager(maker: str) -> None:
     model, compiled = pair(maker, compile=True)
     updates(model, 50)
     updates(compiled, 50)
-    assert compiled._execution is not None and compiled._execution.compiled
-    assert compiled._execution.seconds_compiling > 0
+    assert compiled.learner._execution is not None and compiled.learner._execution.compiled
+    assert compiled.learner._execution.seconds_compiling > 0
     assert largest_difference(model, compiled) < TOLERANCE
     for name, value in model._metrics.items():
         assert compiled._metrics[name].item() == pytest.approx(value.item(), rel=1e-2, abs=1e-3), name
@@ -166,7 +169,7 @@ def test_the_recorder_repeats_and_does_not_ask() -> None:
     updates(model, 5)
     assert recorder.n_repetitions == 2
     before = state(model)
-    _, (own, repeat, metrics) = next(iter(model._execution._captured._recorded.items()))
+    _, (own, repeat, metrics) = next(iter(model.learner._execution._captured._recorded.items()))
     repeat()
     first = metrics["train/critic_loss"].item()
     after = state(model)
@@ -245,13 +248,18 @@ def test_a_captured_step_gives_its_own_metrics_and_no_old_gradients() -> None:
     assert model.gradients_are_stale
 
 
+class AbsoluteHead(ValueHead):
+    def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        return 3 * (q - target).abs().mean()
+
+
 @pytest.mark.parametrize("how", [pytest.param("compiled", marks=COMPILES), "captured"])
 @pytest.mark.parametrize(
     "change",
     [
         lambda m: setattr(m, "actor_pessimism", 1),
-        lambda m: setattr(m, "_critic_loss", lambda q, target: 3 * (q - target).abs().mean()),
-        lambda m: setattr(m, "pessimism_rule", Pessimism(0.3)),
+        lambda m: setattr(m.learner, "head", AbsoluteHead()),
+        lambda m: setattr(m.learner, "pessimism_rule", Pessimism(0.3)),
         lambda m: m.critic.optimizer.param_groups[0].update(eps=0.1),
     ],
     ids=["integer", "loss", "part", "optimizer"],
@@ -263,7 +271,7 @@ def test_changes_on_the_way_are_noticed(how: str, change: Callable[[SAC], None])
     for m in (model, other):
         updates(m, 5)
         change(m)
-        if how == "captured" and m is other and not m._execution.serves(m):
+        if how == "captured" and m is other and not m.learner._execution.serves(m.learner):
             captured(m)
         updates(m, 6, seed=1)
     assert largest_difference(model, other) < TOLERANCE
@@ -292,11 +300,14 @@ def test_diagnostics_do_not_have_steps_captured_anew() -> None:
 
 @COMPILES
 def test_a_gradient_step_of_ones_own() -> None:
-    class Own(SAC):
-        def _gradient_step(self, *args: Any) -> dict[str, torch.Tensor]:
-            return super()._gradient_step(*args)
+    class OwnLearner(Learner):
+        def gradient_step(self, *args: Any) -> dict[str, torch.Tensor]:
+            return super().gradient_step(*args)
 
-    assert sac(cls=Own, compile=True).learn(20)._execution.compiled
+    class Own(SAC):
+        learner_class = OwnLearner
+
+    assert sac(cls=Own, compile=True).learn(20).learner._execution.compiled
 
 
 def test_a_copied_model_trains_on_and_a_file_holds_no_transitions(tmp_path: Path) -> None:
@@ -354,7 +365,7 @@ def test_auto_compiles_where_it_pays_and_the_file_remembers(tmp_path: Path, monk
     assert model.compile == "auto" and model.compiled is None
     assert sac(learning_starts=20, replay_ratio=1).learn(69).compiled is False
     model.learn(70)
-    assert model.compiled is True and model._execution.compiled
+    assert model.compiled is True and model.learner._execution.compiled
     model.save(tmp_path / "model.zip")
     assert SAC.load(tmp_path / "model.zip").compiled is True
     assert SAC.load(tmp_path / "model.zip", compile=False).compiled is False
@@ -433,7 +444,7 @@ def test_an_old_torch_is_told_of_once(compile: Any, version: str, monkeypatch: p
         f"The gradient step is not compiled: that needs torch 2.13 or newer, and this is {version}. It is run eagerly, "
         "on a GPU captured"
     ]
-    assert not any(model.compiled or model._execution.compiled for model in models)
+    assert not any(model.compiled or model.learner._execution.compiled for model in models)
     assert not differing(state(models[0]), state(eager))
 
 
@@ -517,7 +528,7 @@ def test_diagnostics_find_gradients_of_a_compiled_model(replay_ratio: float) -> 
     model = sac(compile=True, learning_starts=10, replay_ratio=replay_ratio)
     callback = DiagnosticsCallback(Toy(), every=20)
     model.learn(35, callback=callback)
-    assert model._execution.compiled
+    assert model.learner._execution.compiled
     # Measured at 20 steps, of the gradient step after 19; the last left none.
     assert callback.last_results["gradient_norm_critic"] > 0
     assert not any(name.startswith("gradient_norm") for name in callback.measure())

@@ -30,7 +30,7 @@ def samples(model: Any, observation: torch.Tensor, n: int = 4000) -> torch.Tenso
     """Pre-tanh samples of who acts while training, (n, A)."""
     torch.manual_seed(0)
     with torch.no_grad():
-        return torch.atanh(model.explorer.act(model, observation.expand(n, -1)).double())
+        return torch.atanh(model.explorer.act(model.learner, observation.expand(n, -1)).double())
 
 
 def test_plain_exploration_samples_the_actor() -> None:
@@ -38,10 +38,10 @@ def test_plain_exploration_samples_the_actor() -> None:
     assert type(model.explorer) is Exploration
     observations = torch.randn(5, 3)
     torch.manual_seed(0)
-    actions = model.explorer.act(model, observations)
+    actions = model.explorer.act(model.learner, observations)
     torch.manual_seed(0)
     assert torch.equal(actions, model.actor.sample(observations)[0])
-    assert model.explorer.update(model, random_batch(model)) == {}
+    assert model.explorer.update(model.learner, random_batch(model)) == {}
 
 
 def test_starts_near_the_pessimistic_actor() -> None:
@@ -95,7 +95,7 @@ def test_kl_is_the_squared_shift_alone(multiplier: float) -> None:
         model.actor.log_std.weight.zero_()
         model.actor.log_std.bias.fill_(float(np.arctanh((np.log(0.5) + 10) / 6 - 1)))
         exploration.shift.weight.mul_(10)
-    metrics = exploration.update(model, batch)
+    metrics = exploration.update(model.learner, batch)
     with torch.no_grad():
         features = model.actor.features(batch.observations)
         mean, log_std = model.actor.gaussian(features)
@@ -113,7 +113,7 @@ def test_adjustment_signs(scale: float, rises: bool) -> None:
     optimism, weight = exploration.optimism().item(), exploration.kl_weight().item()
     assert optimism == pytest.approx(1.0, rel=1e-5)
     assert weight == pytest.approx(0.25, rel=1e-5)
-    metrics = exploration.update(model, random_batch(model))
+    metrics = exploration.update(model.learner, random_batch(model))
     kl = metrics["exploration/kl"].item()
     assert (kl < exploration.kl_target) == rises
     # The losses by hand: (beta_o - 0) * gap and -weight * gap.
@@ -137,14 +137,14 @@ def test_shift_climbs_the_optimistic_value() -> None:
 
     model, exploration = optimistic(learning_rate=1e-2, n_quantiles=None)
     batch = random_batch(model)
-    object.__setattr__(model, "critic", Critic())
+    object.__setattr__(model.policy, "critic", Critic())
     with torch.no_grad():
         model.actor.mean.weight.zero_()  # a pre-tanh mean of zero
         # A wide Gaussian, so that the divergence permits a shift that can be seen.
         model.actor.log_std.weight.zero_()
         model.actor.log_std.bias.fill_(float(np.arctanh((np.log(0.5) + 10) / 6 - 1)))
     for _ in range(40):
-        metrics = exploration.update(model, batch, torch.zeros(8, 2))
+        metrics = exploration.update(model.learner, batch, torch.zeros(8, 2))
     with torch.no_grad():
         features = model.actor.features(batch.observations)
         mean, _ = model.actor.gaussian(features)
@@ -155,7 +155,7 @@ def test_shift_climbs_the_optimistic_value() -> None:
 
 def test_update_leaves_the_others_alone() -> None:
     model, exploration = optimistic()
-    exploration.update(model, random_batch(model))
+    exploration.update(model.learner, random_batch(model))
     fresh = bro()
     for name in ("actor", "critic", "critic_target", "temperature"):
         ours, theirs = getattr(model, name).state_dict(), getattr(fresh, name).state_dict()

@@ -216,7 +216,7 @@ def replay(path: Path, execution: str = "eager") -> tuple[SAC, dict[str, np.ndar
                 reported["std_e"] = mean_std(explorer.actor, observations)
                 optimistic_mean = torch.tanh(explorer.actor.gaussian(explorer.actor.features(observations))[0])
 
-        model._prepared_execution()
+        model.learner.prepared_execution()
         metrics = {name: value.item() for name, value in model._update(batch, noise).items()}
         reported.update({theirs: metrics[ours] for theirs, ours in SHARED_NAMES.items()})
         # A compiled step leaves no gradients.
@@ -245,7 +245,7 @@ def replay(path: Path, execution: str = "eager") -> tuple[SAC, dict[str, np.ndar
         if i < meta["dims"]["n_updates"] - 1 and f"after/{i}/temp/log_temp" in data:
             check_parameters(named, data, f"after/{i}/", i + 1, model)
     if execution == "compiled":
-        assert model._execution is not None and model._execution.seconds_compiling > 0
+        assert model.learner._execution is not None and model.learner._execution.seconds_compiling > 0
     if recorder is not None:
         assert recorder.n_repetitions == len(info)
     return model, data, info

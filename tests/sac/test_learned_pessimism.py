@@ -13,8 +13,9 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_sample.learner.batch import Batch, CriticStep, Noise
+from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.pessimism import TOP, LearnedPessimism, pessimistic_value
-from sb3_sample.sac import BRO, GPLSAC, OPLSAC, SAC, TOPSAC, VPLSAC, buffers
+from sb3_sample.sac import BRO, GPLSAC, OPLSAC, SAC, TOPSAC, VPLSAC, buffers, sources
 from tests.sac.common import COMPILES, TINY_BRO, TINY_SAC, differing, random_batch, sac, state, vec
 from tests.sac.test_execution import captured
 from tests.sac.test_update import NoSynchronisation
@@ -46,16 +47,9 @@ def transitions(
     return Batch(nothing, torch.zeros(2, 2), nothing, column(*dones), rewards, discounts)
 
 
-def rule(loss: str, beta: float = 1.0, learning_rate: float = 0.01, source: str = "replay", **agent: Any) -> Any:
-    """A rule on its own, and the algorithm it needs, which is little."""
-    stub = SimpleNamespace(
-        minimize=SAC.minimize,
-        validation_proportion=1 / 4,
-        batch_size=8,
-        exploration="actor",
-        action_noise=None,
-        **agent,
-    )
+def rule(loss: str, beta: float = 1.0, learning_rate: float = 0.01, source: str = "replay", **learner: Any) -> Any:
+    """A rule on its own, and the learner it needs, which is little."""
+    stub = SimpleNamespace(minimize=Learner.minimize, **learner)
     return LearnedPessimism(stub, loss, source, beta, learning_rate), stub  # type: ignore[arg-type]
 
 
@@ -252,7 +246,7 @@ def test_no_gradient_reaches_the_networks(name: str) -> None:
     with torch.no_grad():
         q = model.critic(batch.observations, batch.actions)
     rule = model.pessimism_rule
-    rule.update(model, batch, CriticStep(q, q + 1, column(*[0.1] * 8)), None, rule.draw(model))
+    rule.update(model.learner, batch, CriticStep(q, q + 1, column(*[0.1] * 8)), None, rule.draw(model._source))
     assert not torch.equal(beta, model.pessimism_rule.beta())
     assert all(p.grad is None for p in networks(model))
     assert all(torch.equal(a, b) for a, b in zip(before, networks(model), strict=True))
@@ -283,7 +277,7 @@ def test_the_error_of_other_transitions_from_the_networks(name: str) -> None:
     beta = model.pessimism_rule.beta().item()
     np.random.seed(3)
     rule = model.pessimism_rule
-    metrics = rule.update(model, random_batch(model), STEP, noise, rule.draw(model))
+    metrics = rule.update(model.learner, random_batch(model), STEP, noise, rule.draw(model._source))
     wanted = error.square().mean() if "dual" not in name else beta * error.mean()
     assert metrics["pessimism/loss"].item() == pytest.approx(wanted.item(), rel=1e-4, abs=1e-5)
     assert metrics["pessimism/error"].item() == pytest.approx(error.mean().item(), rel=1e-4, abs=1e-5)
@@ -312,13 +306,13 @@ def test_waits_for_a_batch_and_takes_exactly_one(
     learned: Any = model.pessimism_rule
     judged: list[int] = []
     judge = LearnedPessimism._judge
-    spy = lambda agent, batch, noise: (judged.append(len(batch.rewards)), judge(agent, batch, noise))[1]  # noqa: E731
+    spy = lambda learner, batch, *rest: (judged.append(len(batch.rewards)), judge(learner, batch, *rest))[1]  # noqa: E731
     monkeypatch.setattr(LearnedPessimism, "_judge", staticmethod(spy))
     sides = iter([False] * 5 + [True] * (n - 1) + [False] * 5 + [True] + [False] * 5)
     monkeypatch.setattr(np.random, "random", lambda size: np.array([0.0 if next(sides) else 1.0]))
     for i in range(n + 15):
         split.add(np.ones((1, 3)), np.ones((1, 3)), np.zeros((1, 2)), np.ones(1), np.zeros(1), [{}])
-        metrics = learned.update(model, random_batch(model), STEP, None, learned.draw(model))
+        metrics = learned.update(model.learner, random_batch(model), STEP, None, learned.draw(model._source))
         if i < n + 9:
             assert split.n_validation < n and not judged
             assert learned.beta() == 1 and not learned.optimizer.state
@@ -367,7 +361,7 @@ def test_recent_waits_for_eight_steps() -> None:
     model = make("vpl recent", vec(3))
     learned = model.pessimism_rule
     for i in range(10):
-        metrics = learned.update(model, random_batch(model), STEP, None, learned.draw(model))
+        metrics = learned.update(model.learner, random_batch(model), STEP, None, learned.draw(model._source))
         assert ("pessimism/loss" in metrics) == (i >= 8)
         model.replay_buffer.add(np.ones((3, 3)), np.ones((3, 3)), np.zeros((3, 2)), np.ones(3), np.zeros(3), [{}] * 3)
 
@@ -376,7 +370,7 @@ def test_recent_takes_the_latest_of_every_environment(monkeypatch: pytest.Monkey
     model = make("vpl recent", tagged((3, 7)), buffer_size=30, learning_rate=0)
     judged: list[torch.Tensor] = []
     judge = LearnedPessimism._judge
-    spy = lambda agent, batch, noise: (judged.append(batch.rewards), judge(agent, batch, noise))[1]  # noqa: E731
+    spy = lambda learner, batch, *rest: (judged.append(batch.rewards), judge(learner, batch, *rest))[1]  # noqa: E731
     monkeypatch.setattr(LearnedPessimism, "_judge", staticmethod(spy))
     model.learn(100)
     # 50 steps of each of two: the rewards are 1, 2, ... and 10001, 10002, ...
@@ -488,7 +482,7 @@ def test_opl_step_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     step = CriticStep(q, next_q, torch.ones(4, 1))
     monkeypatch.setattr(LearnedPessimism, "_judge", staticmethod(lambda *_: step))
     rule = model.pessimism_rule
-    metrics = rule.update(model, random_batch(model), STEP, None, rule.draw(model))
+    metrics = rule.update(model.learner, random_batch(model), STEP, None, rule.draw(model._source))
     errors = [17.125 - 1, 12520.875 - 2, 24.5 - 3, 10029.5 - 4]
     assert metrics["pessimism/error"].item() == pytest.approx(np.mean(errors), rel=1e-6)
     assert metrics["pessimism/loss"].item() == pytest.approx(np.mean(errors), rel=1e-6)  # beta was 1
@@ -501,13 +495,13 @@ class Segments:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch):
         self.seen: list[tuple[Any, torch.Tensor]] = []
-        original = buffers.latest
+        original = sources.latest
 
         def spy(*args: Any, **kwargs: Any) -> Any:
             self.seen.append(original(*args, **kwargs))
             return self.seen[-1]
 
-        monkeypatch.setattr(buffers, "latest", spy)
+        monkeypatch.setattr(sources, "latest", spy)
 
     def rewards(self, n_envs: int) -> list[list[list[float]]]:
         """Of every segment, by environment."""

@@ -61,7 +61,7 @@ def test_bro_learns_pendulum() -> None:
 @pytest.mark.parametrize("make", [small_sac, small_bro])
 def test_compiled_step_learns_pendulum(make: Callable[..., SAC]) -> None:
     model = make(0, compile=True).learn(3_000)
-    assert model._execution is not None and model._execution.compiled
+    assert model.learner._execution is not None and model.learner._execution.compiled
     assert score(model) > GOOD
 
 

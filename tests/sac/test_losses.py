@@ -7,7 +7,7 @@ import torch
 from torch.distributions import Independent, Normal, TransformedDistribution, kl_divergence
 from torch.distributions.transforms import TanhTransform
 
-from sb3_sample.sac import losses
+from sb3_sample.learner import losses
 
 T = torch.tensor
 

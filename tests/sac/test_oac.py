@@ -51,8 +51,8 @@ class LinearCritics(torch.nn.Module):
 def test_shift_by_hand(optimism: float, shift: tuple[float, float]) -> None:
     model = oac(optimism=optimism, kl_radius=0.5)
     constant_gaussian(model, [0.0, 0.0], [0.5, 1.0])
-    object.__setattr__(model, "critic", LinearCritics())
-    mean, std = model.explorer.shifted_mean(model, torch.randn(4, 3))
+    object.__setattr__(model.policy, "critic", LinearCritics())
+    mean, std = model.explorer.shifted_mean(model.learner, torch.randn(4, 3))
     torch.testing.assert_close(mean, torch.tensor([shift] * 4), atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(std, torch.tensor([[0.5, 1.0]] * 4))
 
@@ -77,7 +77,7 @@ def test_shift_maximises_the_linear_approximation(n_quantiles: int | None) -> No
     candidates = math.sqrt(2 * 0.8) * std[:, None] * circle  # (B, angles, A)
     gains = (candidates * g[:, None]).sum(dim=2)
     best = gains.max(dim=1)
-    shifted, _ = model.explorer.shifted_mean(model, observations)
+    shifted, _ = model.explorer.shifted_mean(model.learner, observations)
     torch.testing.assert_close(((shifted - mean) * g).sum(dim=1), best.values, rtol=1e-3, atol=1e-6)
     expected = candidates[torch.arange(16), best.indices]
     assert ((shifted - mean - expected) / std).abs().max() < 5e-3
@@ -89,7 +89,7 @@ def test_divergence_is_the_radius() -> None:
         model.critic.head.weight.mul_(30)
     assert model.explorer.kl_radius == pytest.approx(6.80805)
     observations = torch.randn(16, 3)
-    shifted, std = model.explorer.shifted_mean(model, observations)
+    shifted, std = model.explorer.shifted_mean(model.learner, observations)
     with torch.no_grad():
         mean, _ = model.actor.gaussian(model.actor.features(observations))
     np.testing.assert_allclose(gaussian_kl(shifted, std, mean, std), 3.69**2 / 2, rtol=1e-3)
@@ -99,7 +99,7 @@ def test_radius_zero_is_the_actor() -> None:
     model = oac(kl_radius=0.0)
     observations = torch.randn(8, 3)
     torch.manual_seed(0)
-    actions = model.explorer.act(model, observations)
+    actions = model.explorer.act(model.learner, observations)
     torch.manual_seed(0)
     assert torch.equal(actions, model.actor.sample(observations)[0])
 
@@ -110,7 +110,7 @@ def test_gradient_of_zero() -> None:
     with torch.no_grad():
         model.critic.head.weight.zero_()
     observations = torch.randn(8, 3)
-    shifted, _ = model.explorer.shifted_mean(model, observations)
+    shifted, _ = model.explorer.shifted_mean(model.learner, observations)
     with torch.no_grad():
         mean, _ = model.actor.gaussian(model.actor.features(observations))
     torch.testing.assert_close(shifted, mean, rtol=1e-6, atol=1e-6)
@@ -119,9 +119,9 @@ def test_gradient_of_zero() -> None:
 def test_acts_around_the_shifted_mean(monkeypatch: pytest.MonkeyPatch) -> None:
     model = oac(optimism=0.0, kl_radius=0.5)
     constant_gaussian(model, [0.0, 0.0], [0.5, 1.0])
-    object.__setattr__(model, "critic", LinearCritics())
+    object.__setattr__(model.policy, "critic", LinearCritics())
     monkeypatch.setattr(torch, "randn_like", torch.ones_like)
-    actions = model.explorer.act(model, torch.randn(3, 3))
+    actions = model.explorer.act(model.learner, torch.randn(3, 3))
     torch.testing.assert_close(actions, torch.tanh(torch.tensor([[0.3 + 0.5, 0.8 + 1.0]] * 3)))
 
 
@@ -129,10 +129,10 @@ def test_acts_in_inference_mode_and_leaves_no_gradient() -> None:
     model = oac()
     observations = torch.randn(4, 3)
     torch.manual_seed(0)
-    expected = model.explorer.act(model, observations)
+    expected = model.explorer.act(model.learner, observations)
     torch.manual_seed(0)
     with torch.inference_mode():
-        actions = model.explorer.act(model, observations * 1)
+        actions = model.explorer.act(model.learner, observations * 1)
         assert torch.is_inference_mode_enabled()
     assert torch.equal(actions, expected)
     for name in ("actor", "critic"):
@@ -163,7 +163,7 @@ def test_warm_up_is_random_and_exploration_is_shifted() -> None:
     critics = LinearCritics()
     # learn looks at the moments of every optimizer at its end.
     critics.optimizer = model.critic.optimizer
-    object.__setattr__(model, "critic", critics)
+    object.__setattr__(model.policy, "critic", critics)
     model.learn(15)
     taken = model.replay_buffer.actions[:15].reshape(15, 2)
     assert (taken[5:] > 0.999).all() and not (taken[:5] > 0.999).all()

@@ -16,12 +16,12 @@ def listen(model: Any) -> tuple[list[Any], list[Any], list[str]]:
     order: list[str] = []
     part = model.pessimism_rule
 
-    def on_step(agent: Any, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
-        assert agent is model
+    def on_step(learner: Any, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        assert learner is model.learner
         steps.append((np.array(rewards), np.array(dones), infos))
         order.append("step")
 
-    def on_episode_end(agent: Any, env_index: int, episode_return: float) -> None:
+    def on_episode_end(learner: Any, env_index: int, episode_return: float) -> None:
         episodes.append((env_index, episode_return))
         order.append("episode")
 
@@ -56,6 +56,8 @@ def test_environments_without_monitor() -> None:
 def test_the_transition_is_stored_before() -> None:
     model = sac(replay_ratio=0)
     sizes = []
-    model.pessimism_rule.on_step = lambda agent, *_: sizes.append((agent.replay_buffer.size(), agent.num_transitions))
+    model.pessimism_rule.on_step = lambda learner, *_: sizes.append(
+        (model.replay_buffer.size(), learner.num_transitions)
+    )
     model.learn(5)
     assert sizes == [(n, n) for n in range(1, 6)]

@@ -114,7 +114,7 @@ def test_one_is_the_minimum_and_zero_the_mean_in_both_losses(beta: float, n_quan
         action, log_prob = model.actor.sample(batch.next_observations, noise.critic)
         next_value = value(model.critic_target(batch.next_observations, action))
         target = batch.rewards + 0.9 * (1 - batch.dones) * (next_value - 0.3 * log_prob)
-        critic_loss = model._critic_loss(model.critic(batch.observations, batch.actions), target)
+        critic_loss = model.learner.head.loss(model.critic(batch.observations, batch.actions), target)
         action, log_prob = model.actor.sample(batch.observations, noise.actor)
         actor_loss = (0.3 * log_prob.flatten() - value(model.critic(batch.observations, action)).mean(dim=1)).mean()
     metrics = model._update(batch, noise)

@@ -18,13 +18,13 @@ class Recorder:
 
     def __init__(self, model: Any):
         self.at: list[int] = []
-        original = model.reinitialize
+        original = model.learner.reinitialize
 
         def reinitialize(shrink: float = 0.0) -> None:
             self.at.append(model.num_transitions)
             original(shrink)
 
-        model.reinitialize = reinitialize
+        model.learner.reinitialize = reinitialize
 
 
 @pytest.mark.parametrize("maker", ["SAC", "BRO"])
@@ -237,7 +237,7 @@ def test_a_period_is_counted_over_the_models_life(tmp_path: Path) -> None:
     model.learn(20)
     model.learn(16)
     assert recorder.at == [15, 30]
-    del model.reinitialize
+    del model.learner.reinitialize
     model.save(tmp_path / "m")
     model.save_replay_buffer(tmp_path / "b")
     loaded = SRSAC.load(tmp_path / "m", env=vec())
@@ -274,13 +274,13 @@ class UpdateRecorder:
 
     def __init__(self, model: Any):
         self.after: list[int] = []
-        original = model.reinitialize
+        original = model.learner.reinitialize
 
         def reinitialize(shrink: float = 0.0) -> None:
             self.after.append(model._n_updates)
             original(shrink)
 
-        model.reinitialize = reinitialize
+        model.learner.reinitialize = reinitialize
 
 
 @pytest.mark.parametrize(
@@ -445,8 +445,8 @@ def test_shrunk_kernels_have_spectral_norm_one(shrink: float) -> None:
 def test_shrink_is_what_the_resets_use() -> None:
     shrinks = []
     model = sac(resets=(20,), reset_shrink=0.4)
-    reinitialize = model.reinitialize
-    model.reinitialize = lambda shrink: shrinks.append(shrink) or reinitialize(shrink)
+    reinitialize = model.learner.reinitialize
+    model.learner.reinitialize = lambda shrink: shrinks.append(shrink) or reinitialize(shrink)
     model.learn(25)
     assert shrinks == [0.4]
 

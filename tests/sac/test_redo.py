@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sb3_sample import SAC
-from sb3_sample.sac import plasticity
+from sb3_sample.learner import plasticity
 from tests.sac.common import bro, differing, random_batch, sac, state, taken_or_refused, vec
 from tests.sac.test_update import NoSynchronisation
 
@@ -69,7 +69,7 @@ def test_a_dead_neuron_by_hand() -> None:
         moments[p]["exp_avg_sq"].fill_(0.25)
 
     model._n_updates = 1000
-    metrics = model.redo.after_update(model, batch)
+    metrics = model.redo.after_update(model.learner, batch)
     assert metrics["plasticity/n_recycled"].item() == int(dead[0].sum() + dead[1].sum()) >= 1
     after = {name: p.detach() for name, p in model.critic.named_parameters()}
     # Fresh incoming weights, no bias, no outgoing weights; the living neurons keep theirs.

@@ -36,7 +36,7 @@ def step_by_hand(model: SAC, batch: Batch, noise: Noise, radius: float, rate: fl
         target = batch.rewards + model.gamma * (1 - batch.dones) * (value + bonus)
 
     def gradients() -> list[torch.Tensor]:
-        loss = model._critic_loss(model.critic(batch.observations, batch.actions), target)
+        loss = model.learner.head.loss(model.critic(batch.observations, batch.actions), target)
         return list(torch.autograd.grad(loss, list(model.critic.parameters())))
 
     names = [name for name, _ in model.critic.named_parameters()]

@@ -232,10 +232,10 @@ def test_training_never_sees_what_is_held_out(
             assert (batch.observations[:, 0] == batch.rewards.flatten() // 10000).all()
         return update(batch, noise)
 
-    def spy_judge(agent: Any, batch: Any, noise: Any) -> Any:
+    def spy_judge(learner: Any, batch: Any, *rest: Any) -> Any:
         assert batch.rewards.shape == (2, 1)
         judged.update(batch.rewards.flatten().tolist())
-        return judge(agent, batch, noise)
+        return judge(learner, batch, *rest)
 
     monkeypatch.setattr(model, "_update", spy_update)
     monkeypatch.setattr(LearnedPessimism, "_judge", staticmethod(spy_judge))

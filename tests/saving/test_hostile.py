@@ -28,7 +28,7 @@ import torch
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.save_util import recursive_getattr
 
-from sb3_sample.learner.parts import ParametersDoNotFit
+from sb3_sample.errors import ParametersDoNotFit
 from sb3_sample.ppo import MBMAPPO
 from sb3_sample.sac import SAC
 from sb3_sample.sac.bro import BRO
