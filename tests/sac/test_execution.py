@@ -410,7 +410,7 @@ def test_without_a_compiler_training_goes_on_uncompiled(compile: Any, monkeypatc
     model = sac(compile=compile)
     without = torch._inductor.config.patch({"cpp.cxx": ("/nonexistent/c++",)})
     with without, warnings.catch_warnings(record=True) as caught:
-        assert "C++ compiler" in (why_not_compiled(model) or "")
+        assert "C++ compiler" in (why_not_compiled(model.learner) or "")
         warnings.simplefilter("always")
         model.learn(30)
     said = [str(w.message) for w in caught if "not compiled" in str(w.message)]
@@ -497,7 +497,7 @@ def test_parts_of_ones_own_are_compiled_when_asked_for(monkeypatch: pytest.Monke
     monkeypatch.setitem(PESSIMISMS, "own", Own)
     monkeypatch.setitem(PESSIMISMS, "counting", Counting)
     assert sac(pessimism="own").learn(20).compiled is False
-    assert sac(pessimism="own", compile=True).learn(20)._execution.compiled
+    assert sac(pessimism="own", compile=True).learn(20).learner._execution.compiled
     with (
         torch._dynamo.config.patch(recompile_limit=2),
         pytest.raises(RuntimeError, match=r"compile=True, but .*compile=False"),

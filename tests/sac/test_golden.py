@@ -320,8 +320,8 @@ def test_torch_adamw_would_fail(monkeypatch: pytest.MonkeyPatch) -> None:
         replay(OWN_FOLDER / "bro_quantile_public.npz")
 
 
-def _torch_adamw(policy: Any, parameters: Any, lr_schedule: Any) -> torch.optim.Optimizer:
-    return torch.optim.AdamW(parameters, lr=lr_schedule(1), weight_decay=policy.optimizer_kwargs["weight_decay"])
+def _torch_adamw(policy: Any, parameters: Any, learning_rate: float) -> torch.optim.Optimizer:
+    return torch.optim.AdamW(parameters, lr=learning_rate, weight_decay=policy.optimizer_kwargs["weight_decay"])
 
 
 def test_layer_norm_epsilon_of_dac() -> None:
