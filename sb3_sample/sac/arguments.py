@@ -13,14 +13,33 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.arguments import NotAllowed, check_every, check_table, check_unused
-from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, DICT, UNIT, Kind, check_value, instance, integer, number, subclass
-from sb3_sample.learner.exploration import EXPLORATIONS
-from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, check_beta
+from sb3_sample.kinds import (
+    ABOVE_0,
+    AT_LEAST_0,
+    DICT,
+    UNIT,
+    Kind,
+    check_value,
+    instance,
+    integer,
+    number,
+    one_of,
+    subclass,
+)
+from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
+from sb3_sample.learner.heads import ValueHead
+from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
+from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.sac.buffers import DeviceReplayBuffer
 from sb3_sample.sac.compact_buffer import CompactReplay
 
 if TYPE_CHECKING:
     from sb3_sample.sac.algorithm import SAC
+
+
+def _is_transform(value: Any) -> bool:
+    cls, kwargs = value if isinstance(value, (tuple, list)) and len(value) == 2 else (value, {})
+    return isinstance(cls, type) and issubclass(cls, BatchTransform) and isinstance(kwargs, dict)
 
 
 #: By argument, what it must be.
@@ -40,8 +59,12 @@ ARGUMENTS: dict[str, Kind] = {
     "n_quantiles": integer(1).or_none("scalar critics"),
     "pessimism_kwargs": DICT,
     "validation_proportion": number("lie in [0, 1)", lambda value: 0 <= value < 1),
-    "exploration": Kind(
-        f"be one of {sorted(EXPLORATIONS)}", lambda value: isinstance(value, str) and value in EXPLORATIONS
+    "value_head": subclass(ValueHead).or_none("scalars or quantiles"),
+    "value_head_kwargs": DICT,
+    "exploration": one_of(EXPLORATIONS, Exploration),
+    "batch_transforms": Kind(
+        "be classes derived from BatchTransform, or pairs of one and its arguments",
+        lambda value: isinstance(value, Sequence) and all(_is_transform(each) for each in value),
     ),
     "exploration_kwargs": DICT,
     "policy_delay": integer(1),
@@ -63,8 +86,8 @@ def check(agent: "SAC") -> None:
     n_critics = check_value("n_critics", agent.policy_kwargs.get("n_critics", 2), integer(1))
     check_target_entropy(agent)
     check_use_sde(agent.use_sde)
-    if n_critics == 1 and (isinstance(agent.pessimism, str) or agent.exploration == "oac"):
-        what = f"pessimism={agent.pessimism!r}" if isinstance(agent.pessimism, str) else "exploration='oac'"
+    if n_critics == 1 and (isinstance(agent.pessimism, (str, type)) or agent.exploration == "oac"):
+        what = f"pessimism={agent.pessimism!r}" if isinstance(agent.pessimism, (str, type)) else "exploration='oac'"
         raise ValueError(f"{what} weighs the critics' spread, which n_critics=1 has not")
     if agent.redo_period is None:
         check_unused(agent, ["redo_threshold"], "redo_period=None")
@@ -77,7 +100,14 @@ def check(agent: "SAC") -> None:
         check_unused(agent, ["reset_shrink"], "no resets")
     if agent.compile not in (True, False, "auto") or not isinstance(agent.compile, (bool, str)):
         raise ValueError(f"compile must be True, False or 'auto', not {agent.compile!r}")
-    for name in ("n_quantiles", "backbone"):
+    if agent.value_head is None:
+        check_unused(agent, ["value_head_kwargs"], "value_head=None")
+    elif agent.n_quantiles is not None:
+        raise ValueError(
+            f"n_quantiles={agent.n_quantiles} and value_head={agent.value_head!r} are two value heads: pass "
+            "n_quantiles=None"
+        )
+    for name in ("n_quantiles", "n_outputs", "backbone"):
         if name in agent.policy_kwargs:
             raise ValueError(f"{name} is an argument of the algorithm, not of policy_kwargs")
     if agent.backbone == "td3":
@@ -132,9 +162,12 @@ def _check_no_entropy(agent: "SAC", name: str) -> None:
 
 
 def _check_pessimism(agent: "SAC") -> None:
-    if isinstance(agent.pessimism, str):
-        if agent.pessimism not in PESSIMISMS:
-            raise ValueError(f"pessimism must be a number, or one of {sorted(PESSIMISMS)}, not {agent.pessimism!r}")
+    if isinstance(agent.pessimism, (str, type)):
+        kind = one_of(PESSIMISMS, Pessimism)
+        if not kind.fits(agent.pessimism):
+            raise ValueError(
+                f"pessimism must be a number, or {kind.words.removeprefix('be ')}, not {agent.pessimism!r}"
+            )
     else:
         check_beta("pessimism", agent.pessimism)
         if agent.pessimism_kwargs:
@@ -144,7 +177,7 @@ def _check_pessimism(agent: "SAC") -> None:
             )
     if agent.actor_pessimism is not None:
         check_beta("actor_pessimism", agent.actor_pessimism)
-    if agent.target_subset == 1 and isinstance(agent.pessimism, str):
+    if agent.target_subset == 1 and isinstance(agent.pessimism, (str, type)):
         raise ValueError(
             f"pessimism={agent.pessimism!r} weighs the spread of the targets, and target_subset=1 leaves none"
         )
@@ -270,7 +303,7 @@ def check_rule(agent: "SAC") -> None:
             raise ValueError("the segments of pessimism='opl' must be on-policy: leave action_noise out")
 
 
-def check_names(argument: str, choice: str, make: Callable[..., Any], kwargs: dict[str, Any]) -> None:
+def check_names(argument: str, choice: Any, make: Callable[..., Any], kwargs: dict[str, Any]) -> None:
     """
     :param argument: name of the argument that chose a part
     :param choice: its value
