@@ -47,18 +47,18 @@ from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.scalars import FixedScalar, LogScalar
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.logged_values import LoggedValues
-from sb3_sample.sac import arguments
-from sb3_sample.sac.buffers import (
+from sb3_sample.replay.buffers import (
     ValidationDictReplayBuffer,
     ValidationReplayBuffer,
     ValidationSplit,
     store_float_actions,
 )
-from sb3_sample.sac.compact_buffer import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
+from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
+from sb3_sample.replay.sources import ReplaySource
+from sb3_sample.sac import arguments
 from sb3_sample.sac.model_learner import check_action_space
 from sb3_sample.sac.policies import BACKBONES, CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.sb3_names import SB3Names
-from sb3_sample.sac.sources import ReplaySource
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ, Checkpointer, refuse_second_call
 from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.model import SafeFiles

@@ -3,7 +3,7 @@
 import inspect
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -30,11 +30,8 @@ from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
 from sb3_sample.learner.transforms import BatchTransform
-from sb3_sample.sac.buffers import DeviceReplayBuffer
-from sb3_sample.sac.compact_buffer import CompactReplay
-
-if TYPE_CHECKING:
-    from sb3_sample.sac.algorithm import SAC
+from sb3_sample.replay.buffers import DeviceReplayBuffer
+from sb3_sample.replay.compact import CompactReplay
 
 
 def _is_transform(value: Any) -> bool:
@@ -76,7 +73,7 @@ ARGUMENTS: dict[str, Kind] = {
 }
 
 
-def check(agent: "SAC") -> None:
+def check(agent: Any) -> None:
     """
     :param agent: an algorithm whose arguments are stored and whose networks do not exist yet
     :raises ValueError: if an argument is out of range or contradicts another
@@ -129,7 +126,7 @@ def has_resets(resets: Any) -> bool:
     return not (isinstance(resets, (Sequence, np.ndarray)) and len(resets) == 0)
 
 
-def check_target_entropy(agent: "SAC") -> None:
+def check_target_entropy(agent: Any) -> None:
     """
     :param agent: an algorithm
     :raises ValueError: if its ``target_entropy`` is neither finite nor "auto", or a number where there is no entropy
@@ -153,7 +150,7 @@ def check_use_sde(use_sde: bool) -> None:
         )
 
 
-def _check_no_entropy(agent: "SAC", name: str) -> None:
+def _check_no_entropy(agent: Any, name: str) -> None:
     if getattr(agent, name) != "auto":
         raise ValueError(
             f"{name}={getattr(agent, name)!r} asks for an entropy, which a deterministic actor (backbone='td3') has "
@@ -161,7 +158,7 @@ def _check_no_entropy(agent: "SAC", name: str) -> None:
         )
 
 
-def _check_pessimism(agent: "SAC") -> None:
+def _check_pessimism(agent: Any) -> None:
     if isinstance(agent.pessimism, (str, type)):
         kind = one_of(PESSIMISMS, Pessimism)
         if not kind.fits(agent.pessimism):
@@ -190,7 +187,7 @@ def _check_pessimism(agent: "SAC") -> None:
             )
 
 
-def _check_buffer_class(agent: "SAC") -> None:
+def _check_buffer_class(agent: Any) -> None:
     """Whether the buffer is one for the observations."""
     cls, space = agent.replay_buffer_class, agent.observation_space
     is_dict = isinstance(space, spaces.Dict)
@@ -211,7 +208,7 @@ def _check_buffer_class(agent: "SAC") -> None:
         )
 
 
-def _check_replay(agent: "SAC") -> None:
+def _check_replay(agent: Any) -> None:
     if agent.validation_proportion > 0:
         cls = agent.replay_buffer_class
         if cls is not None and cls not in (ReplayBuffer, DictReplayBuffer) and not issubclass(cls, CompactReplay):
@@ -228,7 +225,7 @@ def _check_replay(agent: "SAC") -> None:
             )
 
 
-def _check_memory_map(agent: "SAC") -> None:
+def _check_memory_map(agent: Any) -> None:
     """A buffer in files: only those of this package know it."""
     cls, is_split = agent.replay_buffer_class, agent.validation_proportion > 0
     made_by_us = is_split or (agent.n_steps == 1 if cls is None else issubclass(cls, CompactReplay))
@@ -240,7 +237,7 @@ def _check_memory_map(agent: "SAC") -> None:
         )
 
 
-def _check_device_buffer(agent: "SAC") -> None:
+def _check_device_buffer(agent: Any) -> None:
     cls = agent.replay_buffer_class
     if cls is None or not issubclass(cls, DeviceReplayBuffer):
         return
@@ -253,7 +250,7 @@ def _check_device_buffer(agent: "SAC") -> None:
         raise ValueError("replay_buffer_class=DeviceReplayBuffer cannot be combined with optimize_memory_usage=True")
 
 
-def _check_n_steps(agent: "SAC") -> None:
+def _check_n_steps(agent: Any) -> None:
     cls = agent.replay_buffer_class
     if agent.n_steps > 1 and cls is not None and not issubclass(cls, NStepReplayBuffer):
         raise ValueError(
@@ -262,7 +259,7 @@ def _check_n_steps(agent: "SAC") -> None:
         )
 
 
-def _check_train_freq(agent: "SAC") -> None:
+def _check_train_freq(agent: Any) -> None:
     train_freq: Any = agent.train_freq
     if not isinstance(train_freq, TrainFreq):
         every, unit = train_freq if isinstance(train_freq, tuple) else (train_freq, "step")
@@ -274,7 +271,7 @@ def _check_train_freq(agent: "SAC") -> None:
             )
 
 
-def check_rule(agent: "SAC") -> None:
+def check_rule(agent: Any) -> None:
     """
     :param agent: an algorithm with its rule of pessimism
     :raises ValueError: if the transitions that the rule learns from are none that the algorithm has

@@ -24,7 +24,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_sample import MBMAPPO
-from sb3_sample.sac.buffers import DeviceReplayBuffer
+from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.sac.policies import MlpPolicy
 from sb3_sample.saving import container, run_folder, training_state
 from sb3_sample.saving.attributes import Describer, same
