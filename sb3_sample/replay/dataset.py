@@ -179,14 +179,16 @@ def _rows(name: str, values: Any) -> Arrays:
         raise ValueError(f"{name} must be numbers of shape (N, ...), not {array.dtype} of shape {array.shape}")
     if array.dtype.kind != "f":
         return array
-    array = array.astype(np.float32)
+    with np.errstate(over="ignore"):
+        array = array.astype(np.float32)
     if not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite, within float32")
     return array
 
 
 def _column(name: str, values: Any) -> np.ndarray:
-    array = np.asarray(values).astype(np.float32)
+    with np.errstate(over="ignore"):  # what float32 does not hold is refused below
+        array = np.asarray(values).astype(np.float32)
     if array.ndim == 2 and array.shape[1] == 1:
         array = array[:, 0]
     if array.ndim != 1:
