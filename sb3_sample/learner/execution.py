@@ -116,13 +116,11 @@ def _is_ours(thing: Any) -> bool:
 
 
 def _is_compilable(cls: type) -> bool:
-    """What the class says, if it is not of this package, or the first of its bases that says it or is."""
-    for base in cls.__mro__:
-        if _is_ours(base):
-            return True
-        if "compilable" in vars(base):
-            return bool(vars(base)["compilable"])
-    return False
+    """Whether a class is of this package, or it, or the nearest of its bases from outside, says so."""
+    if _is_ours(cls):
+        return True
+    said = [vars(base)["compilable"] for base in cls.__mro__ if not _is_ours(base) and "compilable" in vars(base)]
+    return bool(said and said[0])
 
 
 def _foreign_optimizers(learner: Any) -> str:
