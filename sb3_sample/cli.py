@@ -83,7 +83,7 @@ def _train(arguments: list[str]) -> None:
     from sb3_sample.zoo.patches import reading
 
     options, rest = _own_options(runs.train_parser(), arguments)
-    with _errors("train"), _arguments("train"), reading(options.allow_pickle, options.trusted_modules):
+    with _arguments("train"), _errors("train"), reading(options.allow_pickle, options.trusted_modules):
         start = runs.plan(options, rest)
         _set_command_line("train", rest if start is None else start.arguments)
         runs.train(start)
