@@ -1,8 +1,6 @@
 """
-The files of the zoo's commands that are pickled in the stock zoo: those of our algorithms run no code when they are
-read. They keep the zoo's names (``vecnormalize.pkl``, ``replay_buffer.pkl``), by which its commands find them.
-
-The zoo's own algorithms are read and written as in the stock zoo, since their models are pickled too.
+The tables of runs that the stock zoo pickles, in a file by the same name that runs no code when it is read; and the
+errors and options of the commands that read a run's files.
 """
 
 import argparse
