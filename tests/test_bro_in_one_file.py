@@ -4,6 +4,7 @@ the algorithm that is used.
 """
 
 import dataclasses
+import functools
 import importlib.util
 import json
 import subprocess
@@ -34,7 +35,7 @@ def load() -> ModuleType:
 
 one_file: Any = load()
 TINY = one_file.Config(
-    critic_blocks=1, critic_width=8, actor_width=8, n_quantiles=5, batch_size=8, learning_starts=50, replay_ratio=2
+    critic_blocks=1, critic_width=8, actor_width=8, n_quantiles=5, batch_size=8, learning_starts=20, replay_ratio=2
 )
 
 
@@ -106,6 +107,11 @@ def recorded(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     return data, json.loads(str(data["meta"]))
 
 
+def mean_std(agent: Any, observations: torch.Tensor) -> float:
+    with torch.no_grad():
+        return float(agent.actor(observations)[1].exp().mean())
+
+
 def replay(path: Path) -> int:
     """Run a file's updates, compare all parameters and reported numbers; gives how many numbers were compared."""
     data, meta = recorded(path)
@@ -116,21 +122,32 @@ def replay(path: Path) -> int:
     networks = {"critic": agent.critics, "actor": agent.actor, "actor_o": agent.optimist}
     n_compared = 0
     for i in range(meta["dims"]["n_updates"]):
-        part = {name: torch.as_tensor(data[f"batch/{i}/{name}"]) for name in (*one_file.Batch._fields[:3], "masks")}
-        batch = one_file.Batch(
-            part["observations"], part["actions"], part["rewards"][:, None], 1 - part["masks"][:, None],
-            torch.as_tensor(data[f"batch/{i}/next_observations"]),
-        )  # fmt: skip
+        observations, actions, rewards, masks, next_observations = (
+            torch.as_tensor(data[f"batch/{i}/{name}"])
+            for name in ("observations", "actions", "rewards", "masks", "next_observations")
+        )
         noise = torch.stack([torch.as_tensor(data[f"noise/{i}/{name}"]) for name in ("critic", "actor", "actor_o")])
         reported = {f"{name}_pnorm": golden.norm(list(module.parameters())) for name, module in networks.items()}
+        a = actions.clone().requires_grad_()
+        q1, q2 = agent.critics(observations, a).mean(dim=(1, 2))
+        reported["critic_agnorm"] = float(torch.autograd.grad(0.5 * (q1 + q2), a)[0].norm(dim=1).mean())
+        reported |= {"q1": q1.item(), "q2": q2.item(), "r": rewards.mean().item(), "std": mean_std(agent, observations)}
+
+        batch = one_file.Batch(observations, actions, rewards[:, None], 1 - masks[:, None], next_observations)
         metrics = {name: value.item() for name, value in agent.update(batch, noise).items()}
-        reported |= {f"{name}_gnorm": golden.norm([p.grad for p in m.parameters()]) for name, m in networks.items()}
+
         reported |= {theirs: metrics[ours] for theirs, ours in golden.SHARED_NAMES.items()}
-        reported |= {"optimism": metrics["exploration/optimism"]}
-        reported |= {"kl": metrics["exploration/kl"] * meta["dims"]["act_dim"]}
-        for name, value in reported.items():
-            theirs = float(data[f"info/{i}/{name}"])
-            assert abs(value - theirs) <= golden.INFO_TOLERANCE * max(1, abs(theirs)), f"{i}, {name}: {value}, {theirs}"
+        reported |= {f"{name}_gnorm": golden.norm([p.grad for p in m.parameters()]) for name, m in networks.items()}
+        reported["optimism"] = metrics["exploration/optimism"]
+        reported["kl"] = metrics["exploration/kl"] * meta["dims"]["act_dim"]
+        # The optimistic actor started from the new actor's standard deviation.
+        reported["std_c"] = mean_std(agent, observations)
+        reported["std_o"] = reported["std_c"] * agent.config.std_multiplier
+        for name in {key.split("/")[2] for key in data if key.startswith(f"info/{i}/")}:
+            ours, theirs = reported[name], float(data[f"info/{i}/{name}"])
+            assert abs(ours - theirs) <= golden.INFO_TOLERANCE * max(1, abs(theirs)), (
+                f"{i}, {name}: {ours}, not {theirs}"
+            )
             n_compared += 1
         last = i == meta["dims"]["n_updates"] - 1
         if last or f"after/{i}/temp/log_temp" in data:
@@ -152,7 +169,7 @@ def test_files_are_there() -> None:
 
 @pytest.mark.parametrize("path", FILES, ids=[path.stem for path in FILES])
 def test_golden(path: Path) -> None:
-    assert replay(path) >= 2 * 19
+    assert replay(path) >= len(golden.SHARED_NAMES), "the file reports nothing to compare with"
 
 
 def test_torch_adamw_would_fail(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -190,7 +207,7 @@ def test_defaults_are_the_librarys() -> None:
     ours = named_parameters(agent)
     assert {name: value.shape for name, value in ours.items()} == {name: value.shape for name, value in theirs.items()}
     for name, value in ours.items():  # not the same draws, but of the same size; the numbers are equal
-        assert float(value.norm()) == pytest.approx(float(theirs[name].norm()), rel=1e-3, abs=1e-6), name
+        assert value.norm().item() == pytest.approx(theirs[name].norm().item(), rel=1e-3, abs=1e-6), name
     assert explorer.shift.bias is None and agent.optimist.shift.bias is None
 
 
@@ -231,16 +248,16 @@ def test_library_update() -> None:
             assert value.item() == pytest.approx(metrics[name].item(), rel=1e-4, abs=1e-5), name
     for name, value in ours.items():
         # Relative to how far the parameters went, which is little beside what they are.
-        distance, difference = float((value - start[name]).norm()), float((value - theirs[name]).norm())
-        assert 0 < distance and difference <= 0.01 * distance, f"{name}: off by {difference} after {distance}"
+        distance, difference = (value - start[name]).norm().item(), (value - theirs[name]).norm().item()
+        assert distance > 0 and difference <= 0.01 * distance, f"{name}: off by {difference} after {distance}"
         torch.testing.assert_close(value, theirs[name], rtol=1e-5, atol=2e-6)
 
 
 def run(n_steps: int, seed: int = 0, **changes: Any) -> tuple[Any, list[float]]:
-    return one_file.train("Pendulum-v1", dataclasses.replace(TINY, **changes), n_steps, seed, eval_every=200)
+    return one_file.train("Pendulum-v1", dataclasses.replace(TINY, **changes), n_steps, seed, eval_every=100)
 
 
-@pytest.mark.parametrize("n_steps", [99, 100, 101, 230, 299])
+@pytest.mark.parametrize("n_steps", [29, 30, 31, 75])
 def test_resets_and_replay_ratio(n_steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many gradient steps since the last reset, and as many resets, as the library's BRO has taken."""
     made: list[Any] = []
@@ -252,13 +269,13 @@ def test_resets_and_replay_ratio(n_steps: int, monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(one_file, "Agent", Counted)
     monkeypatch.setattr(one_file, "evaluate", lambda agent, env: 0.0)
-    agent, _ = run(n_steps, resets=(100, 230))
+    agent, _ = run(n_steps, resets=(30, 60))
     model = BRO(
-        "MlpPolicy", "Pendulum-v1", model_size=(1, 8), n_quantiles=5, batch_size=8, learning_starts=50,
-        replay_ratio=2, resets=(100, 230), buffer_size=300, device="cpu", compile=False,
+        "MlpPolicy", "Pendulum-v1", model_size=(1, 8), n_quantiles=5, batch_size=8, learning_starts=20,
+        replay_ratio=2, resets=(30, 60), buffer_size=100, device="cpu", compile=False,
     )  # fmt: skip
     model.learn(n_steps)
-    assert len(made) - 1 == model.plasticity.n_done == sum(step <= n_steps for step in (100, 230))
+    assert len(made) - 1 == model.plasticity.n_done == sum(step <= n_steps for step in (30, 60))
     assert agent is made[-1]
     optimizers = [value for name, value in vars(agent).items() if name.endswith("_optimizer")]
     (theirs,) = {int(state["step"]) for state in model.critic.optimizer.state.values()}
@@ -266,18 +283,58 @@ def test_resets_and_replay_ratio(n_steps: int, monkeypatch: pytest.MonkeyPatch) 
     assert sum(a.critic_optimizer.n_steps for a in made) == model._n_updates
 
 
-def test_equal_seeds_are_equal(capsys: pytest.CaptureFixture[str]) -> None:
-    (first, returns), (second, same_returns), (other, _) = run(420), run(420), run(420, seed=1)
+def test_equal_seeds_are_equal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(one_file, "evaluate", functools.partial(one_file.evaluate, n_episodes=2))
+    runs = [run(250, seed, learning_starts=150, resets=(200,)) for seed in (0, 0, 1)]
+    (first, second, other), (returns, same_returns, _) = zip(*runs, strict=True)
     assert returns == same_returns and len(returns) == 3
     printed = capsys.readouterr().out.splitlines()
-    assert printed[:3] == printed[3:6] and printed[2].startswith(
-        f"step 420, return {returns[2]:.1f}, train/critic_loss"
-    )
+    assert printed[:3] == printed[3:6]
+    assert printed[0] == f"step 100, return {returns[0]:.1f}", "nothing learned yet"
+    assert printed[2].startswith(f"step 250, return {returns[2]:.1f}, train/critic_loss")
     first, second, other = map(named_parameters, (first, second, other))
     for name, value in first.items():
         assert torch.isfinite(value).all(), name
         assert torch.equal(value, second[name]), name
     assert any(not torch.equal(value, other[name]) for name, value in first.items())
+
+
+def test_evaluation_plays_the_mean_action(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = one_file.Agent(3, 1, TINY)
+    observation = np.array([0.5, -0.5, 2.0], np.float32)
+    with torch.no_grad():
+        mean = torch.tanh(agent.actor(torch.as_tensor(observation)[None])[0][0]).numpy()
+    np.testing.assert_allclose(agent.mean_action(observation), mean, rtol=1e-6)
+    monkeypatch.setattr(agent, "explore", None)
+    env = one_file.make_env("Pendulum-v1")
+    env.reset(seed=0)
+    state = torch.get_rng_state()
+    value = one_file.evaluate(agent, env, n_episodes=2)
+    assert torch.equal(state, torch.get_rng_state()), "nothing is drawn"
+    env.reset(seed=0)
+    rewards = []
+    for _ in range(2):
+        observation, done = env.reset()[0], False
+        while not done:
+            observation, reward, _, done, _ = env.step(agent.mean_action(observation))
+            rewards.append(reward)
+    assert len(rewards) == 400 and value == pytest.approx(sum(rewards) / 2)
+
+
+def test_exploration_samples_the_shifted_actor() -> None:
+    """Against the library's formula: tanh of the mean, its shift, and 0.75 standard deviations of noise."""
+    agent = one_file.Agent(3, 1, TINY)
+    torch.nn.init.normal_(agent.optimist.shift.weight)
+    observation = np.array([0.5, -0.5, 2.0], np.float32)
+    torch.manual_seed(0)
+    action = agent.explore(observation)
+    torch.manual_seed(0)
+    with torch.no_grad():
+        observations = torch.as_tensor(observation)[None]
+        mean, log_std = agent.actor(observations)
+        shift = agent.optimist.shift(agent.optimist.trunk(torch.cat((observations, mean), dim=1)))
+        expected = torch.tanh(mean + shift + 0.75 * log_std.exp() * torch.randn(1, 1))
+    np.testing.assert_allclose(action, expected[0].numpy(), rtol=1e-5)
 
 
 def test_replay_ring() -> None:
@@ -295,8 +352,8 @@ def test_replay_ring() -> None:
 def test_what_it_refuses() -> None:
     with pytest.raises(ValueError, match=r"env must have a bounded Box .*; CartPole-v1 has Discrete\(2\)"):
         one_file.make_env("CartPole-v1")
-    with pytest.raises(ValueError, match="steps must be more than learning_starts=50, not 50"):
-        run(50)
+    with pytest.raises(ValueError, match="steps must be more than learning_starts=20, not 20"):
+        run(20)
 
 
 def test_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
