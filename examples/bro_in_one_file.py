@@ -222,10 +222,10 @@ def quantile_huber(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     Quantile Huber loss of predictions (E, B, K) for targets (B, K), threshold 1 (Dabney et al. 2018, equation 10): the
     sum over critics and predicted quantiles, the mean over batch and target quantiles.
     """
-    error = target[:, None, :] - q[..., None]  # (E, B, K, K): every target quantile less every predicted one
-    huber = F.huber_loss(error, torch.zeros_like(error), reduction="none")
-    midpoints = (torch.arange(q.shape[2]) + 0.5) / q.shape[2]
-    weight = (midpoints[:, None] - (error < 0).float()).abs()
+    predicted, target = torch.broadcast_tensors(q[..., None], target[:, None, :])  # (E, B, K, K): all pairs
+    huber = F.huber_loss(predicted, target, reduction="none")
+    midpoints = (torch.arange(q.shape[2])[:, None] + 0.5) / q.shape[2]
+    weight = torch.where(target < predicted, 1 - midpoints, midpoints)
     return (weight * huber).mean(dim=(1, 3)).sum()
 
 
@@ -387,7 +387,9 @@ def train(env_id: str, config: Config, n_steps: int, seed: int, eval_every: int)
     :return: the agent, and the mean return of every evaluation
     """
     if n_steps <= config.learning_starts:
-        raise ValueError(f"steps must be more than learning_starts={config.learning_starts}, not {n_steps}")
+        raise ValueError(f"n_steps must be more than learning_starts={config.learning_starts}, not {n_steps}")
+    if eval_every < 1:
+        raise ValueError(f"eval_every must be at least 1, not {eval_every}")
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
     env, eval_env = make_env(env_id), make_env(env_id)
@@ -422,8 +424,8 @@ def main() -> None:
     parser.add_argument("--fast", action="store_true", help="BRO Fast: replay ratio 2, and the first reset only")
     parser.add_argument("--eval-every", type=int, default=5_000, help="environment steps between two evaluations")
     args = parser.parse_args()
-    if args.env.startswith(("dmc/", "metaworld/", "myosuite/")):
-        import sb3_sample  # noqa: F401 - registers them
+    if args.env not in gym.registry:
+        import sb3_sample  # noqa: F401 - registers DeepMind Control and other suites
 
     blocks, width = MODEL_SIZES[args.model_size]
     fast = {"replay_ratio": 2, "resets": Config.resets[:1]} if args.fast else {}

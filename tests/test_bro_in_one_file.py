@@ -352,8 +352,10 @@ def test_replay_ring() -> None:
 def test_what_it_refuses() -> None:
     with pytest.raises(ValueError, match=r"env must have a bounded Box .*; CartPole-v1 has Discrete\(2\)"):
         one_file.make_env("CartPole-v1")
-    with pytest.raises(ValueError, match="steps must be more than learning_starts=20, not 20"):
+    with pytest.raises(ValueError, match="n_steps must be more than learning_starts=20, not 20"):
         run(20)
+    with pytest.raises(ValueError, match="eval_every must be at least 1, not 0"):
+        one_file.train("Pendulum-v1", TINY, 30, seed=0, eval_every=0)
 
 
 def test_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
