@@ -291,7 +291,7 @@ class Agent:
         q = self.critics(batch.observations, batch.actions)
         loss = quantile_huber(q, target)
         self.critic_optimizer.minimize(loss)
-        with torch.no_grad():  # Target critics, directly behind the critics (the authors' code).
+        with torch.no_grad():  # Polyak average, directly after the critics (the authors' code).
             for old, new in zip(self.target_critics.parameters(), self.critics.parameters(), strict=True):
                 old.lerp_(new, self.config.tau)
         return {"train/critic_loss": loss, "train/q_mean": q.mean()}
