@@ -4,7 +4,6 @@ The off-policy family as Stable-Baselines3's: acting, storing, when and how ofte
 The update is the learner's (``sb3_sample/learner/learner.py``).
 """
 
-import io
 import pathlib
 import warnings
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -22,12 +22,8 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.arguments import check_learn, check_load, check_n_envs, check_program, default_of, naming_changes
-from sb3_sample.envs.finite_check import FiniteCheck
-from sb3_sample.envs.workers import watch_workers
-from sb3_sample.errors import ParametersDoNotFit
-from sb3_sample.export import Exportable
-from sb3_sample.faults import MetricWatch, TrainingDiverged, check_finite_parameters, not_finite
+from sb3_sample.arguments import check_program, default_of
+from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, not_finite
 from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.learner.execution import (
     PAYS_FROM,
@@ -56,12 +52,12 @@ from sb3_sample.sac.model_learner import check_action_space
 from sb3_sample.sac.policies import BACKBONES, CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.sb3_names import SB3Names
 from sb3_sample.sac.sources import ReplaySource
-from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ, Checkpointer, refuse_second_call
-from sb3_sample.saving.container import BadFile
+from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
+from sb3_sample.saving.encoding import Lenient
+from sb3_sample.saving.kept import Kept
 from sb3_sample.saving.model import SafeFiles
-from sb3_sample.saving.model_tree import Description
-from sb3_sample.saving.notice import say_once
 from sb3_sample.saving.replay import SafeReplayBuffers, encode_buffer
+from sb3_sample.training.resumable import Resumable
 
 Self = TypeVar("Self", bound="SAC")
 
@@ -69,7 +65,7 @@ Self = TypeVar("Self", bound="SAC")
 MAX_BATCHES_AT_ONCE = 64
 
 
-class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]  # actor
+class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]  # actor
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
     SAC that the papers compare with (P2-P5): tanh-Gaussian actor, two critics, clipped double Q-learning.
@@ -149,6 +145,16 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
     }
     policy_base = SACPolicy
     policy: SACPolicy
+    _kept: ClassVar[dict[str, Kept]] = {
+        # Saved by its parts.
+        "_learner": Kept.NOWHERE,
+        "_source": Kept.NOWHERE,
+        "_watch": Kept.NOWHERE,
+        # For the log of a run that goes on.
+        "_metrics": Kept.IN_CHECKPOINTS,
+        # An argument that changes with every step.
+        "action_noise": Kept.EVERYWHERE,
+    }
     #: The class of the learner.
     learner_class: ClassVar[type[Learner]] = Learner
     #: beta1 of the temperature's Adam.
@@ -273,21 +279,9 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
     # ---------------------------------------------------------------- construction
 
     def _setup_model(self) -> None:
-        self._check_arguments()
-        given = self.policy_kwargs, self.replay_buffer_kwargs
-        # Policy and buffer are built with more than the user's own arguments, and only the latter are saved.
-        self.policy_kwargs = self._full_policy_kwargs()
-        self._choose_replay_buffer()
-        try:
-            super()._setup_model()
-        finally:
-            self.policy_kwargs, self.replay_buffer_kwargs = given
+        super()._setup_model()
         assert self.replay_buffer is not None
         store_float_actions(self.replay_buffer)
-        if self.device.type == "cpu":
-            # glibc hands freed memory back to the system above a threshold, at first below the size of one gradient,
-            # and every update then pays for page faults. The threshold follows the largest block freed so far.
-            torch.empty(31 * 2**20, dtype=torch.uint8)
         if self.compile != "auto":
             self.compiled = bool(self.compile)
         self._source = ReplaySource(self)
@@ -339,12 +333,10 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
             self.target_entropy = self._target_entropy
 
     def _check_arguments(self) -> None:
-        """
-        :raises ValueError: if an argument is out of range or contradicts another
-        """
         arguments.check(self)
 
-    def _choose_replay_buffer(self) -> None:
+    def _complete_arguments(self) -> None:
+        super()._complete_arguments()
         is_dict = isinstance(self.observation_space, spaces.Dict)
         if self.validation_proportion > 0:
             self.replay_buffer_class = ValidationDictReplayBuffer if is_dict else ValidationReplayBuffer
@@ -363,9 +355,6 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
             self.optimize_memory_usage = False
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
-        """
-        :return: the policy's arguments: the user's and the algorithm's
-        """
         return {**self.policy_kwargs, "n_quantiles": self.n_quantiles, "backbone": self.backbone}
 
     def _full_exploration_kwargs(self) -> dict[str, Any]:
@@ -416,110 +405,23 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         return make(learner, **kwargs)  # type: ignore[no-any-return]
 
     @classmethod
-    def load(
-        cls: type[Self],
-        path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | str | None = None,
-        device: torch.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        *,
-        allow_pickle: bool = False,
-        trusted_modules: Sequence[str] = (),
-        **kwargs: Any,
-    ) -> Self:
-        """
-        Load a model, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it.
-
-        :param path: file, or where ``save`` wrote it
-        :param env: environment to go on with, or its id; none is needed for prediction
-        :param device: "auto", "cpu", "cuda", ...
-        :param custom_objects: objects that replace what the file holds under their names
-        :param print_system_info: whether to print the saved and the present versions
-        :param force_reset: whether the environment is reset before training goes on
-        :param allow_pickle: whether a file in Stable-Baselines3's own, pickled format is loaded too, which can run any
-            code that its author wanted
-        :param trusted_modules: modules, or packages of modules, whose classes and functions the file, and what the
-            model reads later, may name
-        :param kwargs: arguments of the constructor that take the place of the file's, which is not asked for them. What
-            a learned number starts from (``initial_...``, ``ent_coef="auto_..."``) counts from the next reset on: the
-            file has its value
-        :return: the model
-        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
-        :raises ValueError: if ``kwargs`` holds something else, or values that are not allowed
-        """
-        check_load(cls, SAC, env, device, kwargs)
+    def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
+        implied: dict[str, Any] = {}
         if "compile" in kwargs:
-            kwargs["compiled"] = None
+            implied["compiled"] = None
         if "train_freq" in kwargs or "gradient_steps" in kwargs:
-            kwargs.setdefault("replay_ratio", None)
+            implied["replay_ratio"] = None
         # One way to count resets replaces the file's other one.
         if kwargs.get("reset_gradient_steps") is not None:
-            kwargs.setdefault("resets", ())
+            implied["resets"] = ()
         elif "resets" in kwargs:
-            kwargs["reset_gradient_steps"] = None
-        with naming_changes(kwargs):
-            return super().load(
-                path,
-                env,
-                device,
-                custom_objects,
-                print_system_info,
-                force_reset,
-                allow_pickle=allow_pickle,
-                trusted_modules=trusted_modules,
-                **kwargs,
-            )
-
-    def set_parameters(
-        self,
-        load_path_or_dict: str | pathlib.Path | io.BufferedIOBase | dict[str, Any],
-        exact_match: bool = True,
-        device: torch.device | str = "auto",
-        *,
-        allow_pickle: bool = False,
-        trusted_modules: Sequence[str] = (),
-    ) -> None:
-        """
-        Load parameters, as in Stable-Baselines3. The optimizers' moments are loaded, their settings (learning rate,
-        weight decay, ...) stay this model's, so that ``load`` with other ones has them in force.
-
-        :param load_path_or_dict: a file, or parameters as ``get_parameters`` gives them
-        :param exact_match: whether parameters for every module must be there, and no others
-        :param device: "auto", "cpu", "cuda", ...
-        :param allow_pickle: see ``load``
-        :param trusted_modules: see ``load``
-        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
-        :raises ValueError: if the parameters are of other networks or parts
-        """
-        try:
-            super().set_parameters(
-                load_path_or_dict, exact_match, device, allow_pickle=allow_pickle, trusted_modules=trusted_modules
-            )
-        except BadFile:
-            raise
-        except ValueError as error:
-            raise ParametersDoNotFit(str(error)) from error
+            implied["reset_gradient_steps"] = None
+        return implied
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         check_action_space(env.action_space)
-        venv = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-        FiniteCheck.install(venv)
-        watch_workers(venv)
-        return venv
-
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """
-        Go on with another environment, as in Stable-Baselines3.
-
-        :param env: the environment, of the same spaces and as many as the model was made with
-        :param force_reset: whether it is reset before training goes on
-        :raises ValueError: if it is not
-        """
-        check_n_envs(self, env)
-        super().set_env(env, force_reset)
+        return Resumable._wrap_env(env, verbose, monitor_wrapper)
 
     def _parts(self) -> dict[str, Part]:
         return {name: part for name, part in self.learner.parts().items() if part.has_state}
@@ -530,15 +432,6 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "temperature", *self._parts(), *self._optimizers()], []
-
-    def _excluded_save_params(self) -> list[str]:
-        return [
-            *super()._excluded_save_params(),
-            "_learner",
-            "_metrics",
-            "_source",
-            "_watch",
-        ]
 
     def reinitialize(self, shrink: float = 0.0) -> None:
         """
@@ -564,16 +457,11 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
                 actions = self.explorer.act(self.learner, observations)
             scaled = actions.cpu().numpy().reshape((n_envs, *self.action_space.shape))
             if not np.isfinite(scaled).all():
-                self._stop_diverged(scaled)
+                check_finite_parameters(self)
+                raise diverged(self, not_finite({"the policy's action": scaled.sum()}))
         if action_noise is not None:
             scaled = np.clip(scaled + action_noise(), -1, 1)
         return self.policy.unscale_action(scaled), scaled
-
-    def _stop_diverged(self, actions: np.ndarray) -> None:
-        """An action is not finite, and no environment shall see it: say why."""
-        check_finite_parameters(self)
-        worst = not_finite({"the policy's action": actions.sum()})
-        raise TrainingDiverged(worst, f"gradient step {self._n_updates}", self.num_timesteps)
 
     def _store_transition(
         self,
@@ -592,30 +480,9 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         rewards = reward if self._vec_normalize_env is None else self._vec_normalize_env.get_original_reward()
         self.learner.on_step(rewards, dones, infos)
 
-    def load_replay_buffer(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        truncate_last_traj: bool = True,
-        *,
-        allow_pickle: bool = False,
-        trusted_modules: Sequence[str] = (),
-    ) -> None:
-        """
-        Load a replay buffer, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it.
-
-        :param path: file, or where ``save_replay_buffer`` wrote it
-        :param truncate_last_traj: with ``HerReplayBuffer``, whether the last episode counts as ended
-        :param allow_pickle: see ``load``
-        :param trusted_modules: see ``load``
-        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile or pickled
-        :raises ValueError: if it is the buffer of other spaces or of another number of environments, or holds out
-            another share of its transitions than ``validation_proportion``
-        """
-        before = getattr(self, "replay_buffer", None)
-        super().load_replay_buffer(path, truncate_last_traj, allow_pickle=allow_pickle, trusted_modules=trusted_modules)
-        share = self.replay_buffer.validation_proportion if isinstance(self.replay_buffer, ValidationSplit) else 0.0
+    def _check_replay_buffer(self, buffer: ReplayBuffer, path: Any) -> None:
+        share = buffer.validation_proportion if isinstance(buffer, ValidationSplit) else 0.0
         if share != self.validation_proportion:
-            self.replay_buffer = before
             raise ValueError(
                 f"the replay buffer of {path} holds out {share} of its transitions, but this model has "
                 f"validation_proportion={self.validation_proportion}"
@@ -652,54 +519,48 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
             differs) or of an earlier call of ``learn``, cannot be used, or has checkpoints that are all damaged
         :raises TrainingDiverged: if a loss, another metric or a parameter is NaN or infinite
         """
-        total_timesteps = check_learn(self, locals())
-        refuse_second_call(self, checkpoint)
-        resets_environment = reset_num_timesteps or self._last_obs is None
-        total_timesteps, callback = self._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
+        return self._learn(
+            total_timesteps,
+            callback,
+            log_interval,
+            tb_log_name,
+            reset_num_timesteps,
+            progress_bar,
+            checkpoint,
+            checkpoint_freq,
         )
-        if resets_environment:
-            self._on_environment_reset()
-        encoder = Description(self).encoder
+
+    def _described(self) -> Lenient:
+        encoder = super()._described()
         if self.replay_buffer is not None:
             encode_buffer(self.replay_buffer, encoder, only_small=True)
-        say_once(self, encoder)
-        with Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
-            checkpointer.resume()
-            self._decide_compilation(total_timesteps - self.num_timesteps)
-            callback.on_training_start(locals(), globals())
-            checkpointer.start()
-            assert self.env is not None and self.replay_buffer is not None
-            while self.num_timesteps < total_timesteps:
-                rollout = self.collect_rollouts(
-                    self.env,
-                    train_freq=self.train_freq,  # type: ignore[arg-type]  # converted in _setup_model
-                    action_noise=self.action_noise,
-                    callback=checkpointer.callback,
-                    learning_starts=self.learning_starts,
-                    replay_buffer=self.replay_buffer,
-                    log_interval=log_interval,
-                )
-                if not rollout.continue_training:
-                    break
-                n_updates = self._updates_due(rollout.episode_timesteps)
-                if n_updates > 0:
-                    self.train(n_updates, self.batch_size)
-                checkpointer.after_turn()
-            else:
-                self._warn_of_warm_up()
-            check_finite_parameters(self)
-            checkpointer.finish()
-        return self
+        return encoder
+
+    def _turn(self, callback: BaseCallback, log_interval: int) -> bool:
+        assert self.env is not None and self.replay_buffer is not None
+        rollout = self.collect_rollouts(
+            self.env,
+            train_freq=self.train_freq,  # type: ignore[arg-type]  # converted in _setup_model
+            action_noise=self.action_noise,
+            callback=callback,
+            learning_starts=self.learning_starts,
+            replay_buffer=self.replay_buffer,
+            log_interval=log_interval,
+        )
+        if rollout.continue_training:
+            n_updates = self._updates_due(rollout.episode_timesteps)
+            if n_updates > 0:
+                self.train(n_updates, self.batch_size)
+        return rollout.continue_training
 
     def _on_environment_reset(self) -> None:
-        """The environments were reset in the midst of their episodes."""
         self.learner.on_environment_reset()
 
-    def _decide_compilation(self, n_steps: int) -> None:
-        """With ``compile="auto"``, once and for all: whether the coming environment steps pay it back."""
+    def _before_turns(self) -> None:
+        """Decide, with ``compile="auto"`` once and for all, whether the coming environment steps pay it back."""
         if self.compiled is not None:
             return
+        n_steps = self._total_timesteps - self.num_timesteps
         n_steps -= max(self.learning_starts - self.num_transitions, 0)
         if self.replay_ratio is not None:
             n_updates = self.replay_ratio * n_steps
@@ -718,8 +579,8 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
             warn_not_compiled(self.learner, reason)
         self.learner.forget_execution()
 
-    def _warn_of_warm_up(self) -> None:
-        """Say at the end of a training, which no callback has ended, that nothing was learned for want of steps."""
+    def _after_turns(self) -> None:
+        """Say if nothing was learned for want of steps."""
         wanted = self.gradient_steps if self.replay_ratio is None else self.replay_ratio
         if self._n_updates > 0 or self.num_transitions == 0 or wanted == 0 or not self._is_warming_up():
             return
@@ -729,7 +590,7 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
             f"before the first, and the replay buffer has {self.replay_buffer.size() * self.n_envs} of the "
             f"{self.num_transitions} of this model's life. Train for more than {self.learning_starts} steps, or pass a "
             "smaller learning_starts= to the constructor or to load (Stable-Baselines3's SAC has 100)",
-            stacklevel=3,
+            stacklevel=4,
         )
 
     def _is_warming_up(self) -> bool:
