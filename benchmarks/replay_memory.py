@@ -25,8 +25,8 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_sample import CompactReplayBuffer
-from sb3_sample.sac.buffers import BatchMemory
-from sb3_sample.sac.sources import draw_batches
+from sb3_sample.replay.buffers import BatchMemory
+from sb3_sample.replay.sources import draw_batches
 
 OBSERVATION, ACTION, EPISODE, BATCHES, BATCH, ROUNDS = 223, 38, 1_000, 20, 256, 200
 

@@ -4,9 +4,10 @@ from sb3_sample.diagnostics import DiagnosticsCallback
 from sb3_sample.envs import EnvironmentDied, SupervisedSubprocVecEnv, make_env
 from sb3_sample.faults import TrainingDiverged
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
+from sb3_sample.replay.buffers import DeviceReplayBuffer
+from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
+from sb3_sample.replay.dataset import Dataset
 from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
-from sb3_sample.sac.buffers import DeviceReplayBuffer
-from sb3_sample.sac.compact_buffer import CompactDictReplayBuffer, CompactReplayBuffer
 from sb3_sample.version import __version__
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "BROFast",
     "CompactDictReplayBuffer",
     "CompactReplayBuffer",
+    "Dataset",
     "DeviceReplayBuffer",
     "DiagnosticsCallback",
     "EnvironmentDied",

@@ -6,8 +6,6 @@ import sys
 import warnings
 from typing import Any
 
-from stable_baselines3.common.logger import Logger
-
 
 def standard_error() -> int | None:
     """
@@ -52,10 +50,10 @@ class LossyLog:
     While it is in force, lines of the log that a terminal, a pipe or a file does not take are lost with a warning, and
     do not end the training in the midst of a turn.
 
-    :param logger: the algorithm's
+    :param logger: the algorithm's, of Stable-Baselines3
     """
 
-    def __init__(self, logger: Logger):
+    def __init__(self, logger: Any):
         self._formats: list[Any] = list(logger.output_formats)
         for each in self._formats:
             each.write = _Lossy(each)

@@ -27,8 +27,8 @@ from sb3_sample.learner.pessimism import epistemic_std
 from sb3_sample.learner.q_values import evaluate
 from sb3_sample.learner.target import bootstrap
 from sb3_sample.networks import neuron_scores
+from sb3_sample.replay.buffers import samples_at
 from sb3_sample.sac import SAC
-from sb3_sample.sac.buffers import samples_at
 from sb3_sample.saving.rings import Ring
 
 

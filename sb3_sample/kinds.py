@@ -1,7 +1,7 @@
 """Kinds of values that arguments take, and the one check of a value against its kind."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from numbers import Integral, Real
 from typing import Any, NamedTuple, TypeGuard
 
@@ -121,3 +121,31 @@ def check_value(name: str, value: Any, kind: Kind) -> Any:
     if not kind.fits(value):
         raise ValueError(f"{name} must {kind.words}, not {value!r}")
     return value.item() if isinstance(value, np.generic) else value
+
+
+def one_of(table: Mapping[str, Any], base: type) -> Kind:
+    """
+    :param table: choices by name
+    :param base: base class of the choices
+    :return: the kind of their names, and of the classes derived from ``base``
+    """
+    words = f"be one of {sorted(table)}, or a class derived from {base.__name__}"
+    return Kind(
+        words,
+        lambda value: (
+            (isinstance(value, str) and value in table) or (isinstance(value, type) and issubclass(value, base))
+        ),
+    )
+
+
+def chosen(name: str, value: Any, table: Mapping[str, Any], base: type) -> Any:
+    """
+    :param name: name of an argument
+    :param value: its value
+    :param table: choices by name
+    :param base: base class of the choices
+    :return: the choice of that name, or the class itself
+    :raises ValueError: if it is neither
+    """
+    check_value(name, value, one_of(table, base))
+    return table[value] if isinstance(value, str) else value

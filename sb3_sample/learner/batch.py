@@ -69,7 +69,8 @@ class Source(Protocol):
 class Noise(NamedTuple):
     """
     Everything random of one gradient step: standard normal noise of its sampled actions, (B, A) each, and the critics
-    that make the TD target, (n,), if they are drawn. What is None is drawn by :meth:`completed`.
+    that make the TD target, (n,), if they are drawn. What is None is drawn by :meth:`completed`; what the batch
+    transforms need, one each, before.
     """
 
     critic: torch.Tensor | None = None
@@ -77,6 +78,7 @@ class Noise(NamedTuple):
     exploration: torch.Tensor | None = None
     pessimism: torch.Tensor | None = None
     subset: torch.Tensor | None = None
+    transforms: tuple[torch.Tensor | None, ...] | None = None
 
     def completed(self, batch: Batch, extra: Extra | None, subset: tuple[int, int] | None) -> "Noise":
         """
@@ -90,7 +92,7 @@ class Noise(NamedTuple):
         if extra is not None:
             rows["pessimism"] = len(extra.batch.actions)
         missing = {name: n for name, n in rows.items() if getattr(self, name) is None}
-        drawn: dict[str, torch.Tensor] = {}
+        drawn: dict[str, Any] = {}
         if missing:
             values = torch.randn(sum(missing.values()), like.shape[1], dtype=like.dtype, device=like.device)
             drawn.update(zip(missing, values.split(list(missing.values())), strict=True))

@@ -101,11 +101,26 @@ def why_not_compiled(learner: Any) -> str | None:
 def has_foreign_parts(learner: Any) -> bool:
     """
     :param learner: the learner
-    :return: whether it has parts, or a gradient step, from outside of this package, which may not be written to be
-        compiled: a number that they change at every step, say, would have the step compiled anew at every step
+    :return: whether it has parts, networks or a gradient step from outside of this package that do not say that they
+        can be compiled (``compilable = True``): a number that they change at every step, say, would have the step
+        compiled anew at every step
     """
-    parts = (type(learner.explorer), type(learner.pessimism_rule), type(learner).gradient_step)
-    return any(part.__module__.split(".")[0] != __name__.split(".")[0] for part in parts)
+    objects = [learner.explorer, learner.pessimism_rule, learner.head, learner.actor.trunk, learner.critic.trunk]
+    if not _is_ours(type(learner).gradient_step):
+        objects.append(learner)
+    return not all(_is_compilable(type(one)) for one in objects)
+
+
+def _is_ours(thing: Any) -> bool:
+    return bool(thing.__module__.split(".")[0] == __name__.split(".")[0])
+
+
+def _is_compilable(cls: type) -> bool:
+    """Whether a class is of this package, or it, or the nearest of its bases from outside, says so."""
+    if _is_ours(cls):
+        return True
+    said = [vars(base)["compilable"] for base in cls.__mro__ if not _is_ours(base) and "compilable" in vars(base)]
+    return bool(said and said[0])
 
 
 def _foreign_optimizers(learner: Any) -> str:

@@ -13,8 +13,8 @@ from sb3_sample.learner import losses
 from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.parts import Learning, Part
 from sb3_sample.learner.pessimism import epistemic_std
-from sb3_sample.learner.q_values import evaluate
 from sb3_sample.learner.scalars import BoundedLogScalar, LogScalar
+from sb3_sample.learner.target import values
 from sb3_sample.networks import NETWORKS, linear
 from sb3_sample.optim import AdamW
 
@@ -172,7 +172,7 @@ class OptimisticExploration(Exploration):
 
         optimistic_mean, optimistic_std = self._gaussian(batch.observations, features, mean, std)
         action = learner.actor.learned_action(optimistic_mean, self.std_multiplier * optimistic_std, noise)
-        q = evaluate(learner.critic, batch.observations, action)
+        q = values(learner, learner.critic, batch.observations, action)
         q_mean, q_std = q.mean(dim=0), spread(q, self.uncertainty)
         kl = self._kl(learner, (optimistic_mean, optimistic_std), (mean, std))
         upper_value = q_mean + optimism.detach() * q_std
@@ -413,7 +413,7 @@ class OptimisticGradient(Exploration):
         # Acting runs in inference mode, which knows no gradients.
         with torch.inference_mode(False), torch.enable_grad():
             at = mean.clone().requires_grad_()
-            q = evaluate(learner.critic, _cloned(observations), torch.tanh(at))
+            q = values(learner, learner.critic, _cloned(observations), torch.tanh(at))
             upper_value = q.mean(dim=(0, 2)) + self.optimism * epistemic_std(q).mean(dim=1)
             (gradient,) = torch.autograd.grad(upper_value.sum(), at)
         scaled = std.square() * gradient

@@ -1,6 +1,7 @@
 """Value heads: what the outputs of critics mean, what they are drawn to, and by which loss."""
 
 from collections.abc import Callable
+from typing import ClassVar
 
 import torch
 
@@ -13,11 +14,21 @@ class ValueHead:
     """
     Scalar critics, trained by the squared error; and the base class of other heads.
 
-    ``n_outputs`` is K, the outputs a critic; ``n_quantiles`` the same if they are quantiles, else None.
+    ``n_outputs`` is the number of outputs a critic; ``n_quantiles`` the same if they are quantiles, else None. A head
+    that chooses nothing by a tensor's value may say ``compilable = True``.
     """
+
+    compilable: ClassVar[bool] = True
 
     n_outputs: int = 1
     n_quantiles: int | None = None
+
+    def values(self, outputs: torch.Tensor) -> torch.Tensor:
+        """
+        :param outputs: of critics, (E, B, n_outputs)
+        :return: what rules of pessimism and actors see, (E, B, K): values, or quantiles of one
+        """
+        return outputs
 
     def target(
         self,
@@ -28,16 +39,16 @@ class ValueHead:
     ) -> torch.Tensor:
         """
         :param batch: transitions
-        :param next_q: outputs of the target critics for the next state and action, (E, B, K)
+        :param next_q: outputs of the target critics for the next state and action, (E, B, n_outputs)
         :param value: the rule of pessimism's, (E, B, K) to (B, K)
         :param entropy_bonus: ``-alpha * log pi`` of that action, (B, 1)
-        :return: what every critic is drawn to, (B, K)
+        :return: what :meth:`loss` draws every critic to, (B, K) here
         """
-        return td_target(batch, value(next_q), entropy_bonus)
+        return td_target(batch, value(self.values(next_q)), entropy_bonus)
 
     def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """
-        :param q: outputs of the critics, (E, B, K)
+        :param q: outputs of the critics, (E, B, n_outputs)
         :param target: from :meth:`target`, without gradient
         :return: scalar
         """

@@ -24,9 +24,10 @@ from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.q_values import evaluate
 from sb3_sample.learner.randomness import OwnGenerators
 from sb3_sample.learner.scalars import FixedScalar, LogScalar
-from sb3_sample.learner.target import bootstrap
+from sb3_sample.learner.target import bootstrap, values
+from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.networks.modes import ModeSwitch
-from sb3_sample.networks.spectral_norm import SpectralNorm
+from sb3_sample.networks.network import Network
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 
 
@@ -79,6 +80,7 @@ class Learner:
     :param make_explorer: makes a freshly initialised explorer for the learner
     :param plasticity: when everything starts anew
     :param redo: recycling of dormant neurons; None for none
+    :param make_transforms: each makes a batch transform for the learner, applied in this order
     :param learning_rate: of actor, critics and temperature, at the start
     :param temperature_beta1: beta1 of the temperature's Adam
     :param gamma: discount factor of batches that have none of their own
@@ -118,6 +120,7 @@ class Learner:
         make_explorer: Callable[[Any], Exploration],
         plasticity: Resets,
         redo: ReDo | None = None,
+        make_transforms: Sequence[Callable[[Any], BatchTransform]] = (),
         learning_rate: float = 3e-4,
         temperature_beta1: float = 0.9,
         gamma: float = 0.99,
@@ -151,6 +154,7 @@ class Learner:
             self.temperature = make_temperature(self)
             self.pessimism_rule = self.make_pessimism()
             self.explorer = self.make_explorer()
+            self.transforms: Any = nn.ModuleList(make(self).to(self.device) for make in make_transforms)
         self.plasticity, self.redo = plasticity, redo
         self.temperature_optimizer: AdamW | None = None
         if isinstance(self.temperature, LogScalar):
@@ -245,7 +249,8 @@ class Learner:
             "pessimism_rule": self.pessimism_rule,
             "plasticity": self.plasticity,
         }
-        return parts if self.redo is None else {**parts, "redo": self.redo}
+        parts |= {} if self.redo is None else {"redo": self.redo}
+        return parts | {f"transforms.{i}": transform for i, transform in enumerate(self.transforms)}
 
     def optimizers(self) -> dict[str, Optimizer]:
         """
@@ -374,6 +379,8 @@ class Learner:
         execution = self._execution or self.prepared_execution()
         if batch.discounts is None:
             batch = batch._replace(discounts=self.gamma)
+        if self.transforms:
+            batch, noise, extra = self._transformed(batch, noise, extra)
         subset = None if self.target_subset is None else (self.target_subset, self.critic.n_critics)
         noise = (noise or Noise()).completed(batch, extra, subset)
         self._counts._n_updates += 1
@@ -384,6 +391,15 @@ class Learner:
         for part in self.parts().values():
             metrics.update(part.after_update(self, batch))
         return metrics
+
+    def _transformed(self, batch: Batch, noise: Noise | None, extra: Extra | None) -> tuple[Batch, Noise, Extra | None]:
+        noise = noise or Noise()
+        drawn = noise.transforms or tuple(transform.draw(batch) for transform in self.transforms)
+        for transform, numbers in zip(self.transforms, drawn, strict=True):
+            batch = transform.transform(batch, numbers)
+            if extra is not None:
+                extra = extra._replace(batch=transform.transform(extra.batch, transform.draw(extra.batch)))
+        return batch, noise._replace(transforms=None), extra
 
     def gradient_step(
         self, batch: Batch, noise: Noise, extra: Extra | None, moves_targets: bool, moves_actor: bool
@@ -410,6 +426,8 @@ class Learner:
             self.minimize(self.critic.optimizer, critic_loss)
         else:
             self._sharpness_aware_step(critic_loss, batch, target)
+        self.critic.trunk.project()
+        q = self.head.values(q)
         metrics = {"train/critic_loss": critic_loss, "train/q_mean": q.mean()}
 
         # Targets, by Polyak averaging.
@@ -419,9 +437,10 @@ class Learner:
         if moves_actor:
             # Actor, on the new critics.
             actions, log_prob = self.actor.sample(batch.observations, noise.actor)
-            value = self._actor_value(evaluate(self.critic, batch.observations, actions))
+            value = self._actor_value(values(self, self.critic, batch.observations, actions))
             actor_loss = losses.actor_loss(log_prob, value, alpha.detach())
             self.minimize(self.actor.optimizer, actor_loss)
+            self.actor.trunk.project()
             metrics["train/actor_loss"] = actor_loss
             if self.networks.actor_target is not None:
                 self._follow(self.networks.actor_target, self.actor)
@@ -439,7 +458,7 @@ class Learner:
                     metrics["train/ent_coef_loss"] = temperature_loss
 
         # Pessimism.
-        step = CriticStep(q.detach(), next_q, entropy_bonus, noise.subset)
+        step = CriticStep(q.detach(), self.head.values(next_q), entropy_bonus, noise.subset)
         metrics.update(self.pessimism_rule.update(self, batch, step, noise.pessimism, extra))
         return {name: value.detach() for name, value in metrics.items()}
 
@@ -501,7 +520,7 @@ class Learner:
         """
         :return: everything that later steps depend on, besides the arguments
         """
-        modules = {"networks": self.networks, "temperature": self.temperature, **self._parts_with_state()}
+        modules = {"networks": self.networks, "temperature": self.temperature, **self.parts_with_state()}
         state = {name: module.state_dict() for name, module in modules.items()}
         state |= {name: optimizer.state_dict() for name, optimizer in self.optimizers().items()}
         counts = {"n_updates": self.n_updates, "num_transitions": self.num_transitions, "heard": self._heard}
@@ -518,7 +537,7 @@ class Learner:
             raise ValueError(f"state must have the entries {sorted(own)}, not {sorted(state)}")
         for name, module in {"networks": self.networks, "temperature": self.temperature}.items():
             module.load_state_dict(state[name])
-        for name, part in self._parts_with_state().items():
+        for name, part in self.parts_with_state().items():
             part.load_state_dict(state[name])
         for name, optimizer in self.optimizers().items():
             optimizer.load_state_dict(state[name])
@@ -528,7 +547,10 @@ class Learner:
         if self._generators is not None:
             self._generators.load_state_dict(state["generators"])
 
-    def _parts_with_state(self) -> dict[str, Part]:
+    def parts_with_state(self) -> dict[str, Part]:
+        """
+        :return: the parts that are saved, by the path from the learner
+        """
         return {name: part for name, part in self.parts().items() if part.has_state}
 
     # ---------------------------------------------------------------- starting anew
@@ -562,10 +584,10 @@ class Learner:
                 state[name] = torch.lerp(state[name].to(parameter.device), parameter.detach(), shrink)
         module.load_state_dict(state)
         if shrink > 0:
-            # The directions along which kernels are normalised are neither the old nor the fresh ones.
-            for layer in module.modules():
-                if isinstance(layer, SpectralNorm):
-                    layer.find_direction()
+            # What follows from the weights, as the directions of spectral norms, is neither the old nor the fresh.
+            for network in module.modules():
+                if isinstance(network, Network):
+                    network.refresh()
         if isinstance(module, Part):
             for optimizer in module.optimizers().values():
                 optimizer.state.clear()

@@ -123,6 +123,9 @@ class Part(nn.Module):
 
     #: Whether it has parameters, numbers or optimizers that are saved.
     has_state: ClassVar[bool] = True
+    #: Whether what of it is run in a gradient step can be compiled. A class from outside of this package says so
+    #: itself.
+    compilable: ClassVar[bool] = True
 
     def optimizers(self) -> dict[str, Optimizer]:
         """

@@ -19,8 +19,7 @@ from sb3_sample.errors import ParametersDoNotFit
 from sb3_sample.kinds import is_integer, is_number
 from sb3_sample.learner.batch import Batch, CriticStep, Extra, Source
 from sb3_sample.learner.parts import Learning, Part
-from sb3_sample.learner.q_values import evaluate
-from sb3_sample.learner.target import bootstrap, td_target
+from sb3_sample.learner.target import bootstrap, td_target, values
 from sb3_sample.optim import AdamW
 
 
@@ -268,9 +267,8 @@ class LearnedPessimism(Pessimism):
         """What the critics' step computes, of other transitions."""
         with torch.no_grad():
             next_q, entropy_bonus = bootstrap(learner, batch, learner.temperature(), noise, subset)
-            return CriticStep(
-                evaluate(learner.critic, batch.observations, batch.actions), next_q, entropy_bonus, subset
-            )
+            q = values(learner, learner.critic, batch.observations, batch.actions)
+            return CriticStep(q, learner.head.values(next_q), entropy_bonus, subset)
 
     def _td_error(self, batch: Batch, step: CriticStep) -> torch.Tensor:
         """``Q_mean(s, a) - r - gamma V_lb(s')``, (B,)."""

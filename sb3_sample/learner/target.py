@@ -1,11 +1,25 @@
 """The TD target: the one place where it is made, for the gradient step, the rules of pessimism and the diagnostics."""
 
+from typing import Any
+
 import torch
 
 from sb3_sample.learner import losses
 from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.parts import Learning
 from sb3_sample.learner.q_values import evaluate
+
+
+def values(learner: Learning, critics: Any, observations: Any, actions: torch.Tensor) -> torch.Tensor:
+    """
+    :param learner: the learner
+    :param critics: its critics, or the target critics
+    :param observations: (B, O), or a dict of them
+    :param actions: actions in [-1, 1], (B, A)
+    :return: values as rules of pessimism and actors see them, (E, B, K)
+    """
+    found: torch.Tensor = learner.head.values(evaluate(critics, observations, actions))
+    return found
 
 
 def bootstrap(
@@ -16,14 +30,14 @@ def bootstrap(
     subset: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """
-    Target critics' values of the actor's action in the next state, and its entropy bonus. Without gradient.
+    Target critics' outputs for the actor's action in the next state, and its entropy bonus. Without gradient.
 
     :param learner: the learner
     :param batch: transitions
     :param alpha: temperature, a scalar
     :param noise: standard normal noise of the action, (B, A); drawn if None
     :param subset: the critics that make the target, (n,); None for all
-    :return: (E, B, K), or (n, B, K) of a subset; and ``-alpha * log pi(a'|s')``, (B, 1)
+    :return: (E, B, n_outputs), or (n, B, n_outputs) of a subset; and ``-alpha * log pi(a'|s')``, (B, 1)
     """
     with torch.no_grad():
         actions, log_prob = learner.next_actions(batch.next_observations, noise)

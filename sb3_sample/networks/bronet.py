@@ -3,9 +3,9 @@
 import torch
 from torch import nn
 
-from sb3_sample.networks.dormant import HiddenUnits
 from sb3_sample.networks.ensemble import Dense, layer_norm
 from sb3_sample.networks.initialization import linear
+from sb3_sample.networks.network import HiddenUnits, Network
 
 
 class ResidualBlock(nn.Module):
@@ -29,7 +29,7 @@ class ResidualBlock(nn.Module):
         return self.norm2(self.dense2(residual)).add_(x)
 
 
-class BroNet(nn.Module):
+class BroNet(Network):
     """
     The trunk of BRO's critics and actors: Dense, LayerNorm, ReLU, then residual blocks. The output layer
     (quantiles, mean, log standard deviation) belongs to whoever uses the trunk.

@@ -4,37 +4,18 @@ Dormant neurons: how active each hidden neuron is, and new weights for those tha
 Shapes: E copies, N neurons of a layer, B batch. A network without copies has no axis E.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
-
 import torch
 from torch import nn
 
 from sb3_sample.networks.activations import width_factor
-from sb3_sample.networks.ensemble import Dense, EnsembleLinear, Norm
+from sb3_sample.networks.ensemble import Dense, EnsembleLinear
 from sb3_sample.networks.initialization import draw_orthogonal
+from sb3_sample.networks.network import Network
 from sb3_sample.networks.spectral_norm import SpectralNorm
-
-if TYPE_CHECKING:
-    from sb3_sample.networks import Network
-
-
-class HiddenUnits(NamedTuple):
-    """One layer of hidden neurons, as a network's ``hidden_units`` lists them."""
-
-    #: The dense layer's name inside the network
-    name: str
-    #: The layer whose N outputs are the neurons
-    dense: Dense
-    #: The layer norm between the neurons and their activation, if there is one
-    norm: Norm | None
-    #: The module whose output is the neurons' activation
-    activation: nn.Module
-    #: The one layer that reads the activation; None if others read it too, and the neurons cannot be recycled
-    outgoing: Dense | None
 
 
 @torch.no_grad()
-def neuron_scores(trunk: "Network", head: Dense | None, x: torch.Tensor) -> dict[str, torch.Tensor]:
+def neuron_scores(trunk: Network, head: Dense | None, x: torch.Tensor) -> dict[str, torch.Tensor]:
     """
     How active each hidden neuron is (Sokar et al. 2023, equation 1): the mean over the batch of its absolute
     activation, divided by the mean of that over the neurons of its layer. A neuron is τ-dormant if its score is at
@@ -76,7 +57,7 @@ class _Measure:
 
 @torch.no_grad()
 def recycle(
-    trunk: "Network",
+    trunk: Network,
     head: Dense | None,
     x: torch.Tensor,
     threshold: float,

@@ -6,13 +6,13 @@ import torch
 from torch import nn
 
 from sb3_sample.networks.activations import width_factor
-from sb3_sample.networks.dormant import HiddenUnits
 from sb3_sample.networks.ensemble import Dense, Norm
 from sb3_sample.networks.ensemble import layer_norm as make_layer_norm
 from sb3_sample.networks.initialization import linear
+from sb3_sample.networks.network import HiddenUnits, Network
 
 
-class MLP(nn.Module):
+class MLP(Network):
     """
     Hidden layers of an MLP; the output layer belongs to whoever uses them. A hidden layer is Dense, dropout, layer
     norm, activation; the last kernel may have spectral norm 1 (P2, appendix B).

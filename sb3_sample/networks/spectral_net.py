@@ -3,9 +3,9 @@
 import torch
 from torch import nn
 
-from sb3_sample.networks.dormant import HiddenUnits
 from sb3_sample.networks.ensemble import Dense, layer_norm
 from sb3_sample.networks.initialization import linear
+from sb3_sample.networks.network import HiddenUnits, Network
 
 
 class SpectralBlock(nn.Module):
@@ -27,7 +27,7 @@ class SpectralBlock(nn.Module):
         return self.dense2(self.activation(self.dense1(self.norm(x)))) + x
 
 
-class SpectralNet(nn.Module):
+class SpectralNet(Network):
     """
     "Spectral" of P5, figure 14 and table 1, the design of Bjorck et al. (2021): Dense, ReLU, then residual blocks with
     the layer norm at their beginning and spectral norms inside.

@@ -1,7 +1,7 @@
 """Checks of the on-policy family's arguments."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
@@ -21,10 +21,6 @@ from sb3_sample.kinds import (
     number,
     subclass,
 )
-
-if TYPE_CHECKING:
-    from sb3_sample.ppo.simulated_ppo import SimulatedPPO
-
 
 _CLIPPING = ABOVE_0.otherwise("a schedule", callable)
 #: By argument, what it must be.
@@ -54,7 +50,7 @@ ARGUMENTS: dict[str, Kind] = {
 }
 
 
-def check(agent: "SimulatedPPO") -> None:
+def check(agent: Any) -> None:
     """
     :param agent: an algorithm whose arguments are stored and whose networks do not exist yet
     :raises ValueError: if an argument is out of range or contradicts another
@@ -95,7 +91,7 @@ def _check_net_arch(net_arch: Any) -> None:
     check_net_arch(net_arch, ("pi", "vf"), both=False)
 
 
-def _check_buffer_class(agent: "SimulatedPPO") -> None:
+def _check_buffer_class(agent: Any) -> None:
     cls, space = agent.rollout_buffer_class, agent.observation_space
     if cls is not None and issubclass(cls, DictRolloutBuffer) and not isinstance(space, spaces.Dict):
         raise ValueError(
@@ -105,14 +101,14 @@ def _check_buffer_class(agent: "SimulatedPPO") -> None:
         raise ValueError(f"rollout_buffer_class={cls.__name__} cannot hold the observations of {space}: leave it out")
 
 
-def _check_schedule(agent: "SimulatedPPO") -> None:
+def _check_schedule(agent: Any) -> None:
     """When there are how many simulated samples."""
     anneal, warm_up = agent.anneal_until, agent.warm_up_until
     if anneal is not None and (warm_up or 0) >= anneal:
         raise ValueError(f"warm_up_until must be below anneal_until={anneal}, not {warm_up}")
 
 
-def _check_simulation(agent: "SimulatedPPO") -> None:
+def _check_simulation(agent: Any) -> None:
     if agent.use_sde:
         raise ValueError(
             "use_sde=True draws one noise for all actions at a state, so that simulated actions would be equal: "

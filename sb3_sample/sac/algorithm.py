@@ -4,6 +4,7 @@ The off-policy family as Stable-Baselines3's: acting, storing, when and how ofte
 The update is the learner's (``sb3_sample/learner/learner.py``).
 """
 
+import functools
 import pathlib
 import warnings
 from collections.abc import Sequence
@@ -24,6 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_program, default_of
 from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, not_finite
+from sb3_sample.kinds import chosen
 from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.learner.execution import (
     PAYS_FROM,
@@ -39,19 +41,20 @@ from sb3_sample.learner.parts import Part
 from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
 from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.scalars import FixedScalar, LogScalar
+from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.logged_values import LoggedValues
-from sb3_sample.sac import arguments
-from sb3_sample.sac.buffers import (
+from sb3_sample.replay.buffers import (
     ValidationDictReplayBuffer,
     ValidationReplayBuffer,
     ValidationSplit,
     store_float_actions,
 )
-from sb3_sample.sac.compact_buffer import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
+from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
+from sb3_sample.replay.sources import ReplaySource
+from sb3_sample.sac import arguments
 from sb3_sample.sac.model_learner import check_action_space
 from sb3_sample.sac.policies import BACKBONES, CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.sb3_names import SB3Names
-from sb3_sample.sac.sources import ReplaySource
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
 from sb3_sample.saving.encoding import Lenient
 from sb3_sample.saving.kept import Kept
@@ -103,14 +106,19 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
     :param replay_ratio: gradient steps per environment transition after the warm-up, whatever the number of
         environments; may be below 1
     :param n_quantiles: quantiles a critic; None for scalar critics
+    :param value_head: a class of one's own, derived from ``ValueHead``, in the place of those two; with
+        ``n_quantiles=None``
+    :param value_head_kwargs: its arguments
     :param pessimism: weight of the critics' spread that is subtracted from their mean, at least 0; 1 is the
-        minimum of two critics, 0 the mean. Or the rule that moves it: "gpl", "opl", "top", "vpl"
+        minimum of two critics, 0 the mean. Or the rule that moves it: "gpl", "opl", "top", "vpl", or a class derived
+        from ``Pessimism``
     :param pessimism_kwargs: arguments of the rule
     :param actor_pessimism: a weight for the actor's objective alone (REDQ and DroQ: 0); None: the same
     :param target_subset: how many critics, drawn at random, make the TD target (REDQ: 2); None: all
     :param validation_proportion: share of the transitions that is held out of training, in [0, 1); "vpl" learns from
         them
-    :param exploration: who acts while training: "actor", "oac", "optimistic_actor" (DAC), "optimistic_shift" (BRO)
+    :param exploration: who acts while training: "actor", "oac", "optimistic_actor" (DAC), "optimistic_shift" (BRO), or
+        a class derived from ``Exploration``
     :param exploration_kwargs: its arguments
     :param backbone: "sac", or "td3": a deterministic actor, without entropy
     :param policy_delay: gradient steps between two of the actors' and of the temperature
@@ -123,6 +131,8 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
         1,000); None for none
     :param redo_threshold: score up to which a neuron is dormant
     :param sam_radius: radius of sharpness-aware minimisation of the critics' loss (the original: 0.05); None for none
+    :param batch_transforms: classes derived from ``BatchTransform``, or pairs of one and its arguments, which every
+        batch goes through before it is learned from
     :param use_sde: not supported, refused if True
     :param sde_sample_freq: as in Stable-Baselines3, without meaning where ``use_sde`` is False
     :param use_sde_at_warmup: as in Stable-Baselines3, without meaning where ``use_sde`` is False
@@ -182,12 +192,12 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
         target_entropy: str | float = "auto",
         replay_ratio: float = 2,
         n_quantiles: int | None = None,
-        pessimism: float | str = 1.0,
+        pessimism: float | str | type[Pessimism] = 1.0,
         pessimism_kwargs: dict[str, Any] | None = None,
         actor_pessimism: float | None = None,
         target_subset: int | None = None,
         validation_proportion: float = 0.0,
-        exploration: str = "actor",
+        exploration: str | type[Exploration] = "actor",
         exploration_kwargs: dict[str, Any] | None = None,
         backbone: str = "sac",
         policy_delay: int = 1,
@@ -197,6 +207,9 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
         redo_period: int | None = None,
         redo_threshold: float = 0.025,
         sam_radius: float | None = None,
+        value_head: type[ValueHead] | None = None,
+        value_head_kwargs: dict[str, Any] | None = None,
+        batch_transforms: Sequence[Any] = (),
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         use_sde_at_warmup: bool = False,
@@ -262,6 +275,9 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
         self.redo_period = redo_period
         self.redo_threshold = redo_threshold
         self.sam_radius = sam_radius
+        self.value_head = value_head
+        self.value_head_kwargs = value_head_kwargs
+        self.batch_transforms = batch_transforms
         self.compile = compile
         #: Whether the gradient step is compiled; None while that is not decided. Saved: a loaded model goes on with it.
         self.compiled: bool | None = None
@@ -297,12 +313,13 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
         self._take_target_entropy()
         return self.learner_class(
             self._make_networks,
-            head=ValueHead() if self.n_quantiles is None else QuantileHead(self.n_quantiles),
+            head=self._make_head(),
             make_temperature=self._make_temperature,
             make_pessimism=self.make_pessimism,
             make_explorer=self.make_explorer,
             plasticity=Resets(self.resets, self.reset_shrink, self.reset_gradient_steps),
             redo=None if self.redo_period is None else ReDo(self.redo_period, self.redo_threshold),
+            make_transforms=[functools.partial(_make_transform, each) for each in self.batch_transforms],
             learning_rate=self.lr_schedule(1),
             temperature_beta1=self.temperature_beta1,
             target_entropy=self._target_entropy,
@@ -310,6 +327,11 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
             **{name: getattr(self, name) for name in Learner.SETTINGS},
             **kwargs,
         )
+
+    def _make_head(self) -> ValueHead:
+        if self.value_head is not None:
+            return self.value_head(**(self.value_head_kwargs or {}))
+        return ValueHead() if self.n_quantiles is None else QuantileHead(self.n_quantiles)
 
     def _make_networks(self) -> SACPolicy:
         kwargs = self._full_policy_kwargs()
@@ -355,7 +377,7 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
             self.optimize_memory_usage = False
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
-        return {**self.policy_kwargs, "n_quantiles": self.n_quantiles, "backbone": self.backbone}
+        return {**self.policy_kwargs, "n_outputs": self._make_head().n_outputs, "backbone": self.backbone}
 
     def _full_exploration_kwargs(self) -> dict[str, Any]:
         """
@@ -389,18 +411,20 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
         :param learner: whose it is
         :return: a freshly initialised explorer
         """
-        make, kwargs = EXPLORATIONS[self.exploration], self._full_exploration_kwargs()
+        make = chosen("exploration", self.exploration, EXPLORATIONS, Exploration)
+        kwargs = self._full_exploration_kwargs()
         arguments.check_names("exploration", self.exploration, make, kwargs)
-        return make(learner, **kwargs)
+        return make(learner, **kwargs)  # type: ignore[no-any-return]
 
     def make_pessimism(self, learner: Learner) -> Pessimism:
         """
         :param learner: whose it is
         :return: a freshly initialised rule of pessimism
         """
-        if not isinstance(self.pessimism, str):
+        if not isinstance(self.pessimism, (str, type)):
             return Pessimism(self.pessimism)
-        make, kwargs = PESSIMISMS[self.pessimism], self._full_pessimism_kwargs()
+        make = chosen("pessimism", self.pessimism, PESSIMISMS, Pessimism)
+        kwargs = self._full_pessimism_kwargs()
         arguments.check_names("pessimism", self.pessimism, make, kwargs)
         return make(learner, **kwargs)  # type: ignore[no-any-return]
 
@@ -424,7 +448,7 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
         return Resumable._wrap_env(env, verbose, monitor_wrapper)
 
     def _parts(self) -> dict[str, Part]:
-        return {name: part for name, part in self.learner.parts().items() if part.has_state}
+        return self.learner.parts_with_state()
 
     def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Every optimizer by its path from the algorithm."""
@@ -709,3 +733,8 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
                 self.logger.record(name, float(value))
         self._record_counts()
         super().dump_logs()
+
+
+def _make_transform(choice: Any, learner: Learner) -> BatchTransform:
+    make, kwargs = choice if isinstance(choice, (tuple, list)) else (choice, {})
+    return make(learner, **kwargs)  # type: ignore[no-any-return]

@@ -3,7 +3,7 @@
 import inspect
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -13,14 +13,30 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.arguments import NotAllowed, check_every, check_table, check_unused
-from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, DICT, UNIT, Kind, check_value, instance, integer, number, subclass
-from sb3_sample.learner.exploration import EXPLORATIONS
-from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, check_beta
-from sb3_sample.sac.buffers import DeviceReplayBuffer
-from sb3_sample.sac.compact_buffer import CompactReplay
+from sb3_sample.kinds import (
+    ABOVE_0,
+    AT_LEAST_0,
+    DICT,
+    UNIT,
+    Kind,
+    check_value,
+    instance,
+    integer,
+    number,
+    one_of,
+    subclass,
+)
+from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
+from sb3_sample.learner.heads import ValueHead
+from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
+from sb3_sample.learner.transforms import BatchTransform
+from sb3_sample.replay.buffers import DeviceReplayBuffer
+from sb3_sample.replay.compact import CompactReplay
 
-if TYPE_CHECKING:
-    from sb3_sample.sac.algorithm import SAC
+
+def _is_transform(value: Any) -> bool:
+    cls, kwargs = value if isinstance(value, (tuple, list)) and len(value) == 2 else (value, {})
+    return isinstance(cls, type) and issubclass(cls, BatchTransform) and isinstance(kwargs, dict)
 
 
 #: By argument, what it must be.
@@ -40,8 +56,12 @@ ARGUMENTS: dict[str, Kind] = {
     "n_quantiles": integer(1).or_none("scalar critics"),
     "pessimism_kwargs": DICT,
     "validation_proportion": number("lie in [0, 1)", lambda value: 0 <= value < 1),
-    "exploration": Kind(
-        f"be one of {sorted(EXPLORATIONS)}", lambda value: isinstance(value, str) and value in EXPLORATIONS
+    "value_head": subclass(ValueHead).or_none("scalars or quantiles"),
+    "value_head_kwargs": DICT,
+    "exploration": one_of(EXPLORATIONS, Exploration),
+    "batch_transforms": Kind(
+        "be classes derived from BatchTransform, or pairs of one and its arguments",
+        lambda value: isinstance(value, Sequence) and all(_is_transform(each) for each in value),
     ),
     "exploration_kwargs": DICT,
     "policy_delay": integer(1),
@@ -53,7 +73,7 @@ ARGUMENTS: dict[str, Kind] = {
 }
 
 
-def check(agent: "SAC") -> None:
+def check(agent: Any) -> None:
     """
     :param agent: an algorithm whose arguments are stored and whose networks do not exist yet
     :raises ValueError: if an argument is out of range or contradicts another
@@ -63,8 +83,8 @@ def check(agent: "SAC") -> None:
     n_critics = check_value("n_critics", agent.policy_kwargs.get("n_critics", 2), integer(1))
     check_target_entropy(agent)
     check_use_sde(agent.use_sde)
-    if n_critics == 1 and (isinstance(agent.pessimism, str) or agent.exploration == "oac"):
-        what = f"pessimism={agent.pessimism!r}" if isinstance(agent.pessimism, str) else "exploration='oac'"
+    if n_critics == 1 and (isinstance(agent.pessimism, (str, type)) or agent.exploration == "oac"):
+        what = f"pessimism={agent.pessimism!r}" if isinstance(agent.pessimism, (str, type)) else "exploration='oac'"
         raise ValueError(f"{what} weighs the critics' spread, which n_critics=1 has not")
     if agent.redo_period is None:
         check_unused(agent, ["redo_threshold"], "redo_period=None")
@@ -77,7 +97,14 @@ def check(agent: "SAC") -> None:
         check_unused(agent, ["reset_shrink"], "no resets")
     if agent.compile not in (True, False, "auto") or not isinstance(agent.compile, (bool, str)):
         raise ValueError(f"compile must be True, False or 'auto', not {agent.compile!r}")
-    for name in ("n_quantiles", "backbone"):
+    if agent.value_head is None:
+        check_unused(agent, ["value_head_kwargs"], "value_head=None")
+    elif agent.n_quantiles is not None:
+        raise ValueError(
+            f"n_quantiles={agent.n_quantiles} and value_head={agent.value_head!r} are two value heads: pass "
+            "n_quantiles=None"
+        )
+    for name in ("n_quantiles", "n_outputs", "backbone"):
         if name in agent.policy_kwargs:
             raise ValueError(f"{name} is an argument of the algorithm, not of policy_kwargs")
     if agent.backbone == "td3":
@@ -99,7 +126,7 @@ def has_resets(resets: Any) -> bool:
     return not (isinstance(resets, (Sequence, np.ndarray)) and len(resets) == 0)
 
 
-def check_target_entropy(agent: "SAC") -> None:
+def check_target_entropy(agent: Any) -> None:
     """
     :param agent: an algorithm
     :raises ValueError: if its ``target_entropy`` is neither finite nor "auto", or a number where there is no entropy
@@ -123,7 +150,7 @@ def check_use_sde(use_sde: bool) -> None:
         )
 
 
-def _check_no_entropy(agent: "SAC", name: str) -> None:
+def _check_no_entropy(agent: Any, name: str) -> None:
     if getattr(agent, name) != "auto":
         raise ValueError(
             f"{name}={getattr(agent, name)!r} asks for an entropy, which a deterministic actor (backbone='td3') has "
@@ -131,10 +158,13 @@ def _check_no_entropy(agent: "SAC", name: str) -> None:
         )
 
 
-def _check_pessimism(agent: "SAC") -> None:
-    if isinstance(agent.pessimism, str):
-        if agent.pessimism not in PESSIMISMS:
-            raise ValueError(f"pessimism must be a number, or one of {sorted(PESSIMISMS)}, not {agent.pessimism!r}")
+def _check_pessimism(agent: Any) -> None:
+    if isinstance(agent.pessimism, (str, type)):
+        kind = one_of(PESSIMISMS, Pessimism)
+        if not kind.fits(agent.pessimism):
+            raise ValueError(
+                f"pessimism must be a number, or {kind.words.removeprefix('be ')}, not {agent.pessimism!r}"
+            )
     else:
         check_beta("pessimism", agent.pessimism)
         if agent.pessimism_kwargs:
@@ -144,7 +174,7 @@ def _check_pessimism(agent: "SAC") -> None:
             )
     if agent.actor_pessimism is not None:
         check_beta("actor_pessimism", agent.actor_pessimism)
-    if agent.target_subset == 1 and isinstance(agent.pessimism, str):
+    if agent.target_subset == 1 and isinstance(agent.pessimism, (str, type)):
         raise ValueError(
             f"pessimism={agent.pessimism!r} weighs the spread of the targets, and target_subset=1 leaves none"
         )
@@ -157,7 +187,7 @@ def _check_pessimism(agent: "SAC") -> None:
             )
 
 
-def _check_buffer_class(agent: "SAC") -> None:
+def _check_buffer_class(agent: Any) -> None:
     """Whether the buffer is one for the observations."""
     cls, space = agent.replay_buffer_class, agent.observation_space
     is_dict = isinstance(space, spaces.Dict)
@@ -178,7 +208,7 @@ def _check_buffer_class(agent: "SAC") -> None:
         )
 
 
-def _check_replay(agent: "SAC") -> None:
+def _check_replay(agent: Any) -> None:
     if agent.validation_proportion > 0:
         cls = agent.replay_buffer_class
         if cls is not None and cls not in (ReplayBuffer, DictReplayBuffer) and not issubclass(cls, CompactReplay):
@@ -195,7 +225,7 @@ def _check_replay(agent: "SAC") -> None:
             )
 
 
-def _check_memory_map(agent: "SAC") -> None:
+def _check_memory_map(agent: Any) -> None:
     """A buffer in files: only those of this package know it."""
     cls, is_split = agent.replay_buffer_class, agent.validation_proportion > 0
     made_by_us = is_split or (agent.n_steps == 1 if cls is None else issubclass(cls, CompactReplay))
@@ -207,7 +237,7 @@ def _check_memory_map(agent: "SAC") -> None:
         )
 
 
-def _check_device_buffer(agent: "SAC") -> None:
+def _check_device_buffer(agent: Any) -> None:
     cls = agent.replay_buffer_class
     if cls is None or not issubclass(cls, DeviceReplayBuffer):
         return
@@ -220,7 +250,7 @@ def _check_device_buffer(agent: "SAC") -> None:
         raise ValueError("replay_buffer_class=DeviceReplayBuffer cannot be combined with optimize_memory_usage=True")
 
 
-def _check_n_steps(agent: "SAC") -> None:
+def _check_n_steps(agent: Any) -> None:
     cls = agent.replay_buffer_class
     if agent.n_steps > 1 and cls is not None and not issubclass(cls, NStepReplayBuffer):
         raise ValueError(
@@ -229,7 +259,7 @@ def _check_n_steps(agent: "SAC") -> None:
         )
 
 
-def _check_train_freq(agent: "SAC") -> None:
+def _check_train_freq(agent: Any) -> None:
     train_freq: Any = agent.train_freq
     if not isinstance(train_freq, TrainFreq):
         every, unit = train_freq if isinstance(train_freq, tuple) else (train_freq, "step")
@@ -241,7 +271,7 @@ def _check_train_freq(agent: "SAC") -> None:
             )
 
 
-def check_rule(agent: "SAC") -> None:
+def check_rule(agent: Any) -> None:
     """
     :param agent: an algorithm with its rule of pessimism
     :raises ValueError: if the transitions that the rule learns from are none that the algorithm has
@@ -270,7 +300,7 @@ def check_rule(agent: "SAC") -> None:
             raise ValueError("the segments of pessimism='opl' must be on-policy: leave action_noise out")
 
 
-def check_names(argument: str, choice: str, make: Callable[..., Any], kwargs: dict[str, Any]) -> None:
+def check_names(argument: str, choice: Any, make: Callable[..., Any], kwargs: dict[str, Any]) -> None:
     """
     :param argument: name of the argument that chose a part
     :param choice: its value

@@ -10,6 +10,8 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_sample.arguments import check_unused
 from sb3_sample.kinds import AT_LEAST_0, check_value
+from sb3_sample.learner.exploration import Exploration
+from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
@@ -129,14 +131,14 @@ class BRO(SAC):
         replay_ratio: float = 10,
         model_size: str | Sequence[int] | None = "4.92M",
         n_quantiles: int | None = 100,
-        pessimism: float | str = 0.0,
+        pessimism: float | str | type[Pessimism] = 0.0,
         kl_target: float = 0.05,
         std_multiplier: float = 0.75,
         initial_optimism: float = 1.0,
         initial_kl_weight: float = 0.25,
         adjustment_learning_rate: float = 3e-5,
         weight_decay: float = 1e-4,
-        exploration: str = "optimistic_shift",
+        exploration: str | type[Exploration] = "optimistic_shift",
         exploration_kwargs: dict[str, Any] | None = None,
         resets: Sequence[int] | int = BRO_RESETS,
         reset_gradient_steps: int | None = None,

@@ -6,6 +6,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_sample.arguments import check_unused
 from sb3_sample.kinds import FINITE, check_value
+from sb3_sample.learner.exploration import Exploration
 from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
@@ -68,7 +69,7 @@ class DAC(SAC):
         adjustment_learning_rate: float = 3e-5,
         kl_direction: str = "optimistic_to_pessimistic",
         reinitialize_every: int | None = 25_000,
-        exploration: str = "optimistic_actor",
+        exploration: str | type[Exploration] = "optimistic_actor",
         **kwargs: Any,
     ):
         self.kl_target = kl_target
@@ -87,7 +88,7 @@ class DAC(SAC):
             same = {name: name for name in OPTIMISTIC_ACTOR_SETTINGS}
             arguments.check_once("exploration_kwargs", self.exploration_kwargs, same)
         start, beta = check_value("initial_optimism", self.initial_optimism, FINITE.or_none()), self.pessimism
-        if start is not None and not isinstance(beta, str) and not start > -beta:
+        if start is not None and isinstance(beta, (int, float)) and not start > -beta:
             raise ValueError(f"initial_optimism must be above minus the pessimism, {-beta}, not {start}")
         if self.exploration != "optimistic_actor":
             check_unused(self, OPTIMISTIC_ACTOR_SETTINGS, f"exploration={self.exploration!r}")

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
+from torch import nn
 
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.learner import Counts, Learner
@@ -152,6 +153,11 @@ class HasLearner:
     def redo(self) -> ReDo | None:
         """Recycling of dormant neurons; None for none."""
         return self.learner.redo  # type: ignore[no-any-return]
+
+    @property
+    def transforms(self) -> nn.ModuleList:
+        """What every batch goes through before it is learned from."""
+        return self.learner.transforms  # type: ignore[no-any-return]
 
     @property
     def gradients_are_stale(self) -> bool:

@@ -24,7 +24,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_sample.arguments import check_net_arch
-from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, DICT, check_value, integer
+from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, DICT, check_value, chosen, integer
 from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
 from sb3_sample.learner.q_values import QValues
 from sb3_sample.networks import NETWORKS, Network, linear
@@ -96,10 +96,10 @@ class Actor(BasePolicy):
 
     def statistics(self) -> list[torch.Tensor]:
         """
-        :return: running statistics that a target actor takes over: those of the features extractor
+        :return: running statistics that a target actor takes over: those of features extractor and trunk
         """
         assert self.features_extractor is not None
-        return list(self.features_extractor.buffers())
+        return [*self.features_extractor.buffers(), *self.trunk.statistics()]
 
     def gaussian(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """
@@ -392,10 +392,10 @@ class CriticEnsemble(BaseModel):
 
     def statistics(self) -> list[torch.Tensor]:
         """
-        :return: running statistics that the target critics take over: those of the features extractor
+        :return: running statistics that the target critics take over: those of features extractor and trunk
         """
         assert self.features_extractor is not None
-        return list(self.features_extractor.buffers())
+        return [*self.features_extractor.buffers(), *self.trunk.statistics()]
 
     def copied_parameters(self) -> list[nn.Parameter]:
         """
@@ -414,13 +414,13 @@ class SACPolicy(BasePolicy):
     :param net_arch: widths of the hidden layers as in Stable-Baselines3, a list or ``dict(pi=[...], qf=[...])``;
         for the network "mlp" only, the same as ``hidden_sizes`` in the network's arguments
     :param activation_fn: activation of the network "mlp"
-    :param critic_network: trunk of the critics, "mlp", "bronet" or "spectral"
+    :param critic_network: trunk of the critics, "mlp", "bronet", "spectral", or a class derived from ``Network``
     :param critic_network_kwargs: its arguments (``hidden_sizes``, ``layer_norm``, ``dropout``, ...; ``width``,
         ``n_blocks``)
     :param actor_network: trunk of the actor, the same
     :param actor_network_kwargs: its arguments
     :param n_critics: E, the number of critics
-    :param n_quantiles: K quantiles a critic; None for scalar critics
+    :param n_outputs: outputs a critic, as the value head asks for
     :param features_extractor_class: features extractor; actor and critics get one each
     :param features_extractor_kwargs: its arguments
     :param normalize_images: whether images are divided by 255
@@ -446,12 +446,12 @@ class SACPolicy(BasePolicy):
         lr_schedule: Schedule,
         net_arch: Sequence[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] | None = None,
-        critic_network: str = "mlp",
+        critic_network: str | type[Network] = "mlp",
         critic_network_kwargs: dict[str, Any] | None = None,
-        actor_network: str = "mlp",
+        actor_network: str | type[Network] = "mlp",
         actor_network_kwargs: dict[str, Any] | None = None,
         n_critics: int = 2,
-        n_quantiles: int | None = None,
+        n_outputs: int = 1,
         features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
         features_extractor_kwargs: dict[str, Any] | None = None,
         normalize_images: bool = True,
@@ -478,7 +478,7 @@ class SACPolicy(BasePolicy):
             normalize_images=normalize_images,
         )
         check_value("n_critics", n_critics, integer(1))
-        check_value("n_quantiles", n_quantiles, integer(1).or_none("scalar critics"))
+        check_value("n_outputs", n_outputs, integer(1))
         check_net_arch(net_arch, ("pi", "qf"), both=True)
         pi_arch: list[int] | None = None
         qf_arch: list[int] | None = None
@@ -494,7 +494,7 @@ class SACPolicy(BasePolicy):
                 *critic_args,
                 features_extractor=self.make_features_extractor(),
                 n_critics=n_critics,
-                n_outputs=1 if n_quantiles is None else n_quantiles,
+                n_outputs=n_outputs,
                 normalize_images=normalize_images,
             )
 
@@ -523,7 +523,8 @@ class SACPolicy(BasePolicy):
         self.critic.optimizer = self.make_optimizer(
             self.critic.parameters(), lr_schedule(1), **(critic_optimizer_kwargs or {})
         )
-        self._mode_switch = ModeSwitch(self.actor, self.critic, self.critic_target.trunk)
+        targets = [self.critic_target.trunk] if self.critic_target.trunk.trains_in_target else []
+        self._mode_switch = ModeSwitch(self.actor, self.critic, *targets)
         self._constructor_args: dict[str, Any] = dict(
             lr_schedule=self._dummy_schedule,
             net_arch=net_arch,
@@ -533,7 +534,7 @@ class SACPolicy(BasePolicy):
             actor_network=actor_network,
             actor_network_kwargs=actor_network_kwargs,
             n_critics=n_critics,
-            n_quantiles=n_quantiles,
+            n_outputs=n_outputs,
             features_extractor_class=features_extractor_class,
             features_extractor_kwargs=self.features_extractor_kwargs,
             backbone=backbone,
@@ -663,15 +664,14 @@ class MultiInputPolicy(SACPolicy):
 
 def _network_args(
     who: str,
-    network: str,
+    network: str | type[Network],
     kwargs: dict[str, Any] | None,
     net_arch: list[int] | None,
     activation_fn: type[nn.Module] | None,
 ) -> tuple[type[Network], dict[str, Any]]:
     """Class and arguments of a trunk, from its name and from Stable-Baselines3's shorthand."""
     check_value(f"{who}_network_kwargs", kwargs, DICT)
-    if not isinstance(network, str) or network not in NETWORKS:
-        raise ValueError(f"{who}_network must be one of {sorted(NETWORKS)}, not {network!r}")
+    cls = chosen(f"{who}_network", network, NETWORKS, Network)
     kwargs = dict(kwargs or {})
     for name, key, value in (("net_arch", "hidden_sizes", net_arch), ("activation_fn", "activation_fn", activation_fn)):
         if value is None:
@@ -684,10 +684,8 @@ def _network_args(
         if key in kwargs:
             raise ValueError(f"{name} and {who}_network_kwargs[{key!r}] say the same thing: give one of them")
         kwargs[key] = value
-    allowed = [
-        name for name in inspect.signature(NETWORKS[network]).parameters if name not in ("in_features", "n_copies")
-    ]
+    allowed = [name for name in inspect.signature(cls).parameters if name not in ("in_features", "n_copies")]
     for name in kwargs:
         if name not in allowed:
             raise ValueError(f"{who}_network_kwargs has {name!r}, but {who}_network={network!r} takes {allowed}")
-    return NETWORKS[network], kwargs
+    return cls, kwargs

@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_sample.arguments import check_unused
+from sb3_sample.learner.exploration import Exploration
 from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
@@ -180,7 +181,7 @@ class OAC(SAC):
         *,
         optimism: float = 4.36,
         kl_radius: float = 3.69**2 / 2,
-        exploration: str = "oac",
+        exploration: str | type[Exploration] = "oac",
         **kwargs: Any,
     ):
         self.optimism = optimism

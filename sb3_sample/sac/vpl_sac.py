@@ -67,7 +67,7 @@ class VPLSAC(SAC):
         )
 
     def _check_arguments(self) -> None:
-        if isinstance(self.pessimism, str) and self.pessimism != "vpl":
+        if isinstance(self.pessimism, (str, type)) and self.pessimism != "vpl":
             raise ValueError(f"VPLSAC has pessimism='vpl' or a fixed number, not {self.pessimism!r}: use SAC")
         if self.validation_proportion is None:
             self.validation_proportion = 1 / 32 if self.pessimism_source == "validation" else 0.0

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_sample.sac.compact_buffer import CompactReplay
+from sb3_sample.replay.compact import CompactReplay
 from sb3_sample.saving.untrusted import BadFile
 
 #: What a buffer of Stable-Baselines3 keeps of each row.

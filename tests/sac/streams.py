@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 
-from sb3_sample.sac.compact_buffer import CompactDictReplayBuffer, CompactReplayBuffer
+from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
 
 BOX = spaces.Box(-np.inf, np.inf, (3,), np.float32)
 DICT = spaces.Dict(

@@ -12,7 +12,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_sample import SAC, CompactDictReplayBuffer, CompactReplayBuffer
-from sb3_sample.sac.buffers import ValidationReplayBuffer, latest, samples_at
+from sb3_sample.replay.buffers import ValidationReplayBuffer, latest, samples_at
 from tests.sac.common import sac, vec
 from tests.sac.streams import ACTIONS, BOX, DICT, SPACES, Stream, assert_same, draw, pair, same_bits
 

@@ -9,7 +9,7 @@ import pytest
 from gymnasium import spaces
 
 from sb3_sample import CompactDictReplayBuffer, CompactReplayBuffer
-from sb3_sample.sac.buffers import ValidationDictReplayBuffer, ValidationReplayBuffer
+from sb3_sample.replay.buffers import ValidationDictReplayBuffer, ValidationReplayBuffer
 from tests.sac.streams import ACTIONS, BOX, SPACES, Stream, assert_same, pair, same_bits
 
 

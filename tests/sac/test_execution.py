@@ -25,9 +25,9 @@ from sb3_sample.learner.execution import Execution, old_torch, why_not_compiled
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
+from sb3_sample.replay.buffers import PLAIN_BUFFERS, BatchMemory, DeviceReplayBuffer
+from sb3_sample.replay.sources import draw_batches
 from sb3_sample.sac import SAC, algorithm
-from sb3_sample.sac.buffers import PLAIN_BUFFERS, BatchMemory, DeviceReplayBuffer
-from sb3_sample.sac.sources import draw_batches
 from tests.sac.common import COMPILES, MAKERS, Toy, bro, differing, sac, state, vec
 
 #: Largest difference of a parameter after 50 updates, each of which moves it by up to 3e-4. The same arithmetic in

@@ -13,7 +13,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_sample import DiagnosticsCallback
-from sb3_sample.sac.buffers import DeviceReplayBuffer
+from sb3_sample.replay.buffers import DeviceReplayBuffer
 from tests.sac.common import MAKERS, Toy, sac, vec
 
 WIDE = spaces.Box(np.array([-10, 0]), np.array([10, 3]), dtype=np.int64)

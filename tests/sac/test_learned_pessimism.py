@@ -15,7 +15,8 @@ from stable_baselines3.common.noise import NormalActionNoise
 from sb3_sample.learner.batch import Batch, CriticStep, Noise
 from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.pessimism import TOP, LearnedPessimism, pessimistic_value
-from sb3_sample.sac import BRO, GPLSAC, OPLSAC, SAC, TOPSAC, VPLSAC, buffers, sources
+from sb3_sample.replay import buffers, sources
+from sb3_sample.sac import BRO, GPLSAC, OPLSAC, SAC, TOPSAC, VPLSAC
 from tests.sac.common import COMPILES, TINY_BRO, TINY_SAC, differing, random_batch, sac, state, vec
 from tests.sac.test_execution import captured
 from tests.sac.test_update import NoSynchronisation

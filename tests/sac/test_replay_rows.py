@@ -10,13 +10,13 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage
 
-from sb3_sample.sac.buffers import (
+from sb3_sample.replay.buffers import (
     BatchMemory,
     DeviceReplayBuffer,
     ValidationDictReplayBuffer,
     ValidationReplayBuffer,
 )
-from sb3_sample.sac.compact_buffer import CompactDictReplayBuffer, CompactReplayBuffer
+from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
 from tests.sac.common import MAKERS, TINY_SAC, Toy, sac, vec
 
 SPACE = spaces.Box(-1, 1, (2, 3), np.float32)

@@ -25,8 +25,8 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
+from sb3_sample.replay.compact import CompactReplayBuffer
 from sb3_sample.sac import SAC
-from sb3_sample.sac.compact_buffer import CompactReplayBuffer
 from tests.sac.common import MAKERS, Toy, bro, random_batch, sac, vec
 
 BOX = spaces.Box(-10, 10, (3,), np.float32)

@@ -15,15 +15,15 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_sample.learner.pessimism import LearnedPessimism
-from sb3_sample.sac import BRO, SAC, VPLSAC
-from sb3_sample.sac.buffers import (
+from sb3_sample.replay.buffers import (
     ValidationDictReplayBuffer,
     ValidationReplayBuffer,
     ValidationSplit,
     latest,
     samples_at,
 )
-from sb3_sample.sac.compact_buffer import CompactReplayBuffer
+from sb3_sample.replay.compact import CompactReplayBuffer
+from sb3_sample.sac import BRO, SAC, VPLSAC
 from tests.sac.common import TINY_BRO, TINY_SAC, differing, sac, state, vec
 
 

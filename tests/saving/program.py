@@ -40,8 +40,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.diagnostics import DiagnosticsCallback
 from sb3_sample.envs import make_env
-from sb3_sample.sac.buffers import DeviceReplayBuffer
-from sb3_sample.sac.compact_buffer import CompactReplay
+from sb3_sample.replay.buffers import DeviceReplayBuffer
+from sb3_sample.replay.compact import CompactReplay
 from sb3_sample.saving import training_state, vec_envs
 from sb3_sample.saving.callbacks import walk
 from sb3_sample.saving.folders import Folder

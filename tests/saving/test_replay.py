@@ -15,8 +15,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her import HerReplayBuffer
 
+from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.sac import SAC
-from sb3_sample.sac.buffers import DeviceReplayBuffer
 from sb3_sample.saving import BadFile, container
 from sb3_sample.saving.container import PickledFile
 from sb3_sample.saving.encoding import Lenient

@@ -1,13 +1,10 @@
 """Next observations without an array of their own: the observations of the next rows, and what is kept aside."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from sb3_sample.sac.memory_map import zeros
-
-if TYPE_CHECKING:
-    from sb3_sample.sac.compact_buffer import CompactReplay
+from sb3_sample.replay.memory_map import zeros
 
 #: In ``slot``: the next row's observation is the next observation.
 NEXT_ROW = -1
@@ -87,7 +84,7 @@ class NextObservations:
     :param key: which observation, of a dict of them
     """
 
-    def __init__(self, buffer: "CompactReplay", key: str = ONLY):
+    def __init__(self, buffer: Any, key: str = ONLY):
         self._buffer, self._key = buffer, key
         observations = buffer.stored()[key]
         self.shape, self.dtype, self.ndim = observations.shape, observations.dtype, observations.ndim

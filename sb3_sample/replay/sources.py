@@ -6,7 +6,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_sample.learner.batch import Batch, Extra
-from sb3_sample.sac.buffers import BatchMemory, ValidationSplit, latest, samples_as_its_class
+from sb3_sample.replay.buffers import BatchMemory, ValidationSplit, latest, samples_as_its_class
 
 
 class ReplaySource:

@@ -11,13 +11,13 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_sample.sac.compact_buffer import (
+from sb3_sample.replay.compact import (
     CompactDictReplayBuffer,
     CompactReplay,
     CompactReplayBuffer,
 )
-from sb3_sample.sac.next_observations import NextObservations
-from sb3_sample.sac.rows import action_dtype, as_actions, as_observation, as_row, as_timeouts
+from sb3_sample.replay.next_observations import NextObservations
+from sb3_sample.replay.rows import action_dtype, as_actions, as_observation, as_row, as_timeouts
 
 
 def samples_at(

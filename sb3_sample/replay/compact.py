@@ -14,9 +14,9 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 
-from sb3_sample.sac import memory_map as files
-from sb3_sample.sac.next_observations import NEXT_ROW, ONLY, NextObservations, SideStore
-from sb3_sample.sac.rows import action_dtype, as_actions, as_observation, as_row, as_timeouts
+from sb3_sample.replay import memory_map as files
+from sb3_sample.replay.next_observations import NEXT_ROW, ONLY, NextObservations, SideStore
+from sb3_sample.replay.rows import action_dtype, as_actions, as_observation, as_row, as_timeouts
 
 try:  # As in Stable-Baselines3: without it nobody looks at the memory.
     import psutil

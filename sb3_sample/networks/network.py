@@ -1,0 +1,65 @@
+"""Base class of networks, and hidden neurons as a network lists them."""
+
+from typing import ClassVar, NamedTuple
+
+import torch
+from torch import nn
+
+from sb3_sample.networks.ensemble import Dense, Norm
+from sb3_sample.networks.spectral_norm import SpectralNorm
+
+
+class HiddenUnits(NamedTuple):
+    """One layer of hidden neurons, as a network's ``hidden_units`` lists them."""
+
+    #: The dense layer's name inside the network
+    name: str
+    #: The layer whose N outputs are the neurons
+    dense: Dense
+    #: The layer norm between the neurons and their activation, if there is one
+    norm: Norm | None
+    #: The module whose output is the neurons' activation
+    activation: nn.Module
+    #: The one layer that reads the activation; None if others read it too, and the neurons cannot be recycled
+    outgoing: Dense | None
+
+
+class Network(nn.Module):
+    """
+    Base class of trunks, the networks of actors and critics up to the output layer, which belongs to whoever uses them.
+
+    A trunk is made as ``Trunk(in_features, n_copies=E, **kwargs)``: for E independent critics it takes (B, in_features)
+    and gives (E, B, out_features), for an actor (``n_copies=None``) it gives (B, out_features).
+    """
+
+    #: Width of the last layer.
+    out_features: int
+    #: Whether it can be compiled. A class from outside of this package says so itself.
+    compilable: ClassVar[bool] = True
+    #: Whether the copy of it in the target critics is in training mode during gradient steps, as dropout needs (DroQ).
+    #: Batch norm is not: False has the targets use the running statistics.
+    trains_in_target: ClassVar[bool] = True
+
+    def hidden_units(self, head: Dense | None) -> list[HiddenUnits]:
+        """
+        :param head: the layer that reads the network's output, None if several do
+        :return: every hidden layer, in the order of the forward pass, for ReDo and the diagnostics; none by default
+        """
+        return []
+
+    def project(self) -> None:
+        """Called after every step of the optimizer: bring weights back to where they belong, in place."""
+
+    def refresh(self) -> None:
+        """Called after weights were overwritten, as at a shrink and perturb: compute anew what follows from them."""
+        for layer in self.modules():
+            if isinstance(layer, SpectralNorm):
+                layer.find_direction()
+
+    def statistics(self) -> list[torch.Tensor]:
+        """
+        :return: running statistics that a target takes over whole; here all buffers but the directions of spectral
+            norms, which follow the target's own weights
+        """
+        layers = [layer for layer in self.modules() if not isinstance(layer, SpectralNorm)]
+        return [buffer for layer in layers for buffer in layer.buffers(recurse=False)]

@@ -1,0 +1,48 @@
+"""
+The public door for parts of one's own: everything here stays under this name, wherever it moves inside.
+
+A part is a class, accepted where a name is: ``pessimism=``, ``exploration=``, ``value_head=``, ``batch_transforms=``,
+``policy_kwargs=dict(critic_network=..., actor_network=...)``. docs/parts.md says what each has to have.
+"""
+
+from sb3_sample.learner.batch import Batch, CriticStep, Extra, Noise
+from sb3_sample.learner.exploration import EXPLORATIONS, Exploration, OptimisticExploration
+from sb3_sample.learner.heads import QuantileHead, ValueHead
+from sb3_sample.learner.learner import Learner
+from sb3_sample.learner.parts import Learning, Part
+from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, epistemic_std, pessimistic_value
+from sb3_sample.learner.target import bootstrap, td_target, values
+from sb3_sample.learner.transforms import BatchTransform
+from sb3_sample.networks import NETWORKS, EnsembleLayerNorm, EnsembleLinear, HiddenUnits, Network, linear
+from sb3_sample.optim import AdamW
+
+__all__ = [
+    "EXPLORATIONS",
+    "NETWORKS",
+    "PESSIMISMS",
+    "AdamW",
+    "Batch",
+    "BatchTransform",
+    "CriticStep",
+    "EnsembleLayerNorm",
+    "EnsembleLinear",
+    "Exploration",
+    "Extra",
+    "HiddenUnits",
+    "LearnedPessimism",
+    "Learner",
+    "Learning",
+    "Network",
+    "Noise",
+    "OptimisticExploration",
+    "Part",
+    "Pessimism",
+    "QuantileHead",
+    "ValueHead",
+    "bootstrap",
+    "epistemic_std",
+    "linear",
+    "pessimistic_value",
+    "td_target",
+    "values",
+]

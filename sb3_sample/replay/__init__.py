@@ -1,0 +1,1 @@
+"""Sources of batches: replay buffers, and transitions that are already there."""

@@ -1,0 +1,122 @@
+"""Data sets: which steps they hold, and what they refuse."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from sb3_sample import Dataset
+
+#: Two episodes: one of three steps that terminates, one of three that is cut off; then two steps of a third.
+OBSERVATIONS = np.arange(8, dtype=np.float64)[:, None] * 10
+ACTIONS = np.linspace(-1, 1, 8)[:, None]
+REWARDS = np.arange(8.0)
+TERMINATIONS = np.array([0, 0, 1, 0, 0, 0, 0, 0])
+TRUNCATIONS = np.array([0, 0, 0, 0, 0, 1, 0, 0])
+
+
+def arrays(**changes: Any) -> dict[str, Any]:
+    given = {
+        "observations": OBSERVATIONS, "actions": ACTIONS, "rewards": REWARDS, "terminations": TERMINATIONS,
+        "truncations": TRUNCATIONS,
+    }  # fmt: skip
+    return given | changes
+
+
+def rows(data: Dataset, n: int = 4_000) -> dict[float, tuple[float, float]]:
+    """By reward: the next observation and the termination of every step that is ever drawn."""
+    batch = data.sample(n)
+    columns = (batch.rewards, batch.next_observations, batch.dones)
+    return {r.item(): (s.item(), d.item()) for r, s, d in zip(*columns, strict=True)}
+
+
+def test_next_observations_are_the_following_steps() -> None:
+    data = Dataset.from_arrays(**arrays())
+    found = rows(data)
+    # 5 was cut off and 7 is the last: what came next is not known. 2 terminated: nothing is bootstrapped there.
+    assert sorted(found) == [0, 1, 2, 3, 4, 6] and len(data) == 6
+    assert {r: s for r, (s, _) in found.items() if r != 2} == {0: 10, 1: 20, 3: 40, 4: 50, 6: 70}
+    assert {r for r, (_, done) in found.items() if done} == {2}
+
+
+def test_given_next_observations_keep_every_step() -> None:
+    data = Dataset.from_arrays(**arrays(next_observations=OBSERVATIONS + 1))
+    assert {r: s for r, (s, _) in rows(data).items()} == {r: r * 10 + 1 for r in range(8)} and len(data) == 8
+
+
+def test_a_last_step_that_terminates_stays() -> None:
+    ended = TERMINATIONS.copy()
+    ended[7] = 1
+    assert 7 in rows(Dataset.from_arrays(**arrays(terminations=ended)))
+
+
+def test_actions_are_scaled_to_the_unit_interval() -> None:
+    space = spaces.Box(np.array([-2.0]), np.array([6.0]), dtype=np.float64)
+    data = Dataset.from_arrays(**arrays(actions=np.linspace(-2, 6, 8)[:, None]), action_space=space)
+    batch = data.sample(2_000)
+    expected = 2 * batch.rewards / 7 - 1
+    torch.testing.assert_close(batch.actions, expected)
+    assert batch.actions.dtype == batch.rewards.dtype == batch.dones.dtype == torch.float32
+    assert batch.discounts is None
+
+
+def test_batches_are_drawn_uniformly_from_a_generator_of_its_own() -> None:
+    torch.manual_seed(7)
+    before = torch.get_rng_state()
+    data = Dataset.from_arrays(**arrays(), seed=3)
+    drawn = data.sample(6_000).rewards.flatten()
+    assert torch.equal(before, torch.get_rng_state())
+    counts = [(drawn == r).sum().item() for r in (0, 1, 2, 3, 4, 6)]
+    assert sum((n - 1000) ** 2 / 1000 for n in counts) < 25  # chi-squared with 5 degrees of freedom: p = 1e-4
+    again = Dataset.from_arrays(**arrays(), seed=3).sample(6_000).rewards.flatten()
+    other = Dataset.from_arrays(**arrays(), seed=4).sample(6_000).rewards.flatten()
+    assert torch.equal(drawn, again) and not torch.equal(drawn, other)
+
+
+def test_dict_and_image_observations() -> None:
+    images = np.arange(8 * 12, dtype=np.uint8).reshape(8, 3, 2, 2)
+    observations = {"image": images, "vector": OBSERVATIONS}
+    data = Dataset.from_arrays(**arrays(observations=observations))
+    batch = data.sample(50)
+    assert batch.observations["image"].dtype == torch.uint8 and batch.observations["vector"].dtype == torch.float32
+    assert isinstance(data.observation_space, spaces.Dict)
+    assert data.observation_space["image"] == spaces.Box(0, 255, (3, 2, 2), np.uint8)
+    first = (batch.observations["image"][:, 0, 0, 0] / 12 * 10).float()
+    torch.testing.assert_close(first, batch.observations["vector"][:, 0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"rewards": np.zeros(7)}, "observations must have as many steps as rewards, 7, not 8"),
+        ({"rewards": np.zeros((8, 2))}, r"rewards must be of shape \(N,\), not \(8, 2\)"),
+        ({"rewards": np.full(8, np.nan)}, "rewards must be finite"),
+        ({"rewards": np.full(8, 1e39)}, "rewards must be finite, within float32"),
+        ({"terminations": np.full(8, 0.5)}, "terminations must be 0 or 1, not 0.5"),
+        ({"truncations": np.full(8, 2)}, "truncations must be 0 or 1, not 2"),
+        ({"actions": np.full((8, 1), 1.5)}, "actions must lie within the bounds"),
+        ({"actions": np.full((8, 1), np.nan)}, "actions must lie within the bounds"),
+        ({"actions": np.zeros(8)}, r"actions must be of shape \(N, A\), not \(8,\)"),
+        ({"actions": np.zeros((8, 2)), "action_space": spaces.Box(-1, 1, (3,))}, "are none of action_space"),
+        ({"actions": ACTIONS, "action_space": spaces.Box(-np.inf, np.inf, (1,))}, "are none of action_space"),
+        ({"observations": np.full((8, 1), np.inf)}, "observations must be finite"),
+        ({"observations": np.array([["x"]] * 8)}, "observations must be numbers"),
+        ({"observations": np.zeros(8)}, r"observations must be numbers of shape \(N, ...\)"),
+        ({"observation_space": spaces.Box(-1, 1, (2,))}, "are none of observation_space"),
+        ({"next_observations": np.zeros((7, 1))}, "next_observations must have as many steps"),
+        ({"next_observations": np.zeros((8, 2))}, "are none of observation_space"),
+        ({"truncations": np.ones(8), "terminations": np.zeros(8)}, "next_observations must be given"),
+        ({name: value[:0] for name, value in arrays().items()}, "at least one step"),
+    ],
+)  # fmt: skip
+def test_what_is_refused(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        Dataset.from_arrays(**arrays(**changes))
+
+
+@pytest.mark.parametrize("size", [0, -3])
+def test_batches_have_a_size(size: int) -> None:
+    with pytest.raises(ValueError, match=f"batch_size must be at least 1, not {size}"):
+        Dataset.from_arrays(**arrays()).sample(size)
