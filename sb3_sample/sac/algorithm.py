@@ -4,7 +4,6 @@ The off-policy family as Stable-Baselines3's: acting, storing, when and how ofte
 The update is the learner's (``sb3_sample/learner/learner.py``).
 """
 
-import functools
 import pathlib
 import warnings
 from collections.abc import Sequence
@@ -19,13 +18,11 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_program, default_of
 from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, not_finite
-from sb3_sample.kinds import chosen
 from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.learner.execution import (
     PAYS_FROM,
@@ -34,14 +31,9 @@ from sb3_sample.learner.execution import (
     warn_not_compiled,
     why_not_compiled,
 )
-from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
-from sb3_sample.learner.heads import QuantileHead, ValueHead
-from sb3_sample.learner.learner import Learner
-from sb3_sample.learner.parts import Part
-from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
-from sb3_sample.learner.plasticity import ReDo, Resets
-from sb3_sample.learner.scalars import FixedScalar, LogScalar
-from sb3_sample.learner.transforms import BatchTransform
+from sb3_sample.learner.exploration import Exploration
+from sb3_sample.learner.heads import ValueHead
+from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.logged_values import LoggedValues
 from sb3_sample.replay.buffers import (
     ValidationDictReplayBuffer,
@@ -53,7 +45,7 @@ from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplay, Co
 from sb3_sample.replay.sources import ReplaySource
 from sb3_sample.sac import arguments
 from sb3_sample.sac.model_learner import check_action_space
-from sb3_sample.sac.policies import BACKBONES, CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
+from sb3_sample.sac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.sb3_names import SB3Names
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
 from sb3_sample.saving.encoding import Lenient
@@ -165,10 +157,6 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
         # An argument that changes with every step.
         "action_noise": Kept.EVERYWHERE,
     }
-    #: The class of the learner.
-    learner_class: ClassVar[type[Learner]] = Learner
-    #: beta1 of the temperature's Adam.
-    temperature_beta1: ClassVar[float] = 0.9
 
     def __init__(
         self,
@@ -305,55 +293,6 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
         arguments.check_rule(self)
         self._watch = MetricWatch(self.device)
 
-    def _make_learner(self, **kwargs: Any) -> Learner:
-        """
-        :param kwargs: networks, counts and generators of the learner
-        :return: a learner with the parts and the settings of the arguments
-        """
-        self._take_target_entropy()
-        return self.learner_class(
-            self._make_networks,
-            head=self._make_head(),
-            make_temperature=self._make_temperature,
-            make_pessimism=self.make_pessimism,
-            make_explorer=self.make_explorer,
-            plasticity=Resets(self.resets, self.reset_shrink, self.reset_gradient_steps),
-            redo=None if self.redo_period is None else ReDo(self.redo_period, self.redo_threshold),
-            make_transforms=[functools.partial(_make_transform, each) for each in self.batch_transforms],
-            learning_rate=self.lr_schedule(1),
-            temperature_beta1=self.temperature_beta1,
-            target_entropy=self._target_entropy,
-            device=self.device,
-            **{name: getattr(self, name) for name in Learner.SETTINGS},
-            **kwargs,
-        )
-
-    def _make_head(self) -> ValueHead:
-        if self.value_head is not None:
-            return self.value_head(**(self.value_head_kwargs or {}))
-        return ValueHead() if self.n_quantiles is None else QuantileHead(self.n_quantiles)
-
-    def _make_networks(self) -> SACPolicy:
-        kwargs = self._full_policy_kwargs()
-        return self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)  # type: ignore[return-value]
-
-    def _take_settings(self) -> None:
-        """Have the learner take up what was set since the last gradient step."""
-        self._take_target_entropy()
-        self.learner.target_entropy = self._target_entropy
-        for name in Learner.SETTINGS:
-            setattr(self.learner, name, getattr(self, name))
-
-    def _take_target_entropy(self) -> None:
-        """Take up what ``target_entropy`` says, which is a number afterwards."""
-        arguments.check_target_entropy(self)
-        if self.target_entropy == "auto":
-            self._target_entropy = -get_action_dim(self.action_space) / 2
-        else:
-            self._target_entropy = float(self.target_entropy)
-        if BACKBONES[self.backbone].has_entropy:
-            self.target_entropy = self._target_entropy
-
     def _check_arguments(self) -> None:
         arguments.check(self)
 
@@ -379,55 +318,6 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
     def _full_policy_kwargs(self) -> dict[str, Any]:
         return {**self.policy_kwargs, "n_outputs": self._make_head().n_outputs, "backbone": self.backbone}
 
-    def _full_exploration_kwargs(self) -> dict[str, Any]:
-        """
-        :return: the explorer's arguments: the user's and the algorithm's
-        """
-        return dict(self.exploration_kwargs or {})
-
-    def _full_pessimism_kwargs(self) -> dict[str, Any]:
-        """
-        :return: the arguments of the rule that moves pessimism: the user's and the algorithm's
-        """
-        return dict(self.pessimism_kwargs or {})
-
-    def _make_temperature(self, learner: Learner) -> LogScalar | FixedScalar:
-        if not learner.actor.has_entropy:
-            return FixedScalar(0.0).to(self.device)
-        allowed = "'auto' or 'auto_<start above 0>'"
-        if isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto"):
-            start = self.ent_coef.removeprefix("auto").removeprefix("_") or "1"
-            value = arguments.as_number("ent_coef", start, allowed, shown=self.ent_coef)
-            if not 0 < value < np.inf:
-                raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
-            return LogScalar(value).to(self.device)
-        value = arguments.as_number("ent_coef", self.ent_coef, allowed)
-        if not 0 <= value < np.inf:
-            raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
-        return FixedScalar(value).to(self.device)
-
-    def make_explorer(self, learner: Learner) -> Exploration:
-        """
-        :param learner: whose it is
-        :return: a freshly initialised explorer
-        """
-        make = chosen("exploration", self.exploration, EXPLORATIONS, Exploration)
-        kwargs = self._full_exploration_kwargs()
-        arguments.check_names("exploration", self.exploration, make, kwargs)
-        return make(learner, **kwargs)  # type: ignore[no-any-return]
-
-    def make_pessimism(self, learner: Learner) -> Pessimism:
-        """
-        :param learner: whose it is
-        :return: a freshly initialised rule of pessimism
-        """
-        if not isinstance(self.pessimism, (str, type)):
-            return Pessimism(self.pessimism)
-        make = chosen("pessimism", self.pessimism, PESSIMISMS, Pessimism)
-        kwargs = self._full_pessimism_kwargs()
-        arguments.check_names("pessimism", self.pessimism, make, kwargs)
-        return make(learner, **kwargs)  # type: ignore[no-any-return]
-
     @classmethod
     def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
         implied: dict[str, Any] = {}
@@ -446,24 +336,6 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         check_action_space(env.action_space)
         return Resumable._wrap_env(env, verbose, monitor_wrapper)
-
-    def _parts(self) -> dict[str, Part]:
-        return self.learner.parts_with_state()
-
-    def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        """Every optimizer by its path from the algorithm."""
-        return self.learner.optimizers()
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "temperature", *self._parts(), *self._optimizers()], []
-
-    def reinitialize(self, shrink: float = 0.0) -> None:
-        """
-        Start every network, optimizer and learned number anew, in place; the replay buffer stays.
-
-        :param shrink: share of the old parameters that stays
-        """
-        self.learner.reinitialize(shrink)
 
     # ---------------------------------------------------------------- acting
 
@@ -733,8 +605,3 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
                 self.logger.record(name, float(value))
         self._record_counts()
         super().dump_logs()
-
-
-def _make_transform(choice: Any, learner: Learner) -> BatchTransform:
-    make, kwargs = choice if isinstance(choice, (tuple, list)) else (choice, {})
-    return make(learner, **kwargs)  # type: ignore[no-any-return]
