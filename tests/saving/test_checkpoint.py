@@ -31,6 +31,7 @@ from sb3_sample.saving.attributes import Describer, same
 from sb3_sample.saving.callbacks import CallbackStates
 from sb3_sample.saving.encoding import NotPortable, decode, encode
 from sb3_sample.saving.kept import Kept, declared
+from sb3_sample.saving.model_tree import Description
 from sb3_sample.saving.run_folder import RunFolder
 from tests.ppo.common import ALGORITHMS, tiny
 from tests.sac.common import MAKERS, bro, differing, sac, state, vec
@@ -87,6 +88,7 @@ def test_every_attribute_that_changes_is_held(maker: Any, tmp_path: Path) -> Non
     assert not vars(agent).keys() - held - modules - derived - given
     in_no_file = {name for name, places in declared(type(agent)).items() if Kept.IN_FILES not in places}
     assert set(agent._excluded_save_params()) - modules == in_no_file
+    assert Description(agent).encoder.left_out == {}
 
     # And the other way round: what is restored is the same, down to the attributes of the parts.
     agent = model()
