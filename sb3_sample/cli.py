@@ -9,7 +9,7 @@ import runpy
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import NamedTuple
 
 from sb3_sample.envs.base import select_gl_backend
@@ -58,15 +58,6 @@ def _usage() -> str:
 
 def _zoo_module(name: str) -> ModuleType:
     """A module of the zoo, with our algorithms and environments in the zoo."""
-    _register()
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        # Of the zoo itself all is there; what its plots need is an extra of it.
-        sys.exit(f"sb3-sample: {error}. Install it with: {install('zoo', 'plots')}")
-
-
-def _register() -> None:
     try:
         from sb3_sample import zoo
     except ImportError as error:
@@ -74,6 +65,11 @@ def _register() -> None:
             sys.exit(f"sb3-sample: {error}")
         raise
     zoo.register()
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        # Of the zoo itself all is there; what its plots need is an extra of it.
+        sys.exit(f"sb3-sample: {error}. Install it with: {install('zoo', 'plots')}")
 
 
 def _set_command_line(command: str, arguments: list[str]) -> None:
@@ -81,34 +77,24 @@ def _set_command_line(command: str, arguments: list[str]) -> None:
     sys.argv = [f"sb3-sample {command}", *arguments]
 
 
-def _zoo_function(module: str, function: str) -> Callable[[list[str]], None]:
-    def run(arguments: list[str]) -> None:
-        command = getattr(_zoo_module(module), function)
-        _set_command_line(function, arguments)
-        command()
-
-    return run
-
-
 def _train(arguments: list[str]) -> None:
     _zoo_module("rl_zoo3.train")
-    from sb3_sample import zoo_runs
-    from sb3_sample.zoo_files import reading
+    from sb3_sample.zoo import runs
+    from sb3_sample.zoo.patches import reading
 
-    options, rest = _own_options(zoo_runs.train_parser(), arguments)
-    with _errors("train"), _arguments("train"), reading(options.allow_pickle, options.trusted_modules):
-        start = zoo_runs.plan(options, rest)
+    options, rest = _own_options(runs.train_parser(), arguments)
+    with _arguments("train"), _errors("train"), reading(options.allow_pickle, options.trusted_modules):
+        start = runs.plan(options, rest)
         _set_command_line("train", rest if start is None else start.arguments)
-        zoo_runs.train(start)
+        runs.train(start)
 
 
 def _enjoy(arguments: list[str]) -> None:
     module = _zoo_module("rl_zoo3.enjoy")
-    from sb3_sample import zoo_watch
-    from sb3_sample.zoo_files import pairs_checked
+    from sb3_sample.zoo import watch
 
-    options, rest = _own_options(zoo_watch.watch_parser("enjoy"), arguments)
-    with _errors("enjoy"), pairs_checked(module), zoo_watch.watching(options, rest, module) as command:
+    options, rest = _own_options(watch.watch_parser("enjoy"), arguments)
+    with _errors("enjoy"), watch.watching(options, rest, module) as command:
         _set_command_line("enjoy", command)
         module.enjoy()
 
@@ -126,8 +112,7 @@ def _errors(command: str) -> Iterator[None]:
     from sb3_sample.errors import ParametersDoNotFit
     from sb3_sample.saving.container import BadFile, PickledFile
     from sb3_sample.saving.encoding import NotPortable
-    from sb3_sample.zoo_files import Refused
-    from sb3_sample.zoo_runs import RunError
+    from sb3_sample.zoo.files import Refused, RunError
 
     try:
         yield
@@ -166,41 +151,40 @@ def _drawing(command: str) -> Iterator[None]:
 
 
 def _zoo_plot(function: str) -> Callable[[list[str]], None]:
+    def draw(arguments: list[str]) -> None:
+        _set_command_line(function, arguments)
+        getattr(_zoo_module("rl_zoo3.plots"), function)()
+
     def run(arguments: list[str]) -> None:
         # These commands look for the id in the names of the log folders, in which a dash stands for the slash.
         import gymnasium as gym
 
         import sb3_sample.envs  # noqa: F401  # registers the ids
-        from sb3_sample.run_logs import read_evaluations, read_monitors
 
         names = [argument.replace("/", "-") if argument in gym.registry else argument for argument in arguments]
         module = _zoo_module(f"rl_zoo3.plots.{function}")
-        from sb3_sample.zoo_files import PlottedRuns, replaced
+        from sb3_sample.zoo.files import PlottedRuns
+        from sb3_sample.zoo.patches import reading_monitors, reading_tables
 
         if function == "plot_train":
-            with _drawing(function), _errors(function), replaced(module, "load_results", read_monitors):
-                _zoo_function("rl_zoo3.plots", function)(names)
+            with _drawing(function), _errors(function), reading_monitors(module):
+                draw(names)
             return
         parser = argparse.ArgumentParser(f"sb3-sample {function}", usage=argparse.SUPPRESS, add_help=False)
         parser.add_argument(
             "--allow-pickle", action="store_true", help="Read a pickled file too, which can run any code"
         )
         options, names = _own_options(parser, names)
-        # NumPy as the zoo uses it, but for what it opens files with.
-        numpy = SimpleNamespace(**{**vars(module.np), "load": read_evaluations})
         runs = PlottedRuns(options.allow_pickle)
         said: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
         if function == "plot_from_file":
-            from sb3_sample import zoo_scores
+            from sb3_sample.zoo import scores
 
-            rliable, *tasks = zoo_scores.rliable_options(names)
+            rliable, *tasks = scores.rliable_options(names)
             if rliable:
-                runs, said = zoo_scores.NormalizedRuns(options.allow_pickle, *tasks), zoo_scores.saying_so()
-        replacements = {"np": numpy, "pickle": runs, "open": runs.open}
-        with _drawing(function), _errors(function), said, contextlib.ExitStack() as stack:
-            for name, value in replacements.items():
-                stack.enter_context(replaced(module, name, value))
-            _zoo_function("rl_zoo3.plots", function)(names)
+                runs, said = scores.NormalizedRuns(options.allow_pickle, *tasks), scores.saying_so()
+        with _drawing(function), _errors(function), said, reading_tables(module, runs):
+            draw(names)
 
     return run
 
@@ -209,15 +193,14 @@ def _record_video(arguments: list[str]) -> None:
     # The zoo's other commands have this option, this one has not.
     select_gl_backend()
     utils = _zoo_module("rl_zoo3.utils")
-    from sb3_sample import zoo_watch
-    from sb3_sample.zoo_files import pairs_checked
+    from sb3_sample.zoo import watch
 
-    parser = zoo_watch.watch_parser("record_video")
+    parser = watch.watch_parser("record_video")
     parser.add_argument("--gym-packages", nargs="+", default=[], help="Packages to import, as for enjoy")
     options, rest = _own_options(parser, arguments)
     for package in options.gym_packages:
         importlib.import_module(package)
-    with _errors("record_video"), pairs_checked(utils), zoo_watch.watching(options, rest, utils) as command:
+    with _errors("record_video"), watch.watching(options, rest, utils) as command:
         _set_command_line("record_video", command)
         runpy.run_module("rl_zoo3.record_video", run_name="__main__")  # it has no function to call
 

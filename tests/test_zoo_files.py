@@ -21,7 +21,8 @@ import rl_zoo3.utils
 from sb3_sample import cli, make_env, zoo
 from sb3_sample.saving.container import BadFile, PickledFile
 from sb3_sample.saving.normalization import load_vec_normalize
-from sb3_sample.zoo_files import PlottedRuns, check_settings
+from sb3_sample.zoo.files import PlottedRuns
+from sb3_sample.zoo.settings import check_settings
 
 zoo.register()
 

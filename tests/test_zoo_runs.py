@@ -24,8 +24,9 @@ from sb3_sample import cli, zoo
 from sb3_sample.run_logs import read_monitors
 from sb3_sample.saving import container
 from sb3_sample.saving.decoding import decode
-from sb3_sample.zoo_runs import Record, RunError, RunFiles, plan, train_parser
-from sb3_sample.zoo_watch import model_path
+from sb3_sample.zoo.files import RunError
+from sb3_sample.zoo.runs import Record, RunFiles, plan, train_parser
+from sb3_sample.zoo.watch import model_path
 
 zoo.register()
 

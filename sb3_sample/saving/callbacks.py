@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_sample.envs.portable_states import pack, unpack
 from sb3_sample.saving import vec_envs
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Node, Restorer, class_name, same
+from sb3_sample.saving.classes import may_be_set
 from sb3_sample.saving.places import brings_text
 
 #: What every callback has and that is not its own.
@@ -141,7 +142,7 @@ class CallbackStates:
     def _restore(self, path: str, callback: BaseCallback, state: dict[str, Any]) -> None:
         attributes, own, arguments = state["attributes"], vars(callback), _arguments(callback)
         for name in attributes:
-            if name in _skipped(callback) or (name not in own and hasattr(type(callback), name)):
+            if name in _skipped(callback) or not may_be_set(type(callback), name):
                 raise DoesNotFit(f"{name!r:.100} is not saved of it")
         # Where it writes, and what it writes, is said by the present program.
         said = [name for name in attributes if name in arguments and brings_text(attributes[name], own.get(name))]

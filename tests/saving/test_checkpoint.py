@@ -715,6 +715,26 @@ def test_callbacks_that_come_and_go_are_named(tmp_path: Path) -> None:
         sac().learn(30, Counter(), checkpoint=tmp_path)
 
 
+class Best(BaseCallback):
+    """Has its defaults in the class body, as in Stable-Baselines3's documentation."""
+
+    best, hits = -np.inf, 0
+
+    def _on_step(self) -> bool:
+        self.hits += 1
+        self.best = max(self.best, float(self.locals["rewards"].max()))
+        return True
+
+
+def test_defaults_in_the_class_body_go_on_too(tmp_path: Path) -> None:
+    sac().learn(20, Best(), checkpoint=tmp_path)
+    again = Best()
+    sac().learn(30, again, checkpoint=tmp_path)
+    whole = Best()
+    sac().learn(30, whole)
+    assert (again.hits, again.best) == (whole.hits, whole.best) and again.hits == 30
+
+
 class Secretive(BaseCallback):
     def __init__(self) -> None:
         super().__init__()

@@ -11,8 +11,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from sb3_sample.zoo_files import PlottedRuns
-from sb3_sample.zoo_runs import RunError
+from sb3_sample.zoo.files import PlottedRuns, RunError
 
 #: Tasks, by their names in the zoo's tables, that its command normalises itself.
 ZOO_REFERENCES = frozenset({"Half", "Ant", "Hopper", "Walker", "LunarLanderContinuous", "BipedalWalker"})

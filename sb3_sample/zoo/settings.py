@@ -6,6 +6,7 @@ classes of networks, and wrappers from a list.
 
 import ast
 import math
+import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -320,6 +321,21 @@ def read_settings(path: Path, trusted_modules: Sequence[str] = (), given: Sequen
     if not isinstance(settings["replay_buffer_class"], str):
         raise BadFile(f"{path}: replay_buffer_class cannot be {buffer!r:.100}")
     return settings
+
+
+def check_settings(folder: Path, trusted_modules: Sequence[str] = (), given: Sequence[str] = ()) -> None:
+    """
+    Look at a run's ``args.yml`` and ``config.yml`` before the zoo does.
+
+    :param folder: where they are
+    :param trusted_modules: modules, or packages of modules, whose classes they may name
+    :param given: arguments of the environment that the command line gives
+    :raises BadFile: see ``read_settings``
+    """
+    for name in ("args.yml", "config.yml"):
+        # The zoo passes over what is there and no file.
+        if os.path.lexists(folder / name):
+            read_settings(folder / name, trusted_modules, given)
 
 
 def _env_kwargs(arguments: Any, path: Path, given: Sequence[str]) -> dict[str, Any]:

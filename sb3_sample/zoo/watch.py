@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import functools
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,11 +13,11 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.exits import refuse
 from sb3_sample.saving.checkpoint import MODEL
-from sb3_sample.saving.model import SafeFiles
-from sb3_sample.saving.untrusted import BadFile
-from sb3_sample.zoo import ALGORITHMS
-from sb3_sample.zoo_files import Refused, add_trust, check_settings, reading, reading_settings, replaced
-from sb3_sample.zoo_runs import Record, RunError, checkpoints
+from sb3_sample.zoo.algorithms import ALGORITHMS
+from sb3_sample.zoo.files import Refused, RunError, add_trust
+from sb3_sample.zoo.patches import make_answering_env, models_checked, reading, reading_settings, watched_with
+from sb3_sample.zoo.runs import Record, checkpoints
+from sb3_sample.zoo.settings import check_settings
 
 
 def watch_parser(command: str) -> argparse.ArgumentParser:
@@ -55,9 +54,7 @@ def watching(options: argparse.Namespace, arguments: Sequence[str], *modules: An
     given = _given(arguments)
     with contextlib.ExitStack() as stack:
         watch = _Watch(options, given, stack)
-        for module in modules:
-            stack.enter_context(replaced(module, "get_model_path", watch.find))
-            stack.enter_context(replaced(module, "create_test_env", watch.make_env))
+        stack.enter_context(watched_with(watch.find, watch.make_env, *modules))
         yield [*(_of_record(options, given) if options.run_dir is not None else []), *arguments]
 
 
@@ -134,8 +131,7 @@ class _Watch:
             raise Refused(str(error)) from error
         if is_ours:
             self._stack.enter_context(reading(options.allow_pickle, options.trusted_modules))
-            load = vars(SafeFiles)["load"].__func__
-            self._stack.enter_context(replaced(SafeFiles, "load", classmethod(self._fitting(load))))
+            self._stack.enter_context(models_checked(self._check))
         return found
 
     def make_env(self, env_id: str, *args: Any, **kwargs: Any) -> VecEnv:
@@ -144,41 +140,14 @@ class _Watch:
 
         :raises Refused: if the run's settings make none that works
         """
-        make = self._answering_for(env_id, create_test_env) if self._is_safe else create_test_env
-        self._env = make(env_id, *args, **kwargs)
-        for name in ("reset", "step_async", "step_wait", "render") if self._is_safe else ():
-            setattr(self._env, name, self._answering_for(env_id, getattr(self._env, name)))
+        self._env = (make_answering_env if self._is_safe else create_test_env)(env_id, *args, **kwargs)
         return self._env
 
-    @staticmethod
-    def _answering_for(env_id: str, function: Any) -> Any:
-        """What an environment or a wrapper raises, whose arguments are those of a run's file, is said to be theirs."""
-
-        @functools.wraps(function)
-        def call(*args: Any, **kwargs: Any) -> Any:
-            try:
-                return function(*args, **kwargs)
-            except (BadFile, Refused):
-                raise
-            except Exception as error:
-                why = f"{type(error).__name__}: {error}"
-                raise Refused(f"{env_id} with the settings of the run does not work: {why}") from error
-
-        return call
-
-    def _fitting(self, load: Any) -> Any:
-        def call(*args: Any, **kwargs: Any) -> Any:
-            model = load(*args, **kwargs)
-            env = self._env
-            if env is not None:
-                for its, saved in (
-                    (env.observation_space, model.observation_space), (env.action_space, model.action_space)
-                ):  # fmt: skip
-                    if _shapes(its) != _shapes(saved):
-                        raise Refused(f"the model is of {saved!r:.200}, the run's environment of {its!r:.200}")
-            return model
-
-        return call
+    def _check(self, model: Any) -> None:
+        for name in ("observation_space", "action_space") if self._env is not None else ():
+            its, saved = getattr(self._env, name), getattr(model, name)
+            if _shapes(its) != _shapes(saved):
+                raise Refused(f"the model is of {saved!r:.200}, the run's environment of {its!r:.200}")
 
 
 def _shapes(space: gym.Space) -> Any:

@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import rl_zoo3.exp_manager
 import rl_zoo3.train
 from rl_zoo3.exp_manager import ExperimentManager
@@ -32,8 +31,9 @@ from sb3_sample.run_logs import monitor_files, monitor_head
 from sb3_sample.saving.folders import Folder, is_plain
 from sb3_sample.saving.training_state import argument_names
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
-from sb3_sample.zoo import ALGORITHMS
-from sb3_sample.zoo_files import add_trust, pairs_checked, replaced
+from sb3_sample.zoo.algorithms import ALGORITHMS
+from sb3_sample.zoo.files import RunError, add_trust
+from sb3_sample.zoo.patches import managed_by, monitors_go_on
 
 RECORD = "run.json"
 #: Bytes of a record.
@@ -52,10 +52,6 @@ COMPARED = (
 _OF_NOISE = {"noise_type", "noise_std"}
 #: Arguments that the zoo's options give.
 _OF_OPTIONS = {"env", "seed", "verbose", "device", "tensorboard_log"}
-
-
-class RunError(ValueError):
-    """A run that cannot be started or go on as the command says."""
 
 
 class Record(NamedTuple):
@@ -299,7 +295,7 @@ def train(start: Start | None) -> None:
     :raises KeyboardInterrupt: after Ctrl-C, when the zoo has saved the model
     """
     manager = Manager if start is None else functools.partial(RunManager, start)
-    with pairs_checked(rl_zoo3.train), replaced(rl_zoo3.train, "ExperimentManager", manager):
+    with managed_by(manager, rl_zoo3.train):
         rl_zoo3.train.train()
 
 
@@ -416,9 +412,7 @@ class RunManager(Manager):
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         goes_on = self._start.record is not None and get_monitor_files(str(self._folder))
-        # The zoo has no argument for how Monitor is made.
-        make = functools.partial(_make_vec_env, rl_zoo3.exp_manager.make_vec_env)
-        with replaced(rl_zoo3.exp_manager, "make_vec_env", make) if goes_on else contextlib.nullcontext():
+        with monitors_go_on(rl_zoo3.exp_manager) if goes_on else contextlib.nullcontext():
             return super().create_envs(n_envs, eval_env, no_log)
 
     def learn(self, model: BaseAlgorithm) -> None:
@@ -456,25 +450,6 @@ class _Watched:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._model, name)
-
-
-def _make_vec_env(make: Any, *args: Any, monitor_kwargs: dict[str, Any], wrapper_class: Any, **kwargs: Any) -> VecEnv:
-    """Environments whose Monitors go on with the files that are there."""
-
-    def wrap(env: Monitor) -> gym.Env:
-        if env.results_writer is not None:
-            writer, path = env.results_writer, env.results_writer.file_handler.name
-            if os.path.getsize(path):
-                # Their times count from the beginning in the file's head.
-                env.t_start = monitor_head(path)["t_start"]
-            else:  # one of several that was removed
-                head = {"t_start": env.t_start, "env_id": str(env.spec and env.spec.id)}
-                writer.file_handler.write(f"#{json.dumps(head)}\n")
-                writer.logger.writeheader()
-                writer.file_handler.flush()
-        return env if wrapper_class is None else wrapper_class(env)
-
-    return make(*args, monitor_kwargs={**monitor_kwargs, "override_existing": False}, wrapper_class=wrap, **kwargs)
 
 
 class RunFiles(BaseCallback):

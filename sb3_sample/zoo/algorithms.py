@@ -1,0 +1,70 @@
+"""
+The algorithms of this package, as the zoo needs them.
+
+A new algorithm is one entry of ``ALGORITHMS`` and one file ``hyperparams/<name>.yml``.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
+from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
+from sb3_sample.saving.untrusted import BadFile
+from sb3_sample.zoo import search
+from sb3_sample.zoo.trials import check_params
+
+#: The files ``<algorithm>.yml``, read when ``--conf-file`` is not given.
+HYPERPARAMS = Path(__file__).parents[1] / "hyperparams"
+
+
+class ZooAlgorithm(NamedTuple):
+    """
+    An algorithm as the zoo needs it.
+
+    :param algorithm: the class
+    :param space: its search space
+    :param convert: turns suggested parameters, of a trial under way or a stored one, into arguments
+    """
+
+    algorithm: type[BaseAlgorithm]
+    space: search.Space
+    convert: search.Converter = search.decode
+
+
+#: The algorithms by their names in the zoo (``--algo``, log folders, ``hyperparams/<name>.yml``). "sac" is the zoo's
+#: own, Stable-Baselines3's.
+ALGORITHMS: dict[str, ZooAlgorithm] = {
+    "bro": ZooAlgorithm(BRO, search.BRO_SPACE),
+    "bro_fast": ZooAlgorithm(BROFast, search.BRO_FAST_SPACE),
+    "bro_td3": ZooAlgorithm(BROTD3, search.BRO_TD3_SPACE),
+    "dac": ZooAlgorithm(DAC, search.DAC_SPACE),
+    "gpl_sac": ZooAlgorithm(GPLSAC, search.GPL_SPACE),
+    "mbma_ppo": ZooAlgorithm(MBMAPPO, search.MBMA_SPACE),
+    "mbpo_ppo": ZooAlgorithm(MBPOPPO, search.MBPO_SPACE),
+    "oac": ZooAlgorithm(OAC, search.OAC_SPACE),
+    "opl_sac": ZooAlgorithm(OPLSAC, search.OPL_SPACE),
+    "qma_ppo": ZooAlgorithm(QMAPPO, search.ON_POLICY_SPACE),
+    "regularized_sac": ZooAlgorithm(RegularizedSAC, search.REGULARIZED_SPACE, search.decode_regularized),
+    "sac_sample": ZooAlgorithm(SAC, search.SAC_SPACE),
+    "sr_sac": ZooAlgorithm(SRSAC, search.SR_SAC_SPACE),
+    "top_sac": ZooAlgorithm(TOPSAC, search.TOP_SPACE),
+    "vpl_sac": ZooAlgorithm(VPLSAC, search.VPL_SPACE),
+}
+
+
+def stored_arguments(algo: str, params: dict[str, Any], where: str) -> dict[str, Any]:
+    """
+    :param algo: name of an algorithm of ours
+    :param params: parameters of a stored trial, which anybody may have written
+    :param where: whose they are, for messages
+    :return: arguments of the constructor
+    :raises BadFile: (a ``ValueError``) if they are not what a search of the algorithm stores
+    """
+    entry = ALGORITHMS[algo]
+    check_params(params, {**entry.space, **search.HER_SPACE}, where)
+    try:
+        return entry.convert(params)
+    except KeyError as error:
+        raise BadFile(f"{where} has no {error}, which a search of {algo} stores") from error
