@@ -210,18 +210,19 @@ def check_n_envs(agent: Any, env: GymEnv) -> None:
 def names_for_load(cls: type, base: type) -> set[str]:
     """
     :param cls: class of an algorithm
-    :param base: its family's first class
-    :return: the arguments that ``load`` may change: those of the class and of its bases in the family, and
+    :param base: what the algorithms' classes are derived from
+    :return: the arguments that ``load`` may change: those of the class and of its bases below ``base``, and
         ``policy_class``, Stable-Baselines3's name for what the policy is of
     """
-    names = {name for c in cls.__mro__ if issubclass(c, base) for name in inspect.signature(c).parameters}
+    classes = [c for c in cls.__mro__ if issubclass(c, base) and c is not base]
+    names = {name for c in classes for name in inspect.signature(c).parameters}
     return (names | {"policy_class"}) - {"env", "kwargs", "_init_setup_model"}
 
 
 def check_load(cls: type, base: type, env: Any, device: Any, kwargs: dict[str, Any]) -> None:
     """
     :param cls: class of an algorithm
-    :param base: its family's first class
+    :param base: what the algorithms' classes are derived from
     :param env: with which it is to be loaded
     :param device: where it is to be loaded
     :param kwargs: what ``load`` is to change

@@ -103,6 +103,17 @@ def not_finite(values: Mapping[str, float]) -> dict[str, float]:
     return {name: float(value) for name, value in values.items() if not np.isfinite(value)}
 
 
+def diverged(model: BaseAlgorithm, values: Mapping[str, float]) -> TrainingDiverged:
+    """
+    :param model: an algorithm
+    :param values: what of it is not finite, by name
+    :return: the error that says so, and after how many updates
+    """
+    # What PPO counts is passes over its rollouts.
+    kind = "gradient step" if isinstance(model, OffPolicyAlgorithm) else "update"
+    return TrainingDiverged(values, f"{kind} {model._n_updates}", model.num_timesteps)
+
+
 def check_finite_parameters(model: BaseAlgorithm) -> None:
     """
     Look at every parameter of a model and at its optimizers' moments, and at the metrics that nobody looked at yet.
@@ -124,10 +135,7 @@ def check_finite_parameters(model: BaseAlgorithm) -> None:
         largest = torch.stack(torch._foreach_norm(list(tensors.values()), float("inf"))).cpu().tolist()
         bad.update(not_finite(dict(zip(tensors, largest, strict=True))))
     if bad:
-        shown = {name: value for name, value in bad.items() if ".optimizer" not in name} or bad
-        # What PPO counts is passes over its rollouts.
-        kind = "gradient step" if isinstance(model, OffPolicyAlgorithm) else "update"
-        raise TrainingDiverged(shown, f"{kind} {model._n_updates}", model.num_timesteps)
+        raise diverged(model, {name: value for name, value in bad.items() if ".optimizer" not in name} or bad)
 
 
 def _learned(model: BaseAlgorithm) -> Iterator[tuple[str, torch.Tensor]]:

@@ -16,6 +16,7 @@ from sb3_sample.kinds import check_value, integer
 from sb3_sample.ppo.arguments import check_network_kwargs
 from sb3_sample.ppo.dynamics import Dynamics, TransitionBuffer, Transitions
 from sb3_sample.ppo.simulated_ppo import SimulatedPPO
+from sb3_sample.saving.kept import Kept
 
 #: What ``dynamics_kwargs`` may hold, with the defaults (P1, appendix B.2; ``normalize`` is decided here).
 DYNAMICS_DEFAULTS: dict[str, Any] = {
@@ -100,6 +101,7 @@ class ModelBasedPPO(SimulatedPPO):
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
+    _kept: ClassVar[dict[str, Kept]] = {"_model_kwargs": Kept.NOWHERE}
     simulation_arguments: ClassVar[tuple[str, ...]] = (
         *SimulatedPPO.simulation_arguments,
         "simulation_horizon",
@@ -166,9 +168,6 @@ class ModelBasedPPO(SimulatedPPO):
 
     def _model_names(self) -> list[str]:
         return ["dynamics", "dynamics.optimizer", "transitions"]
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_model_kwargs"]
 
     # ---------------------------------------------------------------- collecting
 

@@ -14,6 +14,7 @@ from sb3_sample.optim import AdamW
 from sb3_sample.ppo.arguments import check_network_kwargs
 from sb3_sample.ppo.dynamics import ADAM_EPS, Standardizer, fit, minibatches
 from sb3_sample.ppo.simulated_ppo import SimulatedPPO, SimulatedSamples
+from sb3_sample.saving.kept import Kept
 
 #: What ``q_kwargs`` may hold, with the defaults (P1, appendix B.2; ``normalize`` is decided here).
 Q_DEFAULTS: dict[str, Any] = {"width": 1024, "depth": 2, "learning_rate": 3e-4, "epochs": None, "normalize": True}
@@ -88,6 +89,7 @@ class QMAPPO(SimulatedPPO):
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
+    _kept: ClassVar[dict[str, Kept]] = {"_network_kwargs": Kept.NOWHERE}
     simulation_arguments: ClassVar[tuple[str, ...]] = (*SimulatedPPO.simulation_arguments, "q_kwargs")
 
     def __init__(
@@ -114,9 +116,6 @@ class QMAPPO(SimulatedPPO):
 
     def _model_names(self) -> list[str]:
         return ["q_networks", "q_networks.optimizer"]
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_network_kwargs"]
 
     def fit_models(self) -> None:
         """

@@ -5,12 +5,11 @@ The on-policy family: PPO whose policy gradient also sees simulated samples, and
 samples come from is the business of its subclasses, in ``fit_models`` and ``_simulate``.
 """
 
-import io
 import math
 import pathlib
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -26,20 +25,17 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.arguments import check_learn, check_load, check_n_envs, check_program, default_of, naming_changes
+from sb3_sample.arguments import check_program, default_of
 from sb3_sample.console import say
-from sb3_sample.envs.finite_check import FiniteCheck
-from sb3_sample.envs.workers import watch_workers
-from sb3_sample.export import Exportable
-from sb3_sample.faults import TrainingDiverged, check_finite_parameters, not_finite
+from sb3_sample.faults import TrainingDiverged, check_finite_parameters, diverged, not_finite
 from sb3_sample.kinds import check_value, integer
 from sb3_sample.ppo import arguments
 from sb3_sample.ppo.dynamics import minibatches
 from sb3_sample.ppo.spaces import FlatObservations, ModelActions
-from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ, Checkpointer, refuse_second_call
+from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
+from sb3_sample.saving.kept import Kept
 from sb3_sample.saving.model import SafeFiles
-from sb3_sample.saving.model_tree import Description
-from sb3_sample.saving.notice import say_once
+from sb3_sample.training.resumable import Resumable
 
 Self = TypeVar("Self", bound="SimulatedPPO")
 
@@ -90,7 +86,7 @@ class SimulatedSamples(NamedTuple):
     weights: torch.Tensor | None = None
 
 
-class SimulatedPPO(Exportable, SafeFiles, PPO):
+class SimulatedPPO(Resumable, SafeFiles, PPO):
     """
     PPO whose policy loss also sees simulated samples (P1, Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011,
     algorithm 1): what :class:`MBMAPPO`, :class:`QMAPPO` and :class:`MBPOPPO` share. The critic learns from the real
@@ -143,6 +139,12 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
     """
 
     policy_base = ActorCriticPolicy
+    _kept: ClassVar[dict[str, Kept]] = {
+        "flat_observations": Kept.NOWHERE,
+        "model_actions": Kept.NOWHERE,
+        # Empty at the end of an iteration.
+        "_seconds": Kept.NOWHERE,
+    }
     #: Arguments that mean nothing without simulated samples.
     simulation_arguments: ClassVar[tuple[str, ...]] = ("anneal_until", "warm_up_until")
 
@@ -225,28 +227,14 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
     # ---------------------------------------------------------------- construction
 
     def _setup_model(self) -> None:
-        self._check_arguments()
-        given = self.policy_kwargs
-        # The policy is built with more than the user's own arguments, and only the latter are saved.
-        self.policy_kwargs = self._full_policy_kwargs()
-        try:
-            super()._setup_model()
-        finally:
-            self.policy_kwargs = given
+        super()._setup_model()
         if self.n_simulated > 0:
-            if self.device.type == "cpu":
-                # glibc hands freed memory back to the system above a threshold, and the next block of a simulation
-                # pays for page faults. The threshold follows the largest block freed so far.
-                torch.empty(31 * 2**20, dtype=torch.uint8)
             self.flat_observations = FlatObservations(self.observation_space)
             self.model_actions = ModelActions(self.action_space, self.device)
             # After the policy, whose initial weights are thereby Stable-Baselines3's of the same seed.
             self._setup_models()
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
-        """
-        :return: the policy's arguments: the user's and the algorithm's
-        """
         kwargs = dict(self.policy_kwargs)
         if self._has_named_policy:
             kwargs.setdefault("net_arch", {name: list(widths) for name, widths in NET_ARCH.items()})
@@ -260,9 +248,6 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         return kwargs
 
     def _check_arguments(self) -> None:
-        """
-        :raises ValueError: if an argument is out of range or contradicts another
-        """
         arguments.check(self)
 
     def _setup_models(self) -> None:
@@ -280,83 +265,17 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         if self.n_simulated == 0:
             super()._maybe_recommend_cpu(mlp_class_name)
 
-    @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        venv = PPO._wrap_env(env, verbose, monitor_wrapper)
-        FiniteCheck.install(venv)
-        watch_workers(venv)
-        return venv
-
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """
-        Go on with another environment, as in Stable-Baselines3.
-
-        :param env: the environment, of the same spaces and as many as the model was made with
-        :param force_reset: whether it is reset before training goes on
-        :raises ValueError: if it is not
-        """
-        check_n_envs(self, env)
-        super().set_env(env, force_reset)
-
     # ---------------------------------------------------------------- saving and loading
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names, variables = super()._get_torch_save_params()
         return [*names, *(self._model_names() if self.n_simulated > 0 else [])], variables
 
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "flat_observations", "model_actions", "_seconds"]
-
     @classmethod
-    def load(
-        cls: type[Self],
-        path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | str | None = None,
-        device: torch.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        *,
-        allow_pickle: bool = False,
-        trusted_modules: Sequence[str] = (),
-        **kwargs: Any,
-    ) -> Self:
-        """
-        Load a model, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it. The file has the learned
-        models, their optimizers and their transitions.
-
-        :param path: file, or where ``save`` wrote it
-        :param env: environment to go on with, or its id; none is needed for prediction
-        :param device: "auto", "cpu", "cuda", ...
-        :param custom_objects: objects that replace what the file holds under their names
-        :param print_system_info: whether to print the saved and the present versions
-        :param force_reset: whether the environment is reset before training goes on
-        :param allow_pickle: whether a file in Stable-Baselines3's own, pickled format is loaded too, which can run any
-            code that its author wanted
-        :param trusted_modules: modules, or packages of modules, whose classes and functions the file, and what the
-            model reads later, may name
-        :param kwargs: arguments of the constructor that take the place of the file's, which is not asked for them
-        :return: the model
-        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
-        :raises ValueError: if ``kwargs`` holds something else, or values with which the file's parameters do not fit
-        """
-        check_load(cls, PPO, env, device, kwargs)
-        changes = dict(kwargs)
-        if kwargs.get("n_simulated") == 0:
-            # What the file says of simulated samples is not what the caller has asked for.
-            changes = {name: default_of(cls, name) for name in cls.simulation_arguments} | kwargs
-        with naming_changes(kwargs):
-            return super().load(
-                path,
-                env,
-                device,
-                custom_objects,
-                print_system_info,
-                force_reset,
-                allow_pickle=allow_pickle,
-                trusted_modules=trusted_modules,
-                **changes,
-            )
+    def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
+        # What the file says of simulated samples is not what the caller has asked for.
+        is_plain = kwargs.get("n_simulated") == 0
+        return {name: default_of(cls, name) for name in cls.simulation_arguments} if is_plain else {}
 
     # ---------------------------------------------------------------- the iteration
 
@@ -389,45 +308,38 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
             differs) or of an earlier call of ``learn``, cannot be used, or has checkpoints that are all damaged
         :raises TrainingDiverged: if a loss or a parameter is NaN or infinite
         """
-        total_timesteps = check_learn(self, locals())
-        refuse_second_call(self, checkpoint)
-        total_timesteps, callback = self._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
+        return self._learn(
+            total_timesteps,
+            callback,
+            log_interval,
+            tb_log_name,
+            reset_num_timesteps,
+            progress_bar,
+            checkpoint,
+            checkpoint_freq,
         )
-        self._iteration = 0
-        self._warn_of_one_iteration(total_timesteps)
-        say_once(self, Description(self).encoder)
-        with Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
-            checkpointer.resume()
-            callback.on_training_start(locals(), globals())
-            checkpointer.start()
-            assert self.env is not None
-            while self.num_timesteps < total_timesteps:
-                heard = checkpointer.callback
-                if not self.collect_rollouts(self.env, heard, self.rollout_buffer, n_rollout_steps=self.n_steps):
-                    break
-                self._iteration += 1
-                self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-                if log_interval is not None and self._iteration % log_interval == 0:
-                    self.dump_logs(self._iteration)
-                self.train()
-                checkpointer.after_turn()
-            check_finite_parameters(self)
-            checkpointer.finish()
-        return self
 
-    def _warn_of_one_iteration(self, total_timesteps: int) -> None:
+    def _before_training(self) -> None:
+        self._iteration = 0
         starts_at_none = self.n_simulated > 0 and self._warm_up > 0 and self.num_timesteps == 0
-        if starts_at_none and total_timesteps <= self.n_steps * self.n_envs:
+        if starts_at_none and self._total_timesteps <= self.n_steps * self.n_envs:
             warnings.warn(
-                f"{total_timesteps} steps are a single iteration (n_steps={self.n_steps} times {self.n_envs} "
+                f"{self._total_timesteps} steps are a single iteration (n_steps={self.n_steps} times {self.n_envs} "
                 "environments), in which nothing is simulated: the number of simulated samples rises from 0. Train "
                 "longer, or pass warm_up_until=0",
-                stacklevel=3,
+                stacklevel=4,
             )
 
-    def _on_environment_reset(self) -> None:
-        """The environments were reset in the midst of their episodes, of which nothing is remembered here."""
+    def _turn(self, callback: BaseCallback, log_interval: int) -> bool:
+        assert self.env is not None
+        if not self.collect_rollouts(self.env, callback, self.rollout_buffer, n_rollout_steps=self.n_steps):
+            return False
+        self._iteration += 1
+        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        if log_interval is not None and self._iteration % log_interval == 0:
+            self.dump_logs(self._iteration)
+        self.train()
+        return True
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
@@ -496,7 +408,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         }
         bad = not_finite(logged)
         if bad:
-            raise TrainingDiverged(bad, f"update {self._n_updates}", self.num_timesteps)
+            raise diverged(self, bad)
 
     def _check_parameters(self) -> None:
         """All of them, and the standard deviation: the exponential of a finite one can be 0 or infinite."""
@@ -506,8 +418,7 @@ class SimulatedPPO(Exportable, SafeFiles, PPO):
         std = self.policy.log_std.detach().exp()
         bad = std[~(torch.isfinite(std) & (std > 0))]
         if len(bad) > 0:
-            values = {"the policy's standard deviation": bad[0].item()}
-            raise TrainingDiverged(values, f"update {self._n_updates}", self.num_timesteps)
+            raise diverged(self, {"the policy's standard deviation": bad[0].item()})
 
     def _train(self) -> None:
         n_simulated = self.current_n_simulated()

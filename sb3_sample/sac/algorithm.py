@@ -4,8 +4,6 @@ The off-policy family as Stable-Baselines3's: acting, storing, when and how ofte
 The update is the learner's (``sb3_sample/learner/learner.py``).
 """
 
-import functools
-import io
 import pathlib
 import warnings
 from collections.abc import Sequence
@@ -15,21 +13,16 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.arguments import check_learn, check_load, check_n_envs, check_program, default_of, naming_changes
-from sb3_sample.envs.finite_check import FiniteCheck
-from sb3_sample.envs.workers import watch_workers
-from sb3_sample.errors import ParametersDoNotFit
-from sb3_sample.export import Exportable
-from sb3_sample.faults import MetricWatch, TrainingDiverged, check_finite_parameters, not_finite
-from sb3_sample.kinds import chosen
+from sb3_sample.arguments import check_program, default_of
+from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, not_finite
 from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.learner.execution import (
     PAYS_FROM,
@@ -38,14 +31,9 @@ from sb3_sample.learner.execution import (
     warn_not_compiled,
     why_not_compiled,
 )
-from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
-from sb3_sample.learner.heads import QuantileHead, ValueHead
-from sb3_sample.learner.learner import Learner
-from sb3_sample.learner.parts import Part
-from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
-from sb3_sample.learner.plasticity import ReDo, Resets
-from sb3_sample.learner.scalars import FixedScalar, LogScalar
-from sb3_sample.learner.transforms import BatchTransform
+from sb3_sample.learner.exploration import Exploration
+from sb3_sample.learner.heads import ValueHead
+from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.logged_values import LoggedValues
 from sb3_sample.replay.buffers import (
     ValidationDictReplayBuffer,
@@ -57,14 +45,14 @@ from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplay, Co
 from sb3_sample.replay.sources import ReplaySource
 from sb3_sample.sac import arguments
 from sb3_sample.sac.model_learner import check_action_space
-from sb3_sample.sac.policies import BACKBONES, CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
+from sb3_sample.sac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.sb3_names import SB3Names
-from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ, Checkpointer, refuse_second_call
-from sb3_sample.saving.container import BadFile
+from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
+from sb3_sample.saving.encoding import Lenient
+from sb3_sample.saving.kept import Kept
 from sb3_sample.saving.model import SafeFiles
-from sb3_sample.saving.model_tree import Description
-from sb3_sample.saving.notice import say_once
 from sb3_sample.saving.replay import SafeReplayBuffers, encode_buffer
+from sb3_sample.training.resumable import Resumable
 
 Self = TypeVar("Self", bound="SAC")
 
@@ -72,7 +60,7 @@ Self = TypeVar("Self", bound="SAC")
 MAX_BATCHES_AT_ONCE = 64
 
 
-class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]  # actor
+class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]  # actor
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
     SAC that the papers compare with (P2-P5): tanh-Gaussian actor, two critics, clipped double Q-learning.
@@ -159,10 +147,16 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
     }
     policy_base = SACPolicy
     policy: SACPolicy
-    #: The class of the learner.
-    learner_class: ClassVar[type[Learner]] = Learner
-    #: beta1 of the temperature's Adam.
-    temperature_beta1: ClassVar[float] = 0.9
+    _kept: ClassVar[dict[str, Kept]] = {
+        # Saved by its parts.
+        "_learner": Kept.NOWHERE,
+        "_source": Kept.NOWHERE,
+        "_watch": Kept.NOWHERE,
+        # For the log of a run that goes on.
+        "_metrics": Kept.IN_CHECKPOINTS,
+        # An argument that changes with every step.
+        "action_noise": Kept.EVERYWHERE,
+    }
 
     def __init__(
         self,
@@ -289,21 +283,9 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
     # ---------------------------------------------------------------- construction
 
     def _setup_model(self) -> None:
-        self._check_arguments()
-        given = self.policy_kwargs, self.replay_buffer_kwargs
-        # Policy and buffer are built with more than the user's own arguments, and only the latter are saved.
-        self.policy_kwargs = self._full_policy_kwargs()
-        self._choose_replay_buffer()
-        try:
-            super()._setup_model()
-        finally:
-            self.policy_kwargs, self.replay_buffer_kwargs = given
+        super()._setup_model()
         assert self.replay_buffer is not None
         store_float_actions(self.replay_buffer)
-        if self.device.type == "cpu":
-            # glibc hands freed memory back to the system above a threshold, at first below the size of one gradient,
-            # and every update then pays for page faults. The threshold follows the largest block freed so far.
-            torch.empty(31 * 2**20, dtype=torch.uint8)
         if self.compile != "auto":
             self.compiled = bool(self.compile)
         self._source = ReplaySource(self)
@@ -311,62 +293,11 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         arguments.check_rule(self)
         self._watch = MetricWatch(self.device)
 
-    def _make_learner(self, **kwargs: Any) -> Learner:
-        """
-        :param kwargs: networks, counts and generators of the learner
-        :return: a learner with the parts and the settings of the arguments
-        """
-        self._take_target_entropy()
-        return self.learner_class(
-            self._make_networks,
-            head=self._make_head(),
-            make_temperature=self._make_temperature,
-            make_pessimism=self.make_pessimism,
-            make_explorer=self.make_explorer,
-            plasticity=Resets(self.resets, self.reset_shrink, self.reset_gradient_steps),
-            redo=None if self.redo_period is None else ReDo(self.redo_period, self.redo_threshold),
-            make_transforms=[functools.partial(_make_transform, each) for each in self.batch_transforms],
-            learning_rate=self.lr_schedule(1),
-            temperature_beta1=self.temperature_beta1,
-            target_entropy=self._target_entropy,
-            device=self.device,
-            **{name: getattr(self, name) for name in Learner.SETTINGS},
-            **kwargs,
-        )
-
-    def _make_head(self) -> ValueHead:
-        if self.value_head is not None:
-            return self.value_head(**(self.value_head_kwargs or {}))
-        return ValueHead() if self.n_quantiles is None else QuantileHead(self.n_quantiles)
-
-    def _make_networks(self) -> SACPolicy:
-        kwargs = self._full_policy_kwargs()
-        return self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)  # type: ignore[return-value]
-
-    def _take_settings(self) -> None:
-        """Have the learner take up what was set since the last gradient step."""
-        self._take_target_entropy()
-        self.learner.target_entropy = self._target_entropy
-        for name in Learner.SETTINGS:
-            setattr(self.learner, name, getattr(self, name))
-
-    def _take_target_entropy(self) -> None:
-        """Take up what ``target_entropy`` says, which is a number afterwards."""
-        arguments.check_target_entropy(self)
-        if self.target_entropy == "auto":
-            self._target_entropy = -get_action_dim(self.action_space) / 2
-        else:
-            self._target_entropy = float(self.target_entropy)
-        if BACKBONES[self.backbone].has_entropy:
-            self.target_entropy = self._target_entropy
-
     def _check_arguments(self) -> None:
-        """
-        :raises ValueError: if an argument is out of range or contradicts another
-        """
         arguments.check(self)
 
-    def _choose_replay_buffer(self) -> None:
+    def _complete_arguments(self) -> None:
+        super()._complete_arguments()
         is_dict = isinstance(self.observation_space, spaces.Dict)
         if self.validation_proportion > 0:
             self.replay_buffer_class = ValidationDictReplayBuffer if is_dict else ValidationReplayBuffer
@@ -385,192 +316,26 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
             self.optimize_memory_usage = False
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
-        """
-        :return: the policy's arguments: the user's and the algorithm's
-        """
         return {**self.policy_kwargs, "n_outputs": self._make_head().n_outputs, "backbone": self.backbone}
 
-    def _full_exploration_kwargs(self) -> dict[str, Any]:
-        """
-        :return: the explorer's arguments: the user's and the algorithm's
-        """
-        return dict(self.exploration_kwargs or {})
-
-    def _full_pessimism_kwargs(self) -> dict[str, Any]:
-        """
-        :return: the arguments of the rule that moves pessimism: the user's and the algorithm's
-        """
-        return dict(self.pessimism_kwargs or {})
-
-    def _make_temperature(self, learner: Learner) -> LogScalar | FixedScalar:
-        if not learner.actor.has_entropy:
-            return FixedScalar(0.0).to(self.device)
-        allowed = "'auto' or 'auto_<start above 0>'"
-        if isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto"):
-            start = self.ent_coef.removeprefix("auto").removeprefix("_") or "1"
-            value = arguments.as_number("ent_coef", start, allowed, shown=self.ent_coef)
-            if not 0 < value < np.inf:
-                raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
-            return LogScalar(value).to(self.device)
-        value = arguments.as_number("ent_coef", self.ent_coef, allowed)
-        if not 0 <= value < np.inf:
-            raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
-        return FixedScalar(value).to(self.device)
-
-    def make_explorer(self, learner: Learner) -> Exploration:
-        """
-        :param learner: whose it is
-        :return: a freshly initialised explorer
-        """
-        make = chosen("exploration", self.exploration, EXPLORATIONS, Exploration)
-        kwargs = self._full_exploration_kwargs()
-        arguments.check_names("exploration", self.exploration, make, kwargs)
-        return make(learner, **kwargs)  # type: ignore[no-any-return]
-
-    def make_pessimism(self, learner: Learner) -> Pessimism:
-        """
-        :param learner: whose it is
-        :return: a freshly initialised rule of pessimism
-        """
-        if not isinstance(self.pessimism, (str, type)):
-            return Pessimism(self.pessimism)
-        make = chosen("pessimism", self.pessimism, PESSIMISMS, Pessimism)
-        kwargs = self._full_pessimism_kwargs()
-        arguments.check_names("pessimism", self.pessimism, make, kwargs)
-        return make(learner, **kwargs)  # type: ignore[no-any-return]
-
     @classmethod
-    def load(
-        cls: type[Self],
-        path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | str | None = None,
-        device: torch.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        *,
-        allow_pickle: bool = False,
-        trusted_modules: Sequence[str] = (),
-        **kwargs: Any,
-    ) -> Self:
-        """
-        Load a model, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it.
-
-        :param path: file, or where ``save`` wrote it
-        :param env: environment to go on with, or its id; none is needed for prediction
-        :param device: "auto", "cpu", "cuda", ...
-        :param custom_objects: objects that replace what the file holds under their names
-        :param print_system_info: whether to print the saved and the present versions
-        :param force_reset: whether the environment is reset before training goes on
-        :param allow_pickle: whether a file in Stable-Baselines3's own, pickled format is loaded too, which can run any
-            code that its author wanted
-        :param trusted_modules: modules, or packages of modules, whose classes and functions the file, and what the
-            model reads later, may name
-        :param kwargs: arguments of the constructor that take the place of the file's, which is not asked for them. What
-            a learned number starts from (``initial_...``, ``ent_coef="auto_..."``) counts from the next reset on: the
-            file has its value
-        :return: the model
-        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
-        :raises ValueError: if ``kwargs`` holds something else, or values that are not allowed
-        """
-        check_load(cls, SAC, env, device, kwargs)
+    def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
+        implied: dict[str, Any] = {}
         if "compile" in kwargs:
-            kwargs["compiled"] = None
+            implied["compiled"] = None
         if "train_freq" in kwargs or "gradient_steps" in kwargs:
-            kwargs.setdefault("replay_ratio", None)
+            implied["replay_ratio"] = None
         # One way to count resets replaces the file's other one.
         if kwargs.get("reset_gradient_steps") is not None:
-            kwargs.setdefault("resets", ())
+            implied["resets"] = ()
         elif "resets" in kwargs:
-            kwargs["reset_gradient_steps"] = None
-        with naming_changes(kwargs):
-            return super().load(
-                path,
-                env,
-                device,
-                custom_objects,
-                print_system_info,
-                force_reset,
-                allow_pickle=allow_pickle,
-                trusted_modules=trusted_modules,
-                **kwargs,
-            )
-
-    def set_parameters(
-        self,
-        load_path_or_dict: str | pathlib.Path | io.BufferedIOBase | dict[str, Any],
-        exact_match: bool = True,
-        device: torch.device | str = "auto",
-        *,
-        allow_pickle: bool = False,
-        trusted_modules: Sequence[str] = (),
-    ) -> None:
-        """
-        Load parameters, as in Stable-Baselines3. The optimizers' moments are loaded, their settings (learning rate,
-        weight decay, ...) stay this model's, so that ``load`` with other ones has them in force.
-
-        :param load_path_or_dict: a file, or parameters as ``get_parameters`` gives them
-        :param exact_match: whether parameters for every module must be there, and no others
-        :param device: "auto", "cpu", "cuda", ...
-        :param allow_pickle: see ``load``
-        :param trusted_modules: see ``load``
-        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
-        :raises ValueError: if the parameters are of other networks or parts
-        """
-        try:
-            super().set_parameters(
-                load_path_or_dict, exact_match, device, allow_pickle=allow_pickle, trusted_modules=trusted_modules
-            )
-        except BadFile:
-            raise
-        except ValueError as error:
-            raise ParametersDoNotFit(str(error)) from error
+            implied["reset_gradient_steps"] = None
+        return implied
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         check_action_space(env.action_space)
-        venv = OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-        FiniteCheck.install(venv)
-        watch_workers(venv)
-        return venv
-
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """
-        Go on with another environment, as in Stable-Baselines3.
-
-        :param env: the environment, of the same spaces and as many as the model was made with
-        :param force_reset: whether it is reset before training goes on
-        :raises ValueError: if it is not
-        """
-        check_n_envs(self, env)
-        super().set_env(env, force_reset)
-
-    def _parts(self) -> dict[str, Part]:
-        return self.learner.parts_with_state()
-
-    def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        """Every optimizer by its path from the algorithm."""
-        return self.learner.optimizers()
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "temperature", *self._parts(), *self._optimizers()], []
-
-    def _excluded_save_params(self) -> list[str]:
-        return [
-            *super()._excluded_save_params(),
-            "_learner",
-            "_metrics",
-            "_source",
-            "_watch",
-        ]
-
-    def reinitialize(self, shrink: float = 0.0) -> None:
-        """
-        Start every network, optimizer and learned number anew, in place; the replay buffer stays.
-
-        :param shrink: share of the old parameters that stays
-        """
-        self.learner.reinitialize(shrink)
+        return Resumable._wrap_env(env, verbose, monitor_wrapper)
 
     # ---------------------------------------------------------------- acting
 
@@ -588,16 +353,11 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
                 actions = self.explorer.act(self.learner, observations)
             scaled = actions.cpu().numpy().reshape((n_envs, *self.action_space.shape))
             if not np.isfinite(scaled).all():
-                self._stop_diverged(scaled)
+                check_finite_parameters(self)
+                raise diverged(self, not_finite({"the policy's action": scaled.sum()}))
         if action_noise is not None:
             scaled = np.clip(scaled + action_noise(), -1, 1)
         return self.policy.unscale_action(scaled), scaled
-
-    def _stop_diverged(self, actions: np.ndarray) -> None:
-        """An action is not finite, and no environment shall see it: say why."""
-        check_finite_parameters(self)
-        worst = not_finite({"the policy's action": actions.sum()})
-        raise TrainingDiverged(worst, f"gradient step {self._n_updates}", self.num_timesteps)
 
     def _store_transition(
         self,
@@ -616,30 +376,9 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
         rewards = reward if self._vec_normalize_env is None else self._vec_normalize_env.get_original_reward()
         self.learner.on_step(rewards, dones, infos)
 
-    def load_replay_buffer(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        truncate_last_traj: bool = True,
-        *,
-        allow_pickle: bool = False,
-        trusted_modules: Sequence[str] = (),
-    ) -> None:
-        """
-        Load a replay buffer, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it.
-
-        :param path: file, or where ``save_replay_buffer`` wrote it
-        :param truncate_last_traj: with ``HerReplayBuffer``, whether the last episode counts as ended
-        :param allow_pickle: see ``load``
-        :param trusted_modules: see ``load``
-        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile or pickled
-        :raises ValueError: if it is the buffer of other spaces or of another number of environments, or holds out
-            another share of its transitions than ``validation_proportion``
-        """
-        before = getattr(self, "replay_buffer", None)
-        super().load_replay_buffer(path, truncate_last_traj, allow_pickle=allow_pickle, trusted_modules=trusted_modules)
-        share = self.replay_buffer.validation_proportion if isinstance(self.replay_buffer, ValidationSplit) else 0.0
+    def _check_replay_buffer(self, buffer: ReplayBuffer, path: Any) -> None:
+        share = buffer.validation_proportion if isinstance(buffer, ValidationSplit) else 0.0
         if share != self.validation_proportion:
-            self.replay_buffer = before
             raise ValueError(
                 f"the replay buffer of {path} holds out {share} of its transitions, but this model has "
                 f"validation_proportion={self.validation_proportion}"
@@ -676,54 +415,48 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
             differs) or of an earlier call of ``learn``, cannot be used, or has checkpoints that are all damaged
         :raises TrainingDiverged: if a loss, another metric or a parameter is NaN or infinite
         """
-        total_timesteps = check_learn(self, locals())
-        refuse_second_call(self, checkpoint)
-        resets_environment = reset_num_timesteps or self._last_obs is None
-        total_timesteps, callback = self._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
+        return self._learn(
+            total_timesteps,
+            callback,
+            log_interval,
+            tb_log_name,
+            reset_num_timesteps,
+            progress_bar,
+            checkpoint,
+            checkpoint_freq,
         )
-        if resets_environment:
-            self._on_environment_reset()
-        encoder = Description(self).encoder
+
+    def _described(self) -> Lenient:
+        encoder = super()._described()
         if self.replay_buffer is not None:
             encode_buffer(self.replay_buffer, encoder, only_small=True)
-        say_once(self, encoder)
-        with Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
-            checkpointer.resume()
-            self._decide_compilation(total_timesteps - self.num_timesteps)
-            callback.on_training_start(locals(), globals())
-            checkpointer.start()
-            assert self.env is not None and self.replay_buffer is not None
-            while self.num_timesteps < total_timesteps:
-                rollout = self.collect_rollouts(
-                    self.env,
-                    train_freq=self.train_freq,  # type: ignore[arg-type]  # converted in _setup_model
-                    action_noise=self.action_noise,
-                    callback=checkpointer.callback,
-                    learning_starts=self.learning_starts,
-                    replay_buffer=self.replay_buffer,
-                    log_interval=log_interval,
-                )
-                if not rollout.continue_training:
-                    break
-                n_updates = self._updates_due(rollout.episode_timesteps)
-                if n_updates > 0:
-                    self.train(n_updates, self.batch_size)
-                checkpointer.after_turn()
-            else:
-                self._warn_of_warm_up()
-            check_finite_parameters(self)
-            checkpointer.finish()
-        return self
+        return encoder
+
+    def _turn(self, callback: BaseCallback, log_interval: int) -> bool:
+        assert self.env is not None and self.replay_buffer is not None
+        rollout = self.collect_rollouts(
+            self.env,
+            train_freq=self.train_freq,  # type: ignore[arg-type]  # converted in _setup_model
+            action_noise=self.action_noise,
+            callback=callback,
+            learning_starts=self.learning_starts,
+            replay_buffer=self.replay_buffer,
+            log_interval=log_interval,
+        )
+        if rollout.continue_training:
+            n_updates = self._updates_due(rollout.episode_timesteps)
+            if n_updates > 0:
+                self.train(n_updates, self.batch_size)
+        return rollout.continue_training
 
     def _on_environment_reset(self) -> None:
-        """The environments were reset in the midst of their episodes."""
         self.learner.on_environment_reset()
 
-    def _decide_compilation(self, n_steps: int) -> None:
-        """With ``compile="auto"``, once and for all: whether the coming environment steps pay it back."""
+    def _before_turns(self) -> None:
+        """Decide, with ``compile="auto"`` once and for all, whether the coming environment steps pay it back."""
         if self.compiled is not None:
             return
+        n_steps = self._total_timesteps - self.num_timesteps
         n_steps -= max(self.learning_starts - self.num_transitions, 0)
         if self.replay_ratio is not None:
             n_updates = self.replay_ratio * n_steps
@@ -742,8 +475,8 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
             warn_not_compiled(self.learner, reason)
         self.learner.forget_execution()
 
-    def _warn_of_warm_up(self) -> None:
-        """Say at the end of a training, which no callback has ended, that nothing was learned for want of steps."""
+    def _after_turns(self) -> None:
+        """Say if nothing was learned for want of steps."""
         wanted = self.gradient_steps if self.replay_ratio is None else self.replay_ratio
         if self._n_updates > 0 or self.num_transitions == 0 or wanted == 0 or not self._is_warming_up():
             return
@@ -753,7 +486,7 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
             f"before the first, and the replay buffer has {self.replay_buffer.size() * self.n_envs} of the "
             f"{self.num_transitions} of this model's life. Train for more than {self.learning_starts} steps, or pass a "
             "smaller learning_starts= to the constructor or to load (Stable-Baselines3's SAC has 100)",
-            stacklevel=3,
+            stacklevel=4,
         )
 
     def _is_warming_up(self) -> bool:
@@ -872,8 +605,3 @@ class SAC(SB3Names, Exportable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
                 self.logger.record(name, float(value))
         self._record_counts()
         super().dump_logs()
-
-
-def _make_transform(choice: Any, learner: Learner) -> BatchTransform:
-    make, kwargs = choice if isinstance(choice, (tuple, list)) else (choice, {})
-    return make(learner, **kwargs)  # type: ignore[no-any-return]

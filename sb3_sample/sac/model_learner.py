@@ -1,22 +1,28 @@
 """The learner of a model's own: ``BRO.learner(...)`` makes one, ``model.learner`` is the one inside a model."""
 
+import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.utils import get_device
 from torch import nn
 
-from sb3_sample.learner.exploration import Exploration
+from sb3_sample.kinds import chosen
+from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
+from sb3_sample.learner.heads import QuantileHead, ValueHead
 from sb3_sample.learner.learner import Counts, Learner
-from sb3_sample.learner.pessimism import Pessimism
+from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
 from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.randomness import OwnGenerators
 from sb3_sample.learner.scalars import FixedScalar, LogScalar
+from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.optim import AdamW
-from sb3_sample.sac.policies import Actor, CriticEnsemble
+from sb3_sample.sac import arguments
+from sb3_sample.sac.policies import BACKBONES, Actor, CriticEnsemble, SACPolicy
 
 #: Arguments that say how transitions are collected, stored and drawn, or what is told of it: a learner has none of it.
 OF_TRAINING = (
@@ -105,9 +111,126 @@ def check_action_space(space: spaces.Space) -> None:
 
 
 class HasLearner:
-    """A model's names for what its learner has."""
+    """A model's learner: how it is made of the arguments, and the model's names for what it has."""
 
     learner = LearnerOf()
+    #: The class of the learner.
+    learner_class: ClassVar[type[Learner]] = Learner
+    #: beta1 of the temperature's Adam.
+    temperature_beta1: ClassVar[float] = 0.9
+
+    def _make_learner(self: Any, **kwargs: Any) -> Learner:
+        """
+        :param kwargs: networks, counts and generators of the learner
+        :return: a learner with the parts and the settings of the arguments
+        """
+        self._take_target_entropy()
+        return self.learner_class(
+            self._make_networks,
+            head=self._make_head(),
+            make_temperature=self._make_temperature,
+            make_pessimism=self.make_pessimism,
+            make_explorer=self.make_explorer,
+            plasticity=Resets(self.resets, self.reset_shrink, self.reset_gradient_steps),
+            redo=None if self.redo_period is None else ReDo(self.redo_period, self.redo_threshold),
+            make_transforms=[functools.partial(_make_transform, each) for each in self.batch_transforms],
+            learning_rate=self.lr_schedule(1),
+            temperature_beta1=self.temperature_beta1,
+            target_entropy=self._target_entropy,
+            device=self.device,
+            **{name: getattr(self, name) for name in Learner.SETTINGS},
+            **kwargs,
+        )
+
+    def _make_head(self: Any) -> ValueHead:
+        if self.value_head is not None:
+            return self.value_head(**(self.value_head_kwargs or {}))
+        return ValueHead() if self.n_quantiles is None else QuantileHead(self.n_quantiles)
+
+    def _make_networks(self: Any) -> SACPolicy:
+        kwargs = self._full_policy_kwargs()
+        return self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)
+
+    def _take_settings(self: Any) -> None:
+        """Have the learner take up what was set since the last gradient step."""
+        self._take_target_entropy()
+        self.learner.target_entropy = self._target_entropy
+        for name in Learner.SETTINGS:
+            setattr(self.learner, name, getattr(self, name))
+
+    def _take_target_entropy(self: Any) -> None:
+        """Take up what ``target_entropy`` says, which is a number afterwards."""
+        arguments.check_target_entropy(self)
+        if self.target_entropy == "auto":
+            self._target_entropy = -get_action_dim(self.action_space) / 2
+        else:
+            self._target_entropy = float(self.target_entropy)
+        if BACKBONES[self.backbone].has_entropy:
+            self.target_entropy = self._target_entropy
+
+    def _full_exploration_kwargs(self: Any) -> dict[str, Any]:
+        """
+        :return: the explorer's arguments: the user's and the algorithm's
+        """
+        return dict(self.exploration_kwargs or {})
+
+    def _full_pessimism_kwargs(self: Any) -> dict[str, Any]:
+        """
+        :return: the arguments of the rule that moves pessimism: the user's and the algorithm's
+        """
+        return dict(self.pessimism_kwargs or {})
+
+    def _make_temperature(self: Any, learner: Learner) -> LogScalar | FixedScalar:
+        if not learner.actor.has_entropy:
+            return FixedScalar(0.0).to(self.device)
+        allowed = "'auto' or 'auto_<start above 0>'"
+        if isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto"):
+            start = self.ent_coef.removeprefix("auto").removeprefix("_") or "1"
+            value = arguments.as_number("ent_coef", start, allowed, shown=self.ent_coef)
+            if not 0 < value < np.inf:
+                raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
+            return LogScalar(value).to(self.device)
+        value = arguments.as_number("ent_coef", self.ent_coef, allowed)
+        if not 0 <= value < np.inf:
+            raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
+        return FixedScalar(value).to(self.device)
+
+    def make_explorer(self: Any, learner: Learner) -> Exploration:
+        """
+        :param learner: whose it is
+        :return: a freshly initialised explorer
+        """
+        make = chosen("exploration", self.exploration, EXPLORATIONS, Exploration)
+        kwargs = self._full_exploration_kwargs()
+        arguments.check_names("exploration", self.exploration, make, kwargs)
+        return make(learner, **kwargs)
+
+    def make_pessimism(self: Any, learner: Learner) -> Pessimism:
+        """
+        :param learner: whose it is
+        :return: a freshly initialised rule of pessimism
+        """
+        if not isinstance(self.pessimism, (str, type)):
+            return Pessimism(self.pessimism)
+        make = chosen("pessimism", self.pessimism, PESSIMISMS, Pessimism)
+        kwargs = self._full_pessimism_kwargs()
+        arguments.check_names("pessimism", self.pessimism, make, kwargs)
+        return make(learner, **kwargs)
+
+    def _optimizers(self: Any) -> dict[str, torch.optim.Optimizer]:
+        """Every optimizer by its path from the algorithm."""
+        return self.learner.optimizers()
+
+    def _get_torch_save_params(self: Any) -> tuple[list[str], list[str]]:
+        return ["policy", "temperature", *self.learner.parts_with_state(), *self._optimizers()], []
+
+    def reinitialize(self: Any, shrink: float = 0.0) -> None:
+        """
+        Start every network, optimizer and learned number anew, in place; the replay buffer stays.
+
+        :param shrink: share of the old parameters that stays
+        """
+        self.learner.reinitialize(shrink)
 
     @property
     def actor(self) -> Actor:
@@ -163,3 +286,8 @@ class HasLearner:
     def gradients_are_stale(self) -> bool:
         """Whether ``.grad`` holds the gradients of another gradient step than the last."""
         return self.learner.gradients_are_stale  # type: ignore[no-any-return]
+
+
+def _make_transform(choice: Any, learner: Learner) -> BatchTransform:
+    make, kwargs = choice if isinstance(choice, (tuple, list)) else (choice, {})
+    return make(learner, **kwargs)  # type: ignore[no-any-return]

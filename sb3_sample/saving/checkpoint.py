@@ -19,6 +19,7 @@ from typing import IO, Any
 
 import numpy as np
 import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
@@ -35,7 +36,6 @@ from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.encoding import NotPortable, decode, encode
 from sb3_sample.saving.identity import identity_of
 from sb3_sample.saving.interrupts import Interrupts
-from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.progress import ProgressFile
 from sb3_sample.saving.rings import Ring
 from sb3_sample.saving.run_folder import MODEL, STATE, RunFolder, Segment
@@ -52,7 +52,7 @@ _PARTS: dict[str, type] = {
 _TRAINED: weakref.WeakKeyDictionary[Any, set[str]] = weakref.WeakKeyDictionary()
 
 
-def refuse_second_call(model: SafeFiles, folder: str | Path | None) -> None:
+def refuse_second_call(model: BaseAlgorithm, folder: str | Path | None) -> None:
     """
     Refuse a folder that an earlier ``learn`` of the same model has trained into. The program, started again after a
     kill, would go on within the first call from what the second one has saved, and end elsewhere.
@@ -81,7 +81,7 @@ class Checkpointer:
     :raises ValueError: ``every`` is out of range, the folder cannot be used, or the model cannot be saved
     """
 
-    def __init__(self, model: SafeFiles, callback: BaseCallback, folder: str | Path | None, every: int):
+    def __init__(self, model: BaseAlgorithm, callback: BaseCallback, folder: str | Path | None, every: int):
         if isinstance(every, bool) or not isinstance(every, (int, np.integer)) or every < 1:
             raise ValueError(f"checkpoint_freq must be an integer of at least 1, in environment steps, not {every!r}")
         if folder is None and every != CHECKPOINT_FREQ:
@@ -193,6 +193,7 @@ class Checkpointer:
         if self._resumed is None:
             return
         state, model = self._resumed, self._model
+        safe_files: Any = model
         theirs, ours = self._manifest["circumstances"], training_state.circumstances(model.device)
         changed = [
             f"{name} {theirs.get(name)} (now {value})" for name, value in ours.items() if theirs.get(name) != value
@@ -201,13 +202,13 @@ class Checkpointer:
             warnings.warn(
                 f"The run goes on under other circumstances, so that it need not be the same to the last bit: the "
                 f"checkpoint was made with {', '.join(changed)}",
-                stacklevel=3,
+                stacklevel=4,
             )
         assert self._folder is not None
         segments = self._folder.segments(self._manifest)
         with self._restoring(state):
             with self._folder.opened(f"{state['path'].name}/{MODEL}") as file, importing_nothing():
-                model.set_parameters(file, trusted_modules=_own_modules())  # type: ignore[arg-type]
+                safe_files.set_parameters(file, trusted_modules=_own_modules())
             training_state.restore_attributes(model, state["attributes"])
             check_counts(model, "the checkpoint")
             if model.num_timesteps != self._manifest["steps"]:
@@ -287,11 +288,11 @@ class Checkpointer:
             warnings.warn(
                 "The state of the environment cannot be saved, so that the episodes in progress start anew when the "
                 f"run goes on: {'; '.join(missing)}",
-                stacklevel=4,
+                stacklevel=5,
             )
         lost = self._states.lost()
         if lost:
-            warnings.warn(f"A checkpoint does not hold all of the callbacks' state: {'; '.join(lost)}", stacklevel=4)
+            warnings.warn(f"A checkpoint does not hold all of the callbacks' state: {'; '.join(lost)}", stacklevel=5)
 
     def _restore_rest(self, state: dict[str, Any]) -> None:
         with self._restoring(state):
@@ -310,7 +311,7 @@ class Checkpointer:
 
     def _start_episodes_anew(self, reasons: list[str]) -> None:
         model: Any = self._model
-        warnings.warn(f"The episodes in progress start anew: {'; '.join(reasons)}", stacklevel=5)
+        warnings.warn(f"The episodes in progress start anew: {'; '.join(reasons)}", stacklevel=6)
         if model.seed is not None:
             # Not the episodes of the run's beginning once more.
             self._env.seed(model.seed + model.num_timesteps)
@@ -373,7 +374,7 @@ class Checkpointer:
             warnings.warn(
                 f"No checkpoint at {self._model.num_timesteps} steps, {last}: {self._name} cannot be written to "
                 f"({error}). The training goes on, and it is tried again after {self._every} steps.",
-                stacklevel=4,
+                stacklevel=5,
             )
 
     def _save(self) -> None:

@@ -13,7 +13,7 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 
-from sb3_sample.arguments import NoPolicy, check_policy_class
+from sb3_sample.arguments import NoPolicy, check_load, check_policy_class, naming_changes
 from sb3_sample.saving import container, notice, paths
 from sb3_sample.saving.budget import Budget
 from sb3_sample.saving.checks import (
@@ -26,6 +26,7 @@ from sb3_sample.saving.checks import (
 )
 from sb3_sample.saving.classes import check_trusted
 from sb3_sample.saving.container import BadFile, PickledFile
+from sb3_sample.saving.kept import Kept, declared
 from sb3_sample.saving.model_tree import KIND, Content, Description
 
 Self = TypeVar("Self", bound="SafeFiles")
@@ -37,6 +38,22 @@ class SafeFiles(BaseAlgorithm):
     ``set_parameters`` with files that hold JSON and tensors, and run no code. See docs/saving.md.
     """
 
+    _kept: ClassVar[dict[str, Kept]] = {
+        "_trusted_modules": Kept.NOWHERE,
+        "_told": Kept.NOWHERE,
+        # Stable-Baselines3's. Rollouts are filled anew before they are used.
+        "device": Kept.NOWHERE,
+        "replay_buffer": Kept.NOWHERE,
+        "rollout_buffer": Kept.NOWHERE,
+        "lr_schedule": Kept.NOWHERE,
+        "env": Kept.NOWHERE,
+        "_vec_normalize_env": Kept.NOWHERE,
+        "_logger": Kept.NOWHERE,
+        "_custom_logger": Kept.NOWHERE,
+        # Of the present ``learn``: its clock, and how far it goes.
+        "start_time": Kept.IN_FILES,
+        "_total_timesteps": Kept.IN_FILES,
+    }
     #: From which the policies of these algorithms are derived.
     policy_base: ClassVar[type] = BasePolicy
     #: Modules that whoever loaded the model vouches for. A file never says so.
@@ -45,7 +62,8 @@ class SafeFiles(BaseAlgorithm):
     _told: frozenset[str] = frozenset()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_trusted_modules", "_told", "lr_schedule"]
+        left_out = [name for name, places in declared(type(self)).items() if Kept.IN_FILES not in places]
+        return [*super()._excluded_save_params(), *left_out]
 
     def save(
         self,
@@ -96,7 +114,9 @@ class SafeFiles(BaseAlgorithm):
         **kwargs: Any,
     ) -> Self:
         """
-        Load a model, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it.
+        Load a model, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it. The file has everything
+        that was learned: networks, numbers, optimizers; of the on-policy family also the models of the environment and
+        the transitions that they learn from.
 
         :param path: file, or where ``save`` wrote it
         :param env: environment to go on with, or its id; none is needed for prediction
@@ -109,50 +129,66 @@ class SafeFiles(BaseAlgorithm):
         :param trusted_modules: modules, or packages of modules, whose classes and functions the file, and what the
             model reads later, may name
         :param kwargs: arguments of the constructor that take the place of the file's, which is not asked for them:
-            ``policy`` (a class), ``policy_kwargs``, ``action_noise``, ``learning_rate``, ...
+            ``policy`` (a class), ``policy_kwargs``, ``action_noise``, ``learning_rate``, ... What a learned number
+            starts from (``initial_...``, ``ent_coef="auto_..."``) counts from the next reset on: the file has its value
         :return: the model
         :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, of another class, or names what is
             not trusted; or lacks what must be given
         :raises ParametersDoNotFit: (a ``ValueError``) if its parameters are not those of the model that it describes
+        :raises ValueError: if ``kwargs`` holds something else, or values that are not allowed or with which the file's
+            parameters do not fit
         """
-        trusted, custom_objects = check_trusted(trusted_modules), custom_objects or {}
-        for name in {"policy", "policy_class"} & kwargs.keys():
-            kwargs["policy_class"] = cls._policy_class(kwargs.pop(name))
-        if "stats_window_size" in kwargs:
-            kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
-        if "policy_kwargs" in kwargs:
-            kwargs["policy_kwargs"] = kwargs["policy_kwargs"] or {}
-        try:
-            with paths.opened(path, "zip") as file:
-                content = Content(file, cls, SafeFiles, trusted)
-        except PickledFile:
-            if not allow_pickle:
-                raise
+        check_load(cls, SafeFiles, env, device, kwargs)
+        given, kwargs = kwargs, {**cls._implied(kwargs), **kwargs}
+        with naming_changes(given):
+            trusted, custom_objects = check_trusted(trusted_modules), custom_objects or {}
+            for name in {"policy", "policy_class"} & kwargs.keys():
+                kwargs["policy_class"] = cls._policy_class(kwargs.pop(name))
+            if "stats_window_size" in kwargs:
+                kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
+            if "policy_kwargs" in kwargs:
+                kwargs["policy_kwargs"] = kwargs["policy_kwargs"] or {}
             try:
-                made = None if env is None else maybe_make_env(env, 0)
-                model = super().load(path, made, device, custom_objects, print_system_info, force_reset, **kwargs)
-            except (TypeError, NoPolicy) as error:
-                raise ValueError(
-                    f"{path} holds no model of {cls.__name__} ({error}): a model of one of Stable-Baselines3's own "
-                    "algorithms has other networks, and is loaded by its own class"
-                ) from error
+                with paths.opened(path, "zip") as file:
+                    content = Content(file, cls, SafeFiles, trusted)
+            except PickledFile:
+                if not allow_pickle:
+                    raise
+                try:
+                    made = None if env is None else maybe_make_env(env, 0)
+                    model = super().load(path, made, device, custom_objects, print_system_info, force_reset, **kwargs)
+                except (TypeError, NoPolicy) as error:
+                    raise ValueError(
+                        f"{path} holds no model of {cls.__name__} ({error}): a model of one of Stable-Baselines3's own "
+                        "algorithms has other networks, and is loaded by its own class"
+                    ) from error
+                model._trusted_modules = trusted
+                return model
+            if print_system_info:
+                print("== CURRENT SYSTEM INFO ==")
+                get_system_info()
+                print("== SAVED MODEL SYSTEM INFO ==")
+                print("\n".join(f"- {name}: {version}" for name, version in content.versions.items()))
+            attributes = content.attributes(kwargs.keys(), custom_objects)
+            if "policy_kwargs" in kwargs:
+                content.check_policy_kwargs(kwargs["policy_kwargs"])
+            _forget_folder(attributes, warn=env is not None)
+            model = cls._made(content, attributes, kwargs, custom_objects, env, device, force_reset)
             model._trusted_modules = trusted
+            if content.left_out:
+                shown = ", ".join(f"{name} ({reason:.200})" for name, reason in content.left_out.items())
+                warnings.warn(
+                    f"{content.name} was saved without {shown}: the model has its defaults there", stacklevel=2
+                )
             return model
-        if print_system_info:
-            print("== CURRENT SYSTEM INFO ==")
-            get_system_info()
-            print("== SAVED MODEL SYSTEM INFO ==")
-            print("\n".join(f"- {name}: {version}" for name, version in content.versions.items()))
-        attributes = content.attributes(kwargs.keys(), custom_objects)
-        if "policy_kwargs" in kwargs:
-            content.check_policy_kwargs(kwargs["policy_kwargs"])
-        _forget_folder(attributes, warn=env is not None)
-        model = cls._made(content, attributes, kwargs, custom_objects, env, device, force_reset)
-        model._trusted_modules = trusted
-        if content.left_out:
-            shown = ", ".join(f"{name} ({reason:.200})" for name, reason in content.left_out.items())
-            warnings.warn(f"{content.name} was saved without {shown}: the model has its defaults there", stacklevel=3)
-        return model
+
+    @classmethod
+    def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
+        """
+        :param kwargs: arguments that the caller of ``load`` has given
+        :return: attributes of the file that they take the place of besides, and by what
+        """
+        return {}
 
     @classmethod
     def _made(
@@ -238,7 +274,7 @@ class SafeFiles(BaseAlgorithm):
         :param allow_pickle: see ``load``
         :param trusted_modules: see ``load``; besides those that the model was loaded with
         :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
-        :raises ParametersDoNotFit: (a ``ValueError``) if the file's parameters are not those of this model
+        :raises ParametersDoNotFit: (a ``ValueError``) if the parameters are of other networks or parts
         """
         parameters: Any = load_path_or_dict
         content = None
@@ -261,9 +297,12 @@ class SafeFiles(BaseAlgorithm):
         try:
             super().set_parameters(parameters, exact_match, device)
         except Exception as error:
-            if content is None or isinstance(error, (BadFile, ParametersDoNotFit)):
+            if isinstance(error, (BadFile, ParametersDoNotFit)) or (
+                content is None and not isinstance(error, ValueError)
+            ):
                 raise
-            raise ParametersDoNotFit(f"{content.name}: {error}") from error
+            where = "" if content is None else f"{content.name}: "
+            raise ParametersDoNotFit(f"{where}{error}") from error
         for optimizer, own_groups in zip(optimizers, settings, strict=True):
             for group, own in zip(optimizer.param_groups, own_groups, strict=True):
                 for key in group.keys() - own.keys() - {"params"}:
@@ -293,5 +332,5 @@ def _forget_folder(attributes: dict[str, Any], warn: bool) -> None:
         warnings.warn(
             f"the replay buffer was in the folder {folder!r:.200}, the loaded model's is in memory: pass "
             "replay_buffer_kwargs={'memory_map': <folder>} to load for another folder",
-            stacklevel=4,
+            stacklevel=3,
         )

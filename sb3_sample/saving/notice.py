@@ -38,13 +38,14 @@ def need(cls: type, name: str, path: str, trusted: Sequence[str] = ()) -> str:
     return f"load needs {' or '.join([*wanted, argument])}"
 
 
-def say_once(model: Any, encoder: Lenient, trusted: Sequence[str] = ()) -> None:
+def say_once(model: Any, encoder: Lenient, trusted: Sequence[str] = (), stacklevel: int = 3) -> None:
     """
     Warn of what was not named before.
 
     :param model: an algorithm
     :param encoder: by which its file is written, or would be
     :param trusted: modules that the caller vouches for anyway
+    :param stacklevel: frames from here to the program's
     """
     cls, vouched = type(model), (*model._trusted_modules, *trusted)
     said: dict[str, str] = {}
@@ -60,4 +61,4 @@ def say_once(model: Any, encoder: Lenient, trusted: Sequence[str] = ()) -> None:
     new = "; ".join(text for key, text in said.items() if key not in model._told)
     model._told = frozenset({*model._told, *said})
     if new:
-        warnings.warn(f"What is saved of this {cls.__name__} (docs/saving.md): {new}", stacklevel=3)
+        warnings.warn(f"What is saved of this {cls.__name__} (docs/saving.md): {new}", stacklevel=stacklevel)

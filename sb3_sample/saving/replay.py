@@ -90,7 +90,8 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
         :param trusted_modules: modules, or packages of modules, whose classes the file may name, besides those that the
             model was loaded with
         :raises BadFile: (a ``ValueError``) if the file is damaged, hostile or pickled, or names what is not trusted
-        :raises ValueError: if it is the buffer of other spaces, or of another number of environments
+        :raises ValueError: if it is the buffer of other spaces or of another number of environments, or holds out
+            another share of its transitions than ``validation_proportion``
         """
         trusted = (*self._trusted_modules, *check_trusted(trusted_modules))  # type: ignore[attr-defined]
         found = paths.find(path, SUFFIX, PICKLES_SUFFIX)
@@ -101,27 +102,38 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
         except PickledFile:
             if not allow_pickle:
                 raise
-            self._load_pickled(found, name, truncate_last_traj)
-            return
-        buffer = decode_buffer(tree, tensors, self, name, trusted)
-        if isinstance(buffer, HerReplayBuffer):
-            if self.env is None:
-                raise ValueError("a HerReplayBuffer needs the model's environment: pass env= to load, or call set_env")
-            buffer.set_env(self.env)
-            if truncate_last_traj:
-                buffer.truncate_last_trajectory()
+            buffer = self._pickled_buffer(found, name, truncate_last_traj)
+        else:
+            buffer = decode_buffer(tree, tensors, self, name, trusted)
+            if isinstance(buffer, HerReplayBuffer):
+                if self.env is None:
+                    raise ValueError(
+                        "a HerReplayBuffer needs the model's environment: pass env= to load, or call set_env"
+                    )
+                buffer.set_env(self.env)
+                if truncate_last_traj:
+                    buffer.truncate_last_trajectory()
+        self._check_replay_buffer(buffer, path)
         self.replay_buffer = buffer
 
-    def _load_pickled(self, path: Any, name: str, truncate_last_traj: bool) -> None:
+    def _pickled_buffer(self, path: Any, name: str, truncate_last_traj: bool) -> ReplayBuffer:
         before = getattr(self, "replay_buffer", None)
         super().load_replay_buffer(path, truncate_last_traj)
         loaded: Any = self.replay_buffer
+        self.replay_buffer = before
         try:
             _check_n_envs(loaded.n_envs, self)
             _check_spaces(loaded, self)
         except ValueError as error:
-            self.replay_buffer = before
             raise ValueError(f"{name}: {error}") from error
+        return loaded  # type: ignore[no-any-return]
+
+    def _check_replay_buffer(self, buffer: ReplayBuffer, path: Any) -> None:
+        """
+        :param buffer: what was loaded
+        :param path: where from
+        :raises ValueError: if the algorithm cannot learn from it
+        """
 
 
 def encode_buffer(buffer: ReplayBuffer, encoder: Lenient, only_small: bool = False) -> Any:

@@ -20,17 +20,9 @@ from stable_baselines3.common.logger import Logger
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Node, Opaque, Restorer, without_generators
 from sb3_sample.saving.classes import NotPortable
 from sb3_sample.saving.generators import check_python_state, set_numpy_state
+from sb3_sample.saving.kept import Kept, declared
 from sb3_sample.version import __version__
 
-#: Attributes of an algorithm that its file leaves out and that the future of the run depends on nevertheless.
-KEPT = ("_metrics", "action_noise")
-#: Attributes that follow from the arguments, from what is restored besides, or from the present ``learn``; clocks.
-#: ``_watch``, ``_source`` and ``rollout_buffer`` are filled anew before they are used. What the learner has is saved by
-#: its parts.
-DERIVED = (
-    "start_time", "_total_timesteps", "lr_schedule", "_watch", "_source", "_learner", "_seconds", "rollout_buffer",
-    "env", "_vec_normalize_env", "_logger", "_custom_logger", "replay_buffer", "device",
-)  # fmt: skip
 #: Arguments that may differ between the parts of a run: where it computes, and what it prints.
 HARMLESS = ("verbose", "device", "tensorboard_log", "compile", "_init_setup_model")
 
@@ -44,13 +36,11 @@ def argument_names(cls: type) -> set[str]:
     return {name for parameters in signatures for name in parameters} - {"args", "kwargs", "_init_setup_model"}
 
 
-def _saved_elsewhere(model: BaseAlgorithm) -> set[str]:
-    modules = {name.split(".")[0] for name in model._get_torch_save_params()[0]}
-    return {*modules, *model._excluded_save_params(), *DERIVED} - set(KEPT)
-
-
 def _not_saved(model: BaseAlgorithm) -> set[str]:
-    return (_saved_elsewhere(model) | argument_names(type(model))) - set(KEPT)
+    modules = {name.split(".")[0] for name in model._get_torch_save_params()[0]}
+    where = declared(type(model))
+    kept = {name for name, places in where.items() if Kept.IN_CHECKPOINTS in places}
+    return {*modules, *model._excluded_save_params(), *argument_names(type(model)), *where} - kept
 
 
 def save_attributes(model: BaseAlgorithm) -> dict[str, Node]:

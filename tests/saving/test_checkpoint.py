@@ -10,7 +10,7 @@ import subprocess
 import warnings
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -23,13 +23,15 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, Every
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from sb3_sample import MBMAPPO
+from sb3_sample import MBMAPPO, SAC
 from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.sac.policies import MlpPolicy
 from sb3_sample.saving import container, run_folder, training_state
 from sb3_sample.saving.attributes import Describer, same
 from sb3_sample.saving.callbacks import CallbackStates
-from sb3_sample.saving.encoding import decode, encode
+from sb3_sample.saving.encoding import NotPortable, decode, encode
+from sb3_sample.saving.kept import Kept, declared
+from sb3_sample.saving.model_tree import Description
 from sb3_sample.saving.run_folder import RunFolder
 from tests.ppo.common import ALGORITHMS, tiny
 from tests.sac.common import MAKERS, bro, differing, sac, state, vec
@@ -79,8 +81,14 @@ def test_every_attribute_that_changes_is_held(maker: Any, tmp_path: Path) -> Non
     held = training_state.save_attributes(agent).keys()
     modules = {name.split(".")[0] for name in agent._get_torch_save_params()[0]}
     modules |= {"actor", "critic", "critic_target"} & vars(agent).keys()
-    forgotten = changed - held - modules - set(training_state.DERIVED)
-    assert not forgotten
+    derived = {name for name, places in declared(type(agent)).items() if Kept.IN_CHECKPOINTS not in places}
+    assert not changed - held - modules - derived
+    # Whatever is left out is declared, whether it has changed or not; what is no plain data is given by the program.
+    given = {*training_state.argument_names(type(agent)), "observation_space", "policy_class"}
+    assert not vars(agent).keys() - held - modules - derived - given
+    in_no_file = {name for name, places in declared(type(agent)).items() if Kept.IN_FILES not in places}
+    assert set(agent._excluded_save_params()) - modules == in_no_file
+    assert Description(agent).encoder.left_out == {}
 
     # And the other way round: what is restored is the same, down to the attributes of the parts.
     agent = model()
@@ -93,6 +101,41 @@ def test_every_attribute_that_changes_is_held(maker: Any, tmp_path: Path) -> Non
         ):
             assert same(_plain(ours), _plain(theirs)), (name, path)
     assert not differing_outcomes(outcome(agent, str(tmp_path / "run")), outcome(restored, str(tmp_path / "run")))
+
+
+class WithClock(SAC):
+    """It keeps what no file can hold, and says nothing of it."""
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.clock = iter(range(3))
+        self.step = 0
+
+
+class WithDeclaredClock(WithClock):
+    _kept: ClassVar[dict[str, Kept]] = {"clock": Kept.NOWHERE, "step": Kept.IN_CHECKPOINTS}
+
+
+def test_an_attribute_is_declared_or_refused(tmp_path: Path) -> None:
+    with pytest.raises(NotPortable, match="WithClock has attributes that a checkpoint cannot hold: clock"):
+        training_state.save_attributes(sac(cls=WithClock))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = sac(cls=WithDeclaredClock)
+        model.step = 3
+        held = training_state.save_attributes(model)
+        assert "clock" not in held and "step" in held
+        model.save(tmp_path / "m")
+        assert WithDeclaredClock.load(tmp_path / "m").step == 0
+    # The bases' declarations stay in force.
+    assert declared(WithDeclaredClock) == {**declared(SAC), **WithDeclaredClock._kept}
+
+
+def test_what_is_declared_is_there() -> None:
+    """No name in a declaration that no algorithm has any more."""
+    trained = [MAKERS["BRO"](vec(2)).learn(32), *(tiny(cls, vec(2)).learn(32) for cls in ALGORITHMS)]
+    names = {name for model in trained for name in declared(type(model))}
+    assert [name for name in names if not any(hasattr(model, name) for model in trained)] == []
 
 
 def _with_parts(module: Any) -> list[tuple[str, Any]]:

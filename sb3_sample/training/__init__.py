@@ -1,0 +1,1 @@
+"""Training as Stable-Baselines3 has it: the life cycle of an algorithm."""

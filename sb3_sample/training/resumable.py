@@ -1,0 +1,153 @@
+"""The life cycle of an algorithm, the same for both families: environments, networks, ``learn`` with checkpoints."""
+
+import pathlib
+from typing import Any, TypeVar
+
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_sample.arguments import check_learn, check_n_envs
+from sb3_sample.envs.finite_check import FiniteCheck
+from sb3_sample.envs.workers import watch_workers
+from sb3_sample.export import Exportable
+from sb3_sample.faults import check_finite_parameters
+from sb3_sample.saving.checkpoint import Checkpointer, refuse_second_call
+from sb3_sample.saving.encoding import Lenient
+from sb3_sample.saving.model_tree import Description
+from sb3_sample.saving.notice import say_once
+
+Self = TypeVar("Self", bound="Resumable")
+
+
+class Resumable(Exportable, BaseAlgorithm):
+    """
+    Base of both families, before ``SafeFiles`` and Stable-Baselines3's class: ``learn`` as a sequence of turns, after
+    each of which the training can be saved, and go on from there as if it had never been interrupted. A family says
+    what a turn is, and what comes before and after the turns.
+    """
+
+    # ---------------------------------------------------------------- construction
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        names = "policy_kwargs", "replay_buffer_kwargs"
+        given: dict[str, Any] = {name: vars(self)[name] for name in names if name in vars(self)}
+        # Policy and buffer are built with more than the user's own arguments, and only the latter are saved.
+        self._complete_arguments()
+        try:
+            super()._setup_model()  # type: ignore[safe-super]  # of Stable-Baselines3's algorithm
+        finally:
+            vars(self).update(given)
+        if self.device.type == "cpu":
+            # glibc hands freed memory back to the system above a threshold, at first below the size of one gradient or
+            # of one block of a simulation, and every use then pays for page faults. The threshold follows the largest
+            # block freed so far.
+            torch.empty(31 * 2**20, dtype=torch.uint8)
+
+    def _check_arguments(self) -> None:
+        """
+        :raises ValueError: if an argument is out of range or contradicts another
+        """
+        raise NotImplementedError
+
+    def _complete_arguments(self) -> None:
+        """Add to the arguments of policy and buffer those of the algorithm, while they are built."""
+        self.policy_kwargs = self._full_policy_kwargs()
+
+    def _full_policy_kwargs(self) -> dict[str, Any]:
+        """
+        :return: the policy's arguments: the user's and the algorithm's
+        """
+        raise NotImplementedError
+
+    # ---------------------------------------------------------------- environments
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        venv = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        FiniteCheck.install(venv)
+        watch_workers(venv)
+        return venv
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        Go on with another environment, as in Stable-Baselines3.
+
+        :param env: the environment, of the same spaces and as many as the model was made with
+        :param force_reset: whether it is reset before training goes on
+        :raises ValueError: if it is not
+        """
+        check_n_envs(self, env)
+        super().set_env(env, force_reset)
+
+    def _on_environment_reset(self) -> None:
+        """The environments were reset in the midst of their episodes."""
+
+    # ---------------------------------------------------------------- training
+
+    def _learn(
+        self: Self,
+        total_timesteps: int,
+        callback: MaybeCallback,
+        log_interval: int,
+        tb_log_name: str | None,
+        reset_num_timesteps: bool,
+        progress_bar: bool,
+        checkpoint: str | pathlib.Path | None,
+        checkpoint_freq: int,
+    ) -> Self:
+        """
+        Train. The arguments are those of ``learn``, by the same names, since callbacks read them in its variables.
+        """
+        total_timesteps = check_learn(self, locals())
+        refuse_second_call(self, checkpoint)
+        resets_environment = reset_num_timesteps or self._last_obs is None
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
+        )
+        if resets_environment:
+            self._on_environment_reset()
+        self._before_training()
+        say_once(self, self._described(), stacklevel=4)
+        with Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
+            checkpointer.resume()
+            self._before_turns()
+            callback.on_training_start(locals(), globals())
+            checkpointer.start()
+            while self.num_timesteps < total_timesteps:
+                if not self._turn(checkpointer.callback, log_interval):
+                    break
+                checkpointer.after_turn()
+            else:
+                self._after_turns()
+            check_finite_parameters(self)
+            checkpointer.finish()
+        return self
+
+    def _described(self) -> Lenient:
+        """
+        :return: what has to be said of the model's files
+        """
+        return Description(self).encoder
+
+    def _before_training(self) -> None:
+        """Prepare a training, which may then go on from a checkpoint."""
+
+    def _before_turns(self) -> None:
+        """Prepare the turns, when it is known where they begin."""
+
+    def _turn(self, callback: BaseCallback, log_interval: int) -> bool:
+        """
+        Collect, and learn from it.
+
+        :param callback: called at every step
+        :param log_interval: the argument of ``learn``
+        :return: whether the callback lets the training go on; if not, nothing is learned
+        """
+        raise NotImplementedError
+
+    def _after_turns(self) -> None:
+        """Conclude a training that no callback has ended."""
