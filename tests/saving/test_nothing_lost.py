@@ -772,7 +772,7 @@ def test_numbers_of_networks_beyond_what_a_file_may_ask_for(tmp_path: Path) -> N
     [
         ("rounds", True), ("best", True), ("table", True), ("new", True), ("temperature_beta1", True), ("_new", True),
         ("train", False), ("twice", False), ("load", False), ("logger", False), ("__class__", False), ("a.b", False),
-        ("_setup_model", False), ("__dict__", False), ("_abc_impl", True), ("", False), ("minimize", False),
+        ("_setup_model", False), ("__dict__", False), ("_abc_impl", True), ("", False), ("_wrap_env", False),
     ],
 )  # fmt: skip
 def test_what_a_file_may_set(name: str, allowed: bool) -> None:
