@@ -12,15 +12,26 @@ rounds, with the range, and the ratios medians of each round's ratio. Leave the 
 second core, two threads can be ten times slower than one. "x matmul" is the time over the time of the step's matrix
 multiplications at the rate at which this machine multiplies 2 x 128 x 512 by 2 x 512 x 512 (FLOPs counted by torch),
 "rate" its inverse.
+
+    python benchmarks/update_speed.py --against WORKTREE --rounds 15
+
+compares this checkout with another one, each in a process of its own, which take turns: our lines only, the median of
+the ratios of each round, and an interval that holds the true median with 95% at least (of order statistics).
 """
 
 import argparse
 import importlib
+import json
+import math
+import os
 import platform
 import statistics
+import subprocess
+import sys
 import time
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -32,7 +43,6 @@ from stable_baselines3.common.logger import Logger
 from torch.utils.flop_counter import FlopCounterMode
 
 import sb3_sample
-from sb3_sample.learner.losses import quantile_huber
 from sb3_sample.sac.bro import MODEL_SIZES
 
 OBSERVATION, ACTION = 17, 6  # cheetah-run
@@ -130,32 +140,17 @@ def measure(contenders: dict[str, Callable[[], Any]], rounds: int) -> dict[str, 
     return seconds
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--only", nargs="*", help="contenders whose name begins with one of these")
-    parser.add_argument("--device", default="cpu", help="of the models; the ratios to matmul are a CPU's")
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    warnings.simplefilter("ignore")
-
-    def wanted(name: str) -> bool:
-        return args.only is None or name.startswith(tuple(args.only))
-
-    def synchronised(call: Callable[[], Any]) -> Callable[[], Any]:
-        return call if args.device == "cpu" else lambda: (call(), torch.cuda.synchronize())
-
+def our_steps(args: argparse.Namespace) -> tuple[dict[str, Callable[[], Any]], dict[str, Any], dict[str, float]]:
+    """Gradient steps by label, their models, and the seconds that compiling took."""
     steps: dict[str, Callable[[], Any]] = {}
-    flops: dict[str, int] = {}
-    compiling: dict[str, float] = {}
     models: dict[str, Any] = {}
+    compiling: dict[str, float] = {}
     agents = {f"BRO {size}": ("BRO", {"model_size": size}, 128) for size in MODEL_SIZES}
     agents |= {name: (name, {}, 256) for name in ("SAC", "DAC", "VPLSAC")}
     for name, (cls, kwargs, batch_size) in agents.items():
         for how, compile in (("eager", False), ("compiled", True)):
             label = f"{name}, {how}"
-            if not wanted(label):
+            if args.only is not None and not label.startswith(tuple(args.only)):
                 continue
             model = build(getattr(sb3_sample, cls), compile=compile, device=args.device, **kwargs)
             models[label], steps[label] = model, training_step(model, batch_size)
@@ -163,11 +158,110 @@ def main() -> None:
             steps[label]()
             if compile:
                 compiling[label] = time.perf_counter() - start
-                flops[label] = flops.get(f"{name}, eager", 0)
-            else:
-                with FlopCounterMode(display=False) as counter:
-                    steps[label]()
-                flops[label] = counter.get_total_flops()
+    return steps, models, compiling
+
+
+def serve(args: argparse.Namespace) -> None:
+    """Take the gradient steps that the standard input asks for, ``[label, how many]``, and answer with seconds each."""
+    steps, _, compiling = our_steps(args)
+    print(json.dumps({"labels": list(steps), "compiling": compiling}), flush=True)
+    for line in sys.stdin:
+        label, n = json.loads(line)
+        start = time.perf_counter()
+        for _ in range(n):
+            steps[label]()
+        print(json.dumps((time.perf_counter() - start) / n), flush=True)
+
+
+def median_interval(values: list[float]) -> tuple[float, float]:
+    """An interval that holds the median of what the values are drawn from with a probability of 95% at least."""
+    n, ordered = len(values), sorted(values)
+    below = 0
+    while 2 * sum(math.comb(n, i) for i in range(below + 1)) / 2**n <= 0.05:
+        below += 1
+    return ordered[max(below - 1, 0)], ordered[n - max(below, 1)]
+
+
+def compare(args: argparse.Namespace) -> None:
+    """The gradient steps of this checkout and of another one."""
+    trees = {"here": Path(__file__).parents[1], "there": args.against.resolve()}
+    options = ["--serve", "--threads", str(args.threads), "--device", args.device]
+    options += [] if args.only is None else ["--only", *args.only]
+    servers: dict[str, subprocess.Popen[str]] = {}
+    told: dict[str, Any] = {}
+    for name, tree in trees.items():
+        servers[name] = subprocess.Popen(
+            [sys.executable, __file__, *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            env={**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": str(args.threads)},
+        )  # fmt: skip
+        told[name] = answer(servers[name])
+
+    def seconds(name: str, label: str, n: int) -> float:
+        stdin = servers[name].stdin
+        assert stdin is not None
+        stdin.write(json.dumps([label, n]) + "\n")
+        stdin.flush()
+        return float(answer(servers[name]))
+
+    print(f"{'':24}{'here, ms':>10}{'there, ms':>11}{'ratio':>8}{'95% interval':>16}{'compiling, s':>15}")
+    for label in [label for label in told["here"]["labels"] if label in told["there"]["labels"]]:
+        n = max(3, int(0.3 / max(seconds(name, label, 3) for name in trees)))
+        times: dict[str, list[float]] = {name: [] for name in trees}
+        for i in range(args.rounds):
+            for name in trees if i % 2 else reversed(trees):
+                times[name].append(seconds(name, label, n))
+        ratios = [a / b for a, b in zip(times["here"], times["there"], strict=True)]
+        low, high = median_interval(ratios)
+        line = "".join(
+            f"{1e3 * statistics.median(times[name]):{width}.3f}" for name, width in (("here", 10), ("there", 11))
+        )
+        line += f"{statistics.median(ratios):8.3f}{low:9.3f} -{high:6.3f}"
+        if label in told["here"]["compiling"]:
+            line += "".join(f"{told[name]['compiling'][label]:7.1f}" for name in trees)
+        print(f"{label:24}{line}", flush=True)
+    for server in servers.values():
+        server.terminate()
+
+
+def answer(server: "subprocess.Popen[str]") -> Any:
+    assert server.stdout is not None
+    line = server.stdout.readline()
+    if not line:
+        raise RuntimeError(f"the process of {server.args} ended")
+    return json.loads(line)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--only", nargs="*", help="contenders whose name begins with one of these")
+    parser.add_argument("--device", default="cpu", help="of the models; the ratios to matmul are a CPU's")
+    parser.add_argument("--against", type=Path, metavar="WORKTREE", help="another checkout, to compare this one with")
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    warnings.simplefilter("ignore")
+    if args.serve:
+        return serve(args)
+    if args.against is not None:
+        return compare(args)
+
+    def wanted(name: str) -> bool:
+        return args.only is None or name.startswith(tuple(args.only))
+
+    def synchronised(call: Callable[[], Any]) -> Callable[[], Any]:
+        return call if args.device == "cpu" else lambda: (call(), torch.cuda.synchronize())
+
+    steps, models, compiling = our_steps(args)
+    flops: dict[str, int] = {}
+    for label in steps:
+        if label in compiling:
+            flops[label] = flops.get(label.replace("compiled", "eager"), 0)
+        else:
+            with FlopCounterMode(display=False) as counter:
+                steps[label]()
+            flops[label] = counter.get_total_flops()
     versions = [f"torch {torch.__version__}", f"stable_baselines3 {stable_baselines3.__version__}"]
     for label, (module, cls) in PEERS.items():
         if not wanted(label):
@@ -193,6 +287,8 @@ def main() -> None:
         if f"{name}, compiled" in models and wanted("acting"):
             contenders[f"acting: {name}"] = acting(models[f"{name}, compiled"])
     if wanted("quantile Huber"):
+        from sb3_sample.learner.losses import quantile_huber
+
         contenders["quantile Huber, sorted (eager)"] = loss_step(quantile_huber)
         contenders["quantile Huber, by definition"] = loss_step(pairwise_quantile_huber)
     seconds = measure(contenders, args.rounds)
