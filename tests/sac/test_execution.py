@@ -392,14 +392,16 @@ def test_counts_the_gradient_steps_to_come(
     for threshold, expected in ((n_updates, True), (n_updates + 1, False)):
         monkeypatch.setattr(algorithm, "PAYS_FROM", threshold)
         model = sac(learning_starts=20, **kwargs)
-        model._decide_compilation(100)
+        model._total_timesteps = 100
+        model._before_turns()
         assert model.compiled is expected
 
 
 def test_episodes_of_unknown_length_stay_uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(algorithm, "PAYS_FROM", 1)
     model = sac(learning_starts=20, train_freq=(1, "episode"), gradient_steps=2)
-    model._decide_compilation(100)
+    model._total_timesteps = 100
+    model._before_turns()
     assert model.compiled is False
 
 
