@@ -221,7 +221,7 @@ def test_acting_leaves_statistics_alone() -> None:
     assert torch.equal(before, model.actor.trunk.norm.running_mean) or model._n_updates
 
 
-@pytest.mark.parametrize("compile", [False, pytest.param(True, marks=COMPILES)])
+@pytest.mark.parametrize("compile", [False, pytest.param(True, marks=[COMPILES, pytest.mark.slow])])
 def test_weights_are_projected_after_every_step(compile: bool) -> None:
     kwargs: dict[str, Any] = {"critic_network": Unit, "actor_network": Unit}
     model = sac(policy_kwargs=kwargs, learning_rate=0.1, compile=compile, resets=(25,), reset_shrink=0.5).learn(40)
@@ -301,6 +301,7 @@ def test_which_parts_are_compiled_unasked(kwargs: dict[str, Any], foreign: bool)
     assert has_foreign_parts(sac(**kwargs).learner) == foreign
 
 
+@pytest.mark.slow
 @COMPILES
 def test_parts_that_say_so_are_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sb3_sample.sac.algorithm.PAYS_FROM", 5)
