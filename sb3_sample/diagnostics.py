@@ -24,8 +24,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_nor
 from sb3_sample.console import say
 from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.pessimism import epistemic_std
-from sb3_sample.learner.q_values import evaluate
-from sb3_sample.learner.target import bootstrap
+from sb3_sample.learner.target import bootstrap, values
 from sb3_sample.networks import neuron_scores
 from sb3_sample.replay.buffers import samples_at
 from sb3_sample.sac import SAC
@@ -391,7 +390,7 @@ class DiagnosticsCallback(BaseCallback):
             self._store.add(observation, last, scaled, reward, done, infos)
             self._n_stored += 1
             if step == start:
-                value = evaluate(self.model.critic, tensors, action).mean().item()
+                value = values(self.model.learner, self.model.critic, tensors, action).mean().item()
             if step >= start:
                 rewards.append(reward[0])
                 log_probs.append(log_prob.item())
@@ -430,14 +429,14 @@ class DiagnosticsCallback(BaseCallback):
         noise = self._noise(len(batch.actions))
         next_q, entropy_bonus = bootstrap(model.learner, batch, model.temperature(), noise, subset)
         target = model.learner.head.target(batch, next_q, model.pessimism_rule.value, entropy_bonus)
-        q = evaluate(model.critic, batch.observations, batch.actions)
+        q = values(model.learner, model.critic, batch.observations, batch.actions)
         return (q.mean(dim=(0, 2)) - target.mean(dim=1)).square().mean().item()
 
     def _networks(self, batch: Batch) -> dict[str, float]:
         """Disagreement, dormant neurons and rank, on a batch of the replay buffer."""
         actor, critic = self.model.actor, self.model.critic
         results: dict[str, float] = {}
-        q = evaluate(critic, batch.observations, batch.actions)
+        q = values(self.model.learner, critic, batch.observations, batch.actions)
         if len(q) > 1:
             results["critic_disagreement"] = epistemic_std(q).mean().item()
         extractor: Any = critic.features_extractor

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from sb3_sample import BRO, DAC, SAC
+from sb3_sample import BRO, DAC, SAC, DiagnosticsCallback
 from sb3_sample.learner.execution import has_foreign_parts
 from sb3_sample.parts import (
     Batch,
@@ -20,6 +20,7 @@ from sb3_sample.parts import (
     Part,
     Pessimism,
     ValueHead,
+    epistemic_std,
     linear,
     values,
 )
@@ -313,3 +314,14 @@ def test_parts_that_say_so_are_compiled(monkeypatch: pytest.MonkeyPatch) -> None
     eager = sac(**kwargs, batch_transforms=[Scaled], compile=False).learn(40)
     pairs = zip(model.policy.parameters(), eager.policy.parameters(), strict=True)
     assert max((a - b).abs().max().item() for a, b in pairs) < 1e-4
+
+
+def test_diagnostics_see_values_and_no_logits() -> None:
+    model = sac(value_head=TwoHot)
+    callback = DiagnosticsCallback(vec(), every=40, n_start_states=2, rollout_length=5)
+    model.learn(60, callback=callback)
+    assert np.isfinite(callback.measure()["td_error_training"])
+    batch = random_batch(model)
+    q = values(model.learner, model.critic, batch.observations, batch.actions)
+    measured = callback._networks(batch)["critic_disagreement"]
+    assert measured == pytest.approx(epistemic_std(q).mean().item(), rel=1e-5)
