@@ -21,7 +21,15 @@ class ReplaySource:
         self._model = model
         self._memory = BatchMemory()
 
-    def sample(self, n_batches: int, batch_size: int) -> list[Batch]:
+    def sample(self, batch_size: int) -> Batch:
+        """
+        :param batch_size: B
+        :return: transitions, with the model's discount factor
+        """
+        (batch,) = self.batches(1, batch_size)
+        return batch
+
+    def batches(self, n_batches: int, batch_size: int) -> list[Batch]:
         """
         :param n_batches: number of gradient steps
         :param batch_size: transitions a step

@@ -536,7 +536,7 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
                 self.learner, min(MAX_BATCHES_AT_ONCE, gradient_steps - taken)
             )
             self.learner.prepared_execution()
-            for i, batch in enumerate(self._source.sample(n_batches, batch_size), taken + 1):
+            for i, batch in enumerate(self._source.batches(n_batches, batch_size), taken + 1):
                 self._keeps_gradients = self.keep_next_gradients and i == gradient_steps
                 metrics = self._update(batch)
                 self._watch.note(metrics, self._n_updates, self.num_timesteps)

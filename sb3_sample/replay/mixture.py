@@ -1,0 +1,69 @@
+"""A mixture of sources: batches with a fixed share of each."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import torch
+
+from sb3_sample.learner.batch import Batch
+
+
+class Samples(Protocol):
+    """Whatever batches are drawn from."""
+
+    def sample(self, batch_size: int) -> Batch: ...
+
+
+class Mixture:
+    """
+    Batches of several sources, such as a data set and a replay buffer, the rows of the first source first.
+
+    :param sources: each with ``sample(batch_size)``
+    :param shares: share of each source in a batch; they add up to 1. The last source has what rounding leaves
+    :raises ValueError: if there are not as many shares as sources, one is negative, or they do not add up to 1
+    """
+
+    def __init__(self, sources: Sequence[Samples], shares: Sequence[float]):
+        if len(sources) != len(shares) or not sources:
+            raise ValueError(f"shares must be one for each of {len(sources)} sources, not {list(shares)}")
+        if not all(0 <= share <= 1 for share in shares) or not math.isclose(sum(shares), 1, abs_tol=1e-6):
+            raise ValueError(f"shares must be at least 0 and add up to 1, not {list(shares)}")
+        self.sources, self.shares = tuple(sources), tuple(shares)
+
+    def sample(self, batch_size: int) -> Batch:
+        """
+        :param batch_size: B
+        :return: transitions of all sources
+        :raises ValueError: if the batch size is below 1
+        """
+        if batch_size < 1:
+            raise ValueError(f"batch_size must be at least 1, not {batch_size}")
+        sizes = [round(share * batch_size) for share in self.shares[:-1]]
+        sizes.append(batch_size - sum(sizes))
+        drawn = [source.sample(n) for source, n in zip(self.sources, sizes, strict=True) if n > 0]
+        columns = [_joined([getattr(batch, name) for batch in drawn]) for name in Batch._fields[:-1]]
+        return Batch(*columns, _discounts(drawn))
+
+
+def _joined(columns: list[Any]) -> Any:
+    if isinstance(columns[0], dict):
+        return {key: torch.cat([column[key] for column in columns]) for key in columns[0]}
+    return torch.cat(columns)
+
+
+def _discounts(batches: list[Batch]) -> torch.Tensor | float | None:
+    """One discount factor for all where they agree, or one a row."""
+    kinds = {batch.discounts for batch in batches if not isinstance(batch.discounts, torch.Tensor)}
+    if all(not isinstance(batch.discounts, torch.Tensor) for batch in batches) and len(kinds - {None}) <= 1:
+        # None is the learner's own, which a replay buffer's number is too.
+        return next(iter(kinds - {None}), None)
+    if None in kinds:
+        raise ValueError("a source without discounts cannot be mixed with one of several: give them to its batches")
+    rows = [
+        batch.discounts
+        if isinstance(batch.discounts, torch.Tensor)
+        else torch.full_like(batch.rewards, float(batch.discounts or 0.0))
+        for batch in batches
+    ]
+    return torch.cat(rows)
