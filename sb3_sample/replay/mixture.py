@@ -42,8 +42,8 @@ class Mixture:
         sizes = [round(share * batch_size) for share in self.shares[:-1]]
         sizes.append(batch_size - sum(sizes))
         drawn = [source.sample(n) for source, n in zip(self.sources, sizes, strict=True) if n > 0]
-        columns = [_joined([getattr(batch, name) for batch in drawn]) for name in Batch._fields[:-1]]
-        return Batch(*columns, _discounts(drawn))
+        columns: list[Any] = [_joined([getattr(batch, name) for batch in drawn]) for name in Batch._fields[:-1]]
+        return Batch(*columns)._replace(discounts=_discounts(drawn))
 
 
 def _joined(columns: list[Any]) -> Any:
