@@ -56,7 +56,7 @@ UNCERTAINTIES = ("epistemic", "aleatoric", "both")
 
 def spread(q: torch.Tensor, uncertainty: str) -> torch.Tensor:
     """
-    The uncertainty that optimism adds (P3, figure 12; Moskovitz et al. 2021, section 4).
+    The uncertainty that optimism adds (DAC, figure 12; Moskovitz et al. 2021, section 4).
 
     "epistemic" is the disagreement of the critics, quantile by quantile; "aleatoric" the standard deviation over the
     quantiles of their mean, the spread of the return itself; "both" the root of the sum of the variances, the
@@ -197,7 +197,7 @@ class OptimisticExploration(Exploration):
 
 class OptimisticShift(OptimisticExploration):
     """
-    BRO's optimistic actor (P5, algorithm 2, lines 11, 12, 14, 15; section B.7): a network that sees the
+    BRO's optimistic actor (algorithm 2, lines 11, 12, 14, 15; section B.7): a network that sees the
     observation and the pessimistic actor's pre-tanh mean and answers with a shift of that mean; the standard
     deviation is the pessimistic one times ``std_multiplier``.
 
@@ -265,7 +265,7 @@ class OptimisticShift(OptimisticExploration):
 
 class OptimisticActor(OptimisticExploration):
     """
-    DAC's optimistic actor (P3, algorithm 1, lines 8, 10, 11; eq. 11, 14, 15): a policy of its own, with the networks of
+    DAC's optimistic actor (algorithm 1, lines 8, 10, 11; eq. 11, 14, 15): a policy of its own, with the networks of
     the pessimistic one, that samples with its standard deviation times ``std_multiplier``.
 
     Optimism is kept above minus the pessimism in force: ``optimism = exp(p) - beta``, so that at worst both actors
@@ -383,8 +383,8 @@ class OptimisticGradient(Exploration):
     which maximises the bound's linear approximation among the Gaussians of the same covariance within that divergence.
     Nothing is learned.
 
-    The defaults are those of the comparison in P3 as published with its code (optimism 4.36, ``sqrt(2 * kl_radius)``
-    = 3.69).
+    The defaults are those of the comparison in the DAC paper, as published with its code (optimism 4.36,
+    ``sqrt(2 * kl_radius)`` = 3.69).
 
     :param learner: the learner, whose networks exist already
     :param optimism: weight of the critics' spread in the upper bound, at least 0

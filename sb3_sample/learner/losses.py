@@ -1,7 +1,8 @@
 """
 The losses of the off-policy family: pure functions of tensors.
 
-Shapes use the letters B batch, E critics, K quantiles, A action. "P5" is the BRO paper, "P3" the DAC paper.
+Shapes use the letters B batch, E critics, K quantiles, A action. The papers cited are BRO (https://arxiv.org/abs/2405.16158)
+and DAC (https://arxiv.org/abs/2310.19527).
 """
 
 import math
@@ -22,7 +23,7 @@ def td_target(
 ) -> torch.Tensor:
     """
     The value that every critic is drawn to, ``r + discount * (1 - done) * (V(s') + entropy bonus)``
-    (P5, algorithm 2, line 8), quantile by quantile.
+    (BRO, algorithm 2, line 8), quantile by quantile.
 
     :param rewards: (B, 1)
     :param dones: (B, 1), 1 where the episode terminated; a time limit is 0
@@ -129,7 +130,7 @@ class _QuantileHuberPairs(torch.autograd.Function):
 def quantile_huber(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """
     Quantile Huber loss, threshold 1: sum over the predicted quantiles, mean over the target quantiles and
-    the batch, summed over the critics (P5, algorithm 2, line 8; Dabney et al. 2018, eq. 10). The midpoint
+    the batch, summed over the critics (BRO, algorithm 2, line 8; Dabney et al. 2018, eq. 10). The midpoint
     of predicted quantile i is ``(i + 1/2) / K``. Exact: value and gradient are those of the K x K pairs.
 
     :param q: predicted quantiles, (E, B, K)
@@ -143,7 +144,7 @@ def quantile_huber(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 def actor_loss(log_prob: torch.Tensor, value: torch.Tensor, alpha: torch.Tensor | float) -> torch.Tensor:
     """
-    ``mean(alpha * log pi(a|s) - Q(s, a))`` (P5, algorithm 2, line 10).
+    ``mean(alpha * log pi(a|s) - Q(s, a))`` (BRO, algorithm 2, line 10).
 
     :param log_prob: log-probability of the sampled actions, (B, 1)
     :param value: the ensemble's value of them, (B, K); averaged over quantiles here
@@ -155,7 +156,7 @@ def actor_loss(log_prob: torch.Tensor, value: torch.Tensor, alpha: torch.Tensor 
 
 def temperature_loss(alpha: torch.Tensor, entropy: torch.Tensor, target_entropy: float) -> torch.Tensor:
     """
-    ``alpha * (H - H*)`` (P5, algorithm 2, line 13). The gradient goes through ``alpha`` itself, not its
+    ``alpha * (H - H*)`` (BRO, algorithm 2, line 13). The gradient goes through ``alpha`` itself, not its
     logarithm as in stable_baselines3.
 
     :param alpha: temperature, with gradient, scalar
@@ -168,7 +169,7 @@ def temperature_loss(alpha: torch.Tensor, entropy: torch.Tensor, target_entropy:
 
 def optimistic_actor_loss(upper_value: torch.Tensor, kl: torch.Tensor, kl_weight: torch.Tensor) -> torch.Tensor:
     """
-    ``-mean(Q_upper) + weight * mean(KL)`` (P5, algorithm 2, line 12; P3, eq. 11).
+    ``-mean(Q_upper) + weight * mean(KL)`` (BRO, algorithm 2, line 12; DAC, eq. 11).
 
     :param upper_value: optimistic value of the sampled actions, (B, K)
     :param kl: divergence of the two policies, summed over the action's dimensions, (B, 1)
@@ -180,7 +181,7 @@ def optimistic_actor_loss(upper_value: torch.Tensor, kl: torch.Tensor, kl_weight
 
 def optimism_loss(optimism: torch.Tensor, reference: torch.Tensor | float, kl_gap: torch.Tensor) -> torch.Tensor:
     """
-    ``(beta_o - reference) * (KL / |A| - KL*)`` (P5, algorithm 2, line 14; P3, eq. 14).
+    ``(beta_o - reference) * (KL / |A| - KL*)`` (BRO, algorithm 2, line 14; DAC, eq. 14).
 
     The reference shifts the loss, not its gradient. The papers put beta_p there, which is minus our pessimism;
     BRO's published code puts plus its pessimism.
@@ -195,7 +196,7 @@ def optimism_loss(optimism: torch.Tensor, reference: torch.Tensor | float, kl_ga
 
 def kl_weight_loss(kl_weight: torch.Tensor, kl_gap: torch.Tensor) -> torch.Tensor:
     """
-    ``-weight * (KL / |A| - KL*)`` (P5, algorithm 2, line 15; P3, eq. 14).
+    ``-weight * (KL / |A| - KL*)`` (BRO, algorithm 2, line 15; DAC, eq. 14).
 
     :param kl_weight: tau, with gradient, scalar
     :param kl_gap: ``KL / |A| - KL*``, scalar, without gradient

@@ -114,12 +114,13 @@ class Pessimism(Part):
 class LearnedPessimism(Pessimism):
     """
     A weight that is learned by gradient descent, one step of Adam a gradient step, and kept at least 0: GPL, OPL and
-    VPL are choices of ``loss`` and ``source``, and so are the variants of P4 (figures 8 and 9).
+    VPL are choices of ``loss`` and ``source``, and so are the variants of the VPL paper
+    (https://arxiv.org/abs/2403.01014, figures 8 and 9).
 
     With the lower bound's TD error ``e = Q_mean(s, a) - r - gamma * (V_lb(s'))``, where ``V_lb`` holds beta:
 
-    - ``loss="squared"`` is VPL's ``mean(e^2)`` (P4, eq. 12); the gradient goes through the beta of ``V_lb``;
-    - ``loss="dual"`` is ``beta * mean(e)`` with the error as a constant (P4, eq. 6): beta rises where the lower bound
+    - ``loss="squared"`` is VPL's ``mean(e^2)`` (VPL, eq. 12); the gradient goes through the beta of ``V_lb``;
+    - ``loss="dual"`` is ``beta * mean(e)`` with the error as a constant (VPL, eq. 6): beta rises where the lower bound
       of the next state promises more than the critics' mean gives; for "on_policy", where ``e`` is the return minus
       the lower bound of its state and action, where that bound promises more than the return kept.
 
@@ -287,7 +288,7 @@ class LearnedPessimism(Pessimism):
     ) -> torch.Tensor:
         """
         TD(lambda) returns of recent segments, the estimate of the true value that OPL compares the lower bound with
-        (P4, table 2; Kuznetsov et al. 2021)::
+        (VPL, table 2; Kuznetsov et al. 2021)::
 
             G_t = r_t + gamma * (h + (1 - lambda) * V + lambda * G_{t+1})     within an episode
             G_t = r_t + gamma * (h + V)                                       at the segment's end and at a time limit
@@ -447,11 +448,11 @@ def check_beta(name: str, beta: Any) -> None:
 
 def gpl(learner: Learning, initial_pessimism: float = 1.0, learning_rate: float = 5e-5) -> LearnedPessimism:
     """
-    Generalized pessimism learning (Cetin and Celiktutan 2023; P4, eq. 6): the dual loss on replay.
+    Generalized pessimism learning (Cetin and Celiktutan 2023; VPL, eq. 6): the dual loss on replay.
 
     :param learner: the learner
     :param initial_pessimism: beta at the start
-    :param learning_rate: of beta; 5e-5 in P4, 1e-5 in P2
+    :param learning_rate: of beta; 5e-5 in the VPL paper, 1e-5 in the regularization study (2403.00514)
     :return: the rule
     """
     return LearnedPessimism(learner, "dual", "replay", initial_pessimism, learning_rate)
@@ -465,7 +466,7 @@ def opl(
     td_lambda: float = 0.95,
 ) -> LearnedPessimism:
     """
-    On-policy pessimism learning (Kuznetsov et al. 2021; P4, tables 2 and 5): the dual loss against the TD(lambda)
+    On-policy pessimism learning (Kuznetsov et al. 2021; VPL, tables 2 and 5): the dual loss against the TD(lambda)
     returns of the latest steps.
 
     :param learner: the learner
@@ -486,7 +487,7 @@ def vpl(
     source: str = "validation",
 ) -> LearnedPessimism:
     """
-    Validation pessimism learning (P4, eq. 12 and algorithm 1), and its variants.
+    Validation pessimism learning (VPL, eq. 12 and algorithm 1), and its variants.
 
     :param learner: the learner
     :param initial_pessimism: beta at the start

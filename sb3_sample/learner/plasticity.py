@@ -16,7 +16,7 @@ from sb3_sample.networks.dormant import recycle
 
 class Resets(Part):
     """
-    Full-parameter resets (P5, section 2.2; Nikishin et al. 2022): every network, optimizer and learned number
+    Full-parameter resets (BRO, section 2.2; Nikishin et al. 2022): every network, optimizer and learned number
     starts anew, the replay buffer stays.
 
     With ``shrink`` above 0 it is shrink and perturb (Ash and Adams 2020, in the form of D'Oro et al. 2022): every

@@ -65,7 +65,7 @@ def samples_at(
 
 class ValidationSplit(CompactReplay):
     """
-    What a replay buffer gains that holds transitions out (P4, section 4.1 and algorithm 1, lines 4-10): each
+    What a replay buffer gains that holds transitions out (VPL, section 4.1 and algorithm 1, lines 4-10): each
     transition of each environment goes to the validation side with a given probability, for as long as it is in the
     buffer. ``sample`` never gives such a transition, ``sample_validation`` nothing else.
 
