@@ -282,7 +282,7 @@ def _tensors(inputs: Any) -> list[torch.Tensor]:
 
 
 def _kind(inputs: Any) -> Any:
-    """Structure, shapes, types and devices of nested tuples and dicts of tensors; hashable."""
+    """Structure and contents of nested tuples and dicts but the tensors' values; hashable."""
     if isinstance(inputs, torch.Tensor):
         return tuple(inputs.shape), inputs.dtype, inputs.device
     if isinstance(inputs, dict):

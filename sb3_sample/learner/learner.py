@@ -78,7 +78,7 @@ class Learner:
     :param make_temperature: makes a freshly initialised temperature
     :param make_pessimism: makes a freshly initialised rule of pessimism for the learner
     :param make_explorer: makes a freshly initialised explorer for the learner
-    :param plasticity: resets of all networks
+    :param plasticity: resets of networks, optimizers and learned numbers
     :param redo: recycling of dormant neurons; None for none
     :param make_transforms: each makes a batch transform for the learner, applied in this order
     :param learning_rate: of actor, critics and temperature, at the start
@@ -303,7 +303,7 @@ class Learner:
 
     def on_step(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """
-        Take note of one step of all environments, before the update; the parts are told of it.
+        Record one step of all environments, and pass it to the parts.
 
         :param rewards: unnormalised rewards, (n_envs,)
         :param dones: whether each environment's episode ended, by termination or truncation, (n_envs,)
@@ -318,7 +318,7 @@ class Learner:
                     part.on_episode_end(self, int(index), infos[index]["episode"]["r"])
 
     def on_environment_reset(self) -> None:
-        """Take note that the environments were reset in the midst of their episodes."""
+        """Tell the parts that the environments were reset in the midst of their episodes."""
         for part in self.parts().values():
             part.on_environment_reset(self)
 

@@ -82,7 +82,7 @@ class Resumable(Exportable, BaseAlgorithm):
 
         :param env: the environment, of the same spaces and as many as the model was made with
         :param force_reset: whether it is reset before training goes on
-        :raises ValueError: if its spaces or its number are others
+        :raises ValueError: if its spaces or its number of environments differ
         """
         check_n_envs(self, env)
         super().set_env(env, force_reset)
