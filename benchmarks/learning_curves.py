@@ -9,9 +9,10 @@ transition, 10,000 random steps, target entropy -|A|/2, Adam 3e-4. SRSAC takes e
 
     python benchmarks/learning_curves.py --agent MBMAPPO --action-repeat 4 --steps 40960 --eval-freq 2048
 
-The on-policy agents have P1's settings, and observations and rewards normalised by VecNormalize; "PPO" is MBMAPPO
-without simulated actions, which is stable_baselines3's PPO step for step. The run goes to ``OUTPUT/AGENT/seed_SEED``
-(``evaluations.npz``, Monitor files), ``learning_summary.py`` makes a table and a picture of all of them.
+The on-policy agents have the settings of the MBMA paper (https://arxiv.org/abs/2210.13011), and observations and
+rewards normalised by VecNormalize; "PPO" is MBMAPPO without simulated actions, which is stable_baselines3's PPO step
+for step. The run goes to ``OUTPUT/AGENT/seed_SEED`` (``evaluations.npz``, Monitor files), ``learning_summary.py`` makes
+a table and a picture of all of them.
 """
 
 import argparse

@@ -5,11 +5,12 @@ machine can do, all in one run.
     python benchmarks/simulated_ppo.py [--threads 1] [--rounds 3] [--device cpu]
     python benchmarks/simulated_ppo.py --memory    # peak memory of one iteration of 4,096 steps and 16 actions
 
-An iteration is that of P1: 2,048 steps, minibatches of 64, 10 epochs, networks of 512 (actor) and 1024 (critic and
-models), horizon 12; observations and actions of cheetah-run. The environment costs next to nothing. The contenders take
-turns; figures are medians over the rounds, and the ratios medians of each round's ratio. "of matmul" is the rate of the
-phases' matrix multiplications (counted by torch) over the rate at which this machine multiplies 2048 x 1024 by
-1024 x 1024, measured in the same rounds. Leave the machine alone meanwhile: a run takes some ten minutes on a CPU.
+An iteration is that of the MBMA paper (https://arxiv.org/abs/2210.13011): 2,048 steps, minibatches of 64, 10 epochs,
+networks of 512 (actor) and 1024 (critic and models), horizon 12; observations and actions of cheetah-run. The
+environment costs next to nothing. The contenders take turns; figures are medians over the rounds, and the ratios
+medians of each round's ratio. "of matmul" is the rate of the phases' matrix multiplications (counted by torch) over the
+rate at which this machine multiplies 2048 x 1024 by 1024 x 1024, measured in the same rounds. Leave the machine alone
+meanwhile: a run takes some ten minutes on a CPU.
 """
 
 import argparse
@@ -35,7 +36,7 @@ from sb3_sample.ppo.simulated_ppo import NET_ARCH
 OBSERVATION, ACTION = 17, 6  # cheetah-run
 PHASES = ("collect", "dynamics", "simulate", "policy")
 PPO = "PPO (stable_baselines3)"
-#: The times that P1 has on a GPU, relative to PPO (table B.3).
+#: Times on a GPU, relative to PPO (MBMA, table B.3).
 PUBLISHED = {"MBMA 4": 1.59, "MBMA 8": 2.31, "MBMA 16": 3.60, "QMA 4": 1.22, "QMA 8": 1.62, "QMA 16": 2.07}
 
 
@@ -195,14 +196,14 @@ def main() -> None:
         f"matmul 2048x1024 by 1024x1024: {rate / 1e9:.0f} GFLOP/s ({min(rates) / 1e9:.0f} - {max(rates) / 1e9:.0f})\n"
     )
     heads = "".join(f"{phase:>10}" for phase in PHASES)
-    print(f"{'seconds':26}{'iteration':>10}{heads}{'x PPO':>8}{'P1, GPU':>9}")
+    print(f"{'seconds':26}{'iteration':>10}{heads}{'x PPO':>8}{'paper GPU':>11}")
     reference = contenders[PPO].seconds["iteration"]
     for name, contender in contenders.items():
         medians = {phase: statistics.median(values) for phase, values in contender.seconds.items()}
         pairs = zip(contender.seconds["iteration"], reference, strict=True)
         ratio = statistics.median(a / b for a, b in pairs)
         phases = "".join(f"{medians[phase]:10.2f}" for phase in PHASES)
-        published = f"{PUBLISHED[name]:9.2f}" if name in PUBLISHED else ""
+        published = f"{PUBLISHED[name]:11.2f}" if name in PUBLISHED else ""
         print(f"{name:26}{medians['iteration']:10.2f}{phases}{ratio:8.2f}{published}")
     print(f"\n{'of matmul':26}{'TFLOP':>10}{'all three':>10}{''.join(f'{phase:>10}' for phase in PHASES[1:])}")
     for name, contender in contenders.items():

@@ -247,7 +247,7 @@ def test_every_algorithm_trains_in_two_environments_goes_on_and_is_shown(
     assert (second.num_transitions, second._n_updates) == (100, 80)
 
 
-#: What makes the models of P1's algorithms small.
+#: What makes the models of the MBMA paper's algorithms small.
 ON_POLICY = {
     "mbma_ppo": "dynamics_kwargs:dict(width=8)",
     "mbpo_ppo": "dynamics_kwargs:dict(width=8)",

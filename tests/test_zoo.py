@@ -55,9 +55,9 @@ BUILT = [
     pytest.param(name, env_id, marks=() if name in SAMPLE or env_id == "default" else pytest.mark.slow)
     for name, env_id in ALL_ENTRIES
 ]
-#: Those of P1.
+#: Those of the MBMA paper.
 ON_POLICY = sorted(name for name, entry in zoo.ALGORITHMS.items() if issubclass(entry.algorithm, SimulatedPPO))
-#: Algorithms with the settings that P2 to P4 share.
+#: Algorithms with the settings that DAC, VPL and the regularization study (2403.00514) share.
 FAMILY = sorted(
     name for name, entry in zoo.ALGORITHMS.items() if not issubclass(entry.algorithm, BRO) and name not in ON_POLICY
 )

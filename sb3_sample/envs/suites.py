@@ -82,12 +82,28 @@ BRO_ABLATION = _dmc("acrobot-swingup", "dog-trot", "hopper-hop", "humanoid-run",
     "assembly", "coffee-push", "hand-insert", "push", "stick-pull"
 )
 
-#: The study of overestimation, overfitting and plasticity (P2), section 3: DeepMind Control (7).
-P2_DMC = _dmc("acrobot-swingup", "hopper-hop", "humanoid-walk", "humanoid-run", "dog-trot", "dog-run", "quadruped-run")
-#: P2, section 3: Meta-World (7).
-P2_METAWORLD = _metaworld("hammer", "push", "sweep", "coffee-push", "stick-pull", "reach", "hand-insert")
-#: P2's 14 tasks.
-P2 = P2_DMC + P2_METAWORLD
+#: The regularization study (https://arxiv.org/abs/2403.00514), section 3: DeepMind Control (7).
+REGULARIZATION_DMC = _dmc(
+    "acrobot-swingup",
+    "hopper-hop",
+    "humanoid-walk",
+    "humanoid-run",
+    "dog-trot",
+    "dog-run",
+    "quadruped-run",
+)
+#: The regularization study, section 3: Meta-World (7).
+REGULARIZATION_METAWORLD = _metaworld(
+    "hammer",
+    "push",
+    "sweep",
+    "coffee-push",
+    "stick-pull",
+    "reach",
+    "hand-insert",
+)
+#: The regularization study's 14 tasks.
+REGULARIZATION = REGULARIZATION_DMC + REGULARIZATION_METAWORLD
 
 #: DAC, the domains it names. Its 30 tasks stand in a table 3 that the dissertation's text of the paper does not
 #: contain, and no other list of them was found there: the text says that they come from DeepMind Control, Meta-World

@@ -1,4 +1,4 @@
-"""The update of the off-policy family: it knows no environment, no file, no replay buffer and no Stable-Baselines3."""
+"""Update of the off-policy family, independent of environments, files, replay buffers and Stable-Baselines3."""
 
 from sb3_sample.learner.learner import Learner
 

@@ -1,4 +1,4 @@
-"""What one gradient step learns from."""
+"""Inputs of one gradient step."""
 
 from typing import Any, NamedTuple, Protocol
 
@@ -24,6 +24,8 @@ class Batch(NamedTuple):
     @classmethod
     def of(cls, samples: Any, gamma: float) -> "Batch":
         """
+        Convert samples of a Stable-Baselines3 buffer to a batch.
+
         :param samples: transitions as Stable-Baselines3's buffers give them
         :param gamma: discount factor, where they have none of their own
         :return: the same as a batch
@@ -41,10 +43,10 @@ class Batch(NamedTuple):
 
 class Extra(NamedTuple):
     """
-    Transitions that the rule of pessimism judges besides the step's batch.
+    Transitions that the rule of pessimism learns from besides the step's batch.
 
-    ``ends`` says where an episode ended with the step, for whatever reason (1), (T, N), if they are the latest T steps
-    of N environments in their order; None if they are in none.
+    ``ends`` is 1 where an episode ended with the step, by termination or truncation, (T, N), if they are the latest T
+    steps of N environments in their order; None if they are in no order.
     """
 
     batch: Batch
@@ -52,15 +54,19 @@ class Extra(NamedTuple):
 
 
 class Source(Protocol):
-    """Where batches come from, as a rule of pessimism sees it."""
+    """Interface of the source of batches that a rule of pessimism draws from."""
 
     def held_out(self) -> Batch | None:
         """
-        :return: transitions that are held out of training, as many as a step judges; None while there are fewer
+        Draw transitions of the validation side.
+
+        :return: transitions that are held out of training, as many as a step learns from; None while there are fewer
         """
 
     def latest(self, n_steps: int) -> Extra | None:
         """
+        Return the newest transitions.
+
         :param n_steps: T
         :return: the latest T steps of every environment, the oldest first; None while there are fewer
         """
@@ -82,8 +88,10 @@ class Noise(NamedTuple):
 
     def completed(self, batch: Batch, extra: Extra | None, subset: tuple[int, int] | None) -> "Noise":
         """
+        Draw what is missing.
+
         :param batch: the step's transitions
-        :param extra: those that the rule of pessimism judges besides, if any
+        :param extra: those that the rule of pessimism learns from besides, if any
         :param subset: how many critics are drawn for the TD target, and from how many; None: no drawing
         :return: the same noise, with what was None drawn
         """
@@ -104,8 +112,8 @@ class Noise(NamedTuple):
 
 class CriticStep(NamedTuple):
     """
-    What the critics' step computed, before it changed them: a rule of pessimism that learns from the same
-    transitions need not compute it again. Without gradient.
+    Results of the critics' step, from before the critics changed, for a rule of pessimism that learns from the same
+    transitions. Without gradient.
 
     ``q`` is (E, B, K), the critics' predictions; ``next_q`` (E, B, K), the target critics' of the next state and the
     actor's action there (of the drawn subset, if one is drawn); ``entropy_bonus``, ``-alpha * log pi`` of that

@@ -1,8 +1,8 @@
 """
-How the gradient step is run: operation by operation, compiled by ``torch.compile``, or captured as a CUDA graph.
+Execution of the gradient step: operation by operation, compiled by ``torch.compile``, or captured as a CUDA graph.
 
-All three run the same function, ``Learner.gradient_step``, which knows nothing of them: it takes the batch and all the
-noise as tensors, chooses nothing by the value of a tensor, and counts nothing outside of tensors.
+All three run the same function, ``Learner.gradient_step``, which is independent of them: it takes the batch and all the
+noise as tensors, does not branch on the value of a tensor, and counts nothing outside of tensors.
 """
 
 import re
@@ -31,8 +31,8 @@ Recorder = Callable[[Callable[[], Metrics]], tuple[Callable[[], None], Metrics]]
 
 def _compilation_errors() -> tuple[type[Exception], ...]:
     """
-    What torch raises where it cannot compile, at first where it has not been told to trace gradients, at last where it
-    has compiled the same for too many settings. Imported when needed, since it takes a second.
+    Errors of torch where it cannot compile: the first is raised where the tracing of gradients is switched off, the
+    last where the same was compiled for too many settings. Imported when needed, since it takes a second.
     """
     from torch._dynamo.exc import FailOnRecompileLimitHit, TorchDynamoException, Unsupported
     from torch._inductor.exc import InductorError
@@ -42,7 +42,9 @@ def _compilation_errors() -> tuple[type[Exception], ...]:
 
 def old_torch() -> str | None:
     """
-    :return: that this torch is too old to compile a whole gradient step, in words; None if it is not
+    Check that this torch can compile a whole gradient step.
+
+    :return: the reason, in words, if it is too old; None if it is not
     """
     if tuple(int(number) for number in re.findall(r"\d+", str(torch.__version__))[:2]) >= COMPILES_FROM:
         return None
@@ -56,8 +58,8 @@ _told: set[bool | str] = set()
 
 def warn_not_compiled(learner: Any, reason: str) -> None:
     """
-    Warn that the gradient step is not compiled; of a torch that is too old once a process and way of asking, since that
-    holds for every model.
+    Warn that the gradient step is not compiled. A torch that is too old is warned of once for each value of ``compile``
+    in a process, since it concerns every model.
 
     :param learner: the learner
     :param reason: what keeps it from being compiled
@@ -71,6 +73,8 @@ def warn_not_compiled(learner: Any, reason: str) -> None:
 
 def why_not_compiled(learner: Any) -> str | None:
     """
+    Check whether the gradient step can be compiled here.
+
     :param learner: the learner
     :return: what keeps its gradient step from being compiled here; None if nothing does
     """
@@ -100,10 +104,11 @@ def why_not_compiled(learner: Any) -> str | None:
 
 def has_foreign_parts(learner: Any) -> bool:
     """
+    Check for code from outside of this package that may not be fit to be compiled.
+
     :param learner: the learner
-    :return: whether it has parts, networks or a gradient step from outside of this package that do not say that they
-        can be compiled (``compilable = True``): a number that they change at every step, say, would have the step
-        compiled anew at every step
+    :return: whether it has parts, networks or a gradient step from outside of this package without the declaration
+        ``compilable = True``: a number that changes at every step, for example, causes a compilation at every step
     """
     objects = [learner.explorer, learner.pessimism_rule, learner.head, learner.actor.trunk, learner.critic.trunk]
     if not _is_ours(type(learner).gradient_step):
@@ -116,7 +121,7 @@ def _is_ours(thing: Any) -> bool:
 
 
 def _is_compilable(cls: type) -> bool:
-    """Whether a class is of this package, or it, or the nearest of its bases from outside, says so."""
+    """Whether a class is of this package, or declared ``compilable`` by itself or its nearest base from outside."""
     if _is_ours(cls):
         return True
     said = [vars(base)["compilable"] for base in cls.__mro__ if not _is_ours(base) and "compilable" in vars(base)]
@@ -129,7 +134,7 @@ def _foreign_optimizers(learner: Any) -> str:
 
 class Execution:
     """
-    Runs the gradient steps of one model.
+    Runner of the gradient steps of one model.
 
     :param learner: the learner, its networks and parts built
     :param compiled: whether to compile
@@ -157,6 +162,8 @@ class Execution:
 
     def serves(self, learner: Any) -> bool:
         """
+        Check that a compiled or captured step still belongs to the learner.
+
         :param learner: the learner
         :return: whether it still has the networks, parts, optimizers and loss that this was made for
         """
@@ -165,6 +172,8 @@ class Execution:
     @classmethod
     def of(cls, learner: Any) -> "Execution":
         """
+        Choose how the gradient steps are run.
+
         :param learner: a learner whose ``compiled`` is decided
         :return: what runs its gradient steps
         """
@@ -185,7 +194,7 @@ class Execution:
 
     def prepare(self, learner: Any) -> None:
         """
-        Called before the gradient steps that follow an environment step, when everything else is done.
+        Prepare optimizers and captured steps; called last before the gradient steps that follow an environment step.
 
         :param learner: the learner
         """
@@ -198,12 +207,12 @@ class Execution:
 
     def __call__(self, learner: Any, *inputs: Any, eager: bool = False) -> Metrics:
         """
-        One gradient step.
+        Run one gradient step.
 
         :param learner: the learner
         :param inputs: the arguments of ``Learner.gradient_step``
         :param eager: neither compiled nor captured this time, which leaves the gradients in ``.grad``
-        :return: its result; what a captured step gives holds until the next one
+        :return: its result; that of a captured step is valid until the next one
         """
         if eager:
             return type(learner).gradient_step(learner, *inputs)
@@ -249,11 +258,10 @@ class Execution:
 
 def _settings_and_inputs(guards: Sequence[Any]) -> list[bool]:
     """
-    Which of the conditions under which a compiled step holds are looked at before each step.
+    Select the conditions of a compiled step that are checked before each step.
 
-    Those on parameters, modules and functions are most of them, and looking at them takes as long as a small network's
-    forward pass. They hold as long as :meth:`Execution.serves` says so. A learning rate may change: it is read
-    from a tensor.
+    Most conditions are on parameters, modules and functions, and checking them takes as long as a small network's
+    forward pass. :meth:`Execution.serves` checks them instead. A learning rate may change: it is read from a tensor.
     """
     settings = ("CONSTANT_MATCH", "EQUALS_MATCH", "GRAD_MODE", "GLOBAL_STATE", "DETERMINISTIC_ALGORITHMS")
     inputs = ("batch", "noise", "extra", "moves_targets", "moves_actor")
@@ -266,7 +274,7 @@ def _settings_and_inputs(guards: Sequence[Any]) -> list[bool]:
 
 
 def _tensors(inputs: Any) -> list[torch.Tensor]:
-    """The tensors of nested tuples and dicts, in a fixed order."""
+    """Tensors of nested tuples and dicts, in a fixed order."""
     if isinstance(inputs, torch.Tensor):
         return [inputs]
     values = inputs.values() if isinstance(inputs, dict) else inputs if isinstance(inputs, tuple) else ()
@@ -274,7 +282,7 @@ def _tensors(inputs: Any) -> list[torch.Tensor]:
 
 
 def _kind(inputs: Any) -> Any:
-    """Everything about nested tuples and dicts of tensors but the tensors' values; hashable."""
+    """Structure and contents of nested tuples and dicts but the tensors' values; hashable."""
     if isinstance(inputs, torch.Tensor):
         return tuple(inputs.shape), inputs.dtype, inputs.device
     if isinstance(inputs, dict):
@@ -283,7 +291,7 @@ def _kind(inputs: Any) -> Any:
 
 
 def _like(inputs: Any, make: Callable[[torch.Tensor], torch.Tensor]) -> Any:
-    """The same nested tuples and dicts with other tensors."""
+    """Copy of nested tuples and dicts with other tensors."""
     if isinstance(inputs, torch.Tensor):
         return make(inputs)
     if isinstance(inputs, dict):
@@ -299,7 +307,7 @@ def cuda_graph(run: Callable[[], Metrics]) -> tuple[Callable[[], None], Metrics]
     Capture as a CUDA graph.
 
     :param run: what to capture
-    :return: what repeats it, and its result
+    :return: function that repeats it, and its result
     """
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
@@ -313,8 +321,8 @@ class Captured:
 
     A captured step reads and writes fixed places in memory. Its inputs are copied to theirs before each repetition;
     parameters, moments, step counts and learning rates are changed in place by all that changes them, resets included.
-    Whatever puts one of them elsewhere (loading, a reinitialised optimizer), and whatever changes a number that is not
-    in a tensor, makes :meth:`forget_if_stale` drop the captured steps, and they are captured anew.
+    If one of them moves to another place (loading, a reinitialised optimizer), or a number outside of tensors changes,
+    :meth:`forget_if_stale` drops the captured steps, and they are captured anew.
 
     :param recorder: what captures
     """
@@ -330,7 +338,7 @@ class Captured:
 
     def forget_if_stale(self, learner: Any) -> None:
         """
-        Drop what was captured of a model that has other tensors or other settings now.
+        Drop the captured steps if the model has other tensors or other settings than at their capture.
 
         :param learner: the learner
         """
@@ -341,12 +349,12 @@ class Captured:
 
     def __call__(self, step: Callable[..., Metrics], learner: Any, inputs: tuple[Any, ...]) -> Metrics:
         """
-        One gradient step, repeated if one of its kind is captured.
+        Run one gradient step: the captured one of its kind if there is one.
 
         :param step: the step
         :param learner: its first argument
         :param inputs: its other arguments
-        :return: its result, which holds until the next step
+        :return: its result, valid until the next step
         """
         kind = _kind(inputs)
         runs = self._runs[kind] = self._runs.get(kind, 0) + 1
@@ -363,7 +371,7 @@ class Captured:
 
 
 def _aside(run: Callable[[], Metrics]) -> Metrics:
-    """Run on a stream of its own, as the last steps before a capture have to."""
+    """Run on a stream of its own, as CUDA requires of the last steps before a capture."""
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
@@ -373,7 +381,7 @@ def _aside(run: Callable[[], Metrics]) -> Metrics:
 
 
 def _modules(learner: Any) -> tuple[Any, ...]:
-    """What a compiled or captured step takes for granted, by identity."""
+    """Identities of the objects that a compiled or captured step was made for."""
     critics = (learner.critic, learner.critic.trunk, learner.critic_target, learner.critic_target.trunk)
     networks = (learner.actor, learner.actor.trunk, *critics, learner.temperature)
     parts = (learner.explorer, learner.pessimism_rule, *learner.optimizers().values())
@@ -382,7 +390,7 @@ def _modules(learner: Any) -> tuple[Any, ...]:
 
 
 def _places(learner: Any) -> tuple[int, ...]:
-    """Addresses of every tensor that a gradient step reads or writes, but its inputs."""
+    """Addresses of all tensors that a gradient step reads or writes, without its inputs."""
     modules = (learner.networks, learner.temperature, learner.explorer, learner.pessimism_rule)
     tensors = [t for module in modules for t in (*module.parameters(), *module.buffers())]
     for optimizer in learner.optimizers().values():

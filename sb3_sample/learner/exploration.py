@@ -1,6 +1,4 @@
-"""
-Exploration: who acts while the learner trains. ``predict`` and evaluation are the pessimistic actor's alone.
-"""
+"""Exploration: choice of the actions in training. ``predict`` and evaluation are the pessimistic actor's alone."""
 
 import math
 from typing import Any
@@ -21,7 +19,7 @@ from sb3_sample.optim import AdamW
 
 class Exploration(Part):
     """
-    Base class, and the plain choice: the actor itself, a sample of it or, if it is deterministic, with noise added.
+    Exploration by the actor itself, sampled or, if it is deterministic, with noise added; base class of the others.
 
     :param learner: the learner, whose networks exist already
     """
@@ -31,6 +29,8 @@ class Exploration(Part):
 
     def act(self, learner: Learning, observations: Any) -> torch.Tensor:
         """
+        Sample the actions of the training.
+
         :param learner: the learner
         :param observations: tensors on the device of the model, (B, O) or a dict of them
         :return: actions in [-1, 1], (B, A)
@@ -56,7 +56,7 @@ UNCERTAINTIES = ("epistemic", "aleatoric", "both")
 
 def spread(q: torch.Tensor, uncertainty: str) -> torch.Tensor:
     """
-    The uncertainty that optimism adds (P3, figure 12; Moskovitz et al. 2021, section 4).
+    Uncertainty of the critics, as optimism adds it (DAC, figure 12; Moskovitz et al. 2021, section 4).
 
     "epistemic" is the disagreement of the critics, quantile by quantile; "aleatoric" the standard deviation over the
     quantiles of their mean, the spread of the return itself; "both" the root of the sum of the variances, the
@@ -76,9 +76,9 @@ def spread(q: torch.Tensor, uncertainty: str) -> torch.Tensor:
 
 class OptimisticExploration(Exploration):
     """
-    Base class of the optimistic actors, which only act while training. They climb the optimistic value ``Q_mean +
+    Base class of the optimistic actors, which only act while training. They maximise the optimistic value ``Q_mean +
     optimism * Q_std`` under a penalty on the KL divergence to the pessimistic actor; optimism and the penalty's
-    weight are learned so that the divergence per action dimension meets ``kl_target``.
+    weight are learned so that the divergence per action dimension approaches ``kl_target``.
 
     :param learner: the learner, whose networks exist already
     :param kl_target: KL divergence per action dimension to be met, above 0
@@ -116,7 +116,7 @@ class OptimisticExploration(Exploration):
         self._adjustment_learning_rate = adjustment_learning_rate
 
     def _make_optimizers(self, learner: Learning, actor: Any, optimism: Any, kl_weight: Any) -> None:
-        """For the parameters of the optimistic actor and of the two numbers."""
+        """Make the optimizers of the optimistic actor and of optimism and weight."""
         self.actor_optimizer = learner.make_optimizer(actor)
         # Their learning rate is their own, whatever the schedule of the others.
         scalars = {"params": [*optimism, *kl_weight], "scheduled": False}
@@ -129,6 +129,8 @@ class OptimisticExploration(Exploration):
         self, observations: Any, features: torch.Tensor, mean: torch.Tensor, std: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """
+        Compute the optimistic actor's Gaussian.
+
         :param observations: (B, O) or a dict
         :param features: the pessimistic actor's features of them, (B, F)
         :param mean: the pessimistic actor's pre-tanh mean, (B, A)
@@ -149,11 +151,11 @@ class OptimisticExploration(Exploration):
         raise NotImplementedError
 
     def _kl_weight(self) -> torch.Tensor:
-        """The divergence's weight, a scalar with gradient."""
+        """Weight of the divergence, a scalar with gradient."""
         raise NotImplementedError
 
     def _penalty(self, kl_weight: torch.Tensor) -> torch.Tensor:
-        """The weight as the actor's loss uses it."""
+        """Weight of the divergence in the actor's loss."""
         return kl_weight
 
     def act(self, learner: Learning, observations: Any) -> torch.Tensor:
@@ -197,9 +199,9 @@ class OptimisticExploration(Exploration):
 
 class OptimisticShift(OptimisticExploration):
     """
-    BRO's optimistic actor (P5, algorithm 2, lines 11, 12, 14, 15; section B.7): a network that sees the
-    observation and the pessimistic actor's pre-tanh mean and answers with a shift of that mean; the standard
-    deviation is the pessimistic one times ``std_multiplier``.
+    BRO's optimistic actor (algorithm 2, lines 11, 12, 14, 15; section B.7): a network maps the
+    observation and the pessimistic actor's pre-tanh mean to a shift of that mean; the standard deviation is the
+    pessimistic one times ``std_multiplier``.
 
     Where text and published code differ, the code is followed (the published curves were made with it): the
     divergence goes from the optimistic to the pessimistic Gaussian, with the multiplier removed from the
@@ -265,11 +267,11 @@ class OptimisticShift(OptimisticExploration):
 
 class OptimisticActor(OptimisticExploration):
     """
-    DAC's optimistic actor (P3, algorithm 1, lines 8, 10, 11; eq. 11, 14, 15): a policy of its own, with the networks of
+    DAC's optimistic actor (algorithm 1, lines 8, 10, 11; eq. 11, 14, 15): a policy of its own, with the networks of
     the pessimistic one, that samples with its standard deviation times ``std_multiplier``.
 
     Optimism is kept above minus the pessimism in force: ``optimism = exp(p) - beta``, so that at worst both actors
-    climb the same value. A barrier ends its decline 0.001 above that bound.
+    maximise the same value. A barrier ends its decline 0.001 above that bound.
 
     Where text and published code differ, the code is followed: the divergence goes from the optimistic to the
     pessimistic Gaussian (eq. 11 writes the other order, ``kl_direction="pessimistic_to_optimistic"``), with the
@@ -383,8 +385,8 @@ class OptimisticGradient(Exploration):
     which maximises the bound's linear approximation among the Gaussians of the same covariance within that divergence.
     Nothing is learned.
 
-    The defaults are those of the comparison in P3 as published with its code (optimism 4.36, ``sqrt(2 * kl_radius)``
-    = 3.69).
+    The defaults are those of the comparison in the DAC paper, as published with its code (optimism 4.36,
+    ``sqrt(2 * kl_radius)`` = 3.69).
 
     :param learner: the learner, whose networks exist already
     :param optimism: weight of the critics' spread in the upper bound, at least 0
@@ -403,6 +405,8 @@ class OptimisticGradient(Exploration):
 
     def shifted_mean(self, learner: Learning, observations: Any) -> tuple[torch.Tensor, torch.Tensor]:
         """
+        Shift the actor's mean along the gradient of the upper bound.
+
         :param learner: the learner
         :param observations: (B, O) or a dict of them
         :return: the shifted pre-tanh mean and the standard deviation, (B, A) each
@@ -426,7 +430,7 @@ class OptimisticGradient(Exploration):
 
 
 def _cloned(observations: Any) -> Any:
-    """Ordinary tensors of what may be inference tensors."""
+    """Ordinary copies of tensors that may be inference tensors."""
     if isinstance(observations, dict):
         return {key: value.clone() for key, value in observations.items()}
     return observations.clone()

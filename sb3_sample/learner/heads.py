@@ -1,4 +1,4 @@
-"""Value heads: what the outputs of critics mean, what they are drawn to, and by which loss."""
+"""Value heads: meaning of the critics' outputs, their target, and the loss."""
 
 from collections.abc import Callable
 from typing import ClassVar
@@ -12,10 +12,10 @@ from sb3_sample.learner.target import td_target
 
 class ValueHead:
     """
-    Scalar critics, trained by the squared error; and the base class of other heads.
+    Head of scalar critics, trained by the squared error; base class of other heads.
 
     ``n_outputs`` is the number of outputs a critic; ``n_quantiles`` the same if they are quantiles, else None. A head
-    that chooses nothing by a tensor's value may say ``compilable = True``.
+    from outside of this package that does not branch on a tensor's value may declare ``compilable = True``.
     """
 
     compilable: ClassVar[bool] = True
@@ -25,8 +25,10 @@ class ValueHead:
 
     def values(self, outputs: torch.Tensor) -> torch.Tensor:
         """
+        Convert outputs to values.
+
         :param outputs: of critics, (E, B, n_outputs)
-        :return: what rules of pessimism and actors see, (E, B, K): values, or quantiles of one
+        :return: input of the rules of pessimism and of the actors, (E, B, K): values, or quantiles of one
         """
         return outputs
 
@@ -38,16 +40,20 @@ class ValueHead:
         entropy_bonus: torch.Tensor,
     ) -> torch.Tensor:
         """
+        Compute the target of the critics.
+
         :param batch: transitions
         :param next_q: outputs of the target critics for the next state and action, (E, B, n_outputs)
-        :param value: the rule of pessimism's, (E, B, K) to (B, K)
+        :param value: value of the ensemble by the rule of pessimism, (E, B, K) to (B, K)
         :param entropy_bonus: ``-alpha * log pi`` of that action, (B, 1)
-        :return: what :meth:`loss` draws every critic to, (B, K) here
+        :return: the target of every critic in :meth:`loss`, (B, K) here
         """
         return td_target(batch, value(self.values(next_q)), entropy_bonus)
 
     def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """
+        Compute the critics' loss.
+
         :param q: outputs of the critics, (E, B, n_outputs)
         :param target: from :meth:`target`, without gradient
         :return: scalar
@@ -57,7 +63,7 @@ class ValueHead:
 
 class QuantileHead(ValueHead):
     """
-    Quantiles of the return, trained by the quantile Huber loss (BRO, algorithm 2, line 8).
+    Head of critics with quantiles of the return, trained by the quantile Huber loss (BRO, algorithm 2, line 8).
 
     :param n_quantiles: K, at least 1
     """

@@ -1,5 +1,5 @@
 """
-The learner of the off-policy family: networks, targets, learned numbers, optimizers and parts, and their one update.
+Learner of the off-policy family: networks, targets, learned numbers, optimizers and parts, and their one update.
 
 ``Learner.gradient_step`` is the whole gradient step, in the order of BRO's pseudo-code (BRO, algorithm 2).
 """
@@ -58,12 +58,12 @@ class Networks(Protocol):
 
 
 class Counts:
-    """What a learner counts over its life, and what was decided of how it runs."""
+    """Counts of a learner over its life, and whether its gradient step is compiled."""
 
     def __init__(self) -> None:
         #: Gradient steps taken.
         self._n_updates = 0
-        #: Transitions heard of.
+        #: Transitions reported by :meth:`Learner.on_step`.
         self.num_transitions = 0
         #: Whether the gradient step is compiled; None while that is not decided.
         self.compiled: bool | None = None
@@ -78,7 +78,7 @@ class Learner:
     :param make_temperature: makes a freshly initialised temperature
     :param make_pessimism: makes a freshly initialised rule of pessimism for the learner
     :param make_explorer: makes a freshly initialised explorer for the learner
-    :param plasticity: when everything starts anew
+    :param plasticity: resets of networks, optimizers and learned numbers
     :param redo: recycling of dormant neurons; None for none
     :param make_transforms: each makes a batch transform for the learner, applied in this order
     :param learning_rate: of actor, critics and temperature, at the start
@@ -91,17 +91,16 @@ class Learner:
     :param target_subset: how many critics, drawn at random, make the TD target; None: all
     :param actor_pessimism: a weight of pessimism for the actor's objective alone; None: the rule's
     :param sam_radius: radius of sharpness-aware minimisation of the critics' loss; None for none
-    :param learning_starts: transitions, of those that it hears of, whose actions are random
+    :param learning_starts: number of transitions at the beginning whose actions are random
     :param compile: whether the gradient step is compiled; "auto": as ``counts.compiled`` says, else not
     :param device: where the learner computes
     :param verbose: 0 nothing, 1 info
     :param networks: the first networks; made if None
-    :param counts: who keeps the learner's counts, with the attributes of :class:`Counts`; the learner itself by default
-    :param generators: generators of its own, from which everything random of the learner is drawn; None: torch's global
-        ones
+    :param counts: object that holds the learner's counts, with the attributes of :class:`Counts`; made if None
+    :param generators: generators of everything random in the learner; None: torch's global ones
     """
 
-    #: What may be set between two gradient steps, and counts from the next one on.
+    #: Arguments that may be set between two gradient steps, with effect from the next one on.
     SETTINGS = (
         "gamma", "tau", "target_update_interval", "policy_delay", "target_subset", "actor_pessimism", "sam_radius",
         "learning_starts", "verbose", "compile",
@@ -164,7 +163,7 @@ class Learner:
         self._execution: Execution | None = None
         #: Whether ``.grad`` holds the gradients of another gradient step than the last, as a compiled one leaves none.
         self.gradients_are_stale = False
-        # Whether it heard of a step since the last gradient step.
+        # Whether a step was reported since the last gradient step.
         self._heard = False
         self.set_training_mode(False)
 
@@ -175,17 +174,17 @@ class Learner:
 
     @property
     def actor(self) -> Any:
-        """The actor, which acts in evaluation and is learned from the pessimistic value."""
+        """Actor of the evaluation, which is learned from the pessimistic value."""
         return self.networks.actor
 
     @property
     def critic(self) -> Any:
-        """The critics, E at once."""
+        """Critics, E in one module."""
         return self.networks.critic
 
     @property
     def critic_target(self) -> Any:
-        """The target critics."""
+        """Target critics."""
         return self.networks.critic_target
 
     @property
@@ -195,7 +194,7 @@ class Learner:
 
     @property
     def num_transitions(self) -> int:
-        """Transitions heard of by :meth:`on_step` over the learner's life."""
+        """Transitions reported by :meth:`on_step` over the learner's life."""
         return int(self._counts.num_transitions)
 
     @property
@@ -209,24 +208,32 @@ class Learner:
 
     def make_explorer(self) -> Exploration:
         """
+        Make an explorer.
+
         :return: a freshly initialised explorer
         """
         return self._make_explorer(self).to(self.device)
 
     def make_pessimism(self) -> Pessimism:
         """
+        Make a rule of pessimism.
+
         :return: a freshly initialised rule of pessimism
         """
         return self._make_pessimism(self).to(self.device)
 
     def make_actor(self) -> Any:
         """
+        Make an actor.
+
         :return: an actor like the learner's, with parameters of its own
         """
         return self.networks.make_actor()
 
     def make_optimizer(self, parameters: Iterable[nn.Parameter]) -> Optimizer:
         """
+        Make an optimizer.
+
         :param parameters: what to optimise
         :return: an optimizer with the settings of actor and critics
         """
@@ -234,6 +241,8 @@ class Learner:
 
     def next_actions(self, observations: Any, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """
+        Sample the actions of a TD target.
+
         :param observations: next observations, (B, O), or a dict of them
         :param noise: standard normal noise, (B, A); drawn if None
         :return: actions of a TD target in [-1, 1], (B, A), and their log-probability, (B, 1)
@@ -242,6 +251,8 @@ class Learner:
 
     def parts(self) -> dict[str, Part]:
         """
+        List the parts.
+
         :return: the parts, by the name of the attribute that holds them
         """
         parts: dict[str, Part] = {
@@ -254,6 +265,8 @@ class Learner:
 
     def optimizers(self) -> dict[str, Optimizer]:
         """
+        List the optimizers.
+
         :return: every optimizer by its path from the learner
         """
         optimizers: dict[str, Optimizer] = {
@@ -268,6 +281,8 @@ class Learner:
 
     def set_training_mode(self, mode: bool) -> None:
         """
+        Switch networks and parts between training and acting.
+
         :param mode: whether dropout and power iterations are on, as during gradient steps, or off, as when acting
         """
         self.networks.set_training_mode(mode)
@@ -275,6 +290,8 @@ class Learner:
 
     def set_learning_rate(self, rate: float) -> None:
         """
+        Set the learning rate.
+
         :param rate: of every optimizer that has none of its own
         """
         for optimizer in self.optimizers().values():
@@ -282,14 +299,14 @@ class Learner:
                 if group.get("scheduled", True):
                     group["lr"] = rate
 
-    # ---------------------------------------------------------------- what it hears
+    # ---------------------------------------------------------------- what it is told
 
     def on_step(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """
-        Hear of one step of all environments.
+        Record one step of all environments, and pass it to the parts.
 
         :param rewards: unnormalised rewards, (n_envs,)
-        :param dones: whether each environment's episode ended, for whatever reason, (n_envs,)
+        :param dones: whether each environment's episode ended, by termination or truncation, (n_envs,)
         :param infos: each environment's info, with Monitor's "episode" at an end
         """
         self._heard = True
@@ -301,12 +318,12 @@ class Learner:
                     part.on_episode_end(self, int(index), infos[index]["episode"]["r"])
 
     def on_environment_reset(self) -> None:
-        """Hear that the environments were reset in the midst of their episodes."""
+        """Tell the parts that the environments were reset in the midst of their episodes."""
         for part in self.parts().values():
             part.on_environment_reset(self)
 
     def before_updates(self) -> None:
-        """Have the parts do what they do before the gradient steps that follow an environment step."""
+        """Call ``before_updates`` of the parts, before the gradient steps that follow an environment step."""
         self._heard = False
         for part in self.parts().values():
             part.before_updates(self)
@@ -319,12 +336,14 @@ class Learner:
         return 0.0 if self._execution is None else self._execution.seconds_compiling
 
     def forget_execution(self) -> None:
-        """Have it decided anew how the gradient steps are run."""
+        """Drop the execution: how the gradient steps are run is decided anew before the next one."""
         self._execution = None
 
     def prepared_execution(self) -> Execution:
         """
-        :return: what runs the gradient steps, ready for those that follow
+        Prepare the gradient steps that follow.
+
+        :return: runner of the gradient steps
         """
         if self._execution is None or not self._execution.serves(self):
             self._execution = Execution.of(self)
@@ -333,10 +352,10 @@ class Learner:
 
     def update(self, batch: Batch, noise: Noise | None = None, extra: Extra | None = None) -> dict[str, torch.Tensor]:
         """
-        One gradient step, and what is due before it: resets, and what follows from the steps heard of.
+        Take one gradient step, after what is due before it: resets, and the parts' work after environment steps.
 
         :param batch: transitions, on the learner's device
-        :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly.
+        :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly
         :param extra: further transitions for a rule of pessimism that learns from some, from its ``draw``
         :return: what to log, by name, scalars on the learner's device
         """
@@ -352,10 +371,10 @@ class Learner:
 
     def act(self, observations: Any, deterministic: bool = False) -> torch.Tensor:
         """
-        Actions as the learner takes them.
+        Choose actions.
 
         :param observations: tensors on the learner's device, (B, O), or a dict of them
-        :param deterministic: the actor's mean action, as in evaluation, instead of what the explorer draws
+        :param deterministic: the actor's mean action, as in evaluation, instead of the explorer's sample
         :return: actions in [-1, 1], (B, A)
         """
         with self._random(), torch.inference_mode():
@@ -367,7 +386,7 @@ class Learner:
         self, batch: Batch, noise: Noise | None = None, extra: Extra | None = None, eager: bool = False
     ) -> dict[str, torch.Tensor]:
         """
-        One gradient step: what is drawn and counted around it, and the step.
+        Draw the noise, take one gradient step, and count it; without what :meth:`update` does before it.
 
         :param batch: transitions
         :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly.
@@ -405,12 +424,12 @@ class Learner:
         self, batch: Batch, noise: Noise, extra: Extra | None, moves_targets: bool, moves_actor: bool
     ) -> dict[str, torch.Tensor]:
         """
-        The gradient step (BRO, algorithm 2), of tensors only: it is what is compiled and captured.
+        Compute the gradient step (BRO, algorithm 2), on tensors only: this function is compiled or captured.
 
         :param batch: transitions
         :param noise: all that is random
         :param extra: further transitions for the rule of pessimism
-        :param moves_targets: whether the target critics follow in this step
+        :param moves_targets: whether the target critics are updated in this step
         :param moves_actor: whether actors and temperature learn in this step
         :return: what to log, by name, scalars
         """
@@ -445,7 +464,7 @@ class Learner:
             if self.networks.actor_target is not None:
                 self._follow(self.networks.actor_target, self.actor)
 
-            # Whoever explores, on the new critics and the new actor.
+            # Explorer, on the new critics and the new actor.
             metrics.update(self.explorer.update(self, batch, noise.exploration))
 
             # Temperature.
@@ -463,13 +482,13 @@ class Learner:
         return {name: value.detach() for name, value in metrics.items()}
 
     def _actor_value(self, q: torch.Tensor) -> torch.Tensor:
-        """The ensemble's value for the actor's objective, (E, B, K) to (B, K)."""
+        """Value of the ensemble in the actor's objective, (E, B, K) to (B, K)."""
         if self.actor_pessimism is None:
             return self.pessimism_rule.value(q)
         return pessimistic_value(q, float(self.actor_pessimism))
 
     def _follow(self, target: Any, online: Any) -> None:
-        """One step of Polyak averaging; with ``tau=1`` the target is the online network."""
+        """Take one step of Polyak averaging; with ``tau=1`` the target is the online network."""
         with torch.no_grad():
             torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), weight=self.tau)
             # Running statistics, as in Stable-Baselines3.
@@ -478,7 +497,7 @@ class Learner:
                 ours.copy_(theirs)
 
     def _sharpness_aware_step(self, loss: torch.Tensor, batch: Batch, target: torch.Tensor) -> None:
-        """One step of the critics' optimizer with the gradient from ``sam_radius`` uphill."""
+        """Take one step of the critics' optimizer with the gradient at the point ``sam_radius`` uphill."""
         assert self.sam_radius is not None
         parameters = list(self.critic.parameters())
         copied = {id(p) for p in self.critic.copied_parameters()}
@@ -494,7 +513,7 @@ class Learner:
     @staticmethod
     def minimize(optimizer: Optimizer, loss: torch.Tensor) -> None:
         """
-        One step of an optimizer. Only its own parameters get a gradient, whatever else the loss passed through.
+        Take one step of an optimizer. Only its own parameters get a gradient, also where the loss depends on others.
 
         :param optimizer: the optimizer
         :param loss: scalar
@@ -504,7 +523,7 @@ class Learner:
 
     @staticmethod
     def _descend(optimizer: Optimizer, gradients: Sequence[torch.Tensor | None]) -> None:
-        """One step of an optimizer with gradients in the order of its parameters."""
+        """Take one step of an optimizer with gradients in the order of its parameters."""
         if torch.compiler.is_compiling():
             assert isinstance(optimizer, AdamW)
             optimizer.apply(gradients)
@@ -518,6 +537,8 @@ class Learner:
 
     def state_dict(self) -> dict[str, Any]:
         """
+        Collect the learner's state.
+
         :return: everything that later steps depend on, besides the arguments
         """
         modules = {"networks": self.networks, "temperature": self.temperature, **self.parts_with_state()}
@@ -529,6 +550,8 @@ class Learner:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """
+        Restore the learner's state.
+
         :param state: from ``state_dict`` of a learner with the same arguments
         :raises ValueError: if it has other entries
         """
@@ -549,6 +572,8 @@ class Learner:
 
     def parts_with_state(self) -> dict[str, Part]:
         """
+        List the parts that are saved.
+
         :return: the parts that are saved, by the path from the learner
         """
         return {name: part for name, part in self.parts().items() if part.has_state}
@@ -584,7 +609,7 @@ class Learner:
                 state[name] = torch.lerp(state[name].to(parameter.device), parameter.detach(), shrink)
         module.load_state_dict(state)
         if shrink > 0:
-            # What follows from the weights, as the directions of spectral norms, is neither the old nor the fresh.
+            # Quantities computed from the weights, such as the directions of spectral norms, are refreshed.
             for network in module.modules():
                 if isinstance(network, Network):
                     network.refresh()

@@ -1,7 +1,8 @@
 """
-The losses of the off-policy family: pure functions of tensors.
+Losses of the off-policy family: pure functions of tensors.
 
-Shapes use the letters B batch, E critics, K quantiles, A action. "P5" is the BRO paper, "P3" the DAC paper.
+Shapes use the letters B batch, E critics, K quantiles, A action. The papers cited are BRO
+(https://arxiv.org/abs/2405.16158) and DAC (https://arxiv.org/abs/2310.19527).
 """
 
 import math
@@ -21,8 +22,8 @@ def td_target(
     entropy_bonus: torch.Tensor | float,
 ) -> torch.Tensor:
     """
-    The value that every critic is drawn to, ``r + discount * (1 - done) * (V(s') + entropy bonus)``
-    (P5, algorithm 2, line 8), quantile by quantile.
+    TD target of every critic, ``r + discount * (1 - done) * (V(s') + entropy bonus)`` (BRO, algorithm 2, line 8),
+    quantile by quantile.
 
     :param rewards: (B, 1)
     :param dones: (B, 1), 1 where the episode terminated; a time limit is 0
@@ -56,8 +57,8 @@ class _QuantileHuber(torch.autograd.Function):
         near above   x <= y <= x + 1  weight t        loss (y - x)^2 / 2      derivative x - y
         far above    y > x + 1        weight t        loss (y - x) - 1/2      derivative -1
 
-    A binary search gives the borders of the intervals, differences of prefix sums of y and y^2 the sums over
-    them. The prefix sums are float64 since they are differences of large numbers.
+    The borders of the intervals are found by binary search, the sums over them as differences of prefix sums of y and
+    y^2. The prefix sums are float64 since they are differences of large numbers.
     """
 
     @staticmethod
@@ -102,7 +103,7 @@ class _QuantileHuber(torch.autograd.Function):
 
 
 class _QuantileHuberPairs(torch.autograd.Function):
-    """The same over all K x K pairs, which a compiler fuses into one pass without storing them."""
+    """Quantile Huber loss over all K x K pairs, which a compiler fuses into one pass without storing them."""
 
     @staticmethod
     def forward(ctx: Any, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
@@ -129,7 +130,7 @@ class _QuantileHuberPairs(torch.autograd.Function):
 def quantile_huber(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """
     Quantile Huber loss, threshold 1: sum over the predicted quantiles, mean over the target quantiles and
-    the batch, summed over the critics (P5, algorithm 2, line 8; Dabney et al. 2018, eq. 10). The midpoint
+    the batch, summed over the critics (BRO, algorithm 2, line 8; Dabney et al. 2018, eq. 10). The midpoint
     of predicted quantile i is ``(i + 1/2) / K``. Exact: value and gradient are those of the K x K pairs.
 
     :param q: predicted quantiles, (E, B, K)
@@ -137,13 +138,13 @@ def quantile_huber(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     :return: scalar
     """
     if isinstance(q, QValues):
-        q = q.tensor  # A Function takes it for no tensor, and gives no gradient.
+        q = q.tensor  # An autograd Function would not take it for a tensor: no gradient.
     return (_QuantileHuberPairs if torch.compiler.is_compiling() else _QuantileHuber).apply(q, target)
 
 
 def actor_loss(log_prob: torch.Tensor, value: torch.Tensor, alpha: torch.Tensor | float) -> torch.Tensor:
     """
-    ``mean(alpha * log pi(a|s) - Q(s, a))`` (P5, algorithm 2, line 10).
+    Loss of the actor, ``mean(alpha * log pi(a|s) - Q(s, a))`` (BRO, algorithm 2, line 10).
 
     :param log_prob: log-probability of the sampled actions, (B, 1)
     :param value: the ensemble's value of them, (B, K); averaged over quantiles here
@@ -155,8 +156,8 @@ def actor_loss(log_prob: torch.Tensor, value: torch.Tensor, alpha: torch.Tensor 
 
 def temperature_loss(alpha: torch.Tensor, entropy: torch.Tensor, target_entropy: float) -> torch.Tensor:
     """
-    ``alpha * (H - H*)`` (P5, algorithm 2, line 13). The gradient goes through ``alpha`` itself, not its
-    logarithm as in stable_baselines3.
+    Loss of the temperature, ``alpha * (H - H*)`` (BRO, algorithm 2, line 13). The gradient goes through ``alpha``
+    itself, not its logarithm as in stable_baselines3.
 
     :param alpha: temperature, with gradient, scalar
     :param entropy: mean of ``-log pi`` over the batch, scalar
@@ -168,7 +169,7 @@ def temperature_loss(alpha: torch.Tensor, entropy: torch.Tensor, target_entropy:
 
 def optimistic_actor_loss(upper_value: torch.Tensor, kl: torch.Tensor, kl_weight: torch.Tensor) -> torch.Tensor:
     """
-    ``-mean(Q_upper) + weight * mean(KL)`` (P5, algorithm 2, line 12; P3, eq. 11).
+    Loss of the optimistic actor, ``-mean(Q_upper) + weight * mean(KL)`` (BRO, algorithm 2, line 12; DAC, eq. 11).
 
     :param upper_value: optimistic value of the sampled actions, (B, K)
     :param kl: divergence of the two policies, summed over the action's dimensions, (B, 1)
@@ -180,10 +181,10 @@ def optimistic_actor_loss(upper_value: torch.Tensor, kl: torch.Tensor, kl_weight
 
 def optimism_loss(optimism: torch.Tensor, reference: torch.Tensor | float, kl_gap: torch.Tensor) -> torch.Tensor:
     """
-    ``(beta_o - reference) * (KL / |A| - KL*)`` (P5, algorithm 2, line 14; P3, eq. 14).
+    Loss of the optimism, ``(beta_o - reference) * (KL / |A| - KL*)`` (BRO, algorithm 2, line 14; DAC, eq. 14).
 
-    The reference shifts the loss, not its gradient. The papers put beta_p there, which is minus our pessimism;
-    BRO's published code puts plus its pessimism.
+    The reference shifts the loss, not its gradient. In the papers it is beta_p, which is minus our pessimism; in BRO's
+    published code it is plus the pessimism.
 
     :param optimism: beta_o, with gradient, scalar
     :param reference: what optimism is measured from
@@ -195,7 +196,7 @@ def optimism_loss(optimism: torch.Tensor, reference: torch.Tensor | float, kl_ga
 
 def kl_weight_loss(kl_weight: torch.Tensor, kl_gap: torch.Tensor) -> torch.Tensor:
     """
-    ``-weight * (KL / |A| - KL*)`` (P5, algorithm 2, line 15; P3, eq. 14).
+    Loss of the divergence's weight, ``-weight * (KL / |A| - KL*)`` (BRO, algorithm 2, line 15; DAC, eq. 14).
 
     :param kl_weight: tau, with gradient, scalar
     :param kl_gap: ``KL / |A| - KL*``, scalar, without gradient

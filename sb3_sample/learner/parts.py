@@ -1,10 +1,10 @@
 """
-Exchangeable parts of an off-policy learner, and what they may ask of it.
+Exchangeable parts of an off-policy learner, and the learner's interface to them.
 
 A part is a ``torch.nn.Module``, so that its networks, learned numbers and buffers move with the learner's device and
-are saved with it (``state_dict``; numbers that are not tensors go into ``get_extra_state``). It hears of the
-environment and of the gradient steps through the methods of :class:`Part`, and through those of its own base class
-(``Pessimism.update``, ``Exploration.update``).
+are saved with it (``state_dict``; numbers that are not tensors go into ``get_extra_state``). The learner
+calls the methods of :class:`Part` at the steps of the environment and at the gradient steps, and those of its own base
+class (``Pessimism.update``, ``Exploration.update``).
 """
 
 from collections.abc import Iterable
@@ -19,22 +19,24 @@ from sb3_sample.learner.batch import Batch
 
 
 class Rule(Protocol):
-    """A rule of pessimism as the other parts see it."""
+    """Interface of a rule of pessimism to the other parts."""
 
     def beta(self) -> torch.Tensor | float:
         """
+        Weight of pessimism.
+
         :return: the weight in force, at least 0, a number or a scalar tensor without gradient
         """
 
 
 class Learning(Protocol):
     """
-    The learner as its parts see it.
+    Interface of the learner to its parts.
 
     ``actor``, ``critic`` and ``critic_target`` are the networks, ``temperature()`` the entropy's weight, a scalar,
-    ``head`` says what the critics' outputs are, ``gamma`` is the discount factor. ``n_updates`` counts gradient steps;
-    ``num_transitions`` the transitions heard of, over the learner's life, of which the first ``learning_starts`` have
-    random actions.
+    ``head`` gives the meaning of the critics' outputs, ``gamma`` is the discount factor. ``n_updates`` counts gradient
+    steps; ``num_transitions`` counts the environments' transitions over the learner's life, of which the first
+    ``learning_starts`` have random actions.
     """
 
     @property
@@ -72,6 +74,8 @@ class Learning(Protocol):
 
     def next_actions(self, observations: Any, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """
+        Sample the actions of a TD target.
+
         :param observations: next observations, (B, O), or a dict of them
         :param noise: standard normal noise, (B, A); drawn if None
         :return: actions of a TD target in [-1, 1], (B, A), and their log-probability, (B, 1)
@@ -79,18 +83,22 @@ class Learning(Protocol):
 
     def make_actor(self) -> Any:
         """
+        Make an actor.
+
         :return: an actor like the learner's, with parameters of its own
         """
 
     def make_optimizer(self, parameters: Iterable[nn.Parameter]) -> Optimizer:
         """
+        Make an optimizer.
+
         :param parameters: what to optimise
         :return: an optimizer with the settings of actor and critics
         """
 
     def minimize(self, optimizer: Optimizer, loss: torch.Tensor) -> None:
         """
-        One step of an optimizer. Only its own parameters get a gradient, whatever else the loss passed through.
+        Take one step of an optimizer. Only its own parameters get a gradient, also where the loss depends on others.
 
         :param optimizer: the optimizer
         :param loss: scalar
@@ -98,6 +106,8 @@ class Learning(Protocol):
 
     def make_explorer(self) -> Any:
         """
+        Make an explorer.
+
         :return: a freshly initialised explorer
         """
 
@@ -119,17 +129,16 @@ class Learning(Protocol):
 
 
 class Part(nn.Module):
-    """A part of an off-policy learner; its subclasses override what they need."""
+    """Part of an off-policy learner; subclasses override what they need."""
 
     #: Whether it has parameters, numbers or optimizers that are saved.
     has_state: ClassVar[bool] = True
-    #: Whether what of it is run in a gradient step can be compiled. A class from outside of this package says so
-    #: itself.
+    #: Whether its code in a gradient step can be compiled. A class from outside of this package declares it itself.
     compilable: ClassVar[bool] = True
 
     def optimizers(self) -> dict[str, Optimizer]:
         """
-        The part's optimizers by the name of the attribute that holds them. The learner saves them and clears their
+        List the part's optimizers by the name of the attribute that holds them. The learner saves them and clears their
         state at a reset.
         """
         return {}
@@ -164,8 +173,8 @@ class Part(nn.Module):
 
         :param learner: the learner
         :param rewards: unnormalised rewards, (n_envs,)
-        :param dones: whether each environment's episode ended, for whatever reason, (n_envs,)
-        :param infos: each environment's info; ``TimeLimit.truncated`` tells a time limit from a termination
+        :param dones: whether each environment's episode ended, by termination or truncation, (n_envs,)
+        :param infos: each environment's info; ``TimeLimit.truncated`` is true at a time limit
         """
 
     def on_episode_end(self, learner: Learning, env_index: int, episode_return: float) -> None:

@@ -1,5 +1,5 @@
 """
-Pessimism: how an ensemble of Q becomes one value, and how the weight of its spread moves.
+Pessimism: value of an ensemble of Q, and rules that move the weight of its spread.
 
 Everywhere in this package pessimism beta >= 0 is subtracted: ``Q_mean - beta * Q_std``, with the population
 standard deviation over the critics. With two critics the spread is ``|Q1 - Q2| / 2``, so 1 is clipped double
@@ -39,7 +39,7 @@ def epistemic_std(q: torch.Tensor) -> torch.Tensor:
 
 def pessimistic_value(q: torch.Tensor, beta: torch.Tensor | float) -> torch.Tensor:
     """
-    The one value of an ensemble, ``Q_mean - beta * Q_std``, quantile by quantile.
+    Value of an ensemble, ``Q_mean - beta * Q_std``, quantile by quantile.
 
     :param q: (E, B, K)
     :param beta: pessimism, at least 0
@@ -55,7 +55,8 @@ def pessimistic_value(q: torch.Tensor, beta: torch.Tensor | float) -> torch.Tens
 
 class Pessimism(Part):
     """
-    A constant weight, and the base class of the rules that move it: 1 is clipped double Q-learning, 0 the mean (BRO).
+    Constant weight of pessimism, and base class of the rules that move it; 1 is clipped double Q-learning, 0 the mean
+    (BRO).
 
     :param beta: the weight
     :raises ValueError: if it is negative or not finite
@@ -68,13 +69,15 @@ class Pessimism(Part):
 
     def beta(self) -> torch.Tensor | float:
         """
+        Weight of pessimism.
+
         :return: the weight in force, at least 0, a number or a scalar tensor without gradient
         """
         return self._beta
 
     def value(self, q: torch.Tensor) -> torch.Tensor:
         """
-        The one value of an ensemble under the weight in force.
+        Value of an ensemble under the weight in force.
 
         :param q: (E, B, K)
         :return: (B, K)
@@ -85,7 +88,7 @@ class Pessimism(Part):
         """
         Draw the transitions that the next update needs besides the step's batch; called before the step.
 
-        :param source: where the batches come from
+        :param source: source of the batches
         :return: the transitions, None if there are none
         """
         return None
@@ -99,13 +102,13 @@ class Pessimism(Part):
         extra: Extra | None = None,
     ) -> dict[str, torch.Tensor]:
         """
-        Move the weight; called last in every gradient step, and part of what is compiled.
+        Move the weight; called last in every gradient step, and compiled with it.
 
         :param learner: the learner, its networks already updated
         :param batch: the step's batch
-        :param step: what the critics' step computed of it
+        :param step: results of the critics' step for it
         :param noise: standard normal noise of the actions sampled for ``extra``, one row each; drawn if None
-        :param extra: what :meth:`draw` gave
+        :param extra: from :meth:`draw`
         :return: what to log, by name, scalars
         """
         return {}
@@ -113,28 +116,29 @@ class Pessimism(Part):
 
 class LearnedPessimism(Pessimism):
     """
-    A weight that is learned by gradient descent, one step of Adam a gradient step, and kept at least 0: GPL, OPL and
-    VPL are choices of ``loss`` and ``source``, and so are the variants of P4 (figures 8 and 9).
+    Weight that is learned by gradient descent, one step of Adam a gradient step, and kept at least 0: GPL, OPL and
+    VPL are choices of ``loss`` and ``source``, and so are the variants of the VPL paper
+    (https://arxiv.org/abs/2403.01014, figures 8 and 9).
 
     With the lower bound's TD error ``e = Q_mean(s, a) - r - gamma * (V_lb(s'))``, where ``V_lb`` holds beta:
 
-    - ``loss="squared"`` is VPL's ``mean(e^2)`` (P4, eq. 12); the gradient goes through the beta of ``V_lb``;
-    - ``loss="dual"`` is ``beta * mean(e)`` with the error as a constant (P4, eq. 6): beta rises where the lower bound
-      of the next state promises more than the critics' mean gives; for "on_policy", where ``e`` is the return minus
-      the lower bound of its state and action, where that bound promises more than the return kept.
+    - ``loss="squared"`` is VPL's ``mean(e^2)`` (VPL, eq. 12); the gradient goes through the beta of ``V_lb``;
+    - ``loss="dual"`` is ``beta * mean(e)`` with the error as a constant (VPL, eq. 6): beta rises where the target
+      by the lower bound of the next state exceeds the critics' mean; for "on_policy", where ``e`` is the return minus
+      the lower bound of its state and action, beta rises where that bound exceeds the return.
 
-    - ``source="replay"`` takes the gradient step's own batch (GPL), and what the critics' step has computed of it;
+    - ``source="replay"`` takes the gradient step's own batch (GPL), and the critics' step's results for it;
     - ``source="validation"`` takes transitions that are held out of training (VPL), ``round(validation_proportion *
       batch_size)`` of them, at least 1; there is no step before as many are held out;
     - ``source="recent"`` takes the latest 8 steps of every environment;
     - ``source="on_policy"`` (OPL) takes the latest 8 steps too and replaces the estimate ``Q_mean`` by the
-      TD(0.95) return of what really followed; see :meth:`lambda_returns`.
+      TD(0.95) return of the recorded steps; see :meth:`lambda_returns`.
 
-    What the papers leave open: the bootstrap ``V_lb`` is that of the TD target, of the target critics and a fresh
-    action of the actor, with its entropy bonus, since that is the value whose bias beta has to mend; with
-    ``target_subset`` it is that of the critics which make the step's own target, whatever the source. ``Q_mean(s, a)``
-    is of the online critics, all of them, which are trained towards it. The batch of replay is judged with the values
-    from before the step, which cost nothing more. Quantiles are averaged after the spread over critics is taken.
+    Left open by the papers and decided here: the bootstrap ``V_lb`` is that of the TD target, of the target critics and
+    a fresh action of the actor, with its entropy bonus, since beta corrects the bias of that value; with
+    ``target_subset`` it is that of the critics of the step's own target, for every source. ``Q_mean(s, a)`` is of all
+    online critics, which are trained towards it. The error on the batch of replay is that of the values from before the
+    step, which need no further computation. Quantiles are averaged after the spread over critics is taken.
 
     At a reset beta and its optimizer start anew, as every learned number does.
 
@@ -203,7 +207,9 @@ class LearnedPessimism(Pessimism):
 
     def draw(self, source: Source) -> Extra | None:
         """
-        :param source: where the batches come from
+        Draw the transitions of the source.
+
+        :param source: source of the batches
         :return: the transitions of "validation", "recent" and "on_policy"; None if there are too few yet
         """
         if self.source == "replay":
@@ -240,6 +246,8 @@ class LearnedPessimism(Pessimism):
         self, learner: Learning, extra: Extra, noise: torch.Tensor | None, subset: torch.Tensor | None
     ) -> torch.Tensor:
         """
+        Compute the lower bound's error on transitions other than the step's.
+
         :return: error of the lower bound on transitions other than the step's, (B,), its gradient through beta
         """
         batch = extra.batch
@@ -264,14 +272,14 @@ class LearnedPessimism(Pessimism):
     def _judge(
         learner: Learning, batch: Batch, noise: torch.Tensor | None, subset: torch.Tensor | None = None
     ) -> CriticStep:
-        """What the critics' step computes, of other transitions."""
+        """Compute what the critics' step computes, on other transitions."""
         with torch.no_grad():
             next_q, entropy_bonus = bootstrap(learner, batch, learner.temperature(), noise, subset)
             q = values(learner, learner.critic, batch.observations, batch.actions)
             return CriticStep(q, learner.head.values(next_q), entropy_bonus, subset)
 
     def _td_error(self, batch: Batch, step: CriticStep) -> torch.Tensor:
-        """``Q_mean(s, a) - r - gamma V_lb(s')``, (B,)."""
+        """TD error of the lower bound, ``Q_mean(s, a) - r - gamma V_lb(s')``, (B,)."""
         next_value = pessimistic_value(step.next_q, self.weight).mean(dim=1, keepdim=True)
         return step.q.mean(dim=(0, 2)) - td_target(batch, next_value, step.entropy_bonus).squeeze(1)
 
@@ -286,20 +294,20 @@ class LearnedPessimism(Pessimism):
         td_lambda: float,
     ) -> torch.Tensor:
         """
-        TD(lambda) returns of recent segments, the estimate of the true value that OPL compares the lower bound with
-        (P4, table 2; Kuznetsov et al. 2021)::
+        TD(lambda) returns of recent segments, OPL's estimate of the true value that the lower bound is compared with
+        (VPL, table 2; Kuznetsov et al. 2021)::
 
             G_t = r_t + gamma * (h + (1 - lambda) * V + lambda * G_{t+1})     within an episode
             G_t = r_t + gamma * (h + V)                                       at the segment's end and at a time limit
             G_t = r_t                                                         at a termination
 
-        V and h are the lower bound of, and the entropy bonus for, an action that the actor samples anew in the next
-        state: the log-probability of the recorded one is infinite where tanh rounds to 1. After a time limit the next
-        state is the one that the episode ended in, not the first of the next episode.
+        V and h are the lower bound of, and the entropy bonus for, a fresh action of the actor in the next state: the
+        log-probability of the recorded one is infinite where tanh rounds to 1. After a time limit the next state is the
+        one that the episode ended in, not the first of the next episode.
 
         :param rewards: r, (T, N) for N environments
         :param terminated: 1 where the episode terminated, (T, N)
-        :param ends: 1 where it ended for whatever reason, (T, N)
+        :param ends: 1 where it ended, by termination or truncation, (T, N)
         :param next_values: V, (T, N)
         :param entropy_bonus: h, (T, N)
         :param gamma: discount factor
@@ -327,10 +335,10 @@ class TOP(Pessimism):
     has none. One arm is in force for all environments. Once each of them has ended an episode under it, the bandit
     learns and draws anew; a second episode of a fast environment counts as well.
 
-    The papers' learning rate is for raw returns, up to 1000 an episode: the bandit is then quick to decide. Where
+    The papers' learning rate is for raw returns, up to 1000 an episode, with which the bandit decides quickly. Where
     returns are larger, make it smaller.
 
-    At a reset the bandit starts anew too, so that the arm in force is not blamed for the drop.
+    At a reset the bandit starts anew too, so that the drop of the return does not count against the arm in force.
 
     :param learner: the learner
     :param arms: the values of beta
@@ -365,6 +373,8 @@ class TOP(Pessimism):
 
     def probabilities(self) -> list[float]:
         """
+        Compute the bandit's distribution.
+
         :return: each arm's probability to be drawn
         """
         top = max(self.log_weights)
@@ -437,6 +447,8 @@ class TOP(Pessimism):
 
 def check_beta(name: str, beta: Any) -> None:
     """
+    Check a weight of pessimism.
+
     :param name: name of the argument
     :param beta: a weight of pessimism
     :raises ValueError: if it is not a finite number of at least 0
@@ -447,11 +459,11 @@ def check_beta(name: str, beta: Any) -> None:
 
 def gpl(learner: Learning, initial_pessimism: float = 1.0, learning_rate: float = 5e-5) -> LearnedPessimism:
     """
-    Generalized pessimism learning (Cetin and Celiktutan 2023; P4, eq. 6): the dual loss on replay.
+    Generalized pessimism learning (Cetin and Celiktutan 2023; VPL, eq. 6): the dual loss on replay.
 
     :param learner: the learner
     :param initial_pessimism: beta at the start
-    :param learning_rate: of beta; 5e-5 in P4, 1e-5 in P2
+    :param learning_rate: of beta; 5e-5 in the VPL paper, 1e-5 in the regularization study (2403.00514)
     :return: the rule
     """
     return LearnedPessimism(learner, "dual", "replay", initial_pessimism, learning_rate)
@@ -465,7 +477,7 @@ def opl(
     td_lambda: float = 0.95,
 ) -> LearnedPessimism:
     """
-    On-policy pessimism learning (Kuznetsov et al. 2021; P4, tables 2 and 5): the dual loss against the TD(lambda)
+    On-policy pessimism learning (Kuznetsov et al. 2021; VPL, tables 2 and 5): the dual loss against the TD(lambda)
     returns of the latest steps.
 
     :param learner: the learner
@@ -486,7 +498,7 @@ def vpl(
     source: str = "validation",
 ) -> LearnedPessimism:
     """
-    Validation pessimism learning (P4, eq. 12 and algorithm 1), and its variants.
+    Validation pessimism learning (VPL, eq. 12 and algorithm 1), and its variants.
 
     :param learner: the learner
     :param initial_pessimism: beta at the start

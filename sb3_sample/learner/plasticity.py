@@ -1,4 +1,4 @@
-"""Plasticity: what keeps the networks able to learn, at the steps that it names."""
+"""Plasticity: resets and recycling of neurons, which keep the networks able to learn."""
 
 import itertools
 from collections.abc import Sequence
@@ -16,20 +16,20 @@ from sb3_sample.networks.dormant import recycle
 
 class Resets(Part):
     """
-    Full-parameter resets (P5, section 2.2; Nikishin et al. 2022): every network, optimizer and learned number
+    Full-parameter resets (BRO, section 2.2; Nikishin et al. 2022): every network, optimizer and learned number
     starts anew, the replay buffer stays.
 
     With ``shrink`` above 0 it is shrink and perturb (Ash and Adams 2020, in the form of D'Oro et al. 2022): every
     parameter becomes ``shrink * old + (1 - shrink) * fresh``, target networks and learned numbers (on the scale on
     which they are learned, that of the logarithm for a temperature) included; the optimizers start anew.
 
-    A step counts transitions over the model's life, warm-up included and whatever ``learn`` zeroes; the reset
-    happens at the first update at or after it. The step reached is saved with the model, so that a loaded one
-    does not reset again.
+    A step counts transitions over the model's life, warm-up included and independent of ``num_timesteps``, which
+    ``learn`` zeroes; the reset happens at the first update at or after it. The step reached is saved with the model, so
+    that a loaded one does not reset again.
 
     With ``gradient_steps`` the resets are counted in gradient steps instead, over the model's life too (D'Oro et al.
-    2022: every 2,560,000). After each such number of them the reset comes before the next one is taken, so that nobody
-    acts, or is saved, with networks that have learned nothing.
+    2022: every 2,560,000). After each such number of them the reset comes before the next one is taken, so that
+    networks that have learned nothing neither act nor are saved.
 
     :param steps: transitions at which to reset, above 0, strictly ascending; an integer for every so many; none by
         default

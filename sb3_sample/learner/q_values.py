@@ -1,4 +1,4 @@
-"""What critics answer, for Stable-Baselines3's code and for this package's."""
+"""Values of critics, in the form of Stable-Baselines3 and in that of this package."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,9 +8,9 @@ import torch
 
 class QValues(tuple[torch.Tensor, ...]):
     """
-    The values of E critics: Stable-Baselines3's tuple of E tensors, (B, K) each (K = 1 if they are scalar), and,
-    wherever a tensor is wanted, the one tensor (E, B, K). ``torch.cat(q, dim=1)``, ``q1, q2 = q`` and loops over it see
-    the tuple; arithmetic, torch's other functions, tensors' methods and indices the tensor.
+    Values of E critics: Stable-Baselines3's tuple of E tensors, (B, K) each (K = 1 if they are scalar), and, where a
+    tensor is needed, the one tensor (E, B, K). ``torch.cat(q, dim=1)``, ``q1, q2 = q`` and loops over it use the tuple;
+    arithmetic, torch's other functions, tensors' methods and indices the tensor.
 
     :param tensor: (E, B, K)
     """
@@ -27,7 +27,7 @@ class QValues(tuple[torch.Tensor, ...]):
         return QValues, (self.tensor,)
 
     def __getattr__(self, name: str) -> Any:
-        # How it is copied and printed is no business of the tensor.
+        # Special methods, such as those of copying and printing, are not delegated to the tensor.
         if name.startswith("__"):
             raise AttributeError(name)
         return getattr(self.tensor, name)
@@ -49,8 +49,8 @@ class QValues(tuple[torch.Tensor, ...]):
 
 def evaluate(critics: Callable[..., Any], observations: Any, actions: torch.Tensor) -> torch.Tensor:
     """
-    Values of critics as one tensor, whether they answer as this package's or with a tensor: stand-ins, hooks on the
-    module and networks of one's own are asked like any other.
+    Values of critics as one tensor, from :class:`QValues` as from a tensor: stand-ins, hooks on the module and networks
+    from outside of this package are called like any other.
 
     :param critics: (B, O) and (B, A) to values
     :param observations: (B, O), or a dict of them
@@ -62,7 +62,7 @@ def evaluate(critics: Callable[..., Any], observations: Any, actions: torch.Tens
 
 
 def _with_tensors(values: Any) -> Any:
-    """The same nested lists, tuples and dicts, with tensors for the values of critics."""
+    """Copy of nested lists, tuples and dicts, with tensors in place of the values of critics."""
     if isinstance(values, QValues):
         return values.tensor
     if isinstance(values, dict):

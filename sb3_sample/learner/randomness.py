@@ -1,4 +1,4 @@
-"""Random generators of a learner's own."""
+"""Random generators of one learner."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,8 +9,8 @@ import torch
 
 class OwnGenerators:
     """
-    torch's generators of a learner of its own: inside :meth:`in_force` they stand in the place of the global ones, so
-    that initial weights, noise and dropout draw from them, and nothing else does.
+    Generators of torch for one learner: inside :meth:`in_force` they replace the global ones, so that initial weights,
+    noise and dropout draw from them, and nothing else does.
 
     :param seed: their seed
     :param device: where the learner computes
@@ -24,7 +24,7 @@ class OwnGenerators:
 
     @contextmanager
     def in_force(self) -> Iterator[None]:
-        """Put them in the place of the global generators."""
+        """Replace the global generators inside the context."""
         with self._kept():
             self._put(self._state)
             try:
@@ -53,12 +53,16 @@ class OwnGenerators:
 
     def state_dict(self) -> dict[str, Any]:
         """
+        Copy the generators' states.
+
         :return: their states
         """
         return {name: state.clone() for name, state in self._state.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
+        Restore the generators' states.
+
         :param state: from :meth:`state_dict`
         """
         self._state = {name: value.clone() for name, value in state.items()}

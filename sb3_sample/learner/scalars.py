@@ -10,7 +10,7 @@ from sb3_sample.kinds import check_value, number
 
 class LogScalar(nn.Module):
     """
-    A positive number, the exponential of its parameter.
+    Positive number, the exponential of its parameter.
 
     :param initial: initial value, above 0
     """
@@ -21,6 +21,8 @@ class LogScalar(nn.Module):
 
     def forward(self) -> torch.Tensor:
         """
+        Compute the value.
+
         :return: the value, a scalar with gradient
         """
         return self.log_value.exp()
@@ -28,7 +30,7 @@ class LogScalar(nn.Module):
 
 class BoundedLogScalar(nn.Module):
     """
-    A positive number whose logarithm is kept in an interval by a tanh (BRO's published code):
+    Positive number whose logarithm is kept in an interval by a tanh (BRO's published code):
     ``log(value) = low + (high - low) / 2 * (1 + tanh(parameter))``.
 
     :param name: name of the argument that gives the initial value, for the error
@@ -47,6 +49,8 @@ class BoundedLogScalar(nn.Module):
 
     def forward(self) -> torch.Tensor:
         """
+        Compute the value.
+
         :return: the value, a scalar with gradient
         """
         return torch.exp(self.low + self.half_range * (1 + torch.tanh(self.raw_value)))
@@ -54,7 +58,7 @@ class BoundedLogScalar(nn.Module):
 
 class FixedScalar(nn.Module):
     """
-    A number that is not learned, with the interface of one that is.
+    Number that is not learned, with the interface of one that is.
 
     :param value: the value
     """
@@ -67,6 +71,8 @@ class FixedScalar(nn.Module):
 
     def forward(self) -> torch.Tensor:
         """
+        Return the value.
+
         :return: the value, a scalar without gradient
         """
         return self.value

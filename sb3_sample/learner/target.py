@@ -1,4 +1,4 @@
-"""The TD target: the one place where it is made, for the gradient step, the rules of pessimism and the diagnostics."""
+"""TD target of the gradient step, of the rules of pessimism and of the diagnostics: the only place where it is made."""
 
 from typing import Any
 
@@ -12,11 +12,13 @@ from sb3_sample.learner.q_values import evaluate
 
 def values(learner: Learning, critics: Any, observations: Any, actions: torch.Tensor) -> torch.Tensor:
     """
+    Evaluate critics.
+
     :param learner: the learner
     :param critics: its critics, or the target critics
     :param observations: (B, O), or a dict of them
     :param actions: actions in [-1, 1], (B, A)
-    :return: values as rules of pessimism and actors see them, (E, B, K)
+    :return: values for rules of pessimism and actors, (E, B, K)
     """
     found: torch.Tensor = learner.head.values(evaluate(critics, observations, actions))
     return found
@@ -49,8 +51,10 @@ def bootstrap(
 
 def td_target(batch: Batch, next_values: torch.Tensor, entropy_bonus: torch.Tensor) -> torch.Tensor:
     """
+    Compute the TD target.
+
     :param batch: transitions, with discounts
-    :param next_values: one value of the ensemble, (B, K), as a rule of pessimism makes it of :func:`bootstrap`'s
+    :param next_values: value of the ensemble by a rule of pessimism, from :func:`bootstrap`'s outputs, (B, K)
     :param entropy_bonus: from :func:`bootstrap`, (B, 1)
     :return: target of every critic, (B, K); see :func:`~sb3_sample.learner.losses.td_target`
     """

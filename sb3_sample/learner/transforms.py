@@ -1,4 +1,4 @@
-"""Batch transforms: what is done to transitions between the replay and the gradient step."""
+"""Batch transforms: changes to transitions between the replay and the gradient step."""
 
 import torch
 
@@ -8,8 +8,9 @@ from sb3_sample.learner.parts import Learning, Part
 
 class BatchTransform(Part):
     """
-    Identity, and the base class of transforms. One hears of the environment as every part does, has its statistics in
-    buffers, and is applied to the step's batch and to the further transitions of a rule of pessimism, before the step.
+    Identity, and base class of transforms. A transform is told of the environment's steps as every part is, holds its
+    statistics in buffers, and is applied before the step to its batch and to the further transitions of a rule of
+    pessimism.
 
     :param learner: the learner, whose networks exist already
     """
@@ -19,6 +20,8 @@ class BatchTransform(Part):
 
     def draw(self, batch: Batch) -> torch.Tensor | None:
         """
+        Draw the random numbers of a transform.
+
         :param batch: transitions
         :return: the random numbers that :meth:`transform` needs for them; None if there are none
         """
@@ -26,6 +29,8 @@ class BatchTransform(Part):
 
     def transform(self, batch: Batch, noise: torch.Tensor | None) -> Batch:
         """
+        Transform a batch.
+
         :param batch: transitions
         :param noise: from :meth:`draw`
         :return: the transitions that are learned from

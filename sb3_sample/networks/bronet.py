@@ -38,7 +38,7 @@ class BroNet(Network):
     :param width: width of every layer
     :param n_blocks: number of residual blocks, at least 0
     :param n_copies: E for E independent trunks, None for one
-    :param first_layer_norm: False for "BRO wo first LN" (P5, figure 14): Dense, ReLU, then the blocks
+    :param first_layer_norm: False for "BRO wo first LN" (BRO, figure 14): Dense, ReLU, then the blocks
     :raises ValueError: if a size is out of range
     """
 

@@ -1,4 +1,4 @@
-"""The residual network with spectral norms that BroNet was compared with (P5, figure 14)."""
+"""The residual network with spectral norms that BroNet was compared with (BRO, figure 14)."""
 
 import torch
 from torch import nn
@@ -29,12 +29,12 @@ class SpectralBlock(nn.Module):
 
 class SpectralNet(Network):
     """
-    "Spectral" of P5, figure 14 and table 1, the design of Bjorck et al. (2021): Dense, ReLU, then residual blocks with
-    the layer norm at their beginning and spectral norms inside.
+    "Spectral" of the BRO paper, figure 14 and table 1, the design of Bjorck et al. (2021): Dense, ReLU, then residual
+    blocks with the layer norm at their beginning and spectral norms inside.
 
-    P5 does not say what follows the first Dense. There is a ReLU and no norm here, since P5 gets its "BRO wo first
-    LN" from this network by replacing the spectral norms "in the residual blocks": outside of the blocks the two are
-    then the same. As in BroNet, nothing follows the last addition.
+    The paper does not say what follows the first Dense. There is a ReLU and no norm here, since the paper gets its "BRO
+    wo first LN" from this network by replacing the spectral norms "in the residual blocks": outside of the blocks the
+    two are then the same. As in BroNet, nothing follows the last addition.
 
     :param in_features: width of the input
     :param width: width of every layer

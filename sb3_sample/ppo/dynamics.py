@@ -1,4 +1,4 @@
-"""The learned model of the environment: a transition and a reward network (P1, appendix E), and their transitions."""
+"""The learned model of the environment: a transition and a reward network (MBMA, appendix E), and their transitions."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ from sb3_sample.networks.initialization import linear
 from sb3_sample.networks.mlp import MLP
 from sb3_sample.optim import AdamW
 
-#: Epsilon of Adam for every network of P1.
+#: Epsilon of Adam for every network of the MBMA paper.
 ADAM_EPS = 1e-5
 
 
@@ -186,18 +186,18 @@ class Prediction(NamedTuple):
 
 class Dynamics(nn.Module):
     """
-    The model of P1, appendix E: "Transition model inputs concatenated state-action and outputs a state vector [...]
+    The model of MBMA, appendix E: "Transition model inputs concatenated state-action and outputs a state vector [...]
     trained using MSE loss function with future state used as a target", and likewise the reward model. Two networks
     without shared layers, hidden layers with ReLU.
 
     :param observation_size: O
     :param action_size: D
-    :param width: width of the hidden layers of both networks (P1: 1024)
-    :param depth: hidden layers of both networks (P1: 2)
+    :param width: width of the hidden layers of both networks (MBMA: 1024)
+    :param depth: hidden layers of both networks (MBMA: 2)
     :param learning_rate: of Adam, whose epsilon is 1e-5
     :param normalize: whether observations and rewards are shifted and scaled by the mean and standard deviation of the
-        transitions that the model is trained on, at the input and in the errors. P1 does not say that it does; without
-        it, entries of large numbers are learned at the cost of all others
+        transitions that the model is trained on, at the input and in the errors. MBMA's paper does not mention it;
+        without it, entries of large numbers are learned at the cost of all others
     :param terminations: whether a second output of the reward network predicts that the episode terminates, by its
         cross-entropy
     """

@@ -8,12 +8,12 @@ from sb3_sample.ppo.simulated_ppo import SimulatedSamples
 
 class MBMAPPO(ModelBasedPPO):
     """
-    Model-based many-actions PPO (P1, Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011, section 4 and
+    Model-based many-actions PPO (MBMA, Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011, section 4 and
     appendix E): PPO with ``n_simulated`` extra actions at each real state. Their Q-values are TD(lambda) returns of
     rollouts of a learned model under the policy, ``simulation_horizon`` steps long and bootstrapped with the critic.
 
-    Defaults are those of P1, appendix B.2. They differ from ``stable_baselines3.PPO`` in the networks (512 and 1024
-    instead of 64) and in that advantages are not normalised.
+    Defaults are those of the paper, appendix B.2. They differ from ``stable_baselines3.PPO`` in the networks (512 and
+    1024 instead of 64) and in that advantages are not normalised.
 
     :param policy: "MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes
     :param env: the environment, an id, or a vectorised environment

@@ -8,7 +8,7 @@ from sb3_sample.ppo.simulated_ppo import SimulatedSamples
 
 class MBPOPPO(ModelBasedPPO):
     """
-    PPO with simulated states, the rival of :class:`MBMAPPO` (P1, section 5.1; MBPO by Janner et al. 2019): from each
+    PPO with simulated states, the rival of :class:`MBMAPPO` (MBMA, section 5.1; MBPO by Janner et al. 2019): from each
     real state the learned model is rolled for ``simulation_horizon`` steps under the policy, and the policy gradient
     is also taken at its first ``n_simulated`` states, which makes the trajectory ``n_simulated`` + 1 times as long.
 

@@ -18,7 +18,7 @@ from sb3_sample.ppo.dynamics import Dynamics, TransitionBuffer, Transitions
 from sb3_sample.ppo.simulated_ppo import SimulatedPPO
 from sb3_sample.saving.kept import Kept
 
-#: What ``dynamics_kwargs`` may hold, with the defaults (P1, appendix B.2; ``normalize`` is decided here).
+#: What ``dynamics_kwargs`` may hold, with the defaults (MBMA, appendix B.2; ``normalize`` is decided here).
 DYNAMICS_DEFAULTS: dict[str, Any] = {
     "width": 1024,
     "depth": 2,
@@ -60,7 +60,7 @@ def lambda_returns(
     gae_lambda: float,
 ) -> torch.Tensor:
     """
-    TD(lambda) returns bootstrapped with the critic (P1, algorithm 1, line 9):
+    TD(lambda) returns bootstrapped with the critic (MBMA, algorithm 1, line 9):
     ``G_k = r_k + gamma c_k ((1 - lambda) V(s_{k+1}) + lambda G_{k+1})``, ``G_H = V(s_H)``.
 
     :param rewards: (H, B)
@@ -81,7 +81,7 @@ def lambda_returns(
 
 class ModelBasedPPO(SimulatedPPO):
     """
-    :class:`SimulatedPPO` with a learned model of the environment (P1, appendix E), the base of :class:`MBMAPPO` and
+    :class:`SimulatedPPO` with a learned model of the environment (MBMA, appendix E), the base of :class:`MBMAPPO` and
     :class:`MBPOPPO`. Each iteration the model is trained on the most recent transitions, before the policy.
 
     :param policy: "MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes
@@ -96,7 +96,7 @@ class ModelBasedPPO(SimulatedPPO):
         and in the errors, by the transitions that it learns from
     :param predict_termination: whether the model predicts that episodes terminate: off suits tasks whose episodes end
         by time limits only. None: off for the tasks of the DeepMind Control suite, ``dmc/...``, none of which
-        terminates (P1's setting), and for other environments with a true attribute ``never_terminates``; else on
+        terminates (MBMA's setting), and for other environments with a true attribute ``never_terminates``; else on
     :param kwargs: every other argument of :class:`SimulatedPPO`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -186,7 +186,7 @@ class ModelBasedPPO(SimulatedPPO):
 
     def fit_models(self) -> None:
         """
-        Train the model for ``epochs`` times PPO's minibatches on batches drawn from the transitions so far (P1,
+        Train the model for ``epochs`` times PPO's minibatches on batches drawn from the transitions so far (MBMA,
         algorithm 1, lines 5 to 7), and log its losses: before the training on the new transitions, which it has not
         seen (``dynamics/heldout_...``), and during it (``dynamics/train_...``).
 

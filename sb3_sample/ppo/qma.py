@@ -16,7 +16,7 @@ from sb3_sample.ppo.dynamics import ADAM_EPS, Standardizer, fit, minibatches
 from sb3_sample.ppo.simulated_ppo import SimulatedPPO, SimulatedSamples
 from sb3_sample.saving.kept import Kept
 
-#: What ``q_kwargs`` may hold, with the defaults (P1, appendix B.2; ``normalize`` is decided here).
+#: What ``q_kwargs`` may hold, with the defaults (MBMA, appendix B.2; ``normalize`` is decided here).
 Q_DEFAULTS: dict[str, Any] = {"width": 1024, "depth": 2, "learning_rate": 3e-4, "epochs": None, "normalize": True}
 
 
@@ -26,8 +26,8 @@ class QNetworks(nn.Module):
 
     :param observation_size: O
     :param action_size: D
-    :param width: width of the hidden layers (P1: 1024)
-    :param depth: hidden layers (P1: 2)
+    :param width: width of the hidden layers (MBMA: 1024)
+    :param depth: hidden layers (MBMA: 2)
     :param learning_rate: of Adam, whose epsilon is 1e-5
     :param normalize: whether observations are standardised by those that the networks are trained on
     """
@@ -69,8 +69,8 @@ class QNetworks(nn.Module):
 
 class QMAPPO(SimulatedPPO):
     """
-    PPO with many actions by Q-networks, the rival of :class:`MBMAPPO` (P1, section 5.1; Asadi et al. 2017, Petit et al.
-    2019): ``n_simulated`` extra actions at each real state, their Q-values the smaller of two Q-networks' that are
+    PPO with many actions by Q-networks, the rival of :class:`MBMAPPO` (MBMA, section 5.1; Asadi et al. 2017, Petit et
+    al. 2019): ``n_simulated`` extra actions at each real state, their Q-values the smaller of two Q-networks' that are
     trained on the TD(lambda) returns of each rollout before the policy, by PPO's minibatches and epochs.
 
     :param policy: "MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes

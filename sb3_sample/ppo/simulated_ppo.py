@@ -1,7 +1,7 @@
 """
 The on-policy family: PPO whose policy gradient also sees simulated samples, and the one class that carries the work.
 
-``SimulatedPPO.train`` is the whole iteration after the rollout, in the order of P1, algorithm 1. Where the extra
+``SimulatedPPO.train`` is the whole iteration after the rollout, in the order of MBMA, algorithm 1. Where the extra
 samples come from is the business of its subclasses, in ``fit_models`` and ``_simulate``.
 """
 
@@ -39,9 +39,9 @@ from sb3_sample.training.resumable import Resumable
 
 Self = TypeVar("Self", bound="SimulatedPPO")
 
-#: Hidden widths of actor and critic (P1, appendix B.2), of the policies that are given by these names.
+#: Hidden widths of actor and critic (MBMA, appendix B.2), of the policies that are given by these names.
 NET_ARCH: dict[str, list[int]] = {"pi": [512, 512], "vf": [1024, 1024]}
-#: Share of the training over which the number of samples rises (P1, section 5.1).
+#: Share of the training over which the number of samples rises (MBMA, section 5.1).
 WARM_UP = 0.15
 NAMED_POLICIES = ("MlpPolicy", "MultiInputPolicy")
 
@@ -88,9 +88,9 @@ class SimulatedSamples(NamedTuple):
 
 class SimulatedPPO(Resumable, SafeFiles, PPO):
     """
-    PPO whose policy loss also sees simulated samples (P1, Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011,
-    algorithm 1): what :class:`MBMAPPO`, :class:`QMAPPO` and :class:`MBPOPPO` share. The critic learns from the real
-    samples alone.
+    PPO whose policy loss also sees simulated samples (MBMA, Nauman and Cygan 2023,
+    https://arxiv.org/abs/2210.13011, algorithm 1): what :class:`MBMAPPO`, :class:`QMAPPO` and :class:`MBPOPPO` share.
+    The critic learns from the real samples alone.
 
     The number of updates is PPO's: each takes ``batch_size`` real samples with the simulated ones that belong to them
     for the policy, and the real ones for the value. Without simulated samples it *is* Stable-Baselines3's PPO.
@@ -106,7 +106,7 @@ class SimulatedPPO(Resumable, SafeFiles, PPO):
     :param clip_range: PPO's clipping of the probability ratio, of real and simulated samples; also a schedule
     :param clip_range_vf: clipping of the value's change; None for none
     :param normalize_advantage: whether advantages are normalised, in each minibatch, real and simulated samples
-        together. P1, section 5.1, does not, since "it has no grounding in SPG theory"
+        together. The paper, section 5.1, does not, since "it has no grounding in SPG theory"
     :param ent_coef: weight of the entropy at the real states
     :param vf_coef: weight of the value loss
     :param max_grad_norm: of the gradient of actor and critic together
@@ -118,8 +118,8 @@ class SimulatedPPO(Resumable, SafeFiles, PPO):
         policy loss; None for no limit
     :param stats_window_size: episodes over which the logged return is averaged
     :param tensorboard_log: folder of the TensorBoard log; none if None
-    :param policy_kwargs: arguments of the policy. Without ``net_arch``, "MlpPolicy" and "MultiInputPolicy" have P1's
-        two hidden layers of 512 (actor) and 1024 (critic)
+    :param policy_kwargs: arguments of the policy. Without ``net_arch``, "MlpPolicy" and "MultiInputPolicy" have the
+        paper's two hidden layers of 512 (actor) and 1024 (critic)
     :param verbose: 0 nothing, 1 info, 2 debug
     :param seed: seed of everything random
     :param device: "auto", "cpu", "cuda", ...
@@ -132,8 +132,8 @@ class SimulatedPPO(Resumable, SafeFiles, PPO):
         ``reset_num_timesteps=False``
     :param warm_up_until: share of the training over which X rises linearly from 0 to ``n_simulated`` while the models
         learn, rounded up too; 0 for no rise. None: 0.15, or 0 if ``anneal_until`` is given. With both, the two factors
-        are multiplied. P1, section 5.1: "We anneal the number of additional samples until 15% step of the training for
-        all methods". The default reads it as a rise that ends at 15%; ``anneal_until=0.15`` is the other reading, a
+        are multiplied. MBMA, section 5.1: "We anneal the number of additional samples until 15% step of the training
+        for all methods". The default reads it as a rise that ends at 15%; ``anneal_until=0.15`` is the other reading, a
         decline to none that ends there, with which nothing is left of the gain over PPO (docs/many_actions.md)
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -239,7 +239,7 @@ class SimulatedPPO(Resumable, SafeFiles, PPO):
         if self._has_named_policy:
             kwargs.setdefault("net_arch", {name: list(widths) for name, widths in NET_ARCH.items()})
         optimizer_class = kwargs.get("optimizer_class", torch.optim.Adam)
-        # Without any, Stable-Baselines3's own, whose epsilon is P1's too.
+        # Without any, Stable-Baselines3's own, whose epsilon is the paper's too.
         given = kwargs.get("optimizer_kwargs") or {"eps": 1e-5}
         fusible = optimizer_class is torch.optim.Adam and self.device.type in ("cpu", "cuda")
         if self.n_simulated > 0 and fusible and not {"foreach", "differentiable"} & given.keys():
@@ -383,7 +383,7 @@ class SimulatedPPO(Resumable, SafeFiles, PPO):
 
     def train(self) -> None:
         """
-        Update models, policy and value with the present rollout (P1, algorithm 1, lines 5 to 13).
+        Update models, policy and value with the present rollout (MBMA, algorithm 1, lines 5 to 13).
 
         :raises TrainingDiverged: if a loss or a parameter is NaN or infinite
         """
@@ -569,7 +569,7 @@ class SimulatedPPO(Resumable, SafeFiles, PPO):
 
     def _update_policy(self, rollout: Rollout, samples: SimulatedSamples) -> None:
         """
-        PPO's epochs over the rollout and the samples that belong to it (P1, algorithm 1, lines 10 to 13).
+        PPO's epochs over the rollout and the samples that belong to it (MBMA, algorithm 1, lines 10 to 13).
 
         :param rollout: the real samples
         :param samples: the simulated ones

@@ -1,1 +1,1 @@
-"""Sources of batches: replay buffers, and transitions that are already there."""
+"""Sources of batches: replay buffers, and fixed data sets."""

@@ -24,14 +24,14 @@ def samples_at(
     buffer: ReplayBuffer, positions: np.ndarray, env_indices: np.ndarray, vec_normalize: VecNormalize | None = None
 ) -> ReplayBufferSamples | DictReplayBufferSamples:
     """
-    Named transitions of a replay buffer, each one step, whatever the buffer's own ``sample`` makes of them
-    (n-step returns, relabelled goals).
+    Transitions of a replay buffer at given places, each one step, without the changes that the buffer's own ``sample``
+    makes (n-step returns, relabelled goals).
 
     :param buffer: Stable-Baselines3's replay buffer or a subclass
     :param positions: places in the buffer, (N,)
     :param env_indices: which environment's transition, (N,)
     :param vec_normalize: normalises observations and rewards
-    :return: N transitions, as the buffer's ``sample`` gives them
+    :return: N transitions, in the form of the buffer's ``sample``
     """
 
     def rows(arrays: Any, at: np.ndarray) -> Any:
@@ -65,9 +65,9 @@ def samples_at(
 
 class ValidationSplit(CompactReplay):
     """
-    What a replay buffer gains that holds transitions out (P4, section 4.1 and algorithm 1, lines 4-10): each
+    Mixin of the replay buffers that hold transitions out (VPL, section 4.1 and algorithm 1, lines 4-10): each
     transition of each environment goes to the validation side with a given probability, for as long as it is in the
-    buffer. ``sample`` never gives such a transition, ``sample_validation`` nothing else.
+    buffer. ``sample`` never returns such a transition, ``sample_validation`` nothing else.
 
     Nothing is stored twice: the split is a mask, and a list of the places that it marks.
 
@@ -113,6 +113,8 @@ class ValidationSplit(CompactReplay):
 
     def columns(self) -> dict[str, np.ndarray]:
         """
+        List the arrays of the rows.
+
         :return: what a row holds, as of ``CompactReplayBuffer``, and ``held_out``
         """
         return super().columns() | {"held_out": self.held_out}
@@ -138,6 +140,8 @@ class ValidationSplit(CompactReplay):
 
     def training_places(self, n: int) -> np.ndarray:
         """
+        Draw places of training transitions.
+
         :param n: how many
         :return: places of training transitions (position * n_envs + environment), uniformly with replacement, (n,)
         :raises ValueError: if there is none
@@ -173,22 +177,22 @@ class ValidationSplit(CompactReplay):
 
 
 class ValidationReplayBuffer(ValidationSplit, CompactReplayBuffer):  # type: ignore[misc, override]
-    """A replay buffer that holds transitions out."""
+    """Replay buffer that holds transitions out."""
 
 
 class ValidationDictReplayBuffer(ValidationSplit, CompactDictReplayBuffer):  # type: ignore[misc, override]
-    """The same for dict observations."""
+    """Replay buffer for dict observations that holds transitions out."""
 
 
 def latest(buffer: ReplayBuffer, n_steps: int, vec_normalize: VecNormalize | None = None) -> tuple[Any, torch.Tensor]:
     """
-    The latest steps of every environment.
+    Gather the latest steps of every environment.
 
     :param buffer: replay buffer
     :param n_steps: T, steps of each environment
     :param vec_normalize: normalises observations and rewards
-    :return: T * n_envs transitions, the oldest step of every environment first; and where an episode ended with the
-        step, for whatever reason (1), (T, n_envs)
+    :return: T * n_envs transitions, the oldest step of every environment first; and 1 where an episode ended with
+        the step, by termination or truncation, (T, n_envs)
     :raises ValueError: if the buffer holds fewer steps
     """
     if buffer.size() < n_steps:
@@ -201,7 +205,7 @@ def latest(buffer: ReplayBuffer, n_steps: int, vec_normalize: VecNormalize | Non
 
 class DeviceReplayBuffer(ReplayBuffer):
     """
-    A replay buffer in the memory of the model's device: each transition is moved once, when it is stored, and batches
+    Replay buffer in the memory of the model's device: each transition is moved once, when it is stored, and batches
     are gathered where they are needed. For a GPU; on a CPU it is the plain buffer with other arrays.
 
     Pass ``replay_buffer_class=DeviceReplayBuffer``. For one observation, not a dict of them. It draws the same
@@ -273,6 +277,8 @@ class DeviceReplayBuffer(ReplayBuffer):
 
     def to_torch(self, array: Any, copy: bool = True) -> torch.Tensor:
         """
+        Move an array to the device.
+
         :param array: rows of the buffer, or an array of the host
         :param copy: whether the result has memory of its own
         :return: the same as a tensor on the device
@@ -284,7 +290,7 @@ class DeviceReplayBuffer(ReplayBuffer):
 
 def store_float_actions(buffer: ReplayBuffer) -> None:
     """
-    Have an empty buffer store actions as floats where Stable-Baselines3's cuts what lies in [-1, 1] to integers.
+    Make an empty buffer store actions as floats where Stable-Baselines3's truncates actions in [-1, 1] to integers.
 
     :param buffer: the buffer
     """
@@ -305,15 +311,17 @@ PLAIN_BUFFERS = (
 #: Buffers whose every transition is drawn independently, so that one large draw can be cut into batches. Others compose
 #: each batch (HerReplayBuffer: so many real, so many relabelled transitions) and are asked once a gradient step.
 INDEPENDENT_BUFFERS = (*PLAIN_BUFFERS, NStepReplayBuffer, DeviceReplayBuffer)
-#: What a buffer's samples are made by.
+#: Methods that make a buffer's samples.
 _SAMPLING = ("sample", "_get_samples", "_at", "training_places", "to_torch", "_normalize_obs", "_normalize_reward")
 _OWN_SAMPLING = {cls: [getattr(cls, name, None) for name in _SAMPLING] for cls in INDEPENDENT_BUFFERS}
 
 
 def samples_as_its_class(buffer: ReplayBuffer) -> bool:
     """
+    Check that a buffer's draws are independent.
+
     :param buffer: a replay buffer
-    :return: whether it is one of ``INDEPENDENT_BUFFERS`` whose sampling nobody has replaced, in the class or the object
+    :return: whether it is one of ``INDEPENDENT_BUFFERS``, its sampling replaced neither in the class nor in the object
     """
     present = [getattr(type(buffer), name, None) for name in _SAMPLING]
     return _OWN_SAMPLING.get(type(buffer)) == present and vars(buffer).keys().isdisjoint(_SAMPLING)
@@ -322,7 +330,7 @@ def samples_as_its_class(buffer: ReplayBuffer) -> bool:
 class BatchMemory:
     """
     Memory that the transitions of gradient steps are gathered into, used again and again, and from which they are moved
-    to the device at once. On a CPU what was gathered holds until the next time.
+    to the device at once. On a CPU the gathered transitions are valid until the next call of :meth:`gather`.
     """
 
     def __init__(self) -> None:
@@ -332,16 +340,18 @@ class BatchMemory:
     @staticmethod
     def serves(buffer: ReplayBuffer, vec_normalize: VecNormalize | None) -> bool:
         """
+        Check that transitions can be gathered without the buffer's own ``sample``.
+
         :param buffer: replay buffer
         :param vec_normalize: what normalises the samples
-        :return: whether transitions can be gathered from the buffer without asking it
+        :return: whether they can
         """
         is_plain = type(buffer) in PLAIN_BUFFERS and samples_as_its_class(buffer)
         return is_plain and not buffer.optimize_memory_usage and vec_normalize is None
 
     def gather(self, buffer: ReplayBuffer, n: int) -> ReplayBufferSamples | DictReplayBufferSamples:
         """
-        Draw transitions to train on, uniformly with replacement: the same that ``buffer.sample(n)`` would give.
+        Draw transitions to train on, uniformly with replacement: the same as ``buffer.sample(n)`` would.
 
         :param buffer: a buffer that this memory serves
         :param n: how many

@@ -18,7 +18,7 @@ from sb3_sample.replay import memory_map as files
 from sb3_sample.replay.next_observations import NEXT_ROW, ONLY, NextObservations, SideStore
 from sb3_sample.replay.rows import action_dtype, as_actions, as_observation, as_row, as_timeouts
 
-try:  # As in Stable-Baselines3: without it nobody looks at the memory.
+try:  # As in Stable-Baselines3: without it the free memory is not checked.
     import psutil
 except ImportError:
     psutil = None
@@ -30,12 +30,12 @@ def _file_name(column: str, key: str) -> str:
 
 class CompactReplay:
     """
-    What a replay buffer gains that stores one observation a step.
+    Replay buffer that stores one observation a step.
 
     The next observation of row t is the observation of row t + 1, except where the two differ in a bit: at the end of
-    an episode, where ``learn`` reset the environment, wherever else the sequence broke. That is seen when row t + 1
-    comes, and what differs is kept aside. So every transition is the one that Stable-Baselines3's buffer would hold,
-    time limits included, and none is lost when the buffer is full.
+    an episode, where ``learn`` reset the environment, or where the sequence broke otherwise. The two are compared when
+    row t + 1 is stored, and a next observation that differs is kept aside. So every transition is that of
+    Stable-Baselines3's buffer, time limits included, and none is lost when the buffer is full.
 
     :param buffer_size: capacity in transitions
     :param observation_space: of the environment
@@ -118,13 +118,15 @@ class CompactReplay:
 
     def stored(self) -> dict[str, np.ndarray]:
         """
+        Return the arrays of observations.
+
         :return: the observations by key, (buffer_size, n_envs, O) each
         """
         return self.observations if isinstance(self.observations, dict) else {ONLY: self.observations}
 
     @property
     def next_observations(self) -> Any:
-        """The next observations, or a dict of them, to be read like an array of (buffer_size, n_envs, O)."""
+        """Next observations, or a dict of them, to be read like an array of (buffer_size, n_envs, O)."""
         if isinstance(self.observations, dict):
             return {key: NextObservations(self, key) for key in self.observations}
         return NextObservations(self)
@@ -181,7 +183,7 @@ class CompactReplay:
         }
 
     def _replacing(self, row: int) -> None:
-        """A step is about to be stored in a row."""
+        """Called when a step is about to be stored in a row."""
 
     def _set_newest(self, row: int, following: dict[str, np.ndarray]) -> None:
         for key, array in self.aside.newest().items():
@@ -189,7 +191,7 @@ class CompactReplay:
         self.slot[row] = self.aside.slots_of_newest
 
     def _settle(self, row: int, now: dict[str, np.ndarray]) -> None:
-        """The newest row is followed by another: decide where its next observation is, given that one's observation."""
+        """Decide where the next observation of the newest row is, given the observation of the row that follows."""
         pending = self.aside.newest()
         if all(array.tobytes() == now[key].tobytes() for key, array in pending.items()):
             self.slot[row] = NEXT_ROW
@@ -213,7 +215,9 @@ class CompactReplay:
 
     def columns(self) -> dict[str, np.ndarray]:
         """
-        :return: what a row holds besides its next observation, by name, (buffer_size, n_envs, ...) each; the
+        List the arrays of the rows.
+
+        :return: the columns of a row but its next observation, by name, (buffer_size, n_envs, ...) each; the
             observations are ``observations``, or ``observations/<key>``
         """
         assert isinstance(self, ReplayBuffer)
@@ -221,13 +225,13 @@ class CompactReplay:
         return columns | {name: getattr(self, name) for name in ("actions", "rewards", "dones", "timeouts")}
 
     def _apart(self, index: np.ndarray, places: np.ndarray) -> dict[str, np.ndarray]:
-        """Next observations that are not the next row's, named by ``index``, as they lie in files."""
+        """Next observations that are not the next row's, by ``index``, in the layout of files."""
         values = self._following(places)
         return {"next_index": index} | {_file_name("next_observations", key): value for key, value in values.items()}
 
     def new_rows(self, n: int) -> dict[str, np.ndarray]:
         """
-        The newest steps of every environment, whole in themselves.
+        Copy the newest steps of every environment, complete without the rows before them.
 
         :param n: how many
         :return: copies of the :meth:`columns`, oldest step first, (n, n_envs, ...) each; ``next_index``, (M,), the
@@ -246,7 +250,7 @@ class CompactReplay:
 
     def restore_rows(self, pieces: Iterable[tuple[int, dict[str, np.ndarray]]]) -> None:
         """
-        Make the buffer the one that :meth:`new_rows` was called on, row for row, whatever it held before.
+        Restore the buffer that :meth:`new_rows` was called on, row for row; its own content is dropped.
 
         :param pieces: the number of the first step, counted over the run such that step i lies in row
             i % ``buffer_size``; and the steps from there on. A piece goes on where the one before ended, or replaces
@@ -272,6 +276,8 @@ class CompactReplay:
 
     def _replace(self, rows: np.ndarray, piece: dict[str, np.ndarray], keeps_before: bool) -> None:
         """
+        Store steps, and join them to the row before.
+
         :param rows: where the steps go, in their order
         :param piece: the steps
         :param keeps_before: whether the row before them holds the step before them
@@ -288,6 +294,8 @@ class CompactReplay:
 
     def _put(self, rows: np.ndarray, piece: dict[str, np.ndarray], newest: int) -> None:
         """
+        Write steps into rows.
+
         :param rows: where the steps go
         :param piece: the steps
         :param newest: which of them is the newest
@@ -304,6 +312,8 @@ class CompactReplay:
 
     def _check_rows(self, piece: dict[str, np.ndarray], n: int, newest: int) -> None:
         """
+        Check rows from a file.
+
         :param piece: rows from a file
         :param n: how many they must be
         :param newest: which of them is the newest
@@ -336,8 +346,10 @@ class CompactReplay:
 
     def state_dict(self) -> dict[str, Any]:
         """
+        Collect the buffer's state.
+
         :return: the numbers ``pos``, ``full``, ``buffer_size`` and ``n_envs``, and arrays: what is filled of each of
-            the :meth:`columns`, as it lies and not copied, and what :meth:`new_rows` has of next observations, its
+            the :meth:`columns`, not copied, and the next observations in the form of :meth:`new_rows`, its
             ``next_index`` naming places of the buffer
         """
         assert isinstance(self, ReplayBuffer)
@@ -348,6 +360,8 @@ class CompactReplay:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
+        Restore the buffer's state.
+
         :param state: from :meth:`state_dict` of a buffer of the same sizes
         :raises ValueError: if it is of another buffer
         """
@@ -370,7 +384,7 @@ class CompactReplay:
         self._restored()
 
     def _restored(self) -> None:
-        """The rows have been put back."""
+        """Called when the rows have been restored."""
 
 
 class CompactReplayBuffer(CompactReplay, ReplayBuffer):  # type: ignore[misc, override]  # next_observations is a view
@@ -378,4 +392,4 @@ class CompactReplayBuffer(CompactReplay, ReplayBuffer):  # type: ignore[misc, ov
 
 
 class CompactDictReplayBuffer(CompactReplay, DictReplayBuffer):  # type: ignore[misc, override]  # next_observations is a view
-    """The same for dict observations."""
+    """Replay buffer for dict observations that stores one observation a step."""

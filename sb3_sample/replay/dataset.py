@@ -1,4 +1,4 @@
-"""Transitions that are already there, as a source of batches."""
+"""Fixed data sets of transitions as a source of batches."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ Arrays = np.ndarray | dict[str, np.ndarray]
 
 class Dataset:
     """
-    A fixed set of transitions, from which batches are drawn uniformly with replacement.
+    Fixed set of transitions, from which batches are drawn uniformly with replacement.
 
     :param observations: (N, O), or a dict of such arrays; floats as float32, integers as they are
     :param actions: in [-1, 1], float32, (N, A)
@@ -63,14 +63,14 @@ class Dataset:
         """
         Make a data set of N steps in the order in which they were taken, episode after episode.
 
-        Without ``next_observations`` a step's next observation is the following step's. A step that an episode was cut
-        off at, and the last one, have none then and are left out, unless the episode terminated there.
+        Without ``next_observations`` a step's next observation is the following step's. A truncated step, and the
+        last one, have none then and are left out, unless the episode terminated there.
 
         :param observations: (N, O), or a dict of such arrays
         :param actions: (N, A), within the bounds of ``action_space``
         :param rewards: (N,)
         :param terminations: whether the episode terminated with the step, (N,)
-        :param truncations: whether it was cut off there, by a time limit, say, (N,)
+        :param truncations: whether it was cut off there, by a time limit for example, (N,)
         :param next_observations: as the observations
         :param observation_space: of the observations; None: unbounded, of their shape
         :param action_space: of the actions; None: [-1, 1]
@@ -135,7 +135,9 @@ class Dataset:
 
     def to(self, device: torch.device | str) -> "Dataset":
         """
-        :param device: where the transitions, and so the batches, shall be
+        Move the data set to a device.
+
+        :param device: device of the transitions, and so of the batches
         :return: the data set
         """
         self._columns = tuple(  # type: ignore[assignment]
@@ -146,6 +148,8 @@ class Dataset:
 
     def sample(self, batch_size: int) -> Batch:
         """
+        Draw a batch.
+
         :param batch_size: B
         :return: transitions, whose discount factor is the learner's
         :raises ValueError: if the batch size is below 1
@@ -171,7 +175,7 @@ def _take(arrays: Arrays, rows: np.ndarray) -> Arrays:
 
 
 def _rows(name: str, values: Any) -> Arrays:
-    """Arrays as they are stored: floats as float32."""
+    """Convert arrays to their stored form: floats as float32."""
     if isinstance(values, dict):
         return {key: _rows(f"{name}[{key!r}]", value) for key, value in values.items()}  # type: ignore[misc]
     array = np.asarray(values)

@@ -1,4 +1,4 @@
-"""Arrays that live in files, for replay buffers larger than the memory."""
+"""Arrays in files, for replay buffers larger than the memory."""
 
 import math
 import mmap
@@ -13,19 +13,23 @@ import numpy as np
 
 def n_bytes(shape: tuple[int, ...], dtype: Any) -> int:
     """
+    Compute the size of an array.
+
     :param shape: of an array
     :param dtype: of an array
-    :return: how much memory it takes
+    :return: its bytes
     """
     return math.prod(shape) * np.dtype(dtype).itemsize
 
 
 def check_folder(folder: Any, needed: int) -> str:
     """
-    :param folder: where files shall be; it is made if it is not there
+    Check that a folder can hold the files, and make it.
+
+    :param folder: folder of the files; made if it is missing
     :param needed: how many bytes they will have
     :return: its path
-    :raises ValueError: if there can be no files there, or not of this size
+    :raises ValueError: if files cannot be written there, or the disk has not the space
     """
     if not isinstance(folder, (str, os.PathLike)) or not os.fspath(folder):
         raise ValueError(f"memory_map must be a folder, or None for the memory, not {folder!r}")
@@ -48,11 +52,13 @@ def check_folder(folder: Any, needed: int) -> str:
 
 def zeros(folder: str | None, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     """
-    :param folder: where a file shall hold the array; None for the memory
+    Make an array in memory or in a file.
+
+    :param folder: folder of the file; None for the memory
     :param shape: its shape
     :param dtype: its type
-    :return: an array of zeros. The file has no name and goes with the array: no other run can meet it, and nothing is
-        left of it when this one is killed
+    :return: an array of zeros. The file has no name and is freed with the array: no other run can open it, and nothing
+        is left of it when the process is killed
     :raises OSError: if the disk has not the space
     """
     size = n_bytes(shape, dtype)
@@ -77,7 +83,9 @@ def zeros(folder: str | None, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
 
 def moved(folder: str, array: np.ndarray) -> np.ndarray:
     """
-    :param folder: where a file shall hold the array
+    Copy an array into a file.
+
+    :param folder: folder of the file
     :param array: an array
     :return: the same in a file
     """

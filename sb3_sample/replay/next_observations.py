@@ -1,4 +1,4 @@
-"""Next observations without an array of their own: the observations of the next rows, and what is kept aside."""
+"""Next observations without an array of their own: the observations of the next rows, and a side store."""
 
 from typing import Any
 
@@ -14,8 +14,8 @@ ONLY = ""
 
 class SideStore:
     """
-    The next observations that no row holds, by a number, their slot. Slots 0 to ``n_envs - 1`` are those of the newest
-    row, whose following row is not there yet. It grows as it is needed.
+    Store of the next observations that no row holds, by a number, their slot. Slots 0 to ``n_envs - 1`` are those of
+    the newest row, which no row follows yet. It grows on demand.
 
     :param like: shape and type of the observations, by key
     :param n_envs: number of environments
@@ -30,7 +30,7 @@ class SideStore:
         self._free: list[int] = []
 
     def __len__(self) -> int:
-        """How many are in it, without those of the newest row."""
+        """Number of observations stored, without those of the newest row."""
         return self._capacity() - self._n_envs - len(self._free)
 
     def _capacity(self) -> int:
@@ -38,12 +38,16 @@ class SideStore:
 
     def newest(self) -> dict[str, np.ndarray]:
         """
+        Return the slots of the newest row.
+
         :return: the next observations of the newest row, to be read and written, (n_envs, O) each
         """
         return {key: array[: self._n_envs] for key, array in self.arrays.items()}
 
     def put(self, values: dict[str, np.ndarray]) -> list[int]:
         """
+        Store next observations.
+
         :param values: next observations, (n, O) each
         :return: their slots
         """
@@ -66,7 +70,9 @@ class SideStore:
 
     def free(self, slots: np.ndarray) -> None:
         """
-        :param slots: numbers that are needed no more; those below ``n_envs`` do not count
+        Free slots.
+
+        :param slots: slots that are not needed any more; those below ``n_envs`` are ignored
         """
         self._free.extend(slots[slots >= self._n_envs].tolist())
 
@@ -77,8 +83,8 @@ class SideStore:
 
 class NextObservations:
     """
-    The next observations of a buffer, read like an array: indices of rows and environments come first. Rows that were
-    never stored mean nothing.
+    Next observations of a buffer, read like an array: indices of rows and environments come first. Rows that were never
+    stored are undefined.
 
     :param buffer: the buffer
     :param key: which observation, of a dict of them
@@ -94,6 +100,8 @@ class NextObservations:
 
     def take(self, places: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
         """
+        Gather next observations.
+
         :param places: position * n_envs + environment of each, (N,)
         :param out: memory for the result, (N, O); None for new one
         :return: the next observations there

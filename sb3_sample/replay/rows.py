@@ -1,4 +1,4 @@
-"""One step of all environments on its way into a replay buffer: shapes and types."""
+"""Shapes and types of one step of all environments before it is stored in a replay buffer."""
 
 from typing import Any
 
@@ -8,8 +8,8 @@ from gymnasium import spaces
 
 def as_row(name: str, given: Any, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
     """
-    What an array of the buffer would hold after an assignment, which repeats along axes that are missing or of length
-    one, as in Stable-Baselines3, and never gives a number another place.
+    Convert values to a row of the buffer by the rules of array assignment: repeated along axes that are missing or of
+    length one, as in Stable-Baselines3, and never reordered.
 
     :param name: what it is, for the error
     :param given: one value, or one of each environment
@@ -39,6 +39,8 @@ def as_row(name: str, given: Any, shape: tuple[int, ...], dtype: Any = np.float3
 
 def as_observation(name: str, given: Any, shape: tuple[int, ...], space: spaces.Space) -> np.ndarray:
     """
+    Convert an observation to a row of the buffer.
+
     :param name: what it is, for the error
     :param given: one observation, or one of each environment
     :param shape: of a row, (n_envs, O)
@@ -54,6 +56,8 @@ def as_observation(name: str, given: Any, shape: tuple[int, ...], space: spaces.
 
 def as_actions(given: Any, shape: tuple[int, int], space: spaces.Space) -> np.ndarray:
     """
+    Convert actions to a row of the buffer.
+
     :param given: one action, or one of each environment, with the axes of the space or flat
     :param shape: of a row, (n_envs, A)
     :param space: of one environment's
@@ -78,6 +82,8 @@ def as_actions(given: Any, shape: tuple[int, int], space: spaces.Space) -> np.nd
 
 def as_timeouts(infos: Any, n_envs: int) -> np.ndarray:
     """
+    Convert the infos' time-limit flags to a row of the buffer.
+
     :param infos: each environment's info; ``TimeLimit.truncated`` in it may be an array, of one element or of one for
         each environment
     :param n_envs: number of environments
@@ -92,6 +98,8 @@ def as_timeouts(infos: Any, n_envs: int) -> np.ndarray:
 
 def action_dtype(space: spaces.Space) -> Any:
     """
+    Choose the type of stored actions.
+
     :param space: of the actions
     :return: the type of the actions that a buffer stores: those of a Box lie in [-1, 1], so that they are floats also
         where the space is one of integers

@@ -1,4 +1,4 @@
-"""Sources of batches: what a model's replay buffer gives to its learner."""
+"""Sources of batches: the way from a model's replay buffer to its learner."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from sb3_sample.replay.buffers import BatchMemory, ValidationSplit, latest, samp
 
 class ReplaySource:
     """
-    Batches of a model's replay buffer, normalised as its environment is.
+    Source of batches from a model's replay buffer, normalised as its environment is.
 
     :param model: the algorithm; its ``replay_buffer``, ``gamma``, ``batch_size`` and ``validation_proportion`` are
         those in force when something is drawn
@@ -31,9 +31,11 @@ class ReplaySource:
 
     def batches(self, n_batches: int, batch_size: int) -> list[Batch]:
         """
+        Draw the batches of several gradient steps.
+
         :param n_batches: number of gradient steps
         :param batch_size: transitions a step
-        :return: the batches, which hold until this is called again
+        :return: the batches, valid until the next call
         """
         model = self._model
         return draw_batches(
@@ -42,6 +44,8 @@ class ReplaySource:
 
     def held_out(self) -> Batch | None:
         """
+        Draw transitions of the validation side.
+
         :return: ``round(validation_proportion * batch_size)`` transitions that are held out of training, at least one;
             None while there are fewer
         """
@@ -54,6 +58,8 @@ class ReplaySource:
 
     def latest(self, n_steps: int) -> Extra | None:
         """
+        Return the newest transitions.
+
         :param n_steps: T
         :return: the latest T steps of every environment, the oldest first; None while there are fewer
         """
@@ -73,15 +79,15 @@ def draw_batches(
     memory: BatchMemory | None = None,
 ) -> list[Batch]:
     """
-    The batches of several gradient steps, drawn at once where that gives the same distribution.
+    Draw the batches of several gradient steps, at once where the distribution is the same.
 
     :param buffer: replay buffer
     :param n_batches: number of gradient steps
     :param batch_size: transitions a step
     :param gamma: discount factor, where the buffer has none of its own
     :param vec_normalize: normalises observations and rewards as they are drawn
-    :param memory: what the transitions are gathered into where that is possible
-    :return: the batches; with ``memory``, they hold until it is used again
+    :param memory: memory that the transitions are gathered into where that is possible
+    :return: the batches; with ``memory``, valid until it is used again
     """
     if memory is not None and memory.serves(buffer, vec_normalize):
         return _cut(Batch.of(memory.gather(buffer, n_batches * batch_size), gamma), n_batches, batch_size)
@@ -91,7 +97,7 @@ def draw_batches(
 
 
 def _cut(data: Batch, n_batches: int, batch_size: int) -> list[Batch]:
-    """One large batch as several."""
+    """Cut one large batch into several."""
 
     def cut(x: Any) -> list[Any]:
         if isinstance(x, (int, float)):

@@ -63,7 +63,8 @@ MAX_BATCHES_AT_ONCE = 64
 class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]  # actor
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
-    SAC that the papers compare with (P2-P5): tanh-Gaussian actor, two critics, clipped double Q-learning.
+    SAC that the DAC, VPL and BRO papers and the regularization study (https://arxiv.org/abs/2403.00514) compare with:
+    tanh-Gaussian actor, two critics, clipped double Q-learning.
 
     It differs from ``stable_baselines3.SAC`` by design: the order of the update (critics, targets, actor,
     temperature), the squared error without the factor 1/2, the temperature's gradient through the temperature

@@ -16,7 +16,7 @@ from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
 
-#: Critic sizes by their names in P5, table 7 (parameters of all networks): residual blocks and width.
+#: Critic sizes by their names in BRO, table 7 (parameters of all networks): residual blocks and width.
 MODEL_SIZES: dict[str, tuple[int, int]] = {
     "0.55M": (1, 128),
     "1.05M": (1, 256),
@@ -41,7 +41,7 @@ OPTIMISTIC_SHIFT_SETTINGS = (
 
 class BRO(SAC):
     """
-    BRO: bigger, regularized, optimistic (P5, Nauman et al. 2024, https://arxiv.org/abs/2405.16158, algorithm 2).
+    BRO: bigger, regularized, optimistic (Nauman et al. 2024, https://arxiv.org/abs/2405.16158, algorithm 2).
 
     Two wide BroNet critics with 100 quantiles each and weight decay, their mean as value (no clipped double
     Q-learning), ten gradient steps a transition, full-parameter resets, and an optimistic actor that explores
@@ -76,7 +76,7 @@ class BRO(SAC):
     :param target_entropy: entropy that the learned temperature aims at; "auto" is -|A|/2
     :param replay_ratio: gradient steps per environment transition after the warm-up, whatever the number of
         environments; may be below 1
-    :param model_size: size of the critics by its name in P5, table 7 ("0.55M", "1.05M", "2.83M", "4.92M",
+    :param model_size: size of the critics by its name in BRO, table 7 ("0.55M", "1.05M", "2.83M", "4.92M",
         "26.31M"), or (residual blocks, width); the actors are the same in all. None if ``policy_kwargs`` describe
         the critics
     :param n_quantiles: quantiles a critic; None for scalar critics
@@ -263,7 +263,7 @@ class BROFast(BRO):
 
 class BROTD3(BRO):
     """
-    BRO on TD3 instead of soft actor-critic (P5, section E.3 and figure 17; TD3 by Fujimoto et al. 2018): deterministic
+    BRO on TD3 instead of soft actor-critic (section E.3 and figure 17; TD3 by Fujimoto et al. 2018): deterministic
     actors, a target actor, smoothed target actions, delayed actor updates, and no entropy. The rest, the two actors
     included, is BRO's.
 

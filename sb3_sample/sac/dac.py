@@ -26,7 +26,7 @@ OPTIMISTIC_ACTOR_SETTINGS = (
 
 class DAC(SAC):
     """
-    DAC: decoupled policy actor-critic (P3, Nauman and Cygan 2023, https://arxiv.org/abs/2310.19527, algorithm 1).
+    DAC: decoupled policy actor-critic (Nauman and Cygan 2023, https://arxiv.org/abs/2310.19527, algorithm 1).
 
     Soft actor-critic with a second actor, a network of its own, that explores by climbing an optimistic value, while
     the pessimistic actor learns from its data, makes the TD targets and is evaluated. Optimism and the weight of the
@@ -34,8 +34,8 @@ class DAC(SAC):
 
     Where the paper's text and the published code differ, the update follows the code, whose every number it
     reproduces; :class:`~sb3_sample.learner.exploration.OptimisticActor` names the differences. The networks follow the
-    paper, two hidden layers of 256 without layer norm, which is what P3 to P5 compare with; the published code has
-    ``policy_kwargs=dict(net_arch=[256] * 3, critic_network_kwargs=dict(layer_norm=True))``.
+    paper, two hidden layers of 256 without layer norm, with which the DAC, VPL and BRO papers compare; the published
+    code has ``policy_kwargs=dict(net_arch=[256] * 3, critic_network_kwargs=dict(layer_norm=True))``.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box

@@ -38,7 +38,7 @@ LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
 class Actor(BasePolicy):
     """
     Tanh-Gaussian actor: ``a = tanh(mean + std * noise)``, the log standard deviation squashed by a tanh into
-    [-10, 2] (P5, section B.1; bounds and squashing as in the published code).
+    [-10, 2] (BRO, section B.1; bounds and squashing as in the published code).
 
     :param observation_space: observation space
     :param action_space: action space, a bounded Box; the actor works on [-1, 1]

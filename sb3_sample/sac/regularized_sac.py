@@ -1,4 +1,4 @@
-"""The regularized agents of P2."""
+"""The regularized agents of the study of overestimation, overfitting and plasticity (2403.00514)."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from sb3_sample.sac import arguments
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.policies import SACPolicy
 
-#: The groups of P2, section 3, each with what it may hold.
+#: The groups of the regularization study, section 3, each with what it may hold.
 CRITIC_REGULARIZATIONS = ("none", "cdq", "gpl", "top")
 NETWORK_REGULARIZATIONS = ("none", "layer_norm", "spectral_norm", "weight_decay")
 PLASTICITY_REGULARIZATIONS = ("none", "crelu", "redo", "resets", "sam")
@@ -19,9 +19,9 @@ PLASTICITY_REGULARIZATIONS = ("none", "crelu", "redo", "resets", "sam")
 
 class RegularizedSAC(SAC):
     """
-    The regularized soft actor-critic agents of P2 (Nauman et al. 2024, "Overestimation, overfitting, and plasticity in
-    actor-critic", https://arxiv.org/abs/2403.00514, section 3): one choice from each of three groups makes the 64
-    agents of the paper, and the last two groups take any mixture, ReDo included.
+    The regularized soft actor-critic agents of the regularization study (Nauman et al. 2024, "Overestimation,
+    overfitting, and plasticity in actor-critic", https://arxiv.org/abs/2403.00514, section 3): one choice from each of
+    three groups makes the 64 agents of the paper, and the last two groups take any mixture, ReDo included.
 
     The network regularizations are the critics' alone, and CReLU is the activation of actor and critics (appendix B of
     the paper); resets are of everything; SAM and ReDo act on the critics. The settings are the paper's where it gives

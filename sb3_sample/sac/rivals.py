@@ -50,7 +50,8 @@ class _RuleSAC(SAC):
 class TOPSAC(_RuleSAC):
     """
     Soft actor-critic with tactical optimism and pessimism (Moskovitz et al. 2021): a bandit chooses the pessimism of
-    each episode. With P2's and P4's settings; :class:`~sb3_sample.learner.pessimism.TOP` has the details.
+    each episode. The settings are those of the VPL paper and of the regularization study (2403.00514);
+    :class:`~sb3_sample.learner.pessimism.TOP` has the details.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
@@ -89,7 +90,8 @@ class GPLSAC(_RuleSAC):
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
     :param learning_rate: of actor, critics and temperature
     :param initial_pessimism: pessimism at the start and after a reset
-    :param pessimism_learning_rate: of the pessimism; 5e-5 as in P4 (P2: 1e-5)
+    :param pessimism_learning_rate: of the pessimism; 5e-5 as in the VPL paper (1e-5 in the regularization study,
+        2403.00514)
     :param kwargs: every other argument of :class:`SAC`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -161,7 +163,7 @@ class OPLSAC(_RuleSAC):
 class OAC(SAC):
     """
     Optimistic actor-critic (Ciosek et al. 2019): soft actor-critic that explores with its actor's mean shifted along
-    the gradient of an upper bound. With the settings of P3's comparison;
+    the gradient of an upper bound. The settings are those of the DAC paper's comparison;
     :class:`~sb3_sample.learner.exploration.OptimisticGradient` has the details.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
@@ -205,10 +207,10 @@ class OAC(SAC):
 
 class SRSAC(SAC):
     """
-    SR-SAC: soft actor-critic scaled by resetting (D'Oro et al. 2022), with the settings of P2 to P4: sixteen gradient
-    steps a transition, and full-parameter resets every 160,000 environment steps. (P5 compares with
-    ``replay_ratio=32``.) The original resets every 2,560,000 gradient steps, whatever the replay ratio:
-    ``reset_gradient_steps=2_560_000``; at sixteen a transition that is as often.
+    SR-SAC: soft actor-critic scaled by resetting (D'Oro et al. 2022), with the settings of DAC, VPL and the
+    regularization study (2403.00514): sixteen gradient steps a transition, and full-parameter resets every 160,000
+    environment steps. (The BRO paper compares with ``replay_ratio=32``.) The original resets every 2,560,000 gradient
+    steps, whatever the replay ratio: ``reset_gradient_steps=2_560_000``; at sixteen a transition that is as often.
 
     :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
     :param env: the environment, an id, or a vectorised environment; its action space a bounded Box

@@ -12,7 +12,7 @@ from sb3_sample.sac.policies import SACPolicy
 
 class VPLSAC(SAC):
     """
-    VPL-SAC: soft actor-critic with validation pessimism learning (P4, Nauman et al. 2024,
+    VPL-SAC: soft actor-critic with validation pessimism learning (Nauman et al. 2024,
     https://arxiv.org/abs/2403.01014, eq. 12 and algorithm 1).
 
     A share of the transitions is held out of training, and the pessimism of the critics' targets is learned on it: it

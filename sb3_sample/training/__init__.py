@@ -1,1 +1,1 @@
-"""Training as Stable-Baselines3 has it: the life cycle of an algorithm."""
+"""Life cycle of an algorithm, with the interface of Stable-Baselines3."""

@@ -1,4 +1,4 @@
-"""The life cycle of an algorithm, the same for both families: environments, networks, ``learn`` with checkpoints."""
+"""Life cycle of an algorithm, the same for both families: environments, networks, ``learn`` with checkpoints."""
 
 import pathlib
 from typing import Any, TypeVar
@@ -25,8 +25,8 @@ Self = TypeVar("Self", bound="Resumable")
 class Resumable(Exportable, BaseAlgorithm):
     """
     Base of both families, before ``SafeFiles`` and Stable-Baselines3's class: ``learn`` as a sequence of turns, after
-    each of which the training can be saved, and go on from there as if it had never been interrupted. A family says
-    what a turn is, and what comes before and after the turns.
+    each of which the training can be saved and continued with the result of a training without interruption. A family
+    defines the turn (:meth:`_turn`) and the steps before and after the turns.
     """
 
     # ---------------------------------------------------------------- construction
@@ -49,6 +49,8 @@ class Resumable(Exportable, BaseAlgorithm):
 
     def _check_arguments(self) -> None:
         """
+        Check the arguments.
+
         :raises ValueError: if an argument is out of range or contradicts another
         """
         raise NotImplementedError
@@ -59,6 +61,8 @@ class Resumable(Exportable, BaseAlgorithm):
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         """
+        Complete the policy's arguments.
+
         :return: the policy's arguments: the user's and the algorithm's
         """
         raise NotImplementedError
@@ -74,17 +78,17 @@ class Resumable(Exportable, BaseAlgorithm):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
-        Go on with another environment, as in Stable-Baselines3.
+        Set another environment, as in Stable-Baselines3.
 
         :param env: the environment, of the same spaces and as many as the model was made with
         :param force_reset: whether it is reset before training goes on
-        :raises ValueError: if it is not
+        :raises ValueError: if its spaces or its number of environments differ
         """
         check_n_envs(self, env)
         super().set_env(env, force_reset)
 
     def _on_environment_reset(self) -> None:
-        """The environments were reset in the midst of their episodes."""
+        """Called when the environments were reset in the midst of their episodes."""
 
     # ---------------------------------------------------------------- training
 
@@ -129,15 +133,17 @@ class Resumable(Exportable, BaseAlgorithm):
 
     def _described(self) -> Lenient:
         """
-        :return: what has to be said of the model's files
+        Describe the model's files.
+
+        :return: encoder of the model's description, with what to warn of
         """
         return Description(self).encoder
 
     def _before_training(self) -> None:
-        """Prepare a training, which may then go on from a checkpoint."""
+        """Prepare the training, before a checkpoint is read."""
 
     def _before_turns(self) -> None:
-        """Prepare the turns, when it is known where they begin."""
+        """Prepare the turns, after a checkpoint, if any, was read."""
 
     def _turn(self, callback: BaseCallback, log_interval: int) -> bool:
         """
@@ -145,9 +151,9 @@ class Resumable(Exportable, BaseAlgorithm):
 
         :param callback: called at every step
         :param log_interval: the argument of ``learn``
-        :return: whether the callback lets the training go on; if not, nothing is learned
+        :return: False if the callback ended the training, in which case nothing is learned
         """
         raise NotImplementedError
 
     def _after_turns(self) -> None:
-        """Conclude a training that no callback has ended."""
+        """Finish a training that no callback has ended."""

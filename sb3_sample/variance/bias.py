@@ -1,6 +1,6 @@
 """
-Bias and variance of policy gradients that see simulated samples, relative to the gradient's size (P1, appendix B and
-table 3). M estimates of each method, P parameters of the policy that its actions depend on.
+Bias and variance of policy gradients that see simulated samples, relative to the gradient's size (MBMA, appendix B
+and table 3). M estimates of each method, P parameters of the policy that its actions depend on.
 """
 
 import copy
@@ -22,7 +22,7 @@ from sb3_sample.variance.returns import Agent
 R = TypeVar("R")
 #: Given a rollout, an estimate of the gradient, (P,).
 Estimator = Callable[[R], np.ndarray]
-#: The method without simulated samples, whose gradient has no bias: the actor-critic (AC) of P1's tables.
+#: The method without simulated samples, whose gradient has no bias: the actor-critic (AC) of the MBMA paper's tables.
 ORACLE = "PPO"
 
 
@@ -31,11 +31,11 @@ class GradientSamples:
     """
     Estimates of one policy's gradient by several methods, each from the same M rollouts.
 
-    ``relative_bias`` and ``relative_variance`` are P1's (appendix B, "Table 3"): means over the parameters of ratios to
-    the method's own mean gradient, parameter by parameter. Where the mean of a parameter's gradient is close to 0 its
-    ratio is huge, and the noise of the means counts as bias: a method without bias has a ``relative_bias`` that only
-    vanishes as M grows (``noise_floor`` says how large). ``bias`` and ``variance`` are of the gradient as a whole, with
-    that noise taken off, so that they do not depend on M.
+    ``relative_bias`` and ``relative_variance`` are those of MBMA, appendix B, "Table 3": means over the parameters of
+    ratios to the method's own mean gradient, parameter by parameter. Where the mean of a parameter's gradient is close
+    to 0 its ratio is huge, and the noise of the means counts as bias: a method without bias has a ``relative_bias``
+    that only vanishes as M grows (``noise_floor`` says how large). ``bias`` and ``variance`` are of the gradient as a
+    whole, with that noise taken off, so that they do not depend on M.
 
     :param gradients: by method, (M, P) each
     :param oracle: the method that is taken to be without bias
@@ -196,8 +196,8 @@ def compare_gradients(
     on_estimate: Callable[[int], None] | None = None,
 ) -> GradientSamples:
     """
-    Gradients of one policy by PPO, MBMA, QMA and MBPO, as in P1's table 3: all from the same rollouts of that policy,
-    none ever applied.
+    Gradients of one policy by PPO, MBMA, QMA and MBPO, as in MBMA, table 3: all from the same rollouts of that
+    policy, none ever applied.
 
     First the learned models, the dynamics (one for MBMA and MBPO) and the Q-networks, are trained on ``n_fits``
     rollouts of the policy as their algorithms do; then they stay as they are, so that the estimates are independent,
@@ -205,8 +205,8 @@ def compare_gradients(
 
     :param model: a ``PPO`` or ``A2C``, or a subclass; nothing in it changes
     :param make_env: makes the environment
-    :param n_estimates: M, at least 4 (P1: 125). The gradients take ``16 * M * P`` bytes
-    :param n_steps: states of each rollout (P1: 2,500)
+    :param n_estimates: M, at least 4 (MBMA: 125). The gradients take ``16 * M * P`` bytes
+    :param n_steps: states of each rollout (MBMA: 2,500)
     :param n_fits: rollouts that the learned models are trained on
     :param n_simulated: samples simulated for each real one
     :param simulation_horizon: steps of the model, at least 2

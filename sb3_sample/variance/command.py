@@ -166,10 +166,10 @@ def format_gradients(samples: GradientSamples, confidence: float = 0.95) -> str:
     """
     :param samples: gradients of several methods
     :param confidence: of the intervals
-    :return: Markdown table of bias and variance, P1's definitions and those of the whole gradient
+    :return: Markdown table of bias and variance, by MBMA's definitions (appendix B) and by those of the whole gradient
     """
     lines = [
-        "| method | relative bias (P1) | relative variance (P1) | squared bias | variance |",
+        "| method | relative bias (MBMA, B) | relative variance (MBMA, B) | squared bias | variance |",
         "| --- | ---: | ---: | ---: | ---: |",
     ]
     for name in samples.gradients:
@@ -292,7 +292,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--horizon", type=int, default=12, help="steps of a return before the critic's value ends it")
     parser.add_argument("--max-lag", type=int, help="distance up to which covariances are counted; default: all")
     parser.add_argument("--burn-in", type=int, help="least steps before a rollout; default: an episode")
-    parser.add_argument("--no-baseline", action="store_true", help="do not subtract the critic's value (P1's table 1)")
+    parser.add_argument("--no-baseline", action="store_true", help="do not subtract the critic's value (MBMA, table 1)")
     parser.add_argument("--trajectory", type=int, help="T of the comparison; default: that of the rollouts")
     parser.add_argument("--now", type=int, default=1, metavar="N", help="actions at each state before one more")
     parser.add_argument(

@@ -1,11 +1,11 @@
 """
-Variance of a policy gradient, by lemma 3.1 of P1, and what one more action or a longer trajectory would take off it, by
-lemma 3.2, theorem 3.3 and corollary 3.4. Numbers in, numbers out: nothing here samples anything.
+Variance of a policy gradient (MBMA, lemma 3.1), and what one more action or a longer trajectory would take off it
+(lemma 3.2, theorem 3.3 and corollary 3.4). Numbers in, numbers out: nothing here samples anything.
 
 The gradient is the mean over T states of a trajectory of the mean over N actions of Y(s, a) = Q(s, a) grad log pi(a|s)
-(P1, equation 3, without its factor gamma^t, as in appendix A: with it equation 4 does not hold); only the first of the
-N actions is carried out. Variances and covariances are traces, sums over the policy's parameters of what P1 writes of
-each of them. Y_t is Y at the state t steps later.
+(MBMA, equation 3, without its factor gamma^t, as in appendix A: with it equation 4 does not hold); only the first of
+the N actions is carried out. Variances and covariances are traces, sums over the policy's parameters of what the paper
+writes of each of them. Y_t is Y at the state t steps later.
 """
 
 from dataclasses import dataclass

@@ -161,7 +161,7 @@ def estimate_components(
         ``gym``'s ``max_episode_steps`` if None, or else 1,000. If all episodes have that length, any step of an
         episode is as likely as any other to be the first one of a rollout
     :param baseline: whether the critic's value is subtracted from the returns. It changes the variance, not the
-        gradient; table 1 of P1 is without it
+        gradient; MBMA, table 1, is without it
     :param seed: of everything that is random; the global generators are left as they are
     :param n_envs: environments in which returns are sampled side by side
     :param on_rollout: called after each rollout, with the number of rollouts so far

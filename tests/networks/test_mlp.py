@@ -72,7 +72,7 @@ def test_each_copy_drops_its_own_neurons() -> None:
 
 @pytest.mark.parametrize("n_copies", [None, E])
 def test_five_layers_with_layer_norm(n_copies: int | None) -> None:
-    """ "(Dense + LN) x 5" of P5, figure 14."""
+    """ "(Dense + LN) x 5" of BRO, figure 14."""
     torch.manual_seed(0)
     net = MLP(3, [8] * 5, layer_norm=True, n_copies=n_copies)
     randomize(net)

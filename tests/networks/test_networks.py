@@ -231,7 +231,7 @@ def test_bad_sizes(make: Callable[[], nn.Module]) -> None:
         make()
 
 
-# P5, table 7, in parameters of all networks. An observation of 67 and an action of 24 are humanoid-run's in size.
+# BRO, table 7, in parameters of all networks. An observation of 67 and an action of 24 are humanoid-run's in size.
 @pytest.mark.parametrize(
     ("size", "millions", "tolerance"),
     [

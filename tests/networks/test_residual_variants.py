@@ -1,4 +1,4 @@
-"""The variants of BroNet that P5, figure 14 compares, written out by hand."""
+"""The variants of BroNet that BRO, figure 14 compares, written out by hand."""
 
 from collections.abc import Callable
 

@@ -42,7 +42,7 @@ def test_lemma_3_1_with_three_states_and_with_a_time_limit() -> None:
 
 
 def test_covariances_matter_and_change_sign() -> None:
-    # Were they 0 the tests above would say nothing of the sums; and P1's "Cov_t >= Cov_t+1" does not hold in general.
+    # Were they 0 the tests above would say nothing of the sums; and "Cov_t >= Cov_t+1" (MBMA) does not hold in general.
     parts = [components(task(seed=seed)) for seed in range(3)]
     sizes = [abs(p.policy_covariance_sum(4)) / p.policy_variance for p in parts]
     assert max(sizes) > 0.1
@@ -52,7 +52,7 @@ def test_covariances_matter_and_change_sign() -> None:
 def test_equation_4_holds_without_the_factor_gamma_to_the_t() -> None:
     # As printed, Y_t has the factor gamma^t, in the estimator (equations 2 and 3) and in the covariances (equation 4).
     # The sum is then not that of a stationary process, and equation 4, which counts pairs by their distance, not its
-    # variance. P1's appendix A leaves the factor out, and so does PPO.
+    # variance. MBMA's appendix A leaves the factor out, and so does PPO.
     exact = task()
     parts = components(exact)
     t = np.arange(1, 3)
