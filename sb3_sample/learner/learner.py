@@ -165,6 +165,7 @@ class Learner:
         self.gradients_are_stale = False
         # Whether a step was reported since the last gradient step.
         self._heard = False
+        self._n_envs = 1
         self.set_training_mode(False)
 
     def _random(self) -> AbstractContextManager[None]:
@@ -196,6 +197,11 @@ class Learner:
     def num_transitions(self) -> int:
         """Transitions reported by :meth:`on_step` over the learner's life."""
         return int(self._counts.num_transitions)
+
+    @property
+    def n_envs(self) -> int:
+        """Environments of the latest step that it was told of; 1 before."""
+        return self._n_envs
 
     @property
     def compiled(self) -> bool | None:
@@ -309,7 +315,7 @@ class Learner:
         :param dones: whether each environment's episode ended, by termination or truncation, (n_envs,)
         :param infos: each environment's info, with Monitor's "episode" at an end
         """
-        self._heard = True
+        self._heard, self._n_envs = True, len(dones)
         self._counts.num_transitions += len(dones)
         for part in self.parts().values():
             part.on_step(self, rewards, dones, infos)

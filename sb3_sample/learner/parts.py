@@ -72,6 +72,9 @@ class Learning(Protocol):
     @property
     def num_transitions(self) -> int: ...
 
+    @property
+    def n_envs(self) -> int: ...
+
     def next_actions(self, observations: Any, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """
         Sample the actions of a TD target.

@@ -365,7 +365,6 @@ class TOP(Pessimism):
         self.log_weights = [0.0] * len(self.arms)
         self.arm = 0
         self.register_buffer("weight", torch.tensor(0.0), persistent=False)
-        self._n_envs = 1
         # By environment: the last episode's return, and the improvements under the arm in force.
         self._previous: dict[int, float] = {}
         self._improvements: dict[int, list[float]] = {}
@@ -391,7 +390,6 @@ class TOP(Pessimism):
         return self.weight
 
     def on_step(self, learner: Learning, rewards: Any, dones: Any, infos: list[dict[str, Any]]) -> None:
-        self._n_envs = len(dones)
         for index in np.flatnonzero(dones):
             if "episode" not in infos[index]:
                 raise ValueError(
@@ -401,13 +399,13 @@ class TOP(Pessimism):
 
     def on_episode_end(self, learner: Learning, env_index: int, episode_return: float) -> None:
         # A loaded model may have had more environments.
-        for gone in [index for index in self._improvements if index >= self._n_envs]:
+        for gone in [index for index in self._improvements if index >= learner.n_envs]:
             del self._improvements[gone]
         improvements = self._improvements.setdefault(env_index, [])
         if env_index in self._previous:
             improvements.append(episode_return - self._previous[env_index])
         self._previous[env_index] = episode_return
-        if len(self._improvements) < self._n_envs:
+        if len(self._improvements) < learner.n_envs:
             return
         all_improvements = [x for of_env in self._improvements.values() for x in of_env]
         if all_improvements:

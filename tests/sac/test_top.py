@@ -17,10 +17,8 @@ from tests.sac.test_validation_split import tagged
 
 
 def bandit(n_envs: int = 1, arms: Any = (0.0, 1.0), learning_rate: float = 0.1) -> tuple[TOP, Any]:
-    """A bandit on its own, which has heard of a step of all environments; of the learner it needs nothing."""
-    rule, learner = TOP(SimpleNamespace(), arms, learning_rate), SimpleNamespace()  # type: ignore[arg-type]
-    rule.on_step(learner, np.zeros(n_envs), np.zeros(n_envs), [{}] * n_envs)  # type: ignore[arg-type]
-    return rule, learner
+    """A bandit on its own; of the learner it needs the number of environments only."""
+    return TOP(SimpleNamespace(n_envs=n_envs), arms, learning_rate), SimpleNamespace(n_envs=n_envs)  # type: ignore[arg-type]
 
 
 def top(env: Any = None, **kwargs: Any) -> TOPSAC:
@@ -231,7 +229,7 @@ def test_loaded_with_fewer_environments(tmp_path: Path) -> None:
     draws = []
     draw = rule._draw
     rule._draw = lambda: (draw(), draws.append(rule.arm))
-    rule.on_step(loaded.learner, np.zeros(2), np.zeros(2), [{}] * 2)
+    loaded.learner.on_step(np.zeros(2), np.zeros(2), [{}] * 2)
     rule.on_episode_end(loaded.learner, 0, 5.0)
     assert not draws
     rule.on_episode_end(loaded.learner, 1, 5.0)
