@@ -391,7 +391,7 @@ def _modules(learner: Any) -> tuple[Any, ...]:
 
 def _places(learner: Any) -> tuple[int, ...]:
     """Addresses of all tensors that a gradient step reads or writes, without its inputs."""
-    modules = (learner.networks, learner.temperature, learner.explorer, learner.pessimism_rule)
+    modules = (learner.networks, learner.head, learner.temperature, learner.explorer, learner.pessimism_rule)
     tensors = [t for module in modules for t in (*module.parameters(), *module.buffers())]
     for optimizer in learner.optimizers().values():
         tensors += [t for state in optimizer.state.values() for t in state.values() if isinstance(t, torch.Tensor)]
@@ -411,7 +411,9 @@ def _settings(learner: Any) -> list[Any]:
     def plain(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
         return {name: value for name, value in values if isinstance(value, (int, float, str, type(None)))}
 
-    modules = [m for root in (learner.networks, learner.explorer, learner.pessimism_rule) for m in root.modules()]
+    modules = [
+        m for root in (learner.networks, learner.head, learner.explorer, learner.pessimism_rule) for m in root.modules()
+    ]
     settings: list[Any] = []
     for owner in (learner, *modules):
         public = ((k, v) for k, v in vars(owner).items() if not k.startswith("_") and k not in NO_SETTINGS)

@@ -4,18 +4,20 @@ from collections.abc import Callable
 from typing import ClassVar
 
 import torch
+from torch import nn
 
 from sb3_sample.learner import losses
 from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.target import td_target
 
 
-class ValueHead:
+class ValueHead(nn.Module):
     """
     Head of scalar critics, trained by the squared error; base class of other heads.
 
-    ``n_outputs`` is the number of outputs a critic; ``n_quantiles`` the same if they are quantiles, else None. A head
-    from outside of this package that does not branch on a tensor's value may declare ``compilable = True``.
+    A head is a module: what it keeps in buffers moves with the learner's device and is saved. ``n_outputs`` is the
+    number of outputs a critic; ``n_quantiles`` the same if they are quantiles, else None. A head from outside of this
+    package that does not branch on a tensor's value may declare ``compilable = True``.
     """
 
     compilable: ClassVar[bool] = True
@@ -69,6 +71,7 @@ class QuantileHead(ValueHead):
     """
 
     def __init__(self, n_quantiles: int):
+        super().__init__()
         self.n_outputs = self.n_quantiles = n_quantiles
 
     def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

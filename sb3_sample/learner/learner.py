@@ -146,7 +146,7 @@ class Learner:
         self.target_subset, self.actor_pessimism, self.sam_radius = target_subset, actor_pessimism, sam_radius
         self.learning_starts, self.compile = learning_starts, compile
         self._counts = Counts() if counts is None else counts
-        self._generators, self.head = generators, head
+        self._generators, self.head = generators, head.to(self.device)
         with self._random():
             self.networks = make_networks().to(self.device) if networks is None else networks
             self.target_entropy = -self.actor.action_dim / 2 if target_entropy is None else target_entropy
@@ -576,13 +576,14 @@ class Learner:
         if self._generators is not None:
             self._generators.load_state_dict(state["generators"])
 
-    def parts_with_state(self) -> dict[str, Part]:
+    def parts_with_state(self) -> dict[str, nn.Module]:
         """
-        List the parts that are saved.
+        List the parts that are saved, with the value head if it has parameters or buffers.
 
         :return: the parts that are saved, by the path from the learner
         """
-        return {name: part for name, part in self.parts().items() if part.has_state}
+        parts: dict[str, nn.Module] = {name: part for name, part in self.parts().items() if part.has_state}
+        return {**parts, "head": self.head} if self.head.state_dict() else parts
 
     # ---------------------------------------------------------------- starting anew
 

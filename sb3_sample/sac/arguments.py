@@ -165,6 +165,11 @@ def _check_pessimism(agent: Any) -> None:
             raise ValueError(
                 f"pessimism must be a number, or {kind.words.removeprefix('be ')}, not {agent.pessimism!r}"
             )
+    elif isinstance(agent.pessimism, Pessimism):
+        raise ValueError(
+            f"pessimism must be a number, a name or a class, not an object of {type(agent.pessimism).__name__}: pass the "
+            "class, and its arguments as pessimism_kwargs"
+        )
     else:
         check_beta("pessimism", agent.pessimism)
         if agent.pessimism_kwargs:

@@ -278,6 +278,11 @@ class HasLearner:
         return self.learner.redo  # type: ignore[no-any-return]
 
     @property
+    def head(self) -> nn.Module:
+        """Value head of the critics."""
+        return self.learner.head  # type: ignore[no-any-return]
+
+    @property
     def transforms(self) -> nn.ModuleList:
         """What every batch goes through before it is learned from."""
         return self.learner.transforms  # type: ignore[no-any-return]

@@ -93,10 +93,12 @@ class TwoHot(ValueHead):
     """A categorical head in small: logits over a support, the expectation as value, cross-entropy as loss."""
 
     compilable = True
+    support: torch.Tensor
 
     def __init__(self, low: float = -5.0, high: float = 5.0, n_outputs: int = 11):
+        super().__init__()
         self.n_outputs = n_outputs
-        self.support = torch.linspace(low, high, n_outputs)
+        self.register_buffer("support", torch.linspace(low, high, n_outputs))
 
     def values(self, outputs: torch.Tensor) -> torch.Tensor:
         return (outputs.softmax(-1) * self.support).sum(-1, keepdim=True)
@@ -165,7 +167,7 @@ def test_classes_in_the_place_of_names(kwargs: dict[str, Any], check: Any, tmp_p
     ("kwargs", "words"),
     [
         ({"pessimism": Part}, "pessimism must be a number, or one of .*, or a class derived from Pessimism"),
-        ({"pessimism": Pessimism(1.0)}, "pessimism must be"),
+        ({"pessimism": Pessimism(1.0)}, "not an object of Pessimism: pass the class, and its arguments"),
         ({"pessimism": Rule, "pessimism_kwargs": {"other": 1}}, r"pessimism_kwargs has 'other', .*takes \['weight'\]"),
         ({"exploration": Pessimism}, "exploration must be one of .*, or a class derived from Exploration, not"),
         ({"value_head": nn.Module}, "value_head must be ValueHead or derived from it"),
@@ -261,6 +263,15 @@ def test_a_head_gives_values_to_rules_and_actors() -> None:
     q = values(model.learner, model.critic, batch.observations, batch.actions)
     assert q.shape == (2, 8, 1) and q.abs().max() <= 5
     torch.testing.assert_close(model._update(batch)["train/q_mean"], q.mean())
+
+
+def test_what_a_head_keeps_is_saved(tmp_path: Path) -> None:
+    model = sac(value_head=TwoHot)
+    model.head.support.mul_(2)
+    model.save(tmp_path / "m")
+    loaded = SAC.load(tmp_path / "m", trusted_modules=[__name__])
+    assert torch.equal(loaded.learner.head.support, torch.linspace(-10, 10, 11))
+    assert torch.equal(model.learner.state_dict()["head"]["support"], loaded.head.support)
 
 
 def test_a_head_learns() -> None:
