@@ -411,9 +411,8 @@ def _settings(learner: Any) -> list[Any]:
     def plain(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
         return {name: value for name, value in values if isinstance(value, (int, float, str, type(None)))}
 
-    modules = [
-        m for root in (learner.networks, learner.head, learner.explorer, learner.pessimism_rule) for m in root.modules()
-    ]
+    roots = (learner.networks, learner.head, learner.explorer, learner.pessimism_rule)
+    modules = [module for root in roots for module in root.modules()]
     settings: list[Any] = []
     for owner in (learner, *modules):
         public = ((k, v) for k, v in vars(owner).items() if not k.startswith("_") and k not in NO_SETTINGS)
