@@ -167,8 +167,8 @@ def _check_pessimism(agent: Any) -> None:
             )
     elif isinstance(agent.pessimism, Pessimism):
         raise ValueError(
-            f"pessimism must be a number, a name or a class, not an object of {type(agent.pessimism).__name__}: pass the "
-            "class, and its arguments as pessimism_kwargs"
+            f"pessimism must be a number, a name or a class, not an object of {type(agent.pessimism).__name__}: pass "
+            "the class, and its arguments as pessimism_kwargs"
         )
     else:
         check_beta("pessimism", agent.pessimism)
