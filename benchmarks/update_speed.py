@@ -140,6 +140,10 @@ def measure(contenders: dict[str, Callable[[], Any]], rounds: int) -> dict[str, 
     return seconds
 
 
+def wanted(args: argparse.Namespace, name: str) -> bool:
+    return args.only is None or name.startswith(tuple(args.only))
+
+
 def our_steps(args: argparse.Namespace) -> tuple[dict[str, Callable[[], Any]], dict[str, Any], dict[str, float]]:
     """Gradient steps by label, their models, and the seconds that compiling took."""
     steps: dict[str, Callable[[], Any]] = {}
@@ -150,7 +154,7 @@ def our_steps(args: argparse.Namespace) -> tuple[dict[str, Callable[[], Any]], d
     for name, (cls, kwargs, batch_size) in agents.items():
         for how, compile in (("eager", False), ("compiled", True)):
             label = f"{name}, {how}"
-            if args.only is not None and not label.startswith(tuple(args.only)):
+            if not wanted(args, label):
                 continue
             model = build(getattr(sb3_sample, cls), compile=compile, device=args.device, **kwargs)
             models[label], steps[label] = model, training_step(model, batch_size)
@@ -247,9 +251,6 @@ def main() -> None:
     if args.against is not None:
         return compare(args)
 
-    def wanted(name: str) -> bool:
-        return args.only is None or name.startswith(tuple(args.only))
-
     def synchronised(call: Callable[[], Any]) -> Callable[[], Any]:
         return call if args.device == "cpu" else lambda: (call(), torch.cuda.synchronize())
 
@@ -264,7 +265,7 @@ def main() -> None:
             flops[label] = counter.get_total_flops()
     versions = [f"torch {torch.__version__}", f"stable_baselines3 {stable_baselines3.__version__}"]
     for label, (module, cls) in PEERS.items():
-        if not wanted(label):
+        if not wanted(args, label):
             continue
         try:
             peer = getattr(importlib.import_module(module), cls)
@@ -284,9 +285,9 @@ def main() -> None:
     contenders: dict[str, Callable[[], Any]] = {"matmul": lambda: torch.bmm(x, w)}
     contenders |= {name: synchronised(step) for name, step in steps.items()}
     for name in ("BRO 4.92M", "SAC"):
-        if f"{name}, compiled" in models and wanted("acting"):
+        if f"{name}, compiled" in models and wanted(args, "acting"):
             contenders[f"acting: {name}"] = acting(models[f"{name}, compiled"])
-    if wanted("quantile Huber"):
+    if wanted(args, "quantile Huber"):
         from sb3_sample.learner.losses import quantile_huber
 
         contenders["quantile Huber, sorted (eager)"] = loss_step(quantile_huber)

@@ -22,7 +22,7 @@ from sb3_sample.kinds import AT_LEAST_0, DICT, VERBOSE, Kind, check_value, integ
 
 
 class NotAllowed(ValueError, AssertionError):
-    """What is refused here as everywhere, with a ``ValueError``, and by Stable-Baselines3 with an assertion."""
+    """Refusal that is an assertion in Stable-Baselines3: a ``ValueError``, as every refusal here, and one of those."""
 
 
 class NoPolicy(ValueError):

@@ -109,7 +109,7 @@ def diverged(model: BaseAlgorithm, values: Mapping[str, float]) -> TrainingDiver
     :param values: what of it is not finite, by name
     :return: the error that says so, and after how many updates
     """
-    # What PPO counts is passes over its rollouts.
+    # PPO counts passes over its rollouts.
     kind = "gradient step" if isinstance(model, OffPolicyAlgorithm) else "update"
     return TrainingDiverged(values, f"{kind} {model._n_updates}", model.num_timesteps)
 

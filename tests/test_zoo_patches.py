@@ -2,7 +2,6 @@
 
 import ast
 import contextlib
-import graphlib
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -24,6 +23,7 @@ from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.replay import SafeReplayBuffers
 from sb3_sample.zoo import patches, register
 from sb3_sample.zoo.files import PlottedRuns
+from tests.test_architecture import circles, imports
 
 ROOT = Path(__file__).parents[1]
 ZOO = sorted((ROOT / "sb3_sample/zoo").glob("*.py"))
@@ -148,18 +148,8 @@ def test_the_patches_of_a_command_end_with_it() -> None:
 
 
 def test_the_files_import_each_other_in_one_direction() -> None:
-    names = {f"sb3_sample.zoo.{file.stem}": file for file in ZOO}
-    graph: dict[str, set[str]] = {}
-    for name, file in names.items():
-        graph[name] = set()
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.Import):
-                graph[name] |= {alias.name for alias in node.names} & names.keys()
-            elif isinstance(node, ast.ImportFrom) and node.module == "sb3_sample.zoo":
-                parts = {f"sb3_sample.zoo.{alias.name}" for alias in node.names}
-                graph[name] |= {part if part in names else "sb3_sample.zoo.__init__" for part in parts}
-            elif isinstance(node, ast.ImportFrom):
-                graph[name] |= {str(node.module)} & names.keys()
-    assert "sb3_sample.zoo.patches" in graph["sb3_sample.zoo.runs"]
-    order = list(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError
-    assert set(order) == names.keys()
+    graph = imports(ROOT / "sb3_sample")
+    inside = {name: {other for other in used if other.startswith("sb3_sample.zoo")} for name, used in graph.items()
+              if name.startswith("sb3_sample.zoo")}  # fmt: skip
+    assert len(inside) == len(ZOO) and "sb3_sample.zoo.patches" in inside["sb3_sample.zoo.runs"]
+    assert circles(inside) == []

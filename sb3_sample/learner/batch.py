@@ -1,5 +1,6 @@
 """Inputs of one gradient step."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -39,6 +40,17 @@ class Batch(NamedTuple):
             samples.rewards,
             gamma if discounts is None else discounts,
         )
+
+
+def for_each(function: Callable[[Any], Any], values: Any) -> Any:
+    """
+    Apply a function to a tensor or array, or to each of a dict of them, as observations are.
+
+    :param function: the function
+    :param values: the tensor or array, or the dict
+    :return: its result, or a dict of them
+    """
+    return {key: function(value) for key, value in values.items()} if isinstance(values, dict) else function(values)
 
 
 class Extra(NamedTuple):

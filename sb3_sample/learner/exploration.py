@@ -8,7 +8,7 @@ from torch.optim import Optimizer
 
 from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, check_value, integer
 from sb3_sample.learner import losses
-from sb3_sample.learner.batch import Batch
+from sb3_sample.learner.batch import Batch, for_each
 from sb3_sample.learner.parts import Learning, Part
 from sb3_sample.learner.pessimism import epistemic_std
 from sb3_sample.learner.scalars import BoundedLogScalar, LogScalar
@@ -417,7 +417,7 @@ class OptimisticGradient(Exploration):
         # Acting runs in inference mode, which knows no gradients.
         with torch.inference_mode(False), torch.enable_grad():
             at = mean.clone().requires_grad_()
-            q = values(learner, learner.critic, _cloned(observations), torch.tanh(at))
+            q = values(learner, learner.critic, for_each(torch.clone, observations), torch.tanh(at))
             upper_value = q.mean(dim=(0, 2)) + self.optimism * epistemic_std(q).mean(dim=1)
             (gradient,) = torch.autograd.grad(upper_value.sum(), at)
         scaled = std.square() * gradient
@@ -427,13 +427,6 @@ class OptimisticGradient(Exploration):
     def act(self, learner: Learning, observations: Any) -> torch.Tensor:
         mean, std = self.shifted_mean(learner, observations)
         return learner.actor.act(mean, std, torch.randn_like(std))
-
-
-def _cloned(observations: Any) -> Any:
-    """Ordinary copies of tensors that may be inference tensors."""
-    if isinstance(observations, dict):
-        return {key: value.clone() for key, value in observations.items()}
-    return observations.clone()
 
 
 #: Choices by the name that the algorithm's ``exploration`` argument takes.

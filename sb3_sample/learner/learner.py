@@ -547,9 +547,7 @@ class Learner:
 
         :return: everything that later steps depend on, besides the arguments
         """
-        modules = {"networks": self.networks, "temperature": self.temperature, **self.parts_with_state()}
-        state = {name: module.state_dict() for name, module in modules.items()}
-        state |= {name: optimizer.state_dict() for name, optimizer in self.optimizers().items()}
+        state = {name: owner.state_dict() for name, owner in self._owners_of_state().items()}
         counts = {"n_updates": self.n_updates, "num_transitions": self.num_transitions, "heard": self._heard}
         generators = {} if self._generators is None else {"generators": self._generators.state_dict()}
         return {**state, "counts": counts, **generators}
@@ -564,17 +562,18 @@ class Learner:
         own = self.state_dict()
         if own.keys() != state.keys():
             raise ValueError(f"state must have the entries {sorted(own)}, not {sorted(state)}")
-        for name, module in {"networks": self.networks, "temperature": self.temperature}.items():
-            module.load_state_dict(state[name])
-        for name, part in self.parts_with_state().items():
-            part.load_state_dict(state[name])
-        for name, optimizer in self.optimizers().items():
-            optimizer.load_state_dict(state[name])
+        for name, owner in self._owners_of_state().items():
+            owner.load_state_dict(state[name])
         counts = state["counts"]
         self._counts._n_updates, self._counts.num_transitions = counts["n_updates"], counts["num_transitions"]
         self._heard = counts["heard"]
         if self._generators is not None:
             self._generators.load_state_dict(state["generators"])
+
+    def _owners_of_state(self) -> dict[str, Any]:
+        """Modules and optimizers with a state, in the order in which they are saved and restored."""
+        modules = {"networks": self.networks, "temperature": self.temperature, **self.parts_with_state()}
+        return {**modules, **self.optimizers()}
 
     def parts_with_state(self) -> dict[str, nn.Module]:
         """

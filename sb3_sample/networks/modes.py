@@ -26,7 +26,7 @@ class ModeSwitch:
         :param mode: training (True) or evaluation mode
         """
         for module in self._plain:
-            # What nn.Module's own setattr comes to for this attribute, after looking for much else.
+            # The effect of nn.Module's own setattr on this attribute, without its search for much else.
             module.__dict__["training"] = mode
         for root in self._own:
             root.train(mode)

@@ -18,7 +18,7 @@ from sb3_sample.ppo.dynamics import Dynamics, TransitionBuffer, Transitions
 from sb3_sample.ppo.simulated_ppo import SimulatedPPO
 from sb3_sample.saving.kept import Kept
 
-#: What ``dynamics_kwargs`` may hold, with the defaults (MBMA, appendix B.2; ``normalize`` is decided here).
+#: Entries of ``dynamics_kwargs``, with the defaults (MBMA, appendix B.2; ``normalize`` is decided here).
 DYNAMICS_DEFAULTS: dict[str, Any] = {
     "width": 1024,
     "depth": 2,

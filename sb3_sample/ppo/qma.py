@@ -16,7 +16,7 @@ from sb3_sample.ppo.dynamics import ADAM_EPS, Standardizer, fit, minibatches
 from sb3_sample.ppo.simulated_ppo import SimulatedPPO, SimulatedSamples
 from sb3_sample.saving.kept import Kept
 
-#: What ``q_kwargs`` may hold, with the defaults (MBMA, appendix B.2; ``normalize`` is decided here).
+#: Entries of ``q_kwargs``, with the defaults (MBMA, appendix B.2; ``normalize`` is decided here).
 Q_DEFAULTS: dict[str, Any] = {"width": 1024, "depth": 2, "learning_rate": 3e-4, "epochs": None, "normalize": True}
 
 

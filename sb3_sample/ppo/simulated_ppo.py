@@ -273,7 +273,7 @@ class SimulatedPPO(Resumable, SafeFiles, PPO):
 
     @classmethod
     def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
-        # What the file says of simulated samples is not what the caller has asked for.
+        # The file's arguments of simulated samples contradict n_simulated=0.
         is_plain = kwargs.get("n_simulated") == 0
         return {name: default_of(cls, name) for name in cls.simulation_arguments} if is_plain else {}
 

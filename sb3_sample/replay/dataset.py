@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from sb3_sample.learner.batch import Batch
+from sb3_sample.learner.batch import Batch, for_each
 
 Arrays = np.ndarray | dict[str, np.ndarray]
 
@@ -38,9 +38,9 @@ class Dataset:
     ):
         self.observation_space, self.action_space = observation_space, action_space
         self._columns = (
-            _tensors(observations),
+            for_each(torch.from_numpy, observations),
             torch.from_numpy(actions),
-            _tensors(next_observations),
+            for_each(torch.from_numpy, next_observations),
             torch.from_numpy(terminations).unsqueeze(1),
             torch.from_numpy(rewards).unsqueeze(1),
         )
@@ -141,8 +141,7 @@ class Dataset:
         :return: the data set
         """
         self._columns = tuple(  # type: ignore[assignment]
-            {key: value.to(device) for key, value in column.items()} if isinstance(column, dict) else column.to(device)
-            for column in self._columns
+            for_each(lambda tensor: tensor.to(device), column) for column in self._columns
         )
         return self
 
@@ -157,21 +156,11 @@ class Dataset:
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1, not {batch_size}")
         rows = torch.randint(len(self), (batch_size,), generator=self._generator).to(self._columns[1].device)
-        drawn: list[Any] = [
-            {key: value[rows] for key, value in column.items()} if isinstance(column, dict) else column[rows]
-            for column in self._columns
-        ]
-        return Batch(*drawn)
+        return Batch(*(_take(column, rows) for column in self._columns))
 
 
-def _tensors(arrays: Arrays) -> Any:
-    if isinstance(arrays, dict):
-        return {key: torch.from_numpy(value) for key, value in arrays.items()}
-    return torch.from_numpy(arrays)
-
-
-def _take(arrays: Arrays, rows: np.ndarray) -> Arrays:
-    return {key: value[rows] for key, value in arrays.items()} if isinstance(arrays, dict) else arrays[rows]
+def _take(columns: Any, rows: Any) -> Any:
+    return for_each(lambda column: column[rows], columns)
 
 
 def _rows(name: str, values: Any) -> Arrays:

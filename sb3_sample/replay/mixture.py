@@ -54,16 +54,14 @@ def _joined(columns: list[Any]) -> Any:
 
 def _discounts(batches: list[Batch]) -> torch.Tensor | float | None:
     """One discount factor for all where they agree, or one a row."""
-    kinds = {batch.discounts for batch in batches if not isinstance(batch.discounts, torch.Tensor)}
-    if all(not isinstance(batch.discounts, torch.Tensor) for batch in batches) and len(kinds - {None}) <= 1:
+    given = [batch.discounts for batch in batches]
+    numbers = {discount for discount in given if not isinstance(discount, torch.Tensor)} - {None}
+    if len(numbers) <= 1 and not any(isinstance(discount, torch.Tensor) for discount in given):
         # None is the learner's own, which a replay buffer's number is too.
-        return next(iter(kinds - {None}), None)
-    if None in kinds:
-        raise ValueError("a source without discounts cannot be mixed with one of several: give them to its batches")
-    rows = [
-        batch.discounts
-        if isinstance(batch.discounts, torch.Tensor)
-        else torch.full_like(batch.rewards, float(batch.discounts or 0.0))
-        for batch in batches
-    ]
+        return next(iter(numbers), None)
+    rows = []
+    for batch, discount in zip(batches, given, strict=True):
+        if discount is None:
+            raise ValueError("a source without discounts cannot be mixed with one of several: give them to its batches")
+        rows.append(discount if isinstance(discount, torch.Tensor) else torch.full_like(batch.rewards, float(discount)))
     return torch.cat(rows)

@@ -34,8 +34,18 @@ from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.replay.compact import CompactReplay
 
 
+def transform_choice(value: Any) -> tuple[Any, Any]:
+    """
+    Read an entry of ``batch_transforms``.
+
+    :param value: a class, or a pair of one and its arguments
+    :return: the class and its arguments
+    """
+    return tuple(value) if isinstance(value, (tuple, list)) and len(value) == 2 else (value, {})
+
+
 def _is_transform(value: Any) -> bool:
-    cls, kwargs = value if isinstance(value, (tuple, list)) and len(value) == 2 else (value, {})
+    cls, kwargs = transform_choice(value)
     return isinstance(cls, type) and issubclass(cls, BatchTransform) and isinstance(kwargs, dict)
 
 

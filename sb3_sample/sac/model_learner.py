@@ -61,7 +61,7 @@ def _maker(cls: Any) -> Callable[..., Learner]:
         """
         Make a learner with the parts of this algorithm, without an environment, a replay buffer or a file.
 
-        What counts environment steps (``resets``, the episodes of "top") does nothing unless ``on_step`` is called;
+        ``resets`` and the episodes of "top" count environment steps and do nothing unless ``on_step`` is called;
         ``reset_gradient_steps`` counts what the learner does itself. A learning rate that is a function stays at its
         first value until ``set_learning_rate``. ``compile="auto"`` compiles nothing, since how many steps will follow
         is not known.
@@ -99,6 +99,8 @@ def _maker(cls: Any) -> Callable[..., Learner]:
 
 def check_action_space(space: spaces.Space) -> None:
     """
+    Check an action space.
+
     :param space: of actions
     :raises ValueError: if it is not a Box with finite bounds, low below high
     """
@@ -264,12 +266,12 @@ class HasLearner:
 
     @property
     def explorer(self) -> Exploration:
-        """Whoever acts while training."""
+        """Explorer, which acts while training."""
         return self.learner.explorer  # type: ignore[no-any-return]
 
     @property
     def plasticity(self) -> Resets:
-        """When everything starts anew."""
+        """Resets."""
         return self.learner.plasticity  # type: ignore[no-any-return]
 
     @property
@@ -284,7 +286,7 @@ class HasLearner:
 
     @property
     def transforms(self) -> nn.ModuleList:
-        """What every batch goes through before it is learned from."""
+        """Batch transforms, in their order."""
         return self.learner.transforms  # type: ignore[no-any-return]
 
     @property
@@ -294,5 +296,5 @@ class HasLearner:
 
 
 def _make_transform(choice: Any, learner: Learner) -> BatchTransform:
-    make, kwargs = choice if isinstance(choice, (tuple, list)) else (choice, {})
+    make, kwargs = arguments.transform_choice(choice)
     return make(learner, **kwargs)  # type: ignore[no-any-return]

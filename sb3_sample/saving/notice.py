@@ -51,7 +51,7 @@ def say_once(model: Any, encoder: Lenient, trusted: Sequence[str] = (), stacklev
     said: dict[str, str] = {}
     for name, path in encoder.foreign.items():
         if "<locals>" in path or not within(path.partition(":")[0], vouched):
-            # What an argument has several of, such as the noise of each environment, needs the same once.
+            # Several objects of one argument, such as the noise of each environment, need the same: it is said once.
             wanted = need(cls, name, path)
             said.setdefault(f"{path} {wanted}", f"{name} is {path}, for which {wanted}")
     for name, reason in encoder.left_out.items():
