@@ -2,7 +2,6 @@
 
 import inspect
 import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -29,17 +28,6 @@ class NoPolicy(ValueError):
     """A policy is none of this family."""
 
 
-#: Arguments of Stable-Baselines3's ``BaseAlgorithm``, by the attribute that holds them.
-EVERY_ALGORITHM: dict[str, Kind] = {
-    "learning_rate": AT_LEAST_0.otherwise("a schedule", callable),
-    "policy_kwargs": DICT,
-    "_stats_window_size": integer(1),
-    "tensorboard_log": Kind("be the path of a folder", lambda value: isinstance(value, (str, os.PathLike))).or_none(),
-    "verbose": VERBOSE,
-    # The seeds that NumPy takes.
-    "seed": integer(0, 2**32 - 1).or_none(),
-    "sde_sample_freq": integer(-1),
-}
 #: Entries of ``policy_kwargs`` that Stable-Baselines3's policies and those here have in common.
 EVERY_POLICY: dict[str, Kind] = {
     "optimizer_class": maker(torch.optim.Optimizer, "torch.optim.Adam"),
@@ -64,26 +52,21 @@ _LEARN: dict[str, Kind] = {
 }
 
 
-def check_table(agent: Any, table: Mapping[str, Kind]) -> None:
-    """
-    :param agent: an algorithm that has its arguments as attributes
-    :param table: by attribute, what it must be
-    :raises ValueError: if one of them is something else
-    """
-    for name, kind in table.items():
-        setattr(agent, name, check_value(name.removeprefix("_"), getattr(agent, name), kind))
-
-
 def check_every(agent: Any) -> None:
     """
-    Check what all algorithms and policies take. There are spaces unless a model is made without an environment.
+    Check every argument that has a kind, and what all policies take. There are spaces unless a model is made without an
+    environment.
 
     :param agent: an algorithm whose arguments are stored and whose networks do not exist yet
     :raises ValueError: if one of them is of another kind, or the policy is not one for the observations
     """
     if not hasattr(agent, "observation_space"):
         raise ValueError(f"env must {_ENVIRONMENT.words}, not None")
-    check_table(agent, EVERY_ALGORITHM)
+    for name, argument in type(agent).constructor_arguments.items():
+        if argument.kind is not None:
+            # Stable-Baselines3 stores some under the argument's name that are declared under another for their type.
+            attribute = argument.attribute if argument.attribute in vars(agent) else name
+            setattr(agent, attribute, check_value(name, getattr(agent, attribute), argument.kind))
     kwargs, space = agent.policy_kwargs, agent.observation_space
     for name, kind in EVERY_POLICY.items():
         if name in kwargs:
@@ -162,21 +145,18 @@ def check_device(device: Any) -> None:
         raise ValueError(f"device must be 'auto', 'cpu', 'cuda' or another of torch's, not {device!r}") from error
 
 
-def check_program(cls: type, policy: Any, env: Any, device: Any, verbose: Any) -> None:
+def check_program(cls: type, given: Mapping[str, Any]) -> None:
     """
     Check what Stable-Baselines3's constructor makes use of.
 
     :param cls: class of an algorithm
-    :param policy: the argument
-    :param env: the argument; None where a model is loaded
-    :param device: the argument
-    :param verbose: the argument
+    :param given: its arguments by name; env is None where a model is loaded
     :raises ValueError: if one of them is of another kind
     """
-    check_policy_class(cls, policy)
-    check_value("env", env, _ENVIRONMENT.or_none())
-    check_device(device)
-    check_value("verbose", verbose, VERBOSE)
+    check_policy_class(cls, given["policy"])
+    check_value("env", given["env"], _ENVIRONMENT.or_none())
+    check_device(given["device"])
+    check_value("verbose", given["verbose"], VERBOSE)
 
 
 def check_learn(agent: Any, learn: Mapping[str, Any]) -> int:

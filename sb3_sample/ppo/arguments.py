@@ -1,12 +1,17 @@
-"""Checks of the on-policy family's arguments."""
+"""Arguments of the on-policy family: what each is, what it may be, and what does not go together."""
 
 from collections.abc import Mapping
 from typing import Any
 
+import gymnasium as gym
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.arguments import check_every, check_net_arch, check_table, check_unused, named_policy
+from sb3_sample.arguments import check_every, check_net_arch, check_unused, named_policy
+from sb3_sample.constructor import argument
 from sb3_sample.kinds import (
     ABOVE_0,
     AT_LEAST_0,
@@ -21,33 +26,91 @@ from sb3_sample.kinds import (
     number,
     subclass,
 )
+from sb3_sample.training.resumable import Resumable
 
 _CLIPPING = ABOVE_0.otherwise("a schedule", callable)
-#: By argument, what it must be.
-ARGUMENTS: dict[str, Kind] = {
-    "n_steps": integer(1),
-    "batch_size": integer(1),
-    "n_epochs": integer(1),
-    "gamma": UNIT,
-    "gae_lambda": UNIT,
-    "clip_range": _CLIPPING,
-    "clip_range_vf": _CLIPPING.or_none(),
-    "normalize_advantage": TRUE_OR_FALSE,
-    "ent_coef": FINITE,
-    "vf_coef": AT_LEAST_0,
-    "max_grad_norm": number("be above 0 (float('inf') for no limit)", lambda value: value > 0),
-    "rollout_buffer_class": subclass(RolloutBuffer).or_none(),
-    "rollout_buffer_kwargs": DICT,
-    "target_kl": number("be above 0", lambda value: value > 0).or_none("no limit"),
-    "n_simulated": integer(0),
-    "anneal_until": Kind(
-        "lie in (0, 1], a share of the training, or be None",
-        lambda value: value is None or (is_number(value) and 0 < value <= 1),
-    ),
-    "warm_up_until": Kind(
-        "lie in [0, 1], a share of the training, or be None", lambda value: value is None or UNIT.fits(value)
-    ),
-}
+
+
+class PPOArguments(Resumable):
+    """Arguments that every on-policy algorithm has, those of Stable-Baselines3 first and by position too."""
+
+    _policy: str | type[ActorCriticPolicy] = argument(alias="policy", kw_only=False)
+    """"MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes"""
+    _env: gym.Env[Any, Any] | VecEnv | str | None = argument(alias="env", kw_only=False)
+    """the environment, an id, or a vectorised environment"""
+    learning_rate: float | Schedule = argument(
+        default=3e-4, kind=AT_LEAST_0.otherwise("a schedule", callable), kw_only=False
+    )
+    """of actor and critic; a number or a function of the remaining progress (from 1 to 0)"""
+    n_steps: int = argument(default=2048, kind=integer(1), kw_only=False)
+    """T, steps of each environment between two updates"""
+    batch_size: int = argument(default=64, kind=integer(1), kw_only=False)
+    """real samples a minibatch"""
+    n_epochs: int = argument(default=10, kind=integer(1), kw_only=False)
+    """passes over the rollout"""
+    gamma: float = argument(default=0.99, kind=UNIT, kw_only=False)
+    """discount factor, of real and simulated returns"""
+    gae_lambda: float = argument(default=0.95, kind=UNIT, kw_only=False)
+    """lambda of GAE and of the simulated TD(lambda) returns"""
+    clip_range: float | Schedule = argument(default=0.2, kind=_CLIPPING, kw_only=False)
+    """PPO's clipping of the probability ratio, of real and simulated samples; also a schedule"""
+    clip_range_vf: float | Schedule | None = argument(default=None, kind=_CLIPPING.or_none(), kw_only=False)
+    """clipping of the value's change; None for none"""
+    normalize_advantage: bool = argument(default=False, kind=TRUE_OR_FALSE, kw_only=False)
+    """whether advantages are normalised, in each minibatch, real and simulated samples together. MBMA, section 5.1,
+    has it off: "it has no grounding in SPG theory", it says"""
+    ent_coef: float = argument(default=0.0, kind=FINITE, kw_only=False)
+    """weight of the entropy at the real states"""
+    vf_coef: float = argument(default=0.5, kind=AT_LEAST_0, kw_only=False)
+    """weight of the value loss"""
+    max_grad_norm: float = argument(
+        default=0.5, kind=number("be above 0 (float('inf') for no limit)", lambda value: value > 0), kw_only=False
+    )
+    """of the gradient of actor and critic together"""
+    use_sde: bool = argument(default=False, kw_only=False)
+    """refused with simulated actions, since actions at one state share their noise"""
+    sde_sample_freq: int = argument(default=-1, kind=integer(-1), kw_only=False)
+    """as in Stable-Baselines3"""
+    rollout_buffer_class: type[RolloutBuffer] | None = argument(
+        default=None, kind=subclass(RolloutBuffer).or_none(), kw_only=False
+    )
+    """as in Stable-Baselines3"""
+    _rollout_buffer_kwargs: dict[str, Any] | None = argument(
+        alias="rollout_buffer_kwargs", default=None, kind=DICT, kw_only=False
+    )
+    """as in Stable-Baselines3"""
+    target_kl: float | None = argument(
+        default=None, kind=number("be above 0", lambda value: value > 0).or_none("no limit"), kw_only=False
+    )
+    """the updates of an iteration end above 1.5 times this divergence, taken over all samples of the policy loss; None
+    for no limit"""
+    _policy_kwargs: dict[str, Any] | None = argument(alias="policy_kwargs", default=None)
+    """arguments of the policy. Without ``net_arch``, "MlpPolicy" and "MultiInputPolicy" have the paper's two hidden
+    layers of 512 (actor) and 1024 (critic)"""
+    n_simulated: int = argument(default=8, kind=integer(0))
+    """X, simulated samples for each real one, at the height of the schedule below; 0 for PPO. With a Discrete space:
+    see ``simulate``"""
+    anneal_until: float | None = argument(
+        default=None,
+        kind=Kind(
+            "lie in (0, 1], a share of the training, or be None",
+            lambda value: value is None or (is_number(value) and 0 < value <= 1),
+        ),
+    )
+    """share of the training, of ``total_timesteps``, from which on nothing is simulated any more: at an iteration whose
+    rollout began at the share p of the training, X = ceil(``n_simulated`` (1 - p / ``anneal_until``)). None: X does not
+    decline. A second ``learn`` counts anew, or goes on with ``reset_num_timesteps=False``"""
+    warm_up_until: float | None = argument(
+        default=None,
+        kind=Kind(
+            "lie in [0, 1], a share of the training, or be None", lambda value: value is None or UNIT.fits(value)
+        ),
+    )
+    """share of the training over which X rises linearly from 0 to ``n_simulated`` while the models learn, rounded up
+    too; 0 for no rise. None: 0.15, or 0 if ``anneal_until`` is given. With both, the two factors are multiplied. MBMA,
+    section 5.1: "We anneal the number of additional samples until 15% step of the training for all methods". The
+    default reads it as a rise that ends at 15%; ``anneal_until=0.15`` is the other reading, a decline to none that ends
+    there, with which nothing is left of the gain over PPO (docs/many_actions.md)"""
 
 
 def check(agent: Any) -> None:
@@ -56,7 +119,6 @@ def check(agent: Any) -> None:
     :raises ValueError: if an argument is out of range or contradicts another
     """
     check_every(agent)
-    check_table(agent, ARGUMENTS)
     _check_minibatches(agent.batch_size, agent.normalize_advantage)
     if named_policy(agent) is not None:
         _check_net_arch(agent.policy_kwargs.get("net_arch"))
@@ -68,16 +130,19 @@ def check(agent: Any) -> None:
         _check_simulation(agent)
 
 
-def check_counts(n_steps: Any, batch_size: Any, n_epochs: Any, normalize_advantage: Any) -> None:
+def check_counts(cls: type[PPOArguments], given: Mapping[str, Any]) -> None:
     """
-    What ``PPO.__init__`` divides by and asserts.
+    Check what ``PPO.__init__`` divides by and asserts.
 
+    :param cls: class of an algorithm
+    :param given: its arguments by name
     :raises ValueError: if one of them is out of range
     """
-    given = {"n_steps": n_steps, "batch_size": batch_size, "n_epochs": n_epochs}
-    for name, value in {**given, "normalize_advantage": normalize_advantage}.items():
-        check_value(name, value, ARGUMENTS[name])
-    _check_minibatches(batch_size, normalize_advantage)
+    for name in "n_steps", "batch_size", "n_epochs", "normalize_advantage":
+        kind = cls.constructor_arguments[name].kind
+        assert kind is not None
+        check_value(name, given[name], kind)
+    _check_minibatches(given["batch_size"], given["normalize_advantage"])
 
 
 def _check_minibatches(batch_size: int, normalize_advantage: bool) -> None:

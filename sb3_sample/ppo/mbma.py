@@ -2,6 +2,7 @@
 
 import torch
 
+from sb3_sample.constructor import argument
 from sb3_sample.ppo.model_based import ModelBasedPPO
 from sb3_sample.ppo.simulated_ppo import SimulatedSamples
 
@@ -15,23 +16,12 @@ class MBMAPPO(ModelBasedPPO):
     Defaults are those of the paper, appendix B.2. They differ from ``stable_baselines3.PPO`` in the networks (512 and
     1024 instead of 64) and in that advantages are not normalised.
 
-    :param policy: "MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes
-    :param env: the environment, an id, or a vectorised environment
-    :param learning_rate: of actor and critic; a number or a function of the remaining progress (from 1 to 0)
-    :param n_simulated: X, extra actions at each real state; 0 for PPO. Actions of a Discrete space are not drawn but
-        all taken, weighted as X draws count in expectation
-    :param anneal_until: share of the training from which on nothing is simulated any more; None for no decline
-    :param warm_up_until: share of the training over which X rises from 0; None: 0.15, or 0 if ``anneal_until`` is
-        given. Both in full: :class:`SimulatedPPO`
-    :param simulation_horizon: H, steps of a rollout of the model
-    :param dynamics_buffer_size: transitions that the model learns from
-    :param dynamics_batch_size: transitions in a batch of the model
-    :param dynamics_kwargs: ``width``, ``depth``, ``learning_rate``, ``epochs``, ``normalize``: :class:`ModelBasedPPO`
-    :param predict_termination: whether the model predicts that episodes terminate; None: not for ``dmc/`` tasks
-    :param args: the other arguments of ``stable_baselines3.PPO`` in its order
-    :param kwargs: every other argument of :class:`ModelBasedPPO` and :class:`SimulatedPPO`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
+
+    n_simulated: int = argument(default=8)
+    """X, extra actions at each real state; 0 for PPO. Actions of a Discrete space are not drawn but all taken, weighted
+    as X draws count in expectation"""
 
     def _simulate(
         self, observations: torch.Tensor, values: torch.Tensor, n_simulated: int, noise: torch.Tensor | None

@@ -2,6 +2,7 @@
 
 import torch
 
+from sb3_sample.constructor import argument
 from sb3_sample.ppo.model_based import ModelBasedPPO, draw
 from sb3_sample.ppo.simulated_ppo import SimulatedSamples
 
@@ -20,22 +21,13 @@ class MBPOPPO(ModelBasedPPO):
     lies further than H - 1 steps of the model from a real one. With ``predict_termination`` a sample counts as much as
     the rollout is likely to have come so far.
 
-    :param policy: "MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes
-    :param env: the environment, an id, or a vectorised environment
-    :param learning_rate: of actor and critic; a number or a function of the remaining progress (from 1 to 0)
-    :param n_simulated: X, simulated states for each real one; 0 for PPO
-    :param anneal_until: share of the training from which on nothing is simulated any more; None for no decline
-    :param warm_up_until: share of the training over which X rises from 0; None: 0.15, or 0 if ``anneal_until`` is
-        given. Both in full: :class:`SimulatedPPO`
-    :param simulation_horizon: H, steps of a rollout of the model, at least 2
-    :param dynamics_buffer_size: transitions that the model learns from
-    :param dynamics_batch_size: transitions in a batch of the model
-    :param dynamics_kwargs: ``width``, ``depth``, ``learning_rate``, ``epochs``, ``normalize``: :class:`ModelBasedPPO`
-    :param predict_termination: whether the model predicts that episodes terminate; None: not for ``dmc/`` tasks
-    :param args: the other arguments of ``stable_baselines3.PPO`` in its order
-    :param kwargs: every other argument of :class:`ModelBasedPPO` and :class:`SimulatedPPO`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
+
+    n_simulated: int = argument(default=8)
+    """X, simulated states for each real one; 0 for PPO"""
+    simulation_horizon: int = argument(default=12)
+    """H, steps of a rollout of the model, at least 2"""
 
     def _check_arguments(self) -> None:
         super()._check_arguments()

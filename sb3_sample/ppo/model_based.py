@@ -8,11 +8,10 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import CategoricalDistribution, Distribution
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.kinds import check_value, integer
+from sb3_sample.constructor import argument
+from sb3_sample.kinds import Kind, integer
 from sb3_sample.ppo.arguments import check_network_kwargs
 from sb3_sample.ppo.dynamics import Dynamics, TransitionBuffer, Transitions
 from sb3_sample.ppo.simulated_ppo import SimulatedPPO
@@ -84,20 +83,6 @@ class ModelBasedPPO(SimulatedPPO):
     :class:`SimulatedPPO` with a learned model of the environment (MBMA, appendix E), the base of :class:`MBMAPPO` and
     :class:`MBPOPPO`. Each iteration the model is trained on the most recent transitions, before the policy.
 
-    :param policy: "MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes
-    :param env: the environment, an id, or a vectorised environment
-    :param learning_rate: of actor and critic; a number or a function of the remaining progress (from 1 to 0)
-    :param simulation_horizon: H, steps of a rollout of the model, at whose end the critic's value stands
-    :param dynamics_buffer_size: transitions, of all environments together, that the model learns from
-    :param dynamics_batch_size: transitions in a batch of the model
-    :param dynamics_kwargs: the model: ``width`` (1024) and ``depth`` (2) of the hidden layers of each of its two
-        networks, ``learning_rate`` (3e-4), ``epochs`` (None: ``n_epochs``; an iteration trains it for ``epochs`` times
-        PPO's minibatches), and ``normalize`` (True): whether observations and rewards are standardised, at the input
-        and in the errors, by the transitions that it learns from
-    :param predict_termination: whether the model predicts that episodes terminate: off suits tasks whose episodes end
-        by time limits only. None: off for the tasks of the DeepMind Control suite, ``dmc/...``, none of which
-        terminates (MBMA's setting), and for other environments with a true attribute ``never_terminates``; else on
-    :param kwargs: every other argument of :class:`SimulatedPPO`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
@@ -111,35 +96,29 @@ class ModelBasedPPO(SimulatedPPO):
         "predict_termination",
     )
 
-    def __init__(
-        self,
-        policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 3e-4,
-        *args: Any,
-        simulation_horizon: int = 12,
-        dynamics_buffer_size: int = 25_000,
-        dynamics_batch_size: int = 128,
-        dynamics_kwargs: dict[str, Any] | None = None,
-        predict_termination: bool | None = None,
-        **kwargs: Any,
-    ):
-        self.simulation_horizon = simulation_horizon
-        self.dynamics_buffer_size = dynamics_buffer_size
-        self.dynamics_batch_size = dynamics_batch_size
-        self.dynamics_kwargs = dynamics_kwargs
-        self.predict_termination = predict_termination
-        super().__init__(policy, env, learning_rate, *args, **kwargs)
+    simulation_horizon: int = argument(default=12, kind=integer(1))
+    """H, steps of a rollout of the model, at whose end the critic's value stands"""
+    dynamics_buffer_size: int = argument(default=25_000, kind=integer(1))
+    """transitions, of all environments together, that the model learns from"""
+    dynamics_batch_size: int = argument(default=128, kind=integer(1))
+    """transitions in a batch of the model"""
+    dynamics_kwargs: dict[str, Any] | None = argument(default=None)
+    """the model: ``width`` (1024) and ``depth`` (2) of the hidden layers of each of its two networks, ``learning_rate``
+    (3e-4), ``epochs`` (None: ``n_epochs``; an iteration trains it for ``epochs`` times PPO's minibatches), and
+    ``normalize`` (True): whether observations and rewards are standardised, at the input and in the errors, by the
+    transitions that it learns from"""
+    predict_termination: bool | None = argument(
+        default=None, kind=Kind("be True, False or None", lambda value: value is None or isinstance(value, bool))
+    )
+    """whether the model predicts that episodes terminate: off suits tasks whose episodes end by time limits only. None:
+    off for the tasks of the DeepMind Control suite, ``dmc/...``, none of which terminates (MBMA's setting), and for
+    other environments with a true attribute ``never_terminates``; else on"""
 
     # ---------------------------------------------------------------- construction
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        for name in ("simulation_horizon", "dynamics_buffer_size", "dynamics_batch_size"):
-            check_value(name, getattr(self, name), integer(1))
         check_network_kwargs("dynamics_kwargs", self.dynamics_kwargs, DYNAMICS_DEFAULTS)
-        if self.predict_termination is not None and not isinstance(self.predict_termination, bool):
-            raise ValueError(f"predict_termination must be True, False or None, not {self.predict_termination!r}")
         normalizer = self._vec_normalize_env
         if self.n_simulated > 0 and normalizer is not None and normalizer.observation_space != self.observation_space:
             raise ValueError(

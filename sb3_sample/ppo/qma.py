@@ -4,10 +4,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from torch import nn
 
+from sb3_sample.constructor import argument
 from sb3_sample.networks.initialization import linear
 from sb3_sample.networks.mlp import MLP
 from sb3_sample.optim import AdamW
@@ -73,36 +72,19 @@ class QMAPPO(SimulatedPPO):
     al. 2019): ``n_simulated`` extra actions at each real state, their Q-values the smaller of two Q-networks' that are
     trained on the TD(lambda) returns of each rollout before the policy, by PPO's minibatches and epochs.
 
-    :param policy: "MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes
-    :param env: the environment, an id, or a vectorised environment
-    :param learning_rate: of actor and critic; a number or a function of the remaining progress (from 1 to 0)
-    :param n_simulated: X, extra actions at each real state; 0 for PPO. Actions of a Discrete space are not drawn but
-        all taken, weighted as X draws count in expectation
-    :param anneal_until: share of the training from which on nothing is simulated any more; None for no decline
-    :param warm_up_until: share of the training over which X rises from 0; None: 0.15, or 0 if ``anneal_until`` is
-        given. Both in full: :class:`SimulatedPPO`
-    :param q_kwargs: the Q-networks: ``width`` (1024) and ``depth`` (2) of the hidden layers, ``learning_rate`` (3e-4),
-        ``epochs`` over each rollout (None: ``n_epochs``), and ``normalize`` (True): whether observations are
-        standardised by the rollout
-    :param args: the other arguments of ``stable_baselines3.PPO`` in its order
-    :param kwargs: every other argument of :class:`SimulatedPPO`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
     _kept: ClassVar[dict[str, Kept]] = {"_network_kwargs": Kept.NOWHERE}
     simulation_arguments: ClassVar[tuple[str, ...]] = (*SimulatedPPO.simulation_arguments, "q_kwargs")
 
-    def __init__(
-        self,
-        policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 3e-4,
-        *args: Any,
-        q_kwargs: dict[str, Any] | None = None,
-        **kwargs: Any,
-    ):
-        self.q_kwargs = q_kwargs
-        super().__init__(policy, env, learning_rate, *args, **kwargs)
+    n_simulated: int = argument(default=8)
+    """X, extra actions at each real state; 0 for PPO. Actions of a Discrete space are not drawn but all taken, weighted
+    as X draws count in expectation"""
+    q_kwargs: dict[str, Any] | None = argument(default=None)
+    """the Q-networks: ``width`` (1024) and ``depth`` (2) of the hidden layers, ``learning_rate`` (3e-4), ``epochs``
+    over each rollout (None: ``n_epochs``), and ``normalize`` (True): whether observations are standardised by the
+    rollout"""
 
     def _check_arguments(self) -> None:
         super()._check_arguments()

@@ -5,6 +5,7 @@ The on-policy family: PPO whose policy gradient also sees simulated samples, and
 samples come from is the business of its subclasses, in ``fit_models`` and ``_simulate``.
 """
 
+import inspect
 import math
 import pathlib
 import time
@@ -21,7 +22,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import CategoricalDistribution, DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -30,12 +31,12 @@ from sb3_sample.console import say
 from sb3_sample.faults import TrainingDiverged, check_finite_parameters, diverged, not_finite
 from sb3_sample.kinds import check_value, integer
 from sb3_sample.ppo import arguments
+from sb3_sample.ppo.arguments import PPOArguments
 from sb3_sample.ppo.dynamics import minibatches
 from sb3_sample.ppo.spaces import FlatObservations, ModelActions
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
 from sb3_sample.saving.kept import Kept
 from sb3_sample.saving.model import SafeFiles
-from sb3_sample.training.resumable import Resumable
 
 Self = TypeVar("Self", bound="SimulatedPPO")
 
@@ -44,6 +45,8 @@ NET_ARCH: dict[str, list[int]] = {"pi": [512, 512], "vf": [1024, 1024]}
 #: Share of the training over which the number of samples rises (MBMA, section 5.1).
 WARM_UP = 0.15
 NAMED_POLICIES = ("MlpPolicy", "MultiInputPolicy")
+#: Arguments that Stable-Baselines3's constructor stores.
+_STABLE_BASELINES3 = inspect.signature(PPO.__init__).parameters.keys()
 
 
 class Rollout(NamedTuple):
@@ -86,7 +89,7 @@ class SimulatedSamples(NamedTuple):
     weights: torch.Tensor | None = None
 
 
-class SimulatedPPO(Resumable, SafeFiles, PPO):
+class SimulatedPPO(PPOArguments, SafeFiles, PPO):
     """
     PPO whose policy loss also sees simulated samples (MBMA, Nauman and Cygan 2023,
     https://arxiv.org/abs/2210.13011, algorithm 1): what :class:`MBMAPPO`, :class:`QMAPPO` and :class:`MBPOPPO` share.
@@ -95,46 +98,6 @@ class SimulatedPPO(Resumable, SafeFiles, PPO):
     The number of updates is PPO's: each takes ``batch_size`` real samples with the simulated ones that belong to them
     for the policy, and the real ones for the value. Without simulated samples it *is* Stable-Baselines3's PPO.
 
-    :param policy: "MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes
-    :param env: the environment, an id, or a vectorised environment
-    :param learning_rate: of actor and critic; a number or a function of the remaining progress (from 1 to 0)
-    :param n_steps: T, steps of each environment between two updates
-    :param batch_size: real samples a minibatch
-    :param n_epochs: passes over the rollout
-    :param gamma: discount factor, of real and simulated returns
-    :param gae_lambda: lambda of GAE and of the simulated TD(lambda) returns
-    :param clip_range: PPO's clipping of the probability ratio, of real and simulated samples; also a schedule
-    :param clip_range_vf: clipping of the value's change; None for none
-    :param normalize_advantage: whether advantages are normalised, in each minibatch, real and simulated samples
-        together. The paper, section 5.1, does not, since "it has no grounding in SPG theory"
-    :param ent_coef: weight of the entropy at the real states
-    :param vf_coef: weight of the value loss
-    :param max_grad_norm: of the gradient of actor and critic together
-    :param use_sde: refused with simulated actions, since actions at one state share their noise
-    :param sde_sample_freq: as in Stable-Baselines3
-    :param rollout_buffer_class: as in Stable-Baselines3
-    :param rollout_buffer_kwargs: as in Stable-Baselines3
-    :param target_kl: the updates of an iteration end above 1.5 times this divergence, taken over all samples of the
-        policy loss; None for no limit
-    :param stats_window_size: episodes over which the logged return is averaged
-    :param tensorboard_log: folder of the TensorBoard log; none if None
-    :param policy_kwargs: arguments of the policy. Without ``net_arch``, "MlpPolicy" and "MultiInputPolicy" have the
-        paper's two hidden layers of 512 (actor) and 1024 (critic)
-    :param verbose: 0 nothing, 1 info, 2 debug
-    :param seed: seed of everything random
-    :param device: "auto", "cpu", "cuda", ...
-    :param _init_setup_model: whether to build the networks at once
-    :param n_simulated: X, simulated samples for each real one, at the height of the schedule below; 0 for PPO. With
-        a Discrete space: see ``simulate``
-    :param anneal_until: share of the training, of ``total_timesteps``, from which on nothing is simulated any more: at
-        an iteration whose rollout began at the share p of the training, X = ceil(``n_simulated`` (1 - p /
-        ``anneal_until``)). None: X does not decline. A second ``learn`` counts anew, or goes on with
-        ``reset_num_timesteps=False``
-    :param warm_up_until: share of the training over which X rises linearly from 0 to ``n_simulated`` while the models
-        learn, rounded up too; 0 for no rise. None: 0.15, or 0 if ``anneal_until`` is given. With both, the two factors
-        are multiplied. MBMA, section 5.1: "We anneal the number of additional samples until 15% step of the training
-        for all methods". The default reads it as a rise that ends at 15%; ``anneal_until=0.15`` is the other reading, a
-        decline to none that ends there, with which nothing is left of the gain over PPO (docs/many_actions.md)
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
@@ -148,80 +111,21 @@ class SimulatedPPO(Resumable, SafeFiles, PPO):
     #: Arguments that mean nothing without simulated samples.
     simulation_arguments: ClassVar[tuple[str, ...]] = ("anneal_until", "warm_up_until")
 
-    def __init__(
-        self,
-        policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 3e-4,
-        n_steps: int = 2048,
-        batch_size: int = 64,
-        n_epochs: int = 10,
-        gamma: float = 0.99,
-        gae_lambda: float = 0.95,
-        clip_range: float | Schedule = 0.2,
-        clip_range_vf: float | Schedule | None = None,
-        normalize_advantage: bool = False,
-        ent_coef: float = 0.0,
-        vf_coef: float = 0.5,
-        max_grad_norm: float = 0.5,
-        use_sde: bool = False,
-        sde_sample_freq: int = -1,
-        rollout_buffer_class: type[RolloutBuffer] | None = None,
-        rollout_buffer_kwargs: dict[str, Any] | None = None,
-        target_kl: float | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: torch.device | str = "auto",
-        _init_setup_model: bool = True,
-        *,
-        n_simulated: int = 8,
-        anneal_until: float | None = None,
-        warm_up_until: float | None = None,
-    ):
-        check_program(type(self), policy, env, device, verbose)
-        arguments.check_counts(n_steps, batch_size, n_epochs, normalize_advantage)
-        super().__init__(
-            policy,
-            env,
-            learning_rate=learning_rate,
-            n_steps=n_steps,
-            batch_size=batch_size,
-            n_epochs=n_epochs,
-            gamma=gamma,
-            gae_lambda=gae_lambda,
-            clip_range=clip_range,
-            clip_range_vf=clip_range_vf,
-            normalize_advantage=normalize_advantage,
-            ent_coef=ent_coef,
-            vf_coef=vf_coef,
-            max_grad_norm=max_grad_norm,
-            use_sde=use_sde,
-            sde_sample_freq=sde_sample_freq,
-            rollout_buffer_class=rollout_buffer_class,
-            rollout_buffer_kwargs=rollout_buffer_kwargs,
-            target_kl=target_kl,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_kwargs,
-            verbose=verbose,
-            seed=seed,
-            device=device,
-            _init_setup_model=False,
-        )
-        self.n_simulated = n_simulated
-        self.anneal_until = anneal_until
-        self.warm_up_until = warm_up_until
+    def _construct(self, given: dict[str, Any]) -> None:
+        check_program(type(self), given)
+        arguments.check_counts(type(self), given)
+        is_set_up = given.pop("_init_setup_model")
+        theirs = {name: given.pop(name) for name in _STABLE_BASELINES3 & given.keys()}
+        vars(self).update(given)
+        PPO.__init__(self, **theirs, _init_setup_model=False)
         # A policy class has its own widths. A loaded model's class is known, the name it was given by is not.
-        self._has_named_policy = policy in NAMED_POLICIES
+        self._has_named_policy = theirs["policy"] in NAMED_POLICIES
         # Share of the training at which the present rollout began.
         self._progress = 0.0
         # Of the present or last learn.
         self._iteration = 0
         self._seconds: dict[str, float] = {}
-        if _init_setup_model:
+        if is_set_up:
             self._setup_model()
 
     # ---------------------------------------------------------------- construction

@@ -4,9 +4,9 @@ The off-policy family as Stable-Baselines3's: acting, storing, when and how ofte
 The update is the learner's (``sb3_sample/learner/learner.py``).
 """
 
+import inspect
 import pathlib
 import warnings
-from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -18,7 +18,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_program, default_of
@@ -31,9 +31,6 @@ from sb3_sample.learner.execution import (
     warn_not_compiled,
     why_not_compiled,
 )
-from sb3_sample.learner.exploration import Exploration
-from sb3_sample.learner.heads import ValueHead
-from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.logged_values import LoggedValues
 from sb3_sample.replay.buffers import (
     ValidationDictReplayBuffer,
@@ -43,7 +40,8 @@ from sb3_sample.replay.buffers import (
 )
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
 from sb3_sample.replay.sources import ReplaySource
-from sb3_sample.sac import arguments
+from sb3_sample.sac import checks
+from sb3_sample.sac.arguments import SACArguments
 from sb3_sample.sac.model_learner import check_action_space
 from sb3_sample.sac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.sb3_names import SB3Names
@@ -58,9 +56,11 @@ Self = TypeVar("Self", bound="SAC")
 
 # Batches of at most this many gradient steps are drawn at once, to bound the memory they take.
 MAX_BATCHES_AT_ONCE = 64
+#: Arguments that Stable-Baselines3's constructor stores.
+_STABLE_BASELINES3 = inspect.signature(OffPolicyAlgorithm.__init__).parameters.keys()
 
 
-class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]  # actor
+class SAC(SB3Names, SACArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]  # actor
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
     SAC that the DAC, VPL and BRO papers and the regularization study (https://arxiv.org/abs/2403.00514) compare with:
@@ -71,73 +71,6 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
     instead of its logarithm, a target entropy of -|A|/2, orthogonal initialisation, and a log standard
     deviation squashed into [-10, 2] instead of clipped.
 
-    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
-    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
-    :param learning_rate: of actor, critics and temperature; a number or a function of the remaining progress
-        (from 1 to 0)
-    :param buffer_size: capacity of the replay buffer in transitions
-    :param learning_starts: transitions with uniformly random actions before the first gradient step, counted over
-        the model's life
-    :param batch_size: transitions a gradient step
-    :param tau: weight of the new critics in the Polyak average of the targets, in (0, 1]
-    :param gamma: discount factor
-    :param train_freq: as in Stable-Baselines3, every how many steps (or ``(n, "episode")``) to train; if given,
-        with ``gradient_steps``, it replaces ``replay_ratio``
-    :param gradient_steps: as in Stable-Baselines3, gradient steps each time (-1: as many as transitions were
-        collected); if given, it replaces ``replay_ratio``
-    :param action_noise: noise added to the actions while training
-    :param replay_buffer_class: class of the replay buffer; chosen by the observation space if None, one that stores
-        one observation a step
-    :param replay_buffer_kwargs: its arguments; ``memory_map="folder"`` keeps the default buffer in files
-    :param optimize_memory_usage: for a ``replay_buffer_class`` that knows it. The default buffer saves the memory
-        anyway, with time limits handled, and takes either value
-    :param n_steps: n-step returns, as in Stable-Baselines3
-    :param ent_coef: temperature: "auto" learns it, "auto_0.1" from that start, a number fixes it
-    :param target_update_interval: gradient steps between two updates of the targets; None: ``policy_delay``
-    :param target_entropy: entropy that the learned temperature aims at; "auto" is -|A|/2. As in Stable-Baselines3, a
-        number once the model is made; set anew, it counts from the next ``train`` on
-    :param replay_ratio: gradient steps per environment transition after the warm-up, whatever the number of
-        environments; may be below 1
-    :param n_quantiles: quantiles a critic; None for scalar critics
-    :param value_head: a class of one's own, derived from ``ValueHead``, in the place of those two; with
-        ``n_quantiles=None``
-    :param value_head_kwargs: its arguments
-    :param pessimism: weight of the critics' spread that is subtracted from their mean, at least 0; 1 is the
-        minimum of two critics, 0 the mean. Or the rule that moves it: "gpl", "opl", "top", "vpl", or a class derived
-        from ``Pessimism``
-    :param pessimism_kwargs: arguments of the rule
-    :param actor_pessimism: a weight for the actor's objective alone (REDQ and DroQ: 0); None: the same
-    :param target_subset: how many critics, drawn at random, make the TD target (REDQ: 2); None: all
-    :param validation_proportion: share of the transitions that is held out of training, in [0, 1); "vpl" learns from
-        them
-    :param exploration: who acts while training: "actor", "oac", "optimistic_actor" (DAC), "optimistic_shift" (BRO), or
-        a class derived from ``Exploration``
-    :param exploration_kwargs: its arguments
-    :param backbone: "sac", or "td3": a deterministic actor, without entropy
-    :param policy_delay: gradient steps between two of the actors' and of the temperature
-    :param resets: environment steps at which all parameters start anew, counted in transitions over the model's life;
-        or one integer for every so many
-    :param reset_gradient_steps: resets after every so many gradient steps of the model's life instead (SR-SAC's
-        original: 2,560,000); None for none. Not together with ``resets``
-    :param reset_shrink: share of the old parameters that a reset leaves (shrink and perturb), in [0, 1)
-    :param redo_period: gradient steps between two recyclings of the critics' dormant neurons (ReDo; the original:
-        1,000); None for none
-    :param redo_threshold: score up to which a neuron is dormant
-    :param sam_radius: radius of sharpness-aware minimisation of the critics' loss (the original: 0.05); None for none
-    :param batch_transforms: classes derived from ``BatchTransform``, or pairs of one and its arguments, which every
-        batch goes through before it is learned from
-    :param use_sde: not supported, refused if True
-    :param sde_sample_freq: as in Stable-Baselines3, without meaning where ``use_sde`` is False
-    :param use_sde_at_warmup: as in Stable-Baselines3, without meaning where ``use_sde`` is False
-    :param stats_window_size: episodes over which the logged return is averaged
-    :param tensorboard_log: folder of the TensorBoard log; none if None
-    :param policy_kwargs: arguments of the policy
-    :param verbose: 0 nothing, 1 info, 2 debug
-    :param seed: seed of everything random
-    :param device: "auto", "cpu", "cuda", ...
-    :param compile: whether ``torch.compile`` makes one program of the gradient step; "auto": where that pays back
-        within the run, on a CPU or a GPU with a compiler at hand, see docs/performance.md
-    :param _init_setup_model: whether to build the networks at once
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
@@ -147,7 +80,6 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
         "MultiInputPolicy": MultiInputPolicy,
     }
     policy_base = SACPolicy
-    policy: SACPolicy
     _kept: ClassVar[dict[str, Kept]] = {
         # Saved by its parts.
         "_learner": Kept.NOWHERE,
@@ -159,115 +91,21 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
         "action_noise": Kept.EVERYWHERE,
     }
 
-    def __init__(
-        self,
-        policy: str | type[SACPolicy],
-        env: GymEnv | str | None,
-        learning_rate: float | Schedule = 3e-4,
-        buffer_size: int = 1_000_000,
-        learning_starts: int = 10_000,
-        batch_size: int = 256,
-        tau: float = 0.005,
-        gamma: float = 0.99,
-        train_freq: int | tuple[int, str] | None = None,
-        gradient_steps: int | None = None,
-        action_noise: ActionNoise | None = None,
-        replay_buffer_class: type[ReplayBuffer] | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
-        optimize_memory_usage: bool = False,
-        n_steps: int = 1,
-        ent_coef: str | float = "auto",
-        target_update_interval: int | None = 1,
-        target_entropy: str | float = "auto",
-        replay_ratio: float = 2,
-        n_quantiles: int | None = None,
-        pessimism: float | str | type[Pessimism] = 1.0,
-        pessimism_kwargs: dict[str, Any] | None = None,
-        actor_pessimism: float | None = None,
-        target_subset: int | None = None,
-        validation_proportion: float = 0.0,
-        exploration: str | type[Exploration] = "actor",
-        exploration_kwargs: dict[str, Any] | None = None,
-        backbone: str = "sac",
-        policy_delay: int = 1,
-        resets: Sequence[int] | int = (),
-        reset_gradient_steps: int | None = None,
-        reset_shrink: float = 0.0,
-        redo_period: int | None = None,
-        redo_threshold: float = 0.025,
-        sam_radius: float | None = None,
-        value_head: type[ValueHead] | None = None,
-        value_head_kwargs: dict[str, Any] | None = None,
-        batch_transforms: Sequence[Any] = (),
-        use_sde: bool = False,
-        sde_sample_freq: int = -1,
-        use_sde_at_warmup: bool = False,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: torch.device | str = "auto",
-        compile: bool | str = "auto",
-        _init_setup_model: bool = True,
-    ):
-        check_program(type(self), policy, env, device, verbose)
-        arguments.check_use_sde(use_sde)
-        super().__init__(
-            policy,
-            env,  # type: ignore[arg-type]  # None when a model is loaded for prediction only
-            learning_rate,
-            buffer_size,
-            learning_starts,
-            batch_size,
-            tau,
-            gamma,
-            1 if train_freq is None else train_freq,
-            1 if gradient_steps is None else gradient_steps,
-            action_noise,
-            replay_buffer_class=replay_buffer_class,
-            replay_buffer_kwargs=replay_buffer_kwargs,
-            optimize_memory_usage=optimize_memory_usage,
-            n_steps=n_steps,
-            policy_kwargs=policy_kwargs,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            device=device,
-            seed=seed,
-            sde_sample_freq=sde_sample_freq,
-            use_sde_at_warmup=use_sde_at_warmup,
-            sde_support=False,
-            support_multi_env=True,
-        )
-        # None: Stable-Baselines3's two arguments are in force.
-        self.replay_ratio: float | None = replay_ratio if train_freq is None and gradient_steps is None else None
-        self.n_quantiles = n_quantiles
-        self.ent_coef = ent_coef
-        self.target_update_interval = target_update_interval
-        self.target_entropy = target_entropy
-        self.pessimism = pessimism
-        self.pessimism_kwargs = pessimism_kwargs
-        self.actor_pessimism = actor_pessimism
-        self.target_subset = target_subset
-        self.validation_proportion = validation_proportion
-        self.exploration = exploration
-        self.exploration_kwargs = exploration_kwargs
-        self.backbone = backbone
-        self.policy_delay = policy_delay
-        if reset_gradient_steps is not None and resets is default_of(type(self), "resets"):
+    def _construct(self, given: dict[str, Any]) -> None:
+        check_program(type(self), given)
+        checks.check_use_sde(given["use_sde"])
+        if given["train_freq"] is not None or given["gradient_steps"] is not None:
+            # Stable-Baselines3's two arguments are in force.
+            given["replay_ratio"] = None
+        if given["reset_gradient_steps"] is not None and given["resets"] is default_of(type(self), "resets"):
             # Those that a class has of its own give way. By identity: equal ones that are passed are another object.
-            resets = ()
-        self.resets = resets
-        self.reset_gradient_steps = reset_gradient_steps
-        self.reset_shrink = reset_shrink
-        self.redo_period = redo_period
-        self.redo_threshold = redo_threshold
-        self.sam_radius = sam_radius
-        self.value_head = value_head
-        self.value_head_kwargs = value_head_kwargs
-        self.batch_transforms = batch_transforms
-        self.compile = compile
+            given["resets"] = ()
+        for name in "train_freq", "gradient_steps":
+            given[name] = 1 if given[name] is None else given[name]
+        is_set_up = given.pop("_init_setup_model")
+        theirs = {name: given.pop(name) for name in _STABLE_BASELINES3 & given.keys()}
+        vars(self).update(given)
+        OffPolicyAlgorithm.__init__(self, **theirs, sde_support=False, support_multi_env=True)
         #: Whether the gradient step is compiled; None while that is not decided. Saved: a loaded model goes on with it.
         self.compiled: bool | None = None
         #: A callback that wants gradients in ``.grad`` sets this: the last of the next gradient steps is run eagerly.
@@ -278,7 +116,7 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
         # Gradient steps owed but not yet taken, the fraction that a replay ratio leaves over.
         self._updates_owed = 0.0
         self._metrics: dict[str, torch.Tensor] = {}
-        if _init_setup_model:
+        if is_set_up:
             self._setup_model()
 
     # ---------------------------------------------------------------- construction
@@ -291,11 +129,11 @@ class SAC(SB3Names, Resumable, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm)
             self.compiled = bool(self.compile)
         self._source = ReplaySource(self)
         self.learner = self._make_learner(networks=self.policy, counts=self)
-        arguments.check_rule(self)
+        checks.check_rule(self)
         self._watch = MetricWatch(self.device)
 
     def _check_arguments(self) -> None:
-        arguments.check(self)
+        checks.check(self)
 
     def _complete_arguments(self) -> None:
         super()._complete_arguments()

@@ -1,25 +1,21 @@
-"""Checks of the off-policy family's arguments, and the defaults that follow from others."""
+"""Arguments of the off-policy family: what each is, and what it may be."""
 
-import inspect
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-from gymnasium import spaces
-from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+import gymnasium as gym
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.type_aliases import TrainFreq
-from stable_baselines3.her import HerReplayBuffer
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.arguments import NotAllowed, check_every, check_table, check_unused
+from sb3_sample.constructor import argument
 from sb3_sample.kinds import (
     ABOVE_0,
     AT_LEAST_0,
     DICT,
     UNIT,
     Kind,
-    check_value,
     instance,
     integer,
     number,
@@ -28,10 +24,10 @@ from sb3_sample.kinds import (
 )
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
 from sb3_sample.learner.heads import ValueHead
-from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
+from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.learner.transforms import BatchTransform
-from sb3_sample.replay.buffers import DeviceReplayBuffer
-from sb3_sample.replay.compact import CompactReplay
+from sb3_sample.sac.policies import SACPolicy
+from sb3_sample.training.resumable import Resumable
 
 
 def transform_choice(value: Any) -> tuple[Any, Any]:
@@ -49,310 +45,128 @@ def _is_transform(value: Any) -> bool:
     return isinstance(cls, type) and issubclass(cls, BatchTransform) and isinstance(kwargs, dict)
 
 
-#: By argument, what it must be.
-ARGUMENTS: dict[str, Kind] = {
-    "buffer_size": integer(1),
-    "learning_starts": integer(0),
-    "batch_size": integer(1),
-    "tau": number("lie in (0, 1]", lambda value: 0 < value <= 1),
-    "gamma": UNIT,
-    "gradient_steps": Kind("be an integer of at least 0, or -1 for as many as transitions", integer(-1).fits),
-    "action_noise": instance(ActionNoise).or_none(),
-    "replay_buffer_class": subclass(ReplayBuffer).or_none(),
-    "replay_buffer_kwargs": DICT,
-    "n_steps": integer(1),
-    "target_update_interval": integer(1).or_none("policy_delay"),
-    "replay_ratio": AT_LEAST_0.or_none(),
-    "n_quantiles": integer(1).or_none("scalar critics"),
-    "pessimism_kwargs": DICT,
-    "validation_proportion": number("lie in [0, 1)", lambda value: 0 <= value < 1),
-    "value_head": subclass(ValueHead).or_none("scalars or quantiles"),
-    "value_head_kwargs": DICT,
-    "exploration": one_of(EXPLORATIONS, Exploration),
-    "batch_transforms": Kind(
-        "be classes derived from BatchTransform, or pairs of one and its arguments",
-        lambda value: isinstance(value, Sequence) and all(_is_transform(each) for each in value),
-    ),
-    "exploration_kwargs": DICT,
-    "policy_delay": integer(1),
-    "reset_shrink": number("lie in [0, 1)", lambda value: 0 <= value < 1),
-    "reset_gradient_steps": integer(1).or_none("no such resets"),
-    "redo_period": integer(1).or_none("no recycling"),
-    "redo_threshold": number("be at least 0", lambda value: value >= 0),
-    "sam_radius": ABOVE_0.or_none("no SAM"),
-}
+class SACArguments(Resumable):
+    """Arguments that every off-policy algorithm has, those of Stable-Baselines3 first and by position too."""
 
-
-def check(agent: Any) -> None:
-    """
-    :param agent: an algorithm whose arguments are stored and whose networks do not exist yet
-    :raises ValueError: if an argument is out of range or contradicts another
-    """
-    check_every(agent)
-    check_table(agent, ARGUMENTS)
-    n_critics = check_value("n_critics", agent.policy_kwargs.get("n_critics", 2), integer(1))
-    check_target_entropy(agent)
-    check_use_sde(agent.use_sde)
-    if n_critics == 1 and (isinstance(agent.pessimism, (str, type)) or agent.exploration == "oac"):
-        what = f"pessimism={agent.pessimism!r}" if isinstance(agent.pessimism, (str, type)) else "exploration='oac'"
-        raise ValueError(f"{what} weighs the critics' spread, which n_critics=1 has not")
-    if agent.redo_period is None:
-        check_unused(agent, ["redo_threshold"], "redo_period=None")
-    if agent.reset_gradient_steps is not None and has_resets(agent.resets):
-        raise ValueError(
-            f"resets={agent.resets!r} and reset_gradient_steps={agent.reset_gradient_steps!r} are two ways to say when "
-            "everything starts anew: pass one of them"
-        )
-    if agent.reset_gradient_steps is None and not has_resets(agent.resets):
-        check_unused(agent, ["reset_shrink"], "no resets")
-    if agent.compile not in (True, False, "auto") or not isinstance(agent.compile, (bool, str)):
-        raise ValueError(f"compile must be True, False or 'auto', not {agent.compile!r}")
-    if agent.value_head is None:
-        check_unused(agent, ["value_head_kwargs"], "value_head=None")
-    elif agent.n_quantiles is not None:
-        raise ValueError(
-            f"n_quantiles={agent.n_quantiles} and value_head={agent.value_head!r} are two value heads: pass "
-            "n_quantiles=None"
-        )
-    for name in ("n_quantiles", "n_outputs", "backbone"):
-        if name in agent.policy_kwargs:
-            raise ValueError(f"{name} is an argument of the algorithm, not of policy_kwargs")
-    if agent.backbone == "td3":
-        _check_no_entropy(agent, "ent_coef")
-    _check_pessimism(agent)
-    _check_buffer_class(agent)
-    _check_replay(agent)
-    _check_n_steps(agent)
-    _check_memory_map(agent)
-    _check_device_buffer(agent)
-    _check_train_freq(agent)
-
-
-def has_resets(resets: Any) -> bool:
-    """
-    :param resets: the argument of that name, checked or not
-    :return: whether it asks for a reset: it is no empty sequence
-    """
-    return not (isinstance(resets, (Sequence, np.ndarray)) and len(resets) == 0)
-
-
-def check_target_entropy(agent: Any) -> None:
-    """
-    :param agent: an algorithm
-    :raises ValueError: if its ``target_entropy`` is neither finite nor "auto", or a number where there is no entropy
-    """
-    if agent.backbone == "td3":
-        _check_no_entropy(agent, "target_entropy")
-    value = agent.target_entropy
-    if value != "auto" and not math.isfinite(as_number("target_entropy", value, "'auto'")):
-        raise ValueError(f"target_entropy must be finite, or 'auto', not {value}")
-
-
-def check_use_sde(use_sde: bool) -> None:
-    """
-    :param use_sde: the argument
-    :raises ValueError: if it is asked for
-    """
-    if use_sde:
-        raise ValueError(
-            "use_sde=True is not supported by this family of algorithms: use action_noise, "
-            f"or exploration=, one of {sorted(EXPLORATIONS)}"
-        )
-
-
-def _check_no_entropy(agent: Any, name: str) -> None:
-    if getattr(agent, name) != "auto":
-        raise ValueError(
-            f"{name}={getattr(agent, name)!r} asks for an entropy, which a deterministic actor (backbone='td3') has "
-            f"not: leave {name} out"
-        )
-
-
-def _check_pessimism(agent: Any) -> None:
-    if isinstance(agent.pessimism, (str, type)):
-        kind = one_of(PESSIMISMS, Pessimism)
-        if not kind.fits(agent.pessimism):
-            raise ValueError(
-                f"pessimism must be a number, or {kind.words.removeprefix('be ')}, not {agent.pessimism!r}"
-            )
-    elif isinstance(agent.pessimism, Pessimism):
-        raise ValueError(
-            f"pessimism must be a number, a name or a class, not an object of {type(agent.pessimism).__name__}: pass "
-            "the class, and its arguments as pessimism_kwargs"
-        )
-    else:
-        check_beta("pessimism", agent.pessimism)
-        if agent.pessimism_kwargs:
-            raise ValueError(
-                f"pessimism_kwargs={agent.pessimism_kwargs} are arguments of a rule that moves pessimism, but "
-                f"pessimism={agent.pessimism} is fixed: pass pessimism as one of {sorted(PESSIMISMS)}"
-            )
-    if agent.actor_pessimism is not None:
-        check_beta("actor_pessimism", agent.actor_pessimism)
-    if agent.target_subset == 1 and isinstance(agent.pessimism, (str, type)):
-        raise ValueError(
-            f"pessimism={agent.pessimism!r} weighs the spread of the targets, and target_subset=1 leaves none"
-        )
-    if agent.target_subset is not None:
-        n_critics = agent.policy_kwargs.get("n_critics", 2)
-        if not integer(1, n_critics).fits(agent.target_subset):
-            raise ValueError(
-                f"target_subset must lie between 1 and the number of critics, {n_critics} "
-                f"(policy_kwargs['n_critics']), or be None for all, not {agent.target_subset!r}"
-            )
-
-
-def _check_buffer_class(agent: Any) -> None:
-    """Whether the buffer is one for the observations."""
-    cls, space = agent.replay_buffer_class, agent.observation_space
-    is_dict = isinstance(space, spaces.Dict)
-    if cls is None:
-        if agent.n_steps > 1 and is_dict:
-            raise NotAllowed(f"n_steps={agent.n_steps} is not supported with Dict observation spaces: pass n_steps=1")
-        return
-    if issubclass(cls, DictReplayBuffer) and not is_dict:
-        raise ValueError(
-            f"replay_buffer_class={cls.__name__} needs a Dict observation space, not {space}: leave it out"
-        )
-    if is_dict and cls in (ReplayBuffer, NStepReplayBuffer):
-        raise ValueError(f"replay_buffer_class={cls.__name__} cannot hold the observations of {space}: leave it out")
-    goals = {"observation", "achieved_goal", "desired_goal"}
-    if issubclass(cls, HerReplayBuffer) and isinstance(space, spaces.Dict) and not goals <= space.spaces.keys():
-        raise ValueError(
-            f"replay_buffer_class={cls.__name__} needs an observation space with {sorted(goals)}, not {space}"
-        )
-
-
-def _check_replay(agent: Any) -> None:
-    if agent.validation_proportion > 0:
-        cls = agent.replay_buffer_class
-        if cls is not None and cls not in (ReplayBuffer, DictReplayBuffer) and not issubclass(cls, CompactReplay):
-            raise ValueError(
-                f"validation_proportion={agent.validation_proportion} holds single transitions out, which is known of "
-                f"ReplayBuffer and DictReplayBuffer only, not of {cls.__name__} (samples of several transitions, as "
-                "relabelled goals are, would carry them into training): leave replay_buffer_class out, or pass "
-                "validation_proportion=0"
-            )
-        if agent.n_steps > 1:
-            raise ValueError(
-                f"validation_proportion={agent.validation_proportion} holds single transitions out, which "
-                f"n_steps={agent.n_steps} would carry into training: pass n_steps=1, or validation_proportion=0"
-            )
-
-
-def _check_memory_map(agent: Any) -> None:
-    """A buffer in files: only those of this package know it."""
-    cls, is_split = agent.replay_buffer_class, agent.validation_proportion > 0
-    made_by_us = is_split or (agent.n_steps == 1 if cls is None else issubclass(cls, CompactReplay))
-    if (agent.replay_buffer_kwargs or {}).get("memory_map") is not None and not made_by_us:
-        what = f"n_steps={agent.n_steps}" if cls is None else f"replay_buffer_class={cls.__name__}"
-        raise ValueError(
-            f"replay_buffer_kwargs: memory_map is known to CompactReplayBuffer, the default, and not to the buffer of "
-            f"{what}: leave one of them out"
-        )
-
-
-def _check_device_buffer(agent: Any) -> None:
-    cls = agent.replay_buffer_class
-    if cls is None or not issubclass(cls, DeviceReplayBuffer):
-        return
-    if agent.get_vec_normalize_env() is not None:
-        raise ValueError(
-            "replay_buffer_class=DeviceReplayBuffer cannot be combined with VecNormalize, which normalises on the "
-            "host: leave replay_buffer_class out"
-        )
-    if agent.optimize_memory_usage:
-        raise ValueError("replay_buffer_class=DeviceReplayBuffer cannot be combined with optimize_memory_usage=True")
-
-
-def _check_n_steps(agent: Any) -> None:
-    cls = agent.replay_buffer_class
-    if agent.n_steps > 1 and cls is not None and not issubclass(cls, NStepReplayBuffer):
-        raise ValueError(
-            f"n_steps={agent.n_steps} needs a buffer that makes n-step returns, NStepReplayBuffer, not "
-            f"replay_buffer_class={cls.__name__}: leave replay_buffer_class out"
-        )
-
-
-def _check_train_freq(agent: Any) -> None:
-    train_freq: Any = agent.train_freq
-    if not isinstance(train_freq, TrainFreq):
-        every, unit = train_freq if isinstance(train_freq, tuple) else (train_freq, "step")
-        if not isinstance(every, int) or every < 1 or unit not in ("step", "episode"):
-            raise ValueError(f"train_freq must be at least 1, or (n, 'step' or 'episode'), not {train_freq!r}")
-        if unit == "episode" and agent.env is not None and agent.n_envs > 1:
-            raise ValueError(
-                f"train_freq={train_freq!r} counts episodes, which needs one environment, not {agent.n_envs}"
-            )
-
-
-def check_rule(agent: Any) -> None:
-    """
-    :param agent: an algorithm with its rule of pessimism
-    :raises ValueError: if the transitions that the rule learns from are none that the algorithm has
-    """
-    rule = agent.pessimism_rule
-    if not isinstance(rule, LearnedPessimism):
-        return
-    source, segment_length = rule.source, rule.segment_length
-    if source in ("recent", "on_policy") and segment_length > max(agent.buffer_size // agent.n_envs, 1):
-        raise ValueError(
-            f"segment_length={segment_length} is more than a replay buffer of buffer_size={agent.buffer_size} "
-            f"holds of each of {agent.n_envs} environments"
-        )
-    if source == "validation" and agent.validation_proportion == 0:
-        raise ValueError(
-            "pessimism='vpl' learns from transitions held out, and validation_proportion=0 holds none out: "
-            "pass validation_proportion=1/32, or another source of its transitions"
-        )
-    if source == "on_policy":
-        if agent.exploration != "actor":
-            raise ValueError(
-                f"the segments of pessimism='opl' must be on-policy, but exploration={agent.exploration!r}: "
-                "it goes with exploration='actor' only"
-            )
-        if agent.action_noise is not None:
-            raise ValueError("the segments of pessimism='opl' must be on-policy: leave action_noise out")
-
-
-def check_names(argument: str, choice: Any, make: Callable[..., Any], kwargs: dict[str, Any]) -> None:
-    """
-    :param argument: name of the argument that chose a part
-    :param choice: its value
-    :param make: what builds the part, from the learner and these arguments
-    :param kwargs: arguments for it
-    :raises ValueError: if one of them is none that it takes
-    """
-    # The first is the learner.
-    allowed = list(inspect.signature(make).parameters)[1:]
-    for name in kwargs:
-        if name not in allowed:
-            raise ValueError(f"{argument}_kwargs has {name!r}, but {argument}={choice!r} takes {allowed or 'none'}")
-
-
-def check_once(kwargs_name: str, kwargs: dict[str, Any] | None, arguments: dict[str, str]) -> None:
-    """
-    :param kwargs_name: name of an argument that is a dict
-    :param kwargs: its value
-    :param arguments: by key of the dict, the argument of the class that is the same setting
-    :raises ValueError: if the dict has such a key
-    """
-    for key in kwargs or {}:
-        if key in arguments:
-            raise ValueError(f"{kwargs_name} has {key!r}, which is the argument {arguments[key]} here: pass that")
-
-
-def as_number(name: str, value: Any, otherwise: str, shown: Any = None) -> float:
-    """
-    :param name: name of an argument
-    :param value: its value
-    :param otherwise: what else is allowed, for the error
-    :param shown: the value as the error shows it, if that is another
-    :return: the value as a number
-    :raises ValueError: if it is not one
-    """
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        shown = value if shown is None else shown
-        raise ValueError(f"{name} must be a number, or {otherwise}, not {shown!r}") from None
+    _policy: str | type[SACPolicy] = argument(alias="policy", kw_only=False, of_training=True)
+    """"MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class"""
+    _env: gym.Env[Any, Any] | VecEnv | str | None = argument(alias="env", kw_only=False, of_training=True)
+    """the environment, an id, or a vectorised environment; its action space a bounded Box"""
+    learning_rate: float | Schedule = argument(
+        default=3e-4, kind=AT_LEAST_0.otherwise("a schedule", callable), kw_only=False
+    )
+    """of all networks and the temperature; a number or a function of the remaining progress (from 1 to 0)"""
+    buffer_size: int = argument(default=1_000_000, kind=integer(1), kw_only=False, of_training=True)
+    """capacity of the replay buffer in transitions"""
+    learning_starts: int = argument(default=10_000, kind=integer(0), kw_only=False, of_training=True)
+    """transitions with uniformly random actions before the first gradient step, counted over the model's life"""
+    batch_size: int = argument(default=256, kind=integer(1), kw_only=False, of_training=True)
+    """transitions a gradient step"""
+    tau: float = argument(default=0.005, kind=number("lie in (0, 1]", lambda value: 0 < value <= 1), kw_only=False)
+    """weight of the new critics in the Polyak average of the targets, in (0, 1]"""
+    gamma: float = argument(default=0.99, kind=UNIT, kw_only=False)
+    """discount factor"""
+    _train_freq: int | tuple[int, str] | None = argument(
+        alias="train_freq", default=None, kw_only=False, of_training=True
+    )
+    """as in Stable-Baselines3, every how many steps (or ``(n, "episode")``) to train; if given, with
+    ``gradient_steps``, it replaces ``replay_ratio``"""
+    _gradient_steps: int | None = argument(
+        alias="gradient_steps",
+        default=None,
+        kind=Kind("be an integer of at least 0, or -1 for as many as transitions", integer(-1).fits),
+        kw_only=False,
+        of_training=True,
+    )
+    """as in Stable-Baselines3, gradient steps each time (-1: as many as transitions were collected); if given, it
+    replaces ``replay_ratio``"""
+    action_noise: ActionNoise | None = argument(
+        default=None, kind=instance(ActionNoise).or_none(), kw_only=False, of_training=True
+    )
+    """noise added to the actions while training"""
+    replay_buffer_class: type[ReplayBuffer] | None = argument(
+        default=None, kind=subclass(ReplayBuffer).or_none(), kw_only=False, of_training=True
+    )
+    """class of the replay buffer; chosen by the observation space if None, one that stores one observation a step"""
+    _replay_buffer_kwargs: dict[str, Any] | None = argument(
+        alias="replay_buffer_kwargs", default=None, kind=DICT, kw_only=False, of_training=True
+    )
+    """its arguments; ``memory_map="folder"`` keeps the default buffer in files"""
+    optimize_memory_usage: bool = argument(default=False, kw_only=False, of_training=True)
+    """for a ``replay_buffer_class`` that knows it. The default buffer saves the memory anyway, with time limits
+    handled, and takes either value"""
+    n_steps: int = argument(default=1, kind=integer(1), kw_only=False, of_training=True)
+    """n-step returns, as in Stable-Baselines3"""
+    ent_coef: str | float = argument(default="auto", kw_only=False)
+    """temperature: "auto" learns it from 1, "auto_0.1" from that start, a number fixes it"""
+    target_update_interval: int | None = argument(default=1, kind=integer(1).or_none("policy_delay"), kw_only=False)
+    """gradient steps between two updates of the targets; None: ``policy_delay``"""
+    target_entropy: str | float = argument(default="auto", kw_only=False)
+    """entropy that the learned temperature aims at; "auto" is -|A|/2. As in Stable-Baselines3, a number once the model
+    is made; set anew, it counts from the next ``train`` on"""
+    replay_ratio: float | None = argument(default=2, kind=AT_LEAST_0.or_none(), of_training=True)
+    """gradient steps per environment transition after the warm-up, whatever the number of environments; may be below
+    1"""
+    n_quantiles: int | None = argument(default=None, kind=integer(1).or_none("scalar critics"))
+    """quantiles a critic; None for scalar critics"""
+    value_head: type[ValueHead] | None = argument(
+        default=None, kind=subclass(ValueHead).or_none("scalars or quantiles")
+    )
+    """a class of one's own, derived from ``ValueHead``, in the place of those two; with ``n_quantiles=None``"""
+    value_head_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
+    """its arguments"""
+    pessimism: float | str | type[Pessimism] = argument(default=1.0)
+    """weight of the critics' spread that is subtracted from their mean, at least 0; 1 is the minimum of two critics, 0
+    the mean. Or the rule that moves it: "gpl", "opl", "top", "vpl", or a class derived from ``Pessimism``"""
+    pessimism_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
+    """arguments of the rule"""
+    actor_pessimism: float | None = argument(default=None)
+    """a weight for the actor's objective alone (REDQ and DroQ: 0); None: the same"""
+    target_subset: int | None = argument(default=None)
+    """how many critics, drawn at random, make the TD target (REDQ: 2); None: all"""
+    validation_proportion: float = argument(
+        default=0.0, kind=number("lie in [0, 1)", lambda value: 0 <= value < 1), of_training=True
+    )
+    """share of the transitions that is held out of training, in [0, 1); "vpl" learns from them"""
+    exploration: str | type[Exploration] = argument(default="actor", kind=one_of(EXPLORATIONS, Exploration))
+    """who acts while training: "actor", "oac", "optimistic_actor" (DAC), "optimistic_shift" (BRO), or a class derived
+    from ``Exploration``"""
+    exploration_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
+    """its arguments"""
+    backbone: str = argument(default="sac")
+    """"sac", or "td3": a deterministic actor, without entropy"""
+    policy_delay: int = argument(default=1, kind=integer(1))
+    """gradient steps between two of the actors' and of the temperature"""
+    resets: Sequence[int] | int = argument(default=())
+    """environment steps at which all parameters start anew, counted in transitions over the model's life; or one
+    integer for every so many"""
+    reset_gradient_steps: int | None = argument(default=None, kind=integer(1).or_none("no such resets"))
+    """resets after every so many gradient steps of the model's life instead (SR-SAC's original: 2,560,000), in the
+    place of a class's own ``resets``; None for none. Not together with ``resets``"""
+    reset_shrink: float = argument(default=0.0, kind=number("lie in [0, 1)", lambda value: 0 <= value < 1))
+    """share of the old parameters that a reset leaves (shrink and perturb), in [0, 1)"""
+    redo_period: int | None = argument(default=None, kind=integer(1).or_none("no recycling"))
+    """gradient steps between two recyclings of the critics' dormant neurons (ReDo; the original: 1,000); None for
+    none"""
+    redo_threshold: float = argument(default=0.025, kind=number("be at least 0", lambda value: value >= 0))
+    """score up to which a neuron is dormant"""
+    sam_radius: float | None = argument(default=None, kind=ABOVE_0.or_none("no SAM"))
+    """radius of sharpness-aware minimisation of the critics' loss (the original: 0.05); None for none"""
+    batch_transforms: Sequence[Any] = argument(
+        default=(),
+        kind=Kind(
+            "be classes derived from BatchTransform, or pairs of one and its arguments",
+            lambda value: isinstance(value, Sequence) and all(map(_is_transform, value)),
+        ),
+    )
+    """classes derived from ``BatchTransform``, or pairs of one and its arguments, which every batch goes through before
+    it is learned from"""
+    use_sde: bool = argument(default=False, of_training=True)
+    """not supported, refused if True"""
+    sde_sample_freq: int = argument(default=-1, kind=integer(-1), of_training=True)
+    """as in Stable-Baselines3, without meaning where ``use_sde`` is False"""
+    use_sde_at_warmup: bool = argument(default=False, of_training=True)
+    """as in Stable-Baselines3, without meaning where ``use_sde`` is False"""
+    compile: bool | str = argument(default="auto")
+    """whether ``torch.compile`` makes one program of the gradient step; "auto": where that pays back within the run, on
+    a CPU or a GPU with a compiler at hand, see docs/performance.md"""

@@ -21,16 +21,9 @@ from sb3_sample.learner.randomness import OwnGenerators
 from sb3_sample.learner.scalars import FixedScalar, LogScalar
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.optim import AdamW
-from sb3_sample.sac import arguments
+from sb3_sample.sac import checks
+from sb3_sample.sac.arguments import transform_choice
 from sb3_sample.sac.policies import BACKBONES, Actor, CriticEnsemble, SACPolicy
-
-#: Arguments that say how transitions are collected, stored and drawn, or what is told of it: a learner has none of it.
-OF_TRAINING = (
-    "policy", "env", "buffer_size", "learning_starts", "batch_size", "train_freq", "gradient_steps", "action_noise",
-    "replay_buffer_class", "replay_buffer_kwargs", "optimize_memory_usage", "n_steps", "replay_ratio",
-    "validation_proportion", "use_sde", "sde_sample_freq", "use_sde_at_warmup", "stats_window_size", "tensorboard_log",
-    "_init_setup_model",
-)  # fmt: skip
 
 
 class LearnerOf:
@@ -75,7 +68,9 @@ def _maker(cls: Any) -> Callable[..., Learner]:
         :return: the learner
         :raises ValueError: if an argument is one of training, is out of range or contradicts another
         """
-        of_training = sorted(set(OF_TRAINING) & arguments.keys())
+        of_training = sorted(
+            name for name, each in cls.constructor_arguments.items() if each.of_training and name in arguments
+        )
         if of_training:
             raise ValueError(
                 f"{', '.join(of_training)}: a learner takes no arguments of training; what it learns from is up to its "
@@ -115,6 +110,7 @@ def check_action_space(space: spaces.Space) -> None:
 class HasLearner:
     """A model's learner: how it is made of the arguments, and the model's names for what it has."""
 
+    policy: SACPolicy
     learner = LearnerOf()
     #: The class of the learner.
     learner_class: ClassVar[type[Learner]] = Learner
@@ -162,7 +158,7 @@ class HasLearner:
 
     def _take_target_entropy(self: Any) -> None:
         """Take up what ``target_entropy`` says, which is a number afterwards."""
-        arguments.check_target_entropy(self)
+        checks.check_target_entropy(self)
         if self.target_entropy == "auto":
             self._target_entropy = -get_action_dim(self.action_space) / 2
         else:
@@ -188,11 +184,11 @@ class HasLearner:
         allowed = "'auto' or 'auto_<start above 0>'"
         if isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto"):
             start = self.ent_coef.removeprefix("auto").removeprefix("_") or "1"
-            value = arguments.as_number("ent_coef", start, allowed, shown=self.ent_coef)
+            value = checks.as_number("ent_coef", start, allowed, shown=self.ent_coef)
             if not 0 < value < np.inf:
                 raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
             return LogScalar(value).to(self.device)
-        value = arguments.as_number("ent_coef", self.ent_coef, allowed)
+        value = checks.as_number("ent_coef", self.ent_coef, allowed)
         if not 0 <= value < np.inf:
             raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
         return FixedScalar(value).to(self.device)
@@ -204,7 +200,7 @@ class HasLearner:
         """
         make = chosen("exploration", self.exploration, EXPLORATIONS, Exploration)
         kwargs = self._full_exploration_kwargs()
-        arguments.check_names("exploration", self.exploration, make, kwargs)
+        checks.check_names("exploration", self.exploration, make, kwargs)
         return make(learner, **kwargs)
 
     def make_pessimism(self: Any, learner: Learner) -> Pessimism:
@@ -216,7 +212,7 @@ class HasLearner:
             return Pessimism(self.pessimism)
         make = chosen("pessimism", self.pessimism, PESSIMISMS, Pessimism)
         kwargs = self._full_pessimism_kwargs()
-        arguments.check_names("pessimism", self.pessimism, make, kwargs)
+        checks.check_names("pessimism", self.pessimism, make, kwargs)
         return make(learner, **kwargs)
 
     def _optimizers(self: Any) -> dict[str, torch.optim.Optimizer]:
@@ -296,5 +292,5 @@ class HasLearner:
 
 
 def _make_transform(choice: Any, learner: Learner) -> BatchTransform:
-    make, kwargs = arguments.transform_choice(choice)
+    make, kwargs = transform_choice(choice)
     return make(learner, **kwargs)  # type: ignore[no-any-return]

@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
-
+from sb3_sample.constructor import argument
 from sb3_sample.kinds import AT_LEAST_0, DICT, check_value
+from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.networks import CReLU
-from sb3_sample.sac import arguments
+from sb3_sample.sac import checks
 from sb3_sample.sac.algorithm import SAC
-from sb3_sample.sac.policies import SACPolicy
 
 #: The groups of the regularization study, section 3, each with what it may hold.
 CRITIC_REGULARIZATIONS = ("none", "cdq", "gpl", "top")
@@ -37,73 +36,60 @@ class RegularizedSAC(SAC):
 
     The low replay regime is the default; ``replay_ratio=16`` is the high one.
 
-    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
-    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
-    :param learning_rate: of actor, critics and temperature
-    :param critic_regularization: "none" (the mean of the critics), "cdq" (their minimum), "gpl" or "top"
-    :param network_regularization: "none", or any of "layer_norm", "spectral_norm", "weight_decay", one or several
-    :param plasticity_regularization: "none", or any of "crelu", "redo", "resets", "sam", one or several
-    :param weight_decay: for "weight_decay", its coefficient; None: 0.01, torch's default (optax's: 1e-4)
-    :param sam_radius: for "sam"; None: 0.05
-    :param resets: for "resets", environment steps between two, or the steps of all; None: 160,000, or none with
-        ``reset_gradient_steps``
-    :param reset_gradient_steps: for "resets", gradient steps between two instead
-    :param redo_period: for "redo", gradient steps between two recyclings; None: 1,000
-    :param pessimism_kwargs: for "gpl" and "top", arguments of the rule
-    :param kwargs: every other argument of :class:`SAC`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
-    def __init__(
-        self,
-        policy: str | type[SACPolicy],
-        env: GymEnv | str | None,
-        learning_rate: float | Schedule = 3e-4,
-        *,
-        critic_regularization: str = "cdq",
-        network_regularization: str | Sequence[str] = "none",
-        plasticity_regularization: str | Sequence[str] = "none",
-        weight_decay: float | None = None,
-        sam_radius: float | None = None,
-        resets: Sequence[int] | int | None = None,
-        reset_gradient_steps: int | None = None,
-        redo_period: int | None = None,
-        pessimism_kwargs: dict[str, Any] | None = None,
-        **kwargs: Any,
-    ):
-        if "pessimism" in kwargs:
+    critic_regularization: str = argument(default="cdq")
+    """"none" (the mean of the critics), "cdq" (their minimum), "gpl" or "top"; in the place of ``pessimism``"""
+    network_regularization: str | Sequence[str] = argument(default="none")
+    """"none", or any of "layer_norm", "spectral_norm", "weight_decay", one or several"""
+    plasticity_regularization: str | Sequence[str] = argument(default="none")
+    """"none", or any of "crelu", "redo", "resets", "sam", one or several"""
+    weight_decay: float | None = argument(default=None, kind=AT_LEAST_0.or_none())
+    """for "weight_decay", its coefficient; None: 0.01, torch's default (optax's: 1e-4)"""
+    sam_radius: float | None = argument(default=None)
+    """for "sam"; None: 0.05"""
+    resets: Sequence[int] | int | None = argument(default=None)  # type: ignore[assignment]  # None until it is stored
+    """for "resets", environment steps between two, or the steps of all; None: 160,000, or none with
+    ``reset_gradient_steps``"""
+    reset_gradient_steps: int | None = argument(default=None)
+    """for "resets", gradient steps between two instead"""
+    redo_period: int | None = argument(default=None)
+    """for "redo", gradient steps between two recyclings; None: 1,000"""
+    pessimism: float | str | type[Pessimism] | None = argument(  # type: ignore[assignment]  # None until it is stored
+        default=None
+    )
+    """chosen by ``critic_regularization``"""
+    pessimism_kwargs: dict[str, Any] | None = argument(default=None)
+    """for "gpl" and "top", arguments of the rule"""
+
+    def _construct(self, given: dict[str, Any]) -> None:
+        critics, kwargs = given["critic_regularization"], given["pessimism_kwargs"]
+        if given["pessimism"] is not None:
             raise ValueError("pessimism is what critic_regularization chooses: pass that alone, or use SAC")
-        self.critic_regularization = critic_regularization
-        self.network_regularization = network_regularization
-        self.plasticity_regularization = plasticity_regularization
-        network = _check_group("network_regularization", network_regularization, NETWORK_REGULARIZATIONS)
-        chosen = _check_group("plasticity_regularization", plasticity_regularization, PLASTICITY_REGULARIZATIONS)
-
-        def setting(name: str, given: Any, default: Any, of: str, group: tuple[str, ...]) -> Any:
-            if of in group:
-                return default if given is None else given
-            if given is not None:
-                raise ValueError(f"{name}={given!r} is a setting of {of!r}, which is not among the regularizations")
-            return None
-
-        check_value("pessimism_kwargs", pessimism_kwargs, DICT)
-        gpl = {"learning_rate": 1e-5} if critic_regularization == "gpl" else {}
-        self.weight_decay = setting("weight_decay", weight_decay, 0.01, "weight_decay", network)
-        reset_gradient_steps = setting("reset_gradient_steps", reset_gradient_steps, None, "resets", chosen)
-        default = 160_000 if reset_gradient_steps is None else ()
-        resets = setting("resets", resets, default, "resets", chosen)
-        super().__init__(
-            policy,
-            env,
-            learning_rate,
-            pessimism=_pessimism(critic_regularization),
-            pessimism_kwargs={**gpl, **(pessimism_kwargs or {})} or None,
-            sam_radius=setting("sam_radius", sam_radius, 0.05, "sam", chosen),
-            resets=() if resets is None else resets,
-            reset_gradient_steps=reset_gradient_steps,
-            redo_period=setting("redo_period", redo_period, 1_000, "redo", chosen),
-            **kwargs,
+        network = _check_group("network_regularization", given["network_regularization"], NETWORK_REGULARIZATIONS)
+        chosen = _check_group(
+            "plasticity_regularization", given["plasticity_regularization"], PLASTICITY_REGULARIZATIONS
         )
+
+        def set_default(name: str, default: Any, of: str, group: tuple[str, ...]) -> None:
+            if of in group:
+                given[name] = default if given[name] is None else given[name]
+            elif given[name] is not None:
+                raise ValueError(
+                    f"{name}={given[name]!r} is a setting of {of!r}, which is not among the regularizations"
+                )
+
+        check_value("pessimism_kwargs", kwargs, DICT)
+        gpl = {"learning_rate": 1e-5} if critics == "gpl" else {}
+        set_default("weight_decay", 0.01, "weight_decay", network)
+        set_default("reset_gradient_steps", None, "resets", chosen)
+        set_default("resets", 160_000 if given["reset_gradient_steps"] is None else (), "resets", chosen)
+        set_default("sam_radius", 0.05, "sam", chosen)
+        set_default("redo_period", 1_000, "redo", chosen)
+        given["resets"] = () if given["resets"] is None else given["resets"]
+        given["pessimism"], given["pessimism_kwargs"] = _pessimism(critics), {**gpl, **(kwargs or {})} or None
+        super()._construct(given)
 
     def _check_arguments(self) -> None:
         network = _check_group("network_regularization", self.network_regularization, NETWORK_REGULARIZATIONS)
@@ -115,7 +101,7 @@ class RegularizedSAC(SAC):
             "plasticity_regularization": (
                 (self.sam_radius is not None) == ("sam" in chosen)
                 and (self.redo_period is not None) == ("redo" in chosen)
-                and (self.reset_gradient_steps is not None or arguments.has_resets(self.resets)) == ("resets" in chosen)
+                and (self.reset_gradient_steps is not None or checks.has_resets(self.resets)) == ("resets" in chosen)
             ),
         }
         for name, agrees in in_force.items():
@@ -124,7 +110,6 @@ class RegularizedSAC(SAC):
                     f"{name}={getattr(self, name)!r} is not what the other arguments say: load cannot change the "
                     "regularizations of a model, and an argument of one needs its name among them"
                 )
-        check_value("weight_decay", self.weight_decay, AT_LEAST_0.or_none())
         if "crelu" in chosen and "activation_fn" in self.policy_kwargs:
             raise ValueError(
                 "plasticity_regularization names 'crelu', the activation of actor and critics, and policy_kwargs have "

@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
-
 from sb3_sample.arguments import check_unused
+from sb3_sample.constructor import argument
 from sb3_sample.learner.exploration import Exploration
-from sb3_sample.sac import arguments
+from sb3_sample.learner.pessimism import Pessimism
+from sb3_sample.sac import checks
 from sb3_sample.sac.algorithm import SAC
-from sb3_sample.sac.policies import SACPolicy
 
 #: SR-SAC's environment steps between two resets. An object of its own, which no 160_000 in a program is.
 SR_SAC_RESETS = int("160_000")
@@ -22,17 +21,6 @@ class _RuleSAC(SAC):
     #: The rule's arguments by their names here.
     rule_arguments: ClassVar[dict[str, str]]
 
-    def __init__(
-        self,
-        policy: str | type[SACPolicy],
-        env: GymEnv | str | None,
-        learning_rate: float | Schedule = 3e-4,
-        *,
-        pessimism: float | str | None = None,
-        **kwargs: Any,
-    ):
-        super().__init__(policy, env, learning_rate, pessimism=self.rule if pessimism is None else pessimism, **kwargs)
-
     def _full_pessimism_kwargs(self) -> dict[str, Any]:
         own = {name: getattr(self, argument) for name, argument in self.rule_arguments.items()}
         return {**own, **super()._full_pessimism_kwargs()}
@@ -43,7 +31,7 @@ class _RuleSAC(SAC):
                 f"{type(self).__name__} moves the pessimism itself, pessimism={self.rule!r}, "
                 f"not {self.pessimism!r}: leave pessimism={self.pessimism!r} out, or use SAC"
             )
-        arguments.check_once("pessimism_kwargs", self.pessimism_kwargs, self.rule_arguments)
+        checks.check_once("pessimism_kwargs", self.pessimism_kwargs, self.rule_arguments)
         super()._check_arguments()
 
 
@@ -53,31 +41,18 @@ class TOPSAC(_RuleSAC):
     each episode. The settings are those of the VPL paper and of the regularization study (2403.00514);
     :class:`~sb3_sample.learner.pessimism.TOP` has the details.
 
-    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
-    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
-    :param learning_rate: of actor, critics and temperature
-    :param arms: the pessimisms to choose among
-    :param bandit_learning_rate: of the bandit, for returns of up to 1000
-    :param kwargs: every other argument of :class:`SAC`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
     rule = "top"
     rule_arguments: ClassVar[dict[str, str]] = {"arms": "arms", "learning_rate": "bandit_learning_rate"}
 
-    def __init__(
-        self,
-        policy: str | type[SACPolicy],
-        env: GymEnv | str | None,
-        learning_rate: float | Schedule = 3e-4,
-        *,
-        arms: Sequence[float] = (0.0, 1.0),
-        bandit_learning_rate: float = 0.1,
-        **kwargs: Any,
-    ):
-        self.arms = arms
-        self.bandit_learning_rate = bandit_learning_rate
-        super().__init__(policy, env, learning_rate, **kwargs)
+    pessimism: float | str | type[Pessimism] = argument(default="top")
+    """the rule, "top"; no other"""
+    arms: Sequence[float] = argument(default=(0.0, 1.0))
+    """the pessimisms to choose among"""
+    bandit_learning_rate: float = argument(default=0.1)
+    """of the bandit, for returns of up to 1000"""
 
 
 class GPLSAC(_RuleSAC):
@@ -86,13 +61,6 @@ class GPLSAC(_RuleSAC):
     transitions.
     :class:`~sb3_sample.learner.pessimism.LearnedPessimism` has the details.
 
-    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
-    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
-    :param learning_rate: of actor, critics and temperature
-    :param initial_pessimism: pessimism at the start and after a reset
-    :param pessimism_learning_rate: of the pessimism; 5e-5 as in the VPL paper (1e-5 in the regularization study,
-        2403.00514)
-    :param kwargs: every other argument of :class:`SAC`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
@@ -102,19 +70,12 @@ class GPLSAC(_RuleSAC):
         "learning_rate": "pessimism_learning_rate",
     }
 
-    def __init__(
-        self,
-        policy: str | type[SACPolicy],
-        env: GymEnv | str | None,
-        learning_rate: float | Schedule = 3e-4,
-        *,
-        initial_pessimism: float = 1.0,
-        pessimism_learning_rate: float = 5e-5,
-        **kwargs: Any,
-    ):
-        self.initial_pessimism = initial_pessimism
-        self.pessimism_learning_rate = pessimism_learning_rate
-        super().__init__(policy, env, learning_rate, **kwargs)
+    pessimism: float | str | type[Pessimism] = argument(default="gpl")
+    """the rule, "gpl"; no other"""
+    initial_pessimism: float = argument(default=1.0)
+    """pessimism at the start and after a reset"""
+    pessimism_learning_rate: float = argument(default=5e-5)
+    """of the pessimism; 5e-5 as in the VPL paper (1e-5 in the regularization study, 2403.00514)"""
 
 
 class OPLSAC(_RuleSAC):
@@ -122,14 +83,6 @@ class OPLSAC(_RuleSAC):
     Soft actor-critic with on-policy pessimism learning (Kuznetsov et al. 2021): the dual step against the TD(lambda)
     returns of the latest steps. :class:`~sb3_sample.learner.pessimism.LearnedPessimism` has the details.
 
-    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
-    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
-    :param learning_rate: of actor, critics and temperature
-    :param initial_pessimism: pessimism at the start and after a reset
-    :param pessimism_learning_rate: of the pessimism
-    :param segment_length: steps of each environment that it looks back
-    :param td_lambda: lambda of the returns
-    :param kwargs: every other argument of :class:`SAC`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
@@ -141,23 +94,16 @@ class OPLSAC(_RuleSAC):
         "td_lambda": "td_lambda",
     }
 
-    def __init__(
-        self,
-        policy: str | type[SACPolicy],
-        env: GymEnv | str | None,
-        learning_rate: float | Schedule = 3e-4,
-        *,
-        initial_pessimism: float = 1.0,
-        pessimism_learning_rate: float = 5e-5,
-        segment_length: int = 8,
-        td_lambda: float = 0.95,
-        **kwargs: Any,
-    ):
-        self.initial_pessimism = initial_pessimism
-        self.pessimism_learning_rate = pessimism_learning_rate
-        self.segment_length = segment_length
-        self.td_lambda = td_lambda
-        super().__init__(policy, env, learning_rate, **kwargs)
+    pessimism: float | str | type[Pessimism] = argument(default="opl")
+    """the rule, "opl"; no other"""
+    initial_pessimism: float = argument(default=1.0)
+    """pessimism at the start and after a reset"""
+    pessimism_learning_rate: float = argument(default=5e-5)
+    """of the pessimism"""
+    segment_length: int = argument(default=8)
+    """steps of each environment that it looks back"""
+    td_lambda: float = argument(default=0.95)
+    """lambda of the returns"""
 
 
 class OAC(SAC):
@@ -166,35 +112,21 @@ class OAC(SAC):
     the gradient of an upper bound. The settings are those of the DAC paper's comparison;
     :class:`~sb3_sample.learner.exploration.OptimisticGradient` has the details.
 
-    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
-    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
-    :param learning_rate: of actor, critics and temperature
-    :param optimism: weight of the critics' spread in the upper bound
-    :param kl_radius: KL divergence to the actor, summed over the action's dimensions, that the shift may cost
-    :param kwargs: every other argument of :class:`SAC`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
-    def __init__(
-        self,
-        policy: str | type[SACPolicy],
-        env: GymEnv | str | None,
-        learning_rate: float | Schedule = 3e-4,
-        *,
-        optimism: float = 4.36,
-        kl_radius: float = 3.69**2 / 2,
-        exploration: str | type[Exploration] = "oac",
-        **kwargs: Any,
-    ):
-        self.optimism = optimism
-        self.kl_radius = kl_radius
-        super().__init__(policy, env, learning_rate, exploration=exploration, **kwargs)
+    optimism: float = argument(default=4.36)
+    """weight of the critics' spread in the upper bound"""
+    kl_radius: float = argument(default=3.69**2 / 2)
+    """KL divergence to the actor, summed over the action's dimensions, that the shift may cost"""
+    exploration: str | type[Exploration] = argument(default="oac")
+    """who acts while training: "oac", or another of ``SAC``'s"""
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
         if self.exploration == "oac":
             same = {"optimism": "optimism", "kl_radius": "kl_radius"}
-            arguments.check_once("exploration_kwargs", self.exploration_kwargs, same)
+            checks.check_once("exploration_kwargs", self.exploration_kwargs, same)
         else:
             check_unused(self, ("optimism", "kl_radius"), f"exploration={self.exploration!r}")
 
@@ -212,24 +144,11 @@ class SRSAC(SAC):
     environment steps. (The BRO paper compares with ``replay_ratio=32``.) The original resets every 2,560,000 gradient
     steps, whatever the replay ratio: ``reset_gradient_steps=2_560_000``; at sixteen a transition that is as often.
 
-    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
-    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
-    :param learning_rate: of actor, critics and temperature
-    :param replay_ratio: gradient steps per environment transition
-    :param resets: environment steps between two resets, or the steps of all of them; the default gives way to
-        ``reset_gradient_steps``
-    :param kwargs: every other argument of :class:`SAC`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
-    def __init__(
-        self,
-        policy: str | type[SACPolicy],
-        env: GymEnv | str | None,
-        learning_rate: float | Schedule = 3e-4,
-        *,
-        replay_ratio: float = 16,
-        resets: Sequence[int] | int = SR_SAC_RESETS,
-        **kwargs: Any,
-    ):
-        super().__init__(policy, env, learning_rate, replay_ratio=replay_ratio, resets=resets, **kwargs)
+    replay_ratio: float | None = argument(default=16)
+    """gradient steps per environment transition"""
+    resets: Sequence[int] | int = argument(default=SR_SAC_RESETS)
+    """environment steps between two resets, or the steps of all of them; the default gives way to
+    ``reset_gradient_steps``"""

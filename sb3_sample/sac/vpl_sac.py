@@ -2,12 +2,11 @@
 
 from typing import Any
 
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
-
 from sb3_sample.arguments import check_unused
-from sb3_sample.sac import arguments
+from sb3_sample.constructor import argument
+from sb3_sample.learner.pessimism import Pessimism
+from sb3_sample.sac import checks
 from sb3_sample.sac.algorithm import SAC
-from sb3_sample.sac.policies import SACPolicy
 
 
 class VPLSAC(SAC):
@@ -24,54 +23,31 @@ class VPLSAC(SAC):
     ``validation_proportion``, and ``pessimism=1.0`` for the "regret" run, which holds the transitions out and leaves
     the pessimism fixed.
 
-    :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class
-    :param env: the environment, an id, or a vectorised environment; its action space a bounded Box
-    :param learning_rate: of actor, critics and temperature; a number or a function of the remaining progress
-        (from 1 to 0)
-    :param validation_proportion: share of the transitions that is held out, in [0, 1); the validation batch has the
-        same proportion to ``batch_size``. None: 1/32, or 0 if the pessimism learns from another source
-    :param initial_pessimism: pessimism at the start and after a reset
-    :param pessimism_learning_rate: of the pessimism
-    :param pessimism_source: where the pessimism learns: "validation", "replay" or "recent"
-    :param pessimism_loss: "squared" (eq. 12) or "dual" (eq. 6)
-    :param pessimism: "vpl", or a number for a fixed one
-    :param kwargs: every other argument of :class:`SAC`, by name
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
-    def __init__(
-        self,
-        policy: str | type[SACPolicy],
-        env: GymEnv | str | None,
-        learning_rate: float | Schedule = 3e-4,
-        *,
-        validation_proportion: float | None = None,
-        initial_pessimism: float = 1.0,
-        pessimism_learning_rate: float = 5e-5,
-        pessimism_source: str = "validation",
-        pessimism_loss: str = "squared",
-        pessimism: float | str = "vpl",
-        **kwargs: Any,
-    ):
-        self.initial_pessimism = initial_pessimism
-        self.pessimism_learning_rate = pessimism_learning_rate
-        self.pessimism_source = pessimism_source
-        self.pessimism_loss = pessimism_loss
-        super().__init__(
-            policy,
-            env,
-            learning_rate,
-            validation_proportion=validation_proportion,  # type: ignore[arg-type]  # None until it is checked
-            pessimism=pessimism,
-            **kwargs,
-        )
+    validation_proportion: float | None = argument(  # type: ignore[assignment]  # None until it is checked
+        default=None
+    )
+    """share of the transitions that is held out, in [0, 1); the validation batch has the same proportion to
+    ``batch_size``. None: 1/32, or 0 if the pessimism learns from another source"""
+    initial_pessimism: float = argument(default=1.0)
+    """pessimism at the start and after a reset"""
+    pessimism_learning_rate: float = argument(default=5e-5)
+    """of the pessimism"""
+    pessimism_source: str = argument(default="validation")
+    """transitions that the pessimism learns from: "validation", "replay" or "recent" ones"""
+    pessimism_loss: str = argument(default="squared")
+    """"squared" (eq. 12) or "dual" (eq. 6)"""
+    pessimism: float | str | type[Pessimism] = argument(default="vpl")
+    """"vpl", or a number for a fixed one"""
 
     def _check_arguments(self) -> None:
         if isinstance(self.pessimism, (str, type)) and self.pessimism != "vpl":
             raise ValueError(f"VPLSAC has pessimism='vpl' or a fixed number, not {self.pessimism!r}: use SAC")
         if self.validation_proportion is None:
             self.validation_proportion = 1 / 32 if self.pessimism_source == "validation" else 0.0
-        arguments.check_once(
+        checks.check_once(
             "pessimism_kwargs",
             self.pessimism_kwargs,
             {

@@ -1,5 +1,6 @@
 """Life cycle of an algorithm, the same for both families: environments, networks, ``learn`` with checkpoints."""
 
+import os
 import pathlib
 from typing import Any, TypeVar
 
@@ -10,10 +11,12 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_learn, check_n_envs
+from sb3_sample.constructor import Constructed, argument
 from sb3_sample.envs.finite_check import FiniteCheck
 from sb3_sample.envs.workers import watch_workers
 from sb3_sample.export import Exportable
 from sb3_sample.faults import check_finite_parameters
+from sb3_sample.kinds import DICT, VERBOSE, Kind, integer
 from sb3_sample.saving.checkpoint import Checkpointer, refuse_second_call
 from sb3_sample.saving.encoding import Lenient
 from sb3_sample.saving.model_tree import Description
@@ -22,12 +25,32 @@ from sb3_sample.saving.notice import say_once
 Self = TypeVar("Self", bound="Resumable")
 
 
-class Resumable(Exportable, BaseAlgorithm):
+class Resumable(Constructed, Exportable, BaseAlgorithm):
     """
     Base of both families, before ``SafeFiles`` and Stable-Baselines3's class: ``learn`` as a sequence of turns, after
     each of which the training can be saved and continued with the result of a training without interruption. A family
     defines the turn (:meth:`_turn`) and the steps before and after the turns.
     """
+
+    _stats_window_size: int = argument(alias="stats_window_size", default=100, kind=integer(1), of_training=True)
+    """episodes over which the logged return is averaged"""
+    tensorboard_log: str | None = argument(
+        default=None,
+        kind=Kind("be the path of a folder", lambda value: isinstance(value, (str, os.PathLike))).or_none(),
+        of_training=True,
+    )
+    """folder of the TensorBoard log; none if None"""
+    _policy_kwargs: dict[str, Any] | None = argument(alias="policy_kwargs", default=None, kind=DICT)
+    """arguments of the policy"""
+    verbose: int = argument(default=0, kind=VERBOSE)
+    """0 nothing, 1 info, 2 debug"""
+    # NumPy takes these seeds.
+    seed: int | None = argument(default=None, kind=integer(0, 2**32 - 1).or_none())
+    """seed of everything random"""
+    _device: torch.device | str = argument(alias="device", default="auto")
+    """"auto", "cpu", "cuda", ..."""
+    _init_setup_model: bool = argument(default=True, of_training=True)
+    """whether to build the networks at once"""
 
     # ---------------------------------------------------------------- construction
 

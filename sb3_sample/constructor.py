@@ -1,0 +1,216 @@
+"""
+Constructors declared as attributes: name, type, default, kind and meaning of an argument stand in one place, and a
+class repeats nothing of what it inherits.
+
+Type checkers and editors read the declarations as they stand (``typing.dataclass_transform``): the signature of every
+class is complete without running anything. The string below a declaration is what an editor shows of the argument, and
+``help`` of the class.
+"""
+
+import ast
+import difflib
+import functools
+import inspect
+import sys
+import textwrap
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, cast, dataclass_transform
+
+from sb3_sample.kinds import Kind
+
+REQUIRED: Any = inspect.Parameter.empty
+
+
+@dataclass(frozen=True)
+class Argument:
+    """
+    Argument of a constructor.
+
+    :param name: its name
+    :param attribute: name that it is declared under, the attribute that holds its value
+    :param default: default; ``REQUIRED`` for none
+    :param kind: the kind of its values; None if that is checked elsewhere
+    :param kw_only: whether it is passed by name only
+    :param of_training: whether it says how transitions are collected, stored and drawn, or what is told of it, of which
+        a learner has nothing
+    :param annotation: its type
+    :param meaning: the string below its declaration
+    """
+
+    name: str
+    attribute: str
+    default: Any
+    kind: Kind | None
+    kw_only: bool
+    of_training: bool
+    annotation: Any = REQUIRED
+    meaning: str = ""
+
+
+def argument(
+    *,
+    default: Any = REQUIRED,
+    kind: Kind | None = None,
+    kw_only: bool = True,
+    of_training: bool = False,
+    alias: str | None = None,
+) -> Any:
+    """
+    Declare an argument of a constructor, as the value of an annotated attribute of the class. In the place of an
+    inherited one only its default and what is given here change.
+
+    :param default: default; none if left out
+    :param kind: the kind of its values
+    :param kw_only: whether it is passed by name only
+    :param of_training: whether a learner has nothing of it
+    :param alias: name of the argument, if the declaration needs another: one whose type differs from that of the
+        object's attribute of this name
+    :return: the declaration
+    """
+    return Argument(alias or "", "", default, kind, kw_only, of_training)
+
+
+@dataclass_transform(kw_only_default=True, eq_default=False, field_specifiers=(argument,))
+class Constructed:
+    """
+    Base of classes whose constructors are declared as attributes. A class that defines ``__init__`` itself, or is
+    derived from one that does, keeps it.
+    """
+
+    #: By name, the arguments of the constructor.
+    constructor_arguments: ClassVar[dict[str, Argument]] = {}
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.constructor_arguments = _declared(cls)
+        first = next(base for base in cls.__mro__ if "__init__" in vars(base))
+        others = [base for base in cls.__mro__ if hasattr(vars(base).get("__init__"), "of_declarations")]
+        if first is not cls and (not others or first is others[0]):
+            cls.__init__ = _constructor(cls)  # type: ignore[method-assign, misc]
+        cls.__doc__ = _with_meanings(cls)
+
+    def _construct(self, given: dict[str, Any]) -> None:
+        """
+        Construct the object.
+
+        :param given: the value of every argument, by its name
+        """
+        raise NotImplementedError
+
+
+def _declared(cls: type) -> dict[str, Argument]:
+    """What a class inherits and declares. The declarations are taken away from it: an attribute is the object's."""
+    arguments: dict[str, Argument] = {}
+    for base in reversed(cls.__mro__[1:]):
+        arguments |= vars(base).get("constructor_arguments", {})
+    names = {known.attribute: name for name, known in arguments.items()}
+    annotations, meanings = inspect.get_annotations(cls), _strings_below(cls)
+    for attribute, value in list(vars(cls).items()):
+        # A method or a property of that name is none of the constructor's, unless it is annotated.
+        is_default = attribute in names and (attribute in annotations or not hasattr(type(value), "__get__"))
+        if not isinstance(value, Argument) and not is_default:
+            continue
+        inherited = arguments.get(names.get(attribute, ""))
+        new = value if isinstance(value, Argument) else replace(arguments[names[attribute]], default=value)
+        if inherited is not None:
+            new = replace(
+                new,
+                name=inherited.name,
+                kind=new.kind or inherited.kind,
+                of_training=new.of_training or inherited.of_training,
+                annotation=inherited.annotation,
+                meaning=inherited.meaning,
+            )
+        new = replace(
+            new,
+            name=new.name or attribute,
+            attribute=attribute,
+            annotation=annotations.get(attribute, new.annotation),
+            meaning=meanings.get(attribute, new.meaning),
+        )
+        arguments[new.name] = new
+        delattr(cls, attribute)
+    return arguments
+
+
+@functools.cache
+def _classes_of(module: str) -> dict[str, ast.ClassDef]:
+    """Classes of a module's text by their qualified names; none where there is no text."""
+    try:
+        text = inspect.getsource(sys.modules[module])
+    except (KeyError, OSError, TypeError):
+        text = ""
+    found: dict[str, ast.ClassDef] = {}
+
+    def walk(node: ast.AST, prefix: str) -> None:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.ClassDef):
+                found[prefix + child.name] = child
+                walk(child, f"{prefix}{child.name}.")
+
+    walk(ast.parse(text), "")
+    return found
+
+
+def _strings_below(cls: type) -> dict[str, str]:
+    """By attribute, the string below it in the class's text."""
+    node = _classes_of(cls.__module__).get(cls.__qualname__)
+    found: dict[str, str] = {}
+    if node is None:
+        return found
+    for statement, below in zip(node.body, node.body[1:], strict=False):
+        is_string = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+        if is_string and isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
+            found[statement.target.id] = " ".join(str(cast(ast.Constant, cast(ast.Expr, below).value).value).split())
+    return found
+
+
+def _with_meanings(cls: type[Constructed]) -> str:
+    """The class's docstring, with its arguments before the errors that it raises."""
+    description, separator, errors = inspect.cleandoc(cls.__doc__ or "").partition("\n:raises")
+    wrap = functools.partial(textwrap.fill, width=100, subsequent_indent="    ", break_on_hyphens=False)
+    arguments = [cls.constructor_arguments[name] for name in list(_signature(cls).parameters)[1:]]
+    lines = [wrap(f":param {each.name}: {each.meaning}") for each in arguments if each.meaning]
+    return "\n".join([description.rstrip(), "", *lines]) + separator + errors
+
+
+def _signature(cls: type[Constructed]) -> inspect.Signature:
+    """Arguments as a dataclass has them: those that are passed by position first, in the order of their declaration."""
+    kinds = {False: inspect.Parameter.POSITIONAL_OR_KEYWORD, True: inspect.Parameter.KEYWORD_ONLY}
+    parameters = [
+        inspect.Parameter(name, kinds[each.kw_only], default=each.default, annotation=each.annotation)
+        for name, each in cls.constructor_arguments.items()
+    ]
+    of_object = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return inspect.Signature([of_object, *sorted(parameters, key=lambda each: each.kind)])
+
+
+def _constructor(cls: type[Constructed]) -> Callable[..., None]:
+    signature = _signature(cls)
+
+    def __init__(self: Constructed, *args: Any, **kwargs: Any) -> None:
+        try:
+            bound = signature.bind(self, *args, **kwargs)
+        except TypeError as error:
+            raise TypeError(f"{type(self).__name__}: {error}{_meant(signature, kwargs)}") from None
+        bound.apply_defaults()
+        given = dict(bound.arguments)
+        del given["self"]
+        self._construct(given)
+
+    __init__.__signature__ = signature  # type: ignore[attr-defined]
+    __init__.__annotations__ = {each.name: each.annotation for each in cls.constructor_arguments.values()}
+    __init__.__doc__ = f"Make a ``{cls.__name__}``; the class has the meanings of the arguments."
+    __init__.of_declarations = True  # type: ignore[attr-defined]
+    __init__.__module__, __init__.__qualname__ = cls.__module__, f"{cls.__qualname__}.__init__"
+    return __init__
+
+
+def _meant(signature: inspect.Signature, kwargs: dict[str, Any]) -> str:
+    """The argument that was meant, if a name is close to one."""
+    for name in kwargs.keys() - signature.parameters.keys():
+        close = difflib.get_close_matches(name, signature.parameters, 1)
+        if close:
+            return f". Did you mean {close[0]!r}?"
+    return ""

@@ -1,0 +1,297 @@
+"""Checks of the off-policy family's arguments: what does not go together, and what is more than a kind of value."""
+
+import inspect
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.type_aliases import TrainFreq
+from stable_baselines3.her import HerReplayBuffer
+
+from sb3_sample.arguments import NotAllowed, check_every, check_unused
+from sb3_sample.kinds import (
+    check_value,
+    integer,
+    one_of,
+)
+from sb3_sample.learner.exploration import EXPLORATIONS
+from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
+from sb3_sample.replay.buffers import DeviceReplayBuffer
+from sb3_sample.replay.compact import CompactReplay
+
+
+def check(agent: Any) -> None:
+    """
+    :param agent: an algorithm whose arguments are stored and whose networks do not exist yet
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+    check_every(agent)
+    n_critics = check_value("n_critics", agent.policy_kwargs.get("n_critics", 2), integer(1))
+    check_target_entropy(agent)
+    check_use_sde(agent.use_sde)
+    if n_critics == 1 and (isinstance(agent.pessimism, (str, type)) or agent.exploration == "oac"):
+        what = f"pessimism={agent.pessimism!r}" if isinstance(agent.pessimism, (str, type)) else "exploration='oac'"
+        raise ValueError(f"{what} weighs the critics' spread, which n_critics=1 has not")
+    if agent.redo_period is None:
+        check_unused(agent, ["redo_threshold"], "redo_period=None")
+    if agent.reset_gradient_steps is not None and has_resets(agent.resets):
+        raise ValueError(
+            f"resets={agent.resets!r} and reset_gradient_steps={agent.reset_gradient_steps!r} are two ways to say when "
+            "everything starts anew: pass one of them"
+        )
+    if agent.reset_gradient_steps is None and not has_resets(agent.resets):
+        check_unused(agent, ["reset_shrink"], "no resets")
+    if agent.compile not in (True, False, "auto") or not isinstance(agent.compile, (bool, str)):
+        raise ValueError(f"compile must be True, False or 'auto', not {agent.compile!r}")
+    if agent.value_head is None:
+        check_unused(agent, ["value_head_kwargs"], "value_head=None")
+    elif agent.n_quantiles is not None:
+        raise ValueError(
+            f"n_quantiles={agent.n_quantiles} and value_head={agent.value_head!r} are two value heads: pass "
+            "n_quantiles=None"
+        )
+    for name in ("n_quantiles", "n_outputs", "backbone"):
+        if name in agent.policy_kwargs:
+            raise ValueError(f"{name} is an argument of the algorithm, not of policy_kwargs")
+    if agent.backbone == "td3":
+        _check_no_entropy(agent, "ent_coef")
+    _check_pessimism(agent)
+    _check_buffer_class(agent)
+    _check_replay(agent)
+    _check_n_steps(agent)
+    _check_memory_map(agent)
+    _check_device_buffer(agent)
+    _check_train_freq(agent)
+
+
+def has_resets(resets: Any) -> bool:
+    """
+    :param resets: the argument of that name, checked or not
+    :return: whether it asks for a reset: it is no empty sequence
+    """
+    return not (isinstance(resets, (Sequence, np.ndarray)) and len(resets) == 0)
+
+
+def check_target_entropy(agent: Any) -> None:
+    """
+    :param agent: an algorithm
+    :raises ValueError: if its ``target_entropy`` is neither finite nor "auto", or a number where there is no entropy
+    """
+    if agent.backbone == "td3":
+        _check_no_entropy(agent, "target_entropy")
+    value = agent.target_entropy
+    if value != "auto" and not math.isfinite(as_number("target_entropy", value, "'auto'")):
+        raise ValueError(f"target_entropy must be finite, or 'auto', not {value}")
+
+
+def check_use_sde(use_sde: bool) -> None:
+    """
+    :param use_sde: the argument
+    :raises ValueError: if it is asked for
+    """
+    if use_sde:
+        raise ValueError(
+            "use_sde=True is not supported by this family of algorithms: use action_noise, "
+            f"or exploration=, one of {sorted(EXPLORATIONS)}"
+        )
+
+
+def _check_no_entropy(agent: Any, name: str) -> None:
+    if getattr(agent, name) != "auto":
+        raise ValueError(
+            f"{name}={getattr(agent, name)!r} asks for an entropy, which a deterministic actor (backbone='td3') has "
+            f"not: leave {name} out"
+        )
+
+
+def _check_pessimism(agent: Any) -> None:
+    if isinstance(agent.pessimism, (str, type)):
+        kind = one_of(PESSIMISMS, Pessimism)
+        if not kind.fits(agent.pessimism):
+            raise ValueError(
+                f"pessimism must be a number, or {kind.words.removeprefix('be ')}, not {agent.pessimism!r}"
+            )
+    elif isinstance(agent.pessimism, Pessimism):
+        raise ValueError(
+            f"pessimism must be a number, a name or a class, not an object of {type(agent.pessimism).__name__}: pass "
+            "the class, and its arguments as pessimism_kwargs"
+        )
+    else:
+        check_beta("pessimism", agent.pessimism)
+        if agent.pessimism_kwargs:
+            raise ValueError(
+                f"pessimism_kwargs={agent.pessimism_kwargs} are arguments of a rule that moves pessimism, but "
+                f"pessimism={agent.pessimism} is fixed: pass pessimism as one of {sorted(PESSIMISMS)}"
+            )
+    if agent.actor_pessimism is not None:
+        check_beta("actor_pessimism", agent.actor_pessimism)
+    if agent.target_subset == 1 and isinstance(agent.pessimism, (str, type)):
+        raise ValueError(
+            f"pessimism={agent.pessimism!r} weighs the spread of the targets, and target_subset=1 leaves none"
+        )
+    if agent.target_subset is not None:
+        n_critics = agent.policy_kwargs.get("n_critics", 2)
+        if not integer(1, n_critics).fits(agent.target_subset):
+            raise ValueError(
+                f"target_subset must lie between 1 and the number of critics, {n_critics} "
+                f"(policy_kwargs['n_critics']), or be None for all, not {agent.target_subset!r}"
+            )
+
+
+def _check_buffer_class(agent: Any) -> None:
+    """Whether the buffer is one for the observations."""
+    cls, space = agent.replay_buffer_class, agent.observation_space
+    is_dict = isinstance(space, spaces.Dict)
+    if cls is None:
+        if agent.n_steps > 1 and is_dict:
+            raise NotAllowed(f"n_steps={agent.n_steps} is not supported with Dict observation spaces: pass n_steps=1")
+        return
+    if issubclass(cls, DictReplayBuffer) and not is_dict:
+        raise ValueError(
+            f"replay_buffer_class={cls.__name__} needs a Dict observation space, not {space}: leave it out"
+        )
+    if is_dict and cls in (ReplayBuffer, NStepReplayBuffer):
+        raise ValueError(f"replay_buffer_class={cls.__name__} cannot hold the observations of {space}: leave it out")
+    goals = {"observation", "achieved_goal", "desired_goal"}
+    if issubclass(cls, HerReplayBuffer) and isinstance(space, spaces.Dict) and not goals <= space.spaces.keys():
+        raise ValueError(
+            f"replay_buffer_class={cls.__name__} needs an observation space with {sorted(goals)}, not {space}"
+        )
+
+
+def _check_replay(agent: Any) -> None:
+    if agent.validation_proportion > 0:
+        cls = agent.replay_buffer_class
+        if cls is not None and cls not in (ReplayBuffer, DictReplayBuffer) and not issubclass(cls, CompactReplay):
+            raise ValueError(
+                f"validation_proportion={agent.validation_proportion} holds single transitions out, which is known of "
+                f"ReplayBuffer and DictReplayBuffer only, not of {cls.__name__} (samples of several transitions, as "
+                "relabelled goals are, would carry them into training): leave replay_buffer_class out, or pass "
+                "validation_proportion=0"
+            )
+        if agent.n_steps > 1:
+            raise ValueError(
+                f"validation_proportion={agent.validation_proportion} holds single transitions out, which "
+                f"n_steps={agent.n_steps} would carry into training: pass n_steps=1, or validation_proportion=0"
+            )
+
+
+def _check_memory_map(agent: Any) -> None:
+    """A buffer in files: only those of this package know it."""
+    cls, is_split = agent.replay_buffer_class, agent.validation_proportion > 0
+    made_by_us = is_split or (agent.n_steps == 1 if cls is None else issubclass(cls, CompactReplay))
+    if (agent.replay_buffer_kwargs or {}).get("memory_map") is not None and not made_by_us:
+        what = f"n_steps={agent.n_steps}" if cls is None else f"replay_buffer_class={cls.__name__}"
+        raise ValueError(
+            f"replay_buffer_kwargs: memory_map is known to CompactReplayBuffer, the default, and not to the buffer of "
+            f"{what}: leave one of them out"
+        )
+
+
+def _check_device_buffer(agent: Any) -> None:
+    cls = agent.replay_buffer_class
+    if cls is None or not issubclass(cls, DeviceReplayBuffer):
+        return
+    if agent.get_vec_normalize_env() is not None:
+        raise ValueError(
+            "replay_buffer_class=DeviceReplayBuffer cannot be combined with VecNormalize, which normalises on the "
+            "host: leave replay_buffer_class out"
+        )
+    if agent.optimize_memory_usage:
+        raise ValueError("replay_buffer_class=DeviceReplayBuffer cannot be combined with optimize_memory_usage=True")
+
+
+def _check_n_steps(agent: Any) -> None:
+    cls = agent.replay_buffer_class
+    if agent.n_steps > 1 and cls is not None and not issubclass(cls, NStepReplayBuffer):
+        raise ValueError(
+            f"n_steps={agent.n_steps} needs a buffer that makes n-step returns, NStepReplayBuffer, not "
+            f"replay_buffer_class={cls.__name__}: leave replay_buffer_class out"
+        )
+
+
+def _check_train_freq(agent: Any) -> None:
+    train_freq: Any = agent.train_freq
+    if not isinstance(train_freq, TrainFreq):
+        every, unit = train_freq if isinstance(train_freq, tuple) else (train_freq, "step")
+        if not isinstance(every, int) or every < 1 or unit not in ("step", "episode"):
+            raise ValueError(f"train_freq must be at least 1, or (n, 'step' or 'episode'), not {train_freq!r}")
+        if unit == "episode" and agent.env is not None and agent.n_envs > 1:
+            raise ValueError(
+                f"train_freq={train_freq!r} counts episodes, which needs one environment, not {agent.n_envs}"
+            )
+
+
+def check_rule(agent: Any) -> None:
+    """
+    :param agent: an algorithm with its rule of pessimism
+    :raises ValueError: if the transitions that the rule learns from are none that the algorithm has
+    """
+    rule = agent.pessimism_rule
+    if not isinstance(rule, LearnedPessimism):
+        return
+    source, segment_length = rule.source, rule.segment_length
+    if source in ("recent", "on_policy") and segment_length > max(agent.buffer_size // agent.n_envs, 1):
+        raise ValueError(
+            f"segment_length={segment_length} is more than a replay buffer of buffer_size={agent.buffer_size} "
+            f"holds of each of {agent.n_envs} environments"
+        )
+    if source == "validation" and agent.validation_proportion == 0:
+        raise ValueError(
+            "pessimism='vpl' learns from transitions held out, and validation_proportion=0 holds none out: "
+            "pass validation_proportion=1/32, or another source of its transitions"
+        )
+    if source == "on_policy":
+        if agent.exploration != "actor":
+            raise ValueError(
+                f"the segments of pessimism='opl' must be on-policy, but exploration={agent.exploration!r}: "
+                "it goes with exploration='actor' only"
+            )
+        if agent.action_noise is not None:
+            raise ValueError("the segments of pessimism='opl' must be on-policy: leave action_noise out")
+
+
+def check_names(argument: str, choice: Any, make: Callable[..., Any], kwargs: dict[str, Any]) -> None:
+    """
+    :param argument: name of the argument that chose a part
+    :param choice: its value
+    :param make: what builds the part, from the learner and these arguments
+    :param kwargs: arguments for it
+    :raises ValueError: if one of them is none that it takes
+    """
+    # The first is the learner.
+    allowed = list(inspect.signature(make).parameters)[1:]
+    for name in kwargs:
+        if name not in allowed:
+            raise ValueError(f"{argument}_kwargs has {name!r}, but {argument}={choice!r} takes {allowed or 'none'}")
+
+
+def check_once(kwargs_name: str, kwargs: dict[str, Any] | None, arguments: dict[str, str]) -> None:
+    """
+    :param kwargs_name: name of an argument that is a dict
+    :param kwargs: its value
+    :param arguments: by key of the dict, the argument of the class that is the same setting
+    :raises ValueError: if the dict has such a key
+    """
+    for key in kwargs or {}:
+        if key in arguments:
+            raise ValueError(f"{kwargs_name} has {key!r}, which is the argument {arguments[key]} here: pass that")
+
+
+def as_number(name: str, value: Any, otherwise: str, shown: Any = None) -> float:
+    """
+    :param name: name of an argument
+    :param value: its value
+    :param otherwise: what else is allowed, for the error
+    :param shown: the value as the error shows it, if that is another
+    :return: the value as a number
+    :raises ValueError: if it is not one
+    """
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        shown = value if shown is None else shown
+        raise ValueError(f"{name} must be a number, or {otherwise}, not {shown!r}") from None
