@@ -1,0 +1,165 @@
+"""The table of docs/parts.md of what does not go together: every row is refused, by the names of its arguments."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.her import HerReplayBuffer
+
+from sb3_sample import BRO, DAC, GPLSAC, OAC, OPLSAC, SAC, TOPSAC, VPLSAC, RegularizedSAC
+from sb3_sample.parts import ValueHead
+from tests.sac.common import TINY_BRO, TINY_SAC, vec
+
+DOCS = Path(__file__).parents[2] / "docs" / "parts.md"
+NOISE = NormalActionNoise(np.zeros(2), np.ones(2))
+
+#: By the first cell of a row: classes with arguments that it speaks of, each with the names that the error must have.
+ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
+    '`pessimism="opl"` with `exploration` other than `"actor"`, or `action_noise`': [
+        (SAC, {"pessimism": "opl", "exploration": "oac"}, ("opl", "exploration='oac'")),
+        (SAC, {"pessimism": "opl", "action_noise": NOISE}, ("opl", "action_noise")),
+    ],
+    '`pessimism="vpl"` without `validation_proportion`': [
+        (SAC, {"pessimism": "vpl"}, ("pessimism='vpl'", "validation_proportion=0")),
+    ],
+    "`validation_proportion` with `n_steps` above 1, or `HerReplayBuffer` or another buffer of one's own": [
+        (SAC, {"validation_proportion": 0.1, "n_steps": 3}, ("validation_proportion=0.1", "n_steps=3")),
+        (VPLSAC, {"n_steps": 3}, ("validation_proportion", "n_steps=3")),
+        (
+            SAC,
+            {"validation_proportion": 0.1, "replay_buffer_class": type("Mine", (ReplayBuffer,), {})},
+            ("validation_proportion=0.1", "Mine"),
+        ),
+    ],
+    '`replay_buffer_kwargs={"memory_map": …}` with `n_steps` above 1 or a buffer that does not know it': [
+        (SAC, {"replay_buffer_kwargs": {"memory_map": "x"}, "n_steps": 3}, ("memory_map", "n_steps=3")),
+        (
+            SAC,
+            {"replay_buffer_kwargs": {"memory_map": "x"}, "replay_buffer_class": ReplayBuffer},
+            ("memory_map", "replay_buffer_class=ReplayBuffer"),
+        ),
+    ],
+    '`exploration="oac"` with `backbone="td3"`': [(SAC, {"exploration": "oac", "backbone": "td3"}, ("oac", "td3"))],
+    '`uncertainty="aleatoric"`, `"both"` without quantiles': [
+        (DAC, {"uncertainty": "aleatoric"}, ("uncertainty='aleatoric'", "quantiles")),
+        (DAC, {"uncertainty": "both"}, ("uncertainty='both'", "quantiles")),
+    ],
+    '`ent_coef`, `target_entropy` with `backbone="td3"`': [
+        (SAC, {"backbone": "td3", "ent_coef": 0.1}, ("ent_coef=0.1", "td3")),
+        (SAC, {"backbone": "td3", "target_entropy": -1.0}, ("target_entropy=-1.0", "td3")),
+    ],
+    "`initial_optimism` of DAC not above -β": [(DAC, {"initial_optimism": -1.0}, ("initial_optimism", "-1.0"))],
+    "`pessimism_kwargs`, or VPL-SAC's settings of its rule, with a number": [
+        (SAC, {"pessimism_kwargs": {"arms": (0, 1)}}, ("pessimism_kwargs", "pessimism=1.0")),
+        (VPLSAC, {"pessimism": 1.0, "pessimism_loss": "dual"}, ("pessimism_loss='dual'", "pessimism=1.0")),
+    ],
+    "`kl_target`, `optimism`, … of `DAC`, `BRO`, `OAC` with another class's `exploration`": [
+        (DAC, {"exploration": "actor", "kl_target": 0.1}, ("kl_target=0.1", "exploration='actor'")),
+        (BRO, {"exploration": "actor", "std_multiplier": 2.0}, ("std_multiplier=2.0", "exploration='actor'")),
+        (OAC, {"exploration": "actor", "optimism": 1.0}, ("optimism=1.0", "exploration='actor'")),
+    ],
+    "`target_subset` above the number of critics": [(SAC, {"target_subset": 3}, ("target_subset", "n_critics", "3"))],
+    "a rule of pessimism, or OAC, with one critic or one target": [
+        (SAC, {"pessimism": "gpl", "policy_kwargs": {"n_critics": 1}}, ("pessimism='gpl'", "n_critics=1")),
+        (OAC, {"policy_kwargs": {"n_critics": 1}}, ("exploration='oac'", "n_critics=1")),
+        (SAC, {"pessimism": "gpl", "target_subset": 1}, ("pessimism='gpl'", "target_subset=1")),
+    ],
+    "`resets` with `reset_gradient_steps`": [
+        (SAC, {"resets": 20, "reset_gradient_steps": 20}, ("resets=20", "reset_gradient_steps=20")),
+    ],
+    "`reset_shrink` without resets, `redo_threshold` without `redo_period`": [
+        (SAC, {"reset_shrink": 0.5}, ("reset_shrink=0.5", "no resets")),
+        (SAC, {"redo_threshold": 0.5}, ("redo_threshold=0.5", "redo_period=None")),
+    ],
+    "a setting both as an argument and in `exploration_kwargs`, `pessimism_kwargs` or `policy_kwargs`": [
+        (DAC, {"exploration_kwargs": {"kl_target": 0.1}}, ("exploration_kwargs", "kl_target")),
+        (GPLSAC, {"pessimism_kwargs": {"learning_rate": 0.1}}, ("pessimism_kwargs", "pessimism_learning_rate")),
+        (SAC, {"policy_kwargs": {"n_quantiles": 5}}, ("n_quantiles", "policy_kwargs")),
+        (BRO, {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}}, ("weight_decay", "optimizer_kwargs")),
+    ],
+    "`pessimism` in `TOPSAC`, `GPLSAC`, `OPLSAC`, `RegularizedSAC`": [
+        (TOPSAC, {"pessimism": 0.5}, ("TOPSAC", "pessimism=0.5")),
+        (GPLSAC, {"pessimism": "top"}, ("GPLSAC", "pessimism='top'")),
+        (OPLSAC, {"pessimism": 0.5}, ("OPLSAC", "pessimism=0.5")),
+        (RegularizedSAC, {"pessimism": 0.5}, ("pessimism", "critic_regularization")),
+    ],
+    "`critic_network…` in BRO without `model_size=None`": [
+        (
+            BRO,
+            {"model_size": "0.55M", "policy_kwargs": {"critic_network": "mlp"}},
+            ("critic_network", "model_size=None"),
+        ),
+    ],
+    '`net_arch`, `activation_fn` with a network other than `"mlp"`': [
+        (BRO, {"policy_kwargs": {**TINY_BRO["policy_kwargs"], "net_arch": [8]}}, ("net_arch", "bronet")),
+        (
+            BRO,
+            {"policy_kwargs": {**TINY_BRO["policy_kwargs"], "activation_fn": torch.nn.Tanh}},
+            ("activation_fn", "bronet"),
+        ),
+    ],
+    '`train_freq=(n, "episode")` with several environments': [
+        (SAC, {"train_freq": (1, "episode"), "env": vec(2)}, ("train_freq=(1, 'episode')", "one environment")),
+    ],
+    "`use_sde=True`": [(SAC, {"use_sde": True}, ("use_sde=True",))],
+    "`value_head` with `n_quantiles`, `value_head_kwargs` without `value_head`": [
+        (SAC, {"value_head": ValueHead, "n_quantiles": 5}, ("value_head", "n_quantiles=None")),
+        (SAC, {"value_head_kwargs": {"a": 1}}, ("value_head_kwargs", "value_head=None")),
+    ],
+}
+
+
+def rows() -> list[str]:
+    """First cells of the table."""
+    section = DOCS.read_text().split("\n## What does not go together\n")[1].split("\n## ")[0]
+    cells = [line.split(" | ")[0].removeprefix("| ") for line in section.splitlines() if line.startswith("| ")]
+    return cells[2:]  # below the heading
+
+
+def test_every_row_is_looked_at() -> None:
+    assert rows() == list(ROWS)
+
+
+@pytest.mark.parametrize(
+    ("cls", "arguments", "names"),
+    [pytest.param(*case, id=f"{row[:40]}-{i}") for row, cases in ROWS.items() for i, case in enumerate(cases)],
+)
+def test_it_is_refused(cls: type[SAC], arguments: dict[str, Any], names: tuple[str, ...]) -> None:
+    tiny = TINY_BRO if issubclass(cls, BRO) else TINY_SAC
+    with pytest.raises(ValueError) as error:
+        cls("MlpPolicy", **{"env": vec(), **tiny, **arguments})
+    for name in names:
+        assert name in str(error.value)
+
+
+def test_the_rest_of_each_row_is_allowed() -> None:
+    """Nothing of what is refused in a combination is refused by itself."""
+    for cls in (SAC, DAC, OAC, GPLSAC, OPLSAC, TOPSAC, VPLSAC, RegularizedSAC):
+        cls("MlpPolicy", vec(), **TINY_SAC)
+    for arguments in (
+        {"backbone": "td3"},
+        {"redo_period": 5, "redo_threshold": 0.5},
+        {"resets": 20, "reset_shrink": 0.5},
+        {"validation_proportion": 0.1},
+        {"n_steps": 3},
+        {"pessimism": "gpl", "pessimism_kwargs": {"learning_rate": 0.1}},
+        {"target_subset": 2},
+    ):
+        SAC("MlpPolicy", vec(), **{**TINY_SAC, **arguments})  # type: ignore[arg-type]
+
+
+def test_her_holds_nothing_out() -> None:
+    import gymnasium as gym
+
+    box = gym.spaces.Box(-1, 1, (2,))
+    space = gym.spaces.Dict(dict.fromkeys(("observation", "achieved_goal", "desired_goal"), box))
+    with pytest.raises(ValueError, match="validation_proportion=0.1.*HerReplayBuffer"):
+        SAC(
+            "MultiInputPolicy",
+            vec(obs_space=space),
+            **{**TINY_SAC, "validation_proportion": 0.1, "replay_buffer_class": HerReplayBuffer},
+        )
