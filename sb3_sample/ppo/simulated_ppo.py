@@ -432,6 +432,7 @@ class SimulatedPPO(PPOArguments, SafeFiles, PPO):
         """
         :param observations: flat, (B, O)
         :return: the policy's distribution of the actions
+        :raises ValueError: its parameters are not finite, or it is of another kind than can be simulated with
         """
         distribution = self.policy.get_distribution(self.flat_observations.restore(observations))
         if not isinstance(distribution, (DiagGaussianDistribution, CategoricalDistribution)):
@@ -439,6 +440,7 @@ class SimulatedPPO(PPOArguments, SafeFiles, PPO):
                 "policy must give a diagonal Gaussian or a categorical distribution for simulated samples, not "
                 f"{type(distribution).__name__}: pass n_simulated=0 for plain PPO"
             )
+        check_parameters_of(distribution.distribution)
         return distribution
 
     def values_of(self, observations: torch.Tensor) -> torch.Tensor:
@@ -619,6 +621,19 @@ class SimulatedPPO(PPOArguments, SafeFiles, PPO):
     def _synchronize(self) -> None:
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
+
+
+def check_parameters_of(distribution: torch.distributions.Distribution) -> None:
+    """
+    Check the parameters of a distribution as torch does unless it was told not to: the first ``torch.compile`` of a
+    process, of an off-policy model for one, tells all distributions that are made after it not to.
+
+    :param distribution: a distribution
+    :raises ValueError: they are out of range or NaN
+    """
+    if not distribution._validate_args:
+        shapes = distribution.batch_shape, distribution.event_shape
+        torch.distributions.Distribution.__init__(distribution, *shapes, validate_args=True)
 
 
 def log_prob_of_many(distribution: Distribution, actions: torch.Tensor) -> torch.Tensor:

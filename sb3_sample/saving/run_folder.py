@@ -203,7 +203,7 @@ class RunFolder:
                 continue
             if reasons:
                 warnings.warn(f"{_some(reasons)}. Going on from {path} instead.", stacklevel=3)
-                self._put_aside(path)
+                self._put_damaged_aside(path)
             return path, manifest
         if reasons:
             raise Damaged(
@@ -212,17 +212,14 @@ class RunFolder:
             )
         return None
 
-    def _put_aside(self, good: Path) -> None:
+    def _put_damaged_aside(self, good: Path) -> None:
         """Damaged checkpoints that are newer get another name, so that theirs is free."""
         with Folder.at(self.path) as root:
             for _, name in _checkpoints(root):
                 if name == good.name:
                     return
-                aside = f"damaged-{name}"
-                if root.look(aside) is not None:
-                    aside = f"{aside}-{secrets.token_hex(6)}"
                 try:
-                    root.rename(name, aside)
+                    _put_aside(root, name)
                 except OSError as error:
                     self._warn(f"{self.path / name} is damaged and cannot be renamed ({error})")
 
@@ -277,7 +274,7 @@ class RunFolder:
         with Folder.at(self.path) as root, root.inside(SEGMENTS) as rows:
             try:
                 facts = _write_file(rows, hidden, write)
-                rows.rename(hidden, segment.name)
+                self._rename(rows, hidden, segment.name)
             except BaseException:
                 with contextlib.suppress(OSError):
                     rows.remove(hidden)
@@ -318,9 +315,7 @@ class RunFolder:
                     text = _manifest_text({"steps": steps, **about, "files": facts, "segments": segments})
                     _write_file(folder, MANIFEST, lambda file: file.write(text))
                     sync_folder(folder.path)
-                if root.look(name) is not None:
-                    self._remove(root, name)
-                root.rename(hidden, name)
+                self._rename(root, hidden, name)
             except BaseException:
                 with contextlib.suppress(OSError):
                     _empty(root, hidden)
@@ -332,6 +327,19 @@ class RunFolder:
             except OSError as error:
                 self._warn(f"{self.path} cannot be tidied up ({error})")
         return self.path / name
+
+    def _rename(self, folder: Folder, hidden: str, name: str) -> None:
+        """
+        Give what is complete its name. A file that has it, of a program that was killed, is replaced; what else has it
+        may hold files of the user's, and gets another name.
+
+        :raises OSError: it cannot be renamed, or what is in its way cannot be
+        """
+        found = folder.look(name)
+        if found is not None and not (_SEGMENT.fullmatch(name) and stat.S_ISREG(found.st_mode)):
+            aside = _put_aside(folder, name)
+            self._warn(f"{folder.path / name} was in the way of what a checkpoint writes, and is {aside} now")
+        folder.rename(hidden, name)
 
     def _remove(self, root: Folder, name: str) -> None:
         """
@@ -429,6 +437,20 @@ def _needed(root: Folder) -> dict[str, Any]:
         with contextlib.suppress(Damaged), root.inside(name) as folder:
             needed.update(_read_manifest(folder)["segments"])
     return needed
+
+
+def _put_aside(folder: Folder, name: str) -> str:
+    """
+    Rename what is not what a run has written, and hold on to it.
+
+    :return: its new name
+    :raises OSError: it cannot be renamed
+    """
+    aside = f"damaged-{name}"
+    if folder.look(aside) is not None:
+        aside = f"{aside}-{secrets.token_hex(6)}"
+    folder.rename(name, aside)
+    return aside
 
 
 def _empty(root: Folder, name: str) -> None:

@@ -377,6 +377,7 @@ def test_however_it_diverges_it_is_a_divergence(seed: int) -> None:
         tiny(learning_rate=1e12, seed=seed).learn(64)
 
 
+@pytest.mark.usefixtures("checks_of_distributions")
 def test_a_standard_deviation_of_zero_is_a_divergence() -> None:
     model = collected(tiny())
     with torch.no_grad():

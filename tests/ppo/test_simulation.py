@@ -271,14 +271,28 @@ def test_a_simulation_of_the_present_rollout() -> None:
     torch.testing.assert_close(samples.advantages, samples.q_values - rollout.values[:, None])
 
 
+@pytest.mark.usefixtures("checks_of_distributions")
+@pytest.mark.parametrize("discrete", [False, True])
 @pytest.mark.parametrize(("network", "what"), [("reward", "returns"), ("transition", "states")])
-def test_a_diverged_model_is_an_error(network: str, what: str) -> None:
+def test_a_diverged_model_is_an_error(network: str, what: str, discrete: bool) -> None:
     for cls in (MBMAPPO, MBPOPPO):
-        agent = tiny(cls)
+        agent = tiny(cls, env="CartPole-v1") if discrete else tiny(cls)
         with torch.no_grad():
             getattr(agent.dynamics, network)[-1].bias.fill_(torch.inf)
         with pytest.raises(ValueError, match=f"simulated {what} are not finite: the model has diverged"):
-            agent.simulate(torch.randn(6, 3))
+            agent.simulate(torch.randn(6, 4 if discrete else 3))
+
+
+@pytest.mark.usefixtures("checks_of_distributions")
+@pytest.mark.parametrize(("env", "size", "parameter"), [(None, 3, "loc"), ("CartPole-v1", 4, "logits")])
+def test_a_policy_that_is_not_finite_is_an_error(env: str | None, size: int, parameter: str) -> None:
+    for cls in (MBMAPPO, MBPOPPO, QMAPPO):
+        agent = tiny(cls, env=env)
+        agent.simulate(torch.randn(6, size))
+        with torch.no_grad():
+            agent.policy.action_net.bias.fill_(torch.nan)
+        with pytest.raises(ValueError, match=f"Expected parameter {parameter} "):
+            agent.simulate(torch.randn(6, size))
 
 
 # ---------------------------------------------------------------- the schedule of X

@@ -144,7 +144,7 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _put(path: Path, kind: str, elsewhere: Path) -> None:
+def put(path: Path, kind: str, elsewhere: Path) -> None:
     """Put something else in a place."""
     aside = elsewhere.parent / "aside"
     match kind:
@@ -195,13 +195,13 @@ KINDS = (
 
 def kinds(rng: random.Random, original: dict[str, bytes]) -> Case:
     name, kind = rng.choice([*FILES, *FOLDERS, *FOLDERS, "progress.jsonl", ".lock"]), rng.choice(KINDS)
-    return Case(f"{name} is {kind}", lambda run, elsewhere: _put(run / name, kind, elsewhere), True)
+    return Case(f"{name} is {kind}", lambda run, elsewhere: put(run / name, kind, elsewhere), True)
 
 
 def coming(rng: random.Random, original: dict[str, bytes]) -> Case:
     """In the way of what the run is about to make."""
     name, kind = rng.choice(COMING), rng.choice([each for each in KINDS if each != "same content elsewhere"])
-    return Case(f"{name} is there as {kind}", lambda run, elsewhere: _put(run / name, kind, elsewhere), True)
+    return Case(f"{name} is there as {kind}", lambda run, elsewhere: put(run / name, kind, elsewhere), True)
 
 
 # ---------------------------------------------------------------- files of the user's

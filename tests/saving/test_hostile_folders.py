@@ -44,9 +44,11 @@ from tests.saving.hostile_folders import (
     FILES,
     NEW,
     NEXT,
+    NEXT_ROWS,
     ROWS,
     Case,
     folder_case,
+    put,
     replaced,
     snapshot,
     user_files,
@@ -249,6 +251,21 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def test_one_of_each_family(number: int, base: Path) -> None:
     result = throw(folder_case(0, number, original(base)), base, number)
     assert result["wrong"] is None, result
+
+
+@pytest.mark.parametrize("kind", ["folder", "folder with a file", "pipe", "profile", "theirs", "/dev/zero"])
+@pytest.mark.parametrize("name", [NEXT, NEXT_ROWS])
+def test_in_the_way_of_the_next_checkpoint(name: str, kind: str, base: Path) -> None:
+    number = 1000 + len(list(base.glob("case-*")))
+    case = Case(f"{name} is there as {kind}", lambda run, elsewhere: put(run / name, kind, elsewhere), True)
+    result = throw(case, base, number)
+    assert result["wrong"] is None, result
+    # A link in the run's folder itself is refused before anything is trained.
+    links = name == NEXT and kind in ("profile", "theirs", "/dev/zero")
+    assert result["outcome"] == ("refused: ValueError" if links else "went on")
+    if kind == "folder with a file":
+        kept = (base / f"case-{number}" / "run" / name).with_name(f"damaged-{Path(name).name}") / "notes"
+        assert kept.read_text() == "the user's"
 
 
 def normalised(folder: Path, steps: int) -> Any:

@@ -19,7 +19,7 @@ from sb3_sample.saving import run_folder
 from sb3_sample.saving.folders import Folder
 from sb3_sample.saving.progress import ProgressFile
 from sb3_sample.saving.run_folder import Damaged, RunFolder, Segment
-from tests.saving.hostile_folders import facts_of, rewritten
+from tests.saving.hostile_folders import KINDS, facts_of, put, rewritten, snapshot, user_files
 
 
 def writer(content: bytes) -> Callable[[IO[bytes]], Any]:
@@ -276,10 +276,69 @@ def test_a_copy_by_hard_links_is_a_run_of_its_own(tmp_path: Path) -> None:
     log = ProgressFile(two.path)
     log.restore({"size": 12, "pending": ['{"step": 2}\n']})
     log.close()
-    write(two, 30, write(two, 20))
+    with pytest.warns(UserWarning, match="checkpoint-000000000020 was in the way"):
+        write(two, 30, write(two, 20))
     assert (tmp_path / "one" / "progress.jsonl").read_text() == '{"step": 1}\n'
     assert (tmp_path / "two" / "progress.jsonl").read_text() == '{"step": 1}\n{"step": 2}\n'
     assert one.newest_good()[1]["steps"] == 20  # type: ignore[index]
+
+
+# ---------------------------------------------------------------- what is in the way
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "same content elsewhere"])
+@pytest.mark.parametrize("name", ["checkpoint-000000000030", "replay/model-000000000020-000000000030.zip"])
+def test_a_checkpoint_is_written_whatever_has_its_name(name: str, kind: str, tmp_path: Path) -> None:
+    """Put there during the training; a run that begins refuses or renames what it finds."""
+    run, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    folder = RunFolder(run)
+    segments = write(folder, 20, write(folder, 10))
+    user_files(elsewhere)
+    put(run / name, kind, elsewhere)
+    before = snapshot(elsewhere)
+    replaced = name.startswith("replay") and kind in ("sparse file", "hard link", "hard link, empty")
+    aside = (run / name).with_name(f"damaged-{Path(name).name}")
+    was = (run / name).lstat()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        write(folder, 30, segments)
+    said = f"{run / name} was in the way of what a checkpoint writes, and is {aside.name} now"
+    assert [str(each.message)[: len(said)] for each in caught] == ([] if replaced else [said])
+    assert folder.newest_good()[1]["steps"] == 30  # type: ignore[index]
+    assert os.path.lexists(aside) is not replaced and (replaced or os.path.samestat(aside.lstat(), was))
+    assert kind != "folder with a file" or (aside / "notes").read_text() == "the user's"
+    folder.close()
+    # It stays where it is, and so does what comes into the way later.
+    again = RunFolder(run)
+    put(run / "checkpoint-000000000040", kind, elsewhere)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        segments = write(again, 40, again.newest_good()[1]["segments"])  # type: ignore[index]
+    write(again, 50, segments)
+    assert again.newest_good()[1]["steps"] == 50  # type: ignore[index]
+    assert os.path.lexists(aside) is not replaced and os.path.lexists(run / "damaged-checkpoint-000000000040")
+    assert snapshot(elsewhere) == before
+
+
+def test_what_is_in_the_way_and_cannot_be_renamed(tmp_path: Path, monkeypatch: Any) -> None:
+    """Is an error that names it, which the training warns of, and nothing is left of the attempt."""
+    folder = RunFolder(tmp_path)
+    segments = write(folder, 10)
+    way = tmp_path / "replay" / "model-000000000010-000000000020.zip"
+    way.mkdir()
+    before = sorted(str(p) for p in tmp_path.rglob("*"))
+    rename = os.rename
+
+    def refuse(source: Any, target: Any, **kwargs: Any) -> None:
+        if source == way.name:
+            raise PermissionError(errno.EPERM, os.strerror(errno.EPERM), source)
+        rename(source, target, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "rename", refuse)
+        with pytest.raises(PermissionError, match=re.escape(way.name)):
+            write(folder, 20, segments)
+    assert sorted(str(p) for p in tmp_path.rglob("*")) == before
 
 
 # ---------------------------------------------------------------- what cannot be removed
