@@ -14,7 +14,6 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -31,7 +30,6 @@ from sb3_sample.learner.execution import (
     warn_not_compiled,
     why_not_compiled,
 )
-from sb3_sample.logged_values import LoggedValues
 from sb3_sample.replay.buffers import (
     ValidationDictReplayBuffer,
     ValidationReplayBuffer,
@@ -42,6 +40,7 @@ from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplay, Co
 from sb3_sample.replay.sources import ReplaySource
 from sb3_sample.sac import checks
 from sb3_sample.sac.arguments import SACArguments
+from sb3_sample.sac.metrics_log import MetricsLog
 from sb3_sample.sac.model_learner import check_action_space
 from sb3_sample.sac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.sb3_names import SB3Names
@@ -60,7 +59,7 @@ MAX_BATCHES_AT_ONCE = 64
 _STABLE_BASELINES3 = inspect.signature(OffPolicyAlgorithm.__init__).parameters.keys()
 
 
-class SAC(SB3Names, SACArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]  # actor
+class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]  # actor
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
     SAC that the DAC, VPL and BRO papers and the regularization study (https://arxiv.org/abs/2403.00514) compare with:
@@ -386,38 +385,6 @@ class SAC(SB3Names, SACArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorit
             self._watch.check()
         self._record_metrics()
 
-    @property
-    def logger(self) -> Logger:
-        """The logger. Metrics in it may be on the device until somebody reads them."""
-        if isinstance(self._logger, Logger):
-            LoggedValues.of(self._logger)
-        return self._logger
-
-    @property
-    def _metrics_wait(self) -> bool:
-        """Whether the host would wait for the device if it read a metric now."""
-        return self.device.type != "cpu"
-
-    def _record_metrics(self) -> None:
-        """Record the metrics of the latest gradient step: numbers on a CPU, on a GPU what becomes them when read."""
-        if not hasattr(self, "_logger"):
-            return  # There is none before ``learn`` or ``set_logger``.
-        if self._metrics_wait:
-            LoggedValues.record_later(self.logger, self._metrics)
-        else:
-            for name, value in self._metrics.items():
-                self.logger.record(name, float(value.numpy()))
-        self._record_counts()
-
-    def _record_counts(self) -> None:
-        self.logger.record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        if self.learner.seconds_compiling > 0:
-            self.logger.record("time/seconds_compiling", self.learner.seconds_compiling)
-        self.logger.record("plasticity/reset", self.plasticity.n_done)
-        if isinstance(self.replay_buffer, ValidationSplit):
-            self.logger.record("validation/size", self.replay_buffer.n_validation)
-
     def _set_training_mode(self, mode: bool) -> None:
         """Dropout and power iterations: on during gradient steps, off whoever acts."""
         self.learner.set_training_mode(mode)
@@ -428,19 +395,3 @@ class SAC(SB3Names, SACArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorit
         if eager:
             self.keep_next_gradients = False
         return self.learner.step(batch, noise, self.pessimism_rule.draw(self._source), eager)
-
-    def dump_logs(self) -> None:
-        """
-        Write the log. On a GPU the host waits here for the metrics, at the latest.
-
-        :raises TrainingDiverged: if one of them was NaN or infinite since the last time
-        """
-        self._watch.check()
-        # Those of the latest gradient step also where there was none since the last time; a callback may have put
-        # others in the place of those that there are.
-        recorded = getattr(self.logger, "name_to_excluded", ())
-        for name, value in self._metrics.items():
-            if name not in recorded:
-                self.logger.record(name, float(value))
-        self._record_counts()
-        super().dump_logs()
