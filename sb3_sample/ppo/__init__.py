@@ -3,6 +3,7 @@
 from sb3_sample.ppo.mbma import MBMAPPO
 from sb3_sample.ppo.mbpo import MBPOPPO
 from sb3_sample.ppo.qma import QMAPPO
-from sb3_sample.ppo.simulated_ppo import Rollout, SimulatedPPO, SimulatedSamples
+from sb3_sample.ppo.samples import Rollout, SimulatedSamples
+from sb3_sample.ppo.simulated_ppo import SimulatedPPO
 
 __all__ = ["MBMAPPO", "MBPOPPO", "QMAPPO", "Rollout", "SimulatedPPO", "SimulatedSamples"]

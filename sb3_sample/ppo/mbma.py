@@ -4,7 +4,7 @@ import torch
 
 from sb3_sample.constructor import argument
 from sb3_sample.ppo.model_based import ModelBasedPPO
-from sb3_sample.ppo.simulated_ppo import SimulatedSamples
+from sb3_sample.ppo.samples import SimulatedSamples
 
 
 class MBMAPPO(ModelBasedPPO):

@@ -12,7 +12,8 @@ from sb3_sample.networks.mlp import MLP
 from sb3_sample.optim import AdamW
 from sb3_sample.ppo.arguments import check_network_kwargs
 from sb3_sample.ppo.dynamics import ADAM_EPS, Standardizer, fit, minibatches
-from sb3_sample.ppo.simulated_ppo import SimulatedPPO, SimulatedSamples
+from sb3_sample.ppo.samples import SimulatedSamples
+from sb3_sample.ppo.simulated_ppo import SimulatedPPO
 from sb3_sample.saving.kept import Kept
 
 #: Entries of ``q_kwargs``, with the defaults (MBMA, appendix B.2; ``normalize`` is decided here).

@@ -12,27 +12,25 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.distributions import CategoricalDistribution, DiagGaussianDistribution, Distribution
+from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
-from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_program, default_of
-from sb3_sample.console import say
 from sb3_sample.faults import TrainingDiverged, check_finite_parameters, diverged, not_finite
 from sb3_sample.kinds import check_value, integer
 from sb3_sample.ppo import arguments
 from sb3_sample.ppo.arguments import PPOArguments
-from sb3_sample.ppo.dynamics import minibatches
+from sb3_sample.ppo.policy_update import PolicyUpdate
+from sb3_sample.ppo.samples import Rollout, SimulatedSamples, log_prob_of_many
 from sb3_sample.ppo.spaces import FlatObservations, ModelActions
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
 from sb3_sample.saving.kept import Kept
@@ -49,47 +47,7 @@ NAMED_POLICIES = ("MlpPolicy", "MultiInputPolicy")
 _STABLE_BASELINES3 = inspect.signature(PPO.__init__).parameters.keys()
 
 
-class Rollout(NamedTuple):
-    """
-    The real samples of an iteration. N is their number, steps times environments.
-
-    :param observations: (N, O)
-    :param actions: the policy's, (N, A), or (N,) integers of a Discrete space
-    :param log_probs: of the actions under the policy that took them, (N,)
-    :param values: the critic's of the observations, before the update, (N,)
-    :param advantages: by GAE(lambda), (N,)
-    :param returns: TD(lambda), (N,)
-    """
-
-    observations: torch.Tensor
-    actions: torch.Tensor
-    log_probs: torch.Tensor
-    values: torch.Tensor
-    advantages: torch.Tensor
-    returns: torch.Tensor
-
-
-class SimulatedSamples(NamedTuple):
-    """
-    Samples of the policy that no environment has seen: X for each of N real observations.
-
-    :param observations: the simulated states, (N, X, O); None if the actions are for the N real observations
-    :param actions: the policy's, (N, X, A), or (N, X) integers of a Discrete space
-    :param log_probs: of the actions under the policy that drew them, (N, X)
-    :param q_values: estimates of Q(s, a), (N, X)
-    :param advantages: q_values minus the critic's values of the states, (N, X)
-    :param weights: how much each sample counts, a real one counting 1, (N, X); None if each counts 1
-    """
-
-    observations: torch.Tensor | None
-    actions: torch.Tensor
-    log_probs: torch.Tensor
-    q_values: torch.Tensor
-    advantages: torch.Tensor
-    weights: torch.Tensor | None = None
-
-
-class SimulatedPPO(PPOArguments, SafeFiles, PPO):
+class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
     """
     PPO whose policy loss also sees simulated samples (MBMA, Nauman and Cygan 2023,
     https://arxiv.org/abs/2210.13011, algorithm 1): what :class:`MBMAPPO`, :class:`QMAPPO` and :class:`MBPOPPO` share.
@@ -428,28 +386,6 @@ class SimulatedPPO(PPOArguments, SafeFiles, PPO):
 
     # ---------------------------------------------------------------- the policy's part
 
-    def distribution_at(self, observations: torch.Tensor) -> Distribution:
-        """
-        :param observations: flat, (B, O)
-        :return: the policy's distribution of the actions
-        :raises ValueError: its parameters are not finite, or it is of another kind than can be simulated with
-        """
-        distribution = self.policy.get_distribution(self.flat_observations.restore(observations))
-        if not isinstance(distribution, (DiagGaussianDistribution, CategoricalDistribution)):
-            raise ValueError(
-                "policy must give a diagonal Gaussian or a categorical distribution for simulated samples, not "
-                f"{type(distribution).__name__}: pass n_simulated=0 for plain PPO"
-            )
-        check_parameters_of(distribution.distribution)
-        return distribution
-
-    def values_of(self, observations: torch.Tensor) -> torch.Tensor:
-        """
-        :param observations: flat, (B, O)
-        :return: the critic's values, (B,)
-        """
-        return self.policy.predict_values(self.flat_observations.restore(observations)).flatten()
-
     def _many_actions(
         self, observations: torch.Tensor, n_simulated: int, noise: torch.Tensor | None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
@@ -473,142 +409,6 @@ class SimulatedPPO(PPOArguments, SafeFiles, PPO):
         actions = torch.addcmul(mean, std, noise)
         return actions, log_prob_of_many(distribution, actions), None
 
-    def _update_policy(self, rollout: Rollout, samples: SimulatedSamples) -> None:
-        """
-        PPO's epochs over the rollout and the samples that belong to it (MBMA, algorithm 1, lines 10 to 13).
-
-        :param rollout: the real samples
-        :param samples: the simulated ones
-        """
-        self.policy.set_training_mode(True)
-        self._update_learning_rate(self.policy.optimizer)
-        clip_range = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
-        clip_range_vf = None
-        if self.clip_range_vf is not None:
-            clip_range_vf = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
-
-        # The real sample of a row first, then its simulated ones.
-        real_weights = torch.ones_like(rollout.log_probs)[:, None]
-        weights = torch.ones_like(samples.log_probs) if samples.weights is None else samples.weights
-        columns: dict[str, torch.Tensor] = {
-            "observations": rollout.observations,
-            "values": rollout.values,
-            "returns": rollout.returns,
-            "actions": torch.cat([rollout.actions[:, None], samples.actions], dim=1),
-            "log_probs": torch.cat([rollout.log_probs[:, None], samples.log_probs], dim=1),
-            "advantages": torch.cat([rollout.advantages[:, None], samples.advantages], dim=1),
-            "weights": torch.cat([real_weights, weights], dim=1),
-        }
-        if samples.observations is not None:
-            columns["simulated_observations"] = samples.observations
-
-        metrics: list[dict[str, torch.Tensor]] = []
-        divergences: list[torch.Tensor] = []
-        goes_on = True
-        for epoch in range(self.n_epochs):
-            divergences = []
-            # The same numbers as Stable-Baselines3 draws, and one copy an epoch instead of one a minibatch.
-            order = torch.as_tensor(np.random.permutation(len(rollout.values)), device=self.device)  # noqa: NPY002
-            shuffled = {name: values[order] for name, values in columns.items()}
-            for batch in minibatches(list(shuffled.values()), self.batch_size):
-                try:
-                    loss, step = self._losses(dict(zip(shuffled, batch, strict=True)), clip_range, clip_range_vf)
-                except ValueError:
-                    # What torch's distributions say of a mean that is not finite comes one minibatch late.
-                    self._stop_if_diverged(metrics)
-                    raise
-                metrics.append({name: value.detach() for name, value in step.items()})
-                divergences.append(metrics[-1].pop("approx_kl"))
-                if self.target_kl is not None and divergences[-1] > 1.5 * self.target_kl:
-                    goes_on = False
-                    if self.verbose >= 1:
-                        say(f"Early stopping at step {epoch} due to reaching max kl: {divergences[-1]:.2f}")
-                    break
-                self.policy.optimizer.zero_grad()
-                loss.backward()
-                torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
-                self.policy.optimizer.step()
-            self._n_updates += 1
-            if not goes_on:
-                break
-
-        for name in ("entropy_loss", "policy_gradient_loss", "value_loss", "clip_fraction"):
-            mean = torch.stack([step[name] for step in metrics]).mean().item()
-            if not math.isfinite(mean):
-                self._stop_if_diverged(metrics)
-            self.logger.record(f"train/{name}", mean)
-        self.logger.record("train/approx_kl", torch.stack(divergences).mean().item())
-        self.logger.record("train/loss", loss.item())
-        variance = explained_variance(self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten())
-        self.logger.record("train/explained_variance", variance)
-        if hasattr(self.policy, "log_std"):
-            self.logger.record("train/std", self.policy.log_std.exp().mean().item())
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/clip_range", clip_range)
-        if clip_range_vf is not None:
-            self.logger.record("train/clip_range_vf", clip_range_vf)
-
-    def _stop_if_diverged(self, metrics: list[dict[str, torch.Tensor]]) -> None:
-        """Name the first of the present iteration's minibatches whose metrics are not finite, if there is one."""
-        for i, step in enumerate(metrics, 1):
-            bad = not_finite({f"train/{name}": value.item() for name, value in step.items()})
-            if bad:
-                raise TrainingDiverged(bad, f"minibatch {i} of the iteration", self.num_timesteps)
-
-    def _losses(
-        self, batch: dict[str, torch.Tensor], clip_range: float, clip_range_vf: float | None
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """
-        PPO's loss of a minibatch of B real samples with X simulated ones each.
-
-        :param batch: ``observations`` (B, O), ``values`` and ``returns`` (B,); with the real sample in the first column
-            ``actions`` (B, 1 + X, A), ``log_probs``, ``advantages`` and ``weights`` (B, 1 + X); and perhaps
-            ``simulated_observations`` (B, X, O)
-        :param clip_range: of the probability ratio
-        :param clip_range_vf: of the value's change, or None
-        :return: the loss, and scalars to log by name
-        """
-        observations, actions = batch["observations"], batch["actions"]
-        simulated = batch.get("simulated_observations")
-        if simulated is None:
-            # All actions of a row are at one state: the actor is evaluated once for them.
-            distribution = self.distribution_at(observations)
-            log_probs = log_prob_of_many(distribution, actions)
-            entropy = _entropy(distribution)
-        else:
-            states = torch.cat([observations[:, None], simulated], dim=1).flatten(0, 1)
-            distribution = self.distribution_at(states)
-            log_probs = distribution.log_prob(actions.flatten(0, 1)).view(actions.shape[:2])
-            entropy = _entropy(distribution).view(actions.shape[:2])[:, 0]
-        values = self.values_of(observations)
-
-        weights = batch["weights"]
-        weights = weights / weights.sum()
-        advantages = batch["advantages"]
-        if self.normalize_advantage:
-            centred = advantages - (weights * advantages).sum()
-            # With equal weights torch.std's estimate, which Stable-Baselines3 divides by.
-            variance = (weights * centred.square()).sum() * advantages.numel() / (advantages.numel() - 1)
-            advantages = centred / (variance.sqrt() + 1e-8)
-        log_ratio = log_probs - batch["log_probs"]
-        ratio = log_ratio.exp()
-        clipped = ratio.clamp(1 - clip_range, 1 + clip_range)
-        policy_loss = -(weights * torch.minimum(advantages * ratio, advantages * clipped)).sum()
-        if clip_range_vf is not None:
-            values = batch["values"] + (values - batch["values"]).clamp(-clip_range_vf, clip_range_vf)
-        value_loss = F.mse_loss(batch["returns"], values)
-        entropy_loss = -entropy.mean()
-        loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss
-        with torch.no_grad():
-            scalars = {
-                "policy_gradient_loss": policy_loss,
-                "value_loss": value_loss,
-                "entropy_loss": entropy_loss,
-                "clip_fraction": (weights * ((ratio - 1).abs() > clip_range)).sum(),
-                "approx_kl": (weights * (ratio - 1 - log_ratio)).sum(),
-            }
-        return loss, scalars
-
     @contextmanager
     def _phase(self, name: str) -> Iterator[None]:
         """Measure what a phase of the iteration takes, to be logged."""
@@ -621,39 +421,3 @@ class SimulatedPPO(PPOArguments, SafeFiles, PPO):
     def _synchronize(self) -> None:
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
-
-
-def check_parameters_of(distribution: torch.distributions.Distribution) -> None:
-    """
-    Check the parameters of a distribution as torch does unless it was told not to: the first ``torch.compile`` of a
-    process, of an off-policy model for one, tells all distributions that are made after it not to.
-
-    :param distribution: a distribution
-    :raises ValueError: they are out of range or NaN
-    """
-    if not distribution._validate_args:
-        shapes = distribution.batch_shape, distribution.event_shape
-        torch.distributions.Distribution.__init__(distribution, *shapes, validate_args=True)
-
-
-def log_prob_of_many(distribution: Distribution, actions: torch.Tensor) -> torch.Tensor:
-    """
-    :param distribution: of the actions at B states
-    :param actions: M for each state, (B, M, A), or (B, M) integers
-    :return: their log-probabilities, (B, M)
-    """
-    if isinstance(distribution, CategoricalDistribution):
-        return distribution.distribution.logits.gather(1, actions.long())
-    assert isinstance(distribution, DiagGaussianDistribution)
-    normal: Any = distribution.distribution
-    mean, std = normal.mean[:, None], normal.stddev[:, None]
-    # torch's own formula, without its checks of every argument.
-    squares = ((actions - mean) / std).square().sum(dim=2)
-    constant = normal.stddev.log().sum(dim=1, keepdim=True) + mean.shape[2] * 0.5 * math.log(2 * math.pi)
-    return -0.5 * squares - constant
-
-
-def _entropy(distribution: Distribution) -> torch.Tensor:
-    entropy = distribution.entropy()
-    assert entropy is not None  # Gaussian and categorical distributions have one in closed form
-    return entropy

@@ -15,7 +15,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
-from sb3_sample.ppo.simulated_ppo import Rollout, SimulatedPPO, SimulatedSamples, log_prob_of_many
+from sb3_sample.ppo.samples import Rollout, SimulatedSamples, log_prob_of_many
+from sb3_sample.ppo.simulated_ppo import SimulatedPPO
 from sb3_sample.variance.estimate import Interval, check_counts, jackknife, seeded
 from sb3_sample.variance.returns import Agent
 
