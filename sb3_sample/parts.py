@@ -2,9 +2,11 @@
 The public door for parts of one's own: everything here stays under this name, wherever it moves inside.
 
 A part is a class, accepted where a name is: ``pessimism=``, ``exploration=``, ``value_head=``, ``batch_transforms=``,
-``policy_kwargs=dict(critic_network=..., actor_network=...)``. docs/parts.md says what each has to have.
+``policy_kwargs=dict(critic_network=..., actor_network=...)``. An agent of one's own is a class that declares its
+arguments by ``argument``. docs/parts.md says what each has to have.
 """
 
+from sb3_sample.constructor import argument
 from sb3_sample.learner.batch import Batch, CriticStep, Extra, Noise
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration, OptimisticExploration
 from sb3_sample.learner.heads import QuantileHead, ValueHead
@@ -39,6 +41,7 @@ __all__ = [
     "Pessimism",
     "QuantileHead",
     "ValueHead",
+    "argument",
     "bootstrap",
     "epistemic_std",
     "linear",

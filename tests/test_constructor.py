@@ -161,5 +161,16 @@ def test_a_method_of_an_arguments_name_is_no_default() -> None:
     assert inspect.signature(Strange).parameters["tau"].default == 0.005
 
 
+def test_the_agent_of_the_documentation() -> None:
+    text = (ROOT / "docs" / "parts.md").read_text()
+    (program,) = [block for block in re.findall(r"```python\n(.*?)```", text, re.S) if "class REDQ(SAC)" in block]
+    environment = '"dmc/cheetah-run-v0", '
+    assert environment in program
+    names: dict[str, Any] = {"vec": vec, "__name__": "documentation"}
+    exec(program.replace(environment, "vec(), buffer_size=100, "), names)
+    model = names["model"]
+    assert (model.replay_ratio, model.target_subset, model.actor_pessimism, model.critic.n_critics) == (20, 2, 0, 10)
+
+
 def test_a_required_argument_has_no_default() -> None:
     assert SAC.constructor_arguments["policy"].default is REQUIRED
