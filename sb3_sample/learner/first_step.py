@@ -1,5 +1,5 @@
 """
-Checks before a learner's first gradient step: a part of one's own whose shapes are wrong broadcasts, and trains nonsense.
+Checks before the first gradient step: a part of one's own whose shapes are wrong broadcasts, and trains nonsense.
 
 They run once, eagerly and before anything is compiled. What a gradient step would ask of networks, value head and rule
 of pessimism is asked once more, of a few of its transitions, so many that the batch has a size that nothing else has.
@@ -54,7 +54,7 @@ def check_batch(who: str, batch: Any, like: Batch | None = None) -> None:
     _check_entry(who, "actions", batch.actions, tuple(like.actions.shape))
     for name in ("dones", "rewards"):
         _check_entry(who, name, getattr(batch, name), (n, 1))
-    discounts = batch.discounts
+    discounts: Any = batch.discounts
     if not (discounts is None or is_number(discounts) or (_is_tensor(discounts) and discounts.dim() == 0)):
         _check_entry(who, "discounts", discounts, (n, 1), "a number, or ")
 
@@ -150,22 +150,23 @@ def _new_size(roots: Iterable[nn.Module], batch: Batch) -> int:
 def _rows(batch: Batch, n: int) -> Batch:
     """As many transitions of a batch, again from the first on if there are fewer."""
     rows = torch.arange(n, device=batch.actions.device) % len(batch.actions)
-    entries = [value if is_number(value) or value.dim() == 0 else value[rows] for value in batch[1:2] + batch[3:]]
-    actions, dones, rewards, discounts = entries
-    observations, following = (for_each(lambda x: x[rows], x) for x in (batch.observations, batch.next_observations))
-    return Batch(observations, actions, following, dones, rewards, discounts)
+
+    def take(value: Any) -> Any:
+        return value[rows] if _is_tensor(value) and value.dim() > 0 else value
+
+    return Batch(*(for_each(take, value) for value in batch))
 
 
 @contextmanager
 def _untouched(modules: list[nn.Module]) -> Iterator[None]:
     """Have modules in evaluation mode, without the hooks that others have put on them, and as they were afterwards."""
-    modes = [(module, module.training) for module in modules if isinstance(module, torch.jit.ScriptModule)]
+    scripts = {module: module.training for module in modules if isinstance(module, torch.jit.ScriptModule)}
     plain = [module for module in modules if not isinstance(module, torch.jit.ScriptModule)]
     attributes = [(module, dict(vars(module)), dict(module._buffers)) for module in plain]
     buffers = [(buffer, buffer.clone()) for module in modules for buffer in module.buffers(recurse=False)]
     try:
-        for module, _ in modes:
-            module.eval()
+        for script in scripts:
+            script.eval()
         for module in plain:
             vars(module).update(training=False, _forward_hooks=OrderedDict())
         yield
@@ -175,8 +176,8 @@ def _untouched(modules: list[nn.Module]) -> Iterator[None]:
             vars(module).update(own)
             module._buffers.clear()
             module._buffers.update(held)
-        for module, mode in modes:
-            module.train(mode)
+        for script, mode in scripts.items():
+            script.train(mode)
         with torch.no_grad():
             for buffer, before in buffers:
                 if not torch.equal(buffer, before):

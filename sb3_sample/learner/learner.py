@@ -18,6 +18,7 @@ from sb3_sample.learner.batch import Batch, CriticStep, Extra, Noise
 from sb3_sample.learner.execution import Execution
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
+from sb3_sample.learner.observations import Observations
 from sb3_sample.learner.parts import Part, logged
 from sb3_sample.learner.pessimism import Pessimism, pessimistic_value
 from sb3_sample.learner.plasticity import ReDo, Resets
@@ -39,6 +40,7 @@ class Networks(Protocol):
     not the actor itself.
     """
 
+    observation_space: Any
     actor: Any
     critic: Any
     critic_target: Any
@@ -379,18 +381,21 @@ class Learner:
             finally:
                 self.set_training_mode(False)
 
-    def act(self, observations: Any, deterministic: bool = False) -> torch.Tensor:
+    def act(self, observations: Any, deterministic: bool = False) -> torch.Tensor | np.ndarray:
         """
         Choose actions.
 
-        :param observations: tensors on the learner's device, (B, O), or a dict of them
+        :param observations: tensors, or NumPy's arrays, (B, O) or a single one (O,); or a dict of either
         :param deterministic: the actor's mean action, as in evaluation, instead of the explorer's sample
-        :return: actions in [-1, 1], (B, A)
+        :return: actions in [-1, 1], (B, A), or (A,) for a single observation: a tensor on the learner's device for
+            tensors, an array for arrays
+        :raises ValueError: if the observations have other keys or shapes than the observation space
         """
+        given = Observations(observations, self.networks.observation_space, self.device)
         with self._random(), torch.inference_mode():
             if deterministic:
-                return self.actor(observations, deterministic=True)  # type: ignore[no-any-return]
-            return self.explore(observations)
+                return given.actions(self.actor(given.batch, deterministic=True))
+            return given.actions(self.explore(given.batch))
 
     def explore(self, observations: Any) -> torch.Tensor:
         """

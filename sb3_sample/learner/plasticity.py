@@ -137,7 +137,7 @@ class ReDo(Part):
         trunk = learner.critic.trunk
         if all(units.outgoing is None for units in trunk.hidden_units(learner.critic.head)):
             raise ValueError(
-                f"redo_period={self.period} recycles the hidden neurons that a network lists in hidden_units(head), and "
+                f"redo_period={self.period} recycles hidden neurons that a network lists in hidden_units(head), and "
                 f"{type(trunk).__name__} lists none: define it, or leave redo_period out"
             )
 

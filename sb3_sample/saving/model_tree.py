@@ -215,6 +215,27 @@ class Content:
         except BadFile as error:
             raise BadFile(f"{self.name}: {error}") from error
 
+    def classes_in(self, name: str) -> list[tuple[str, Any]] | None:
+        """
+        Read a sequence of classes, or pairs of one and its arguments, without asking for trust in the classes.
+
+        :param name: the attribute
+        :return: the qualified names of the classes and their arguments; None if the file has no such thing
+        :raises BadFile: if the arguments are damaged, or name what is not trusted
+        """
+        entries = [_items(each) or [each] for each in _items(self.tree["attributes"].get(name)) or ()]
+        if _items(self.tree["attributes"].get(name)) is None or not all(
+            isinstance(entry[0], dict) and isinstance(entry[0].get("import"), str) and len(entry) <= 2
+            for entry in entries
+        ):
+            return None
+        names = [entry[0]["import"].rpartition(":")[2] for entry in entries]
+        try:
+            arguments = [self._decoded(entry[1], name) if len(entry) == 2 else {} for entry in entries]
+        except NotTrusted as error:
+            raise BadFile(f"{self.name}: {error}: {notice.need(self._cls, name, error.path, self._trusted)}") from error
+        return list(zip(names, arguments, strict=True))
+
     def check_policy_kwargs(self, given: Any) -> None:
         """
         :param given: policy_kwargs that take the place of the file's
@@ -360,6 +381,12 @@ class Content:
             return ""
         wanted = " or ".join(f"{name}=" for name in sorted(names))
         return f"{self.name} lacks {', '.join(sorted(names))}, for which the defaults stand (load takes {wanted}): "
+
+
+def _items(tree: Any) -> list[Any] | None:
+    """Entries of a list or a tuple in a file; None if it is none."""
+    inside = tree.get("tuple") if isinstance(tree, dict) else tree
+    return inside if isinstance(inside, list) else None
 
 
 def _agree(theirs: Any, given: Any, name: str) -> bool:
