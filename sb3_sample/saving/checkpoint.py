@@ -198,8 +198,8 @@ class Checkpointer:
             return
         if self._manifest["steps"] >= total_timesteps:
             warnings.warn(
-                f"Nothing is left to train: the run in checkpoint={str(self._name)!r} has {self._manifest['steps']} steps "
-                f"already, of {total_timesteps}. The model is as it was saved. For more steps pass a larger "
+                f"Nothing is left to train: the run in checkpoint={str(self._name)!r} has {self._manifest['steps']} "
+                f"steps already, of {total_timesteps}. The model is as it was saved. For more steps pass a larger "
                 "total_timesteps, for a new run another folder",
                 stacklevel=4,
             )

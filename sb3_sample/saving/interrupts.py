@@ -73,8 +73,8 @@ class Interrupts:
         self.restore(orderly)
         if saved_at is not None:
             tell(
-                f"{signal.Signals(number).name}: saved at {saved_at} steps in {self._folder}; the same program, started "
-                "again, goes on from there\n"
+                f"{signal.Signals(number).name}: saved at {saved_at} steps in {self._folder}; the same program, "
+                "started again, goes on from there\n"
             )
         if number == signal.SIGINT:
             raise KeyboardInterrupt
