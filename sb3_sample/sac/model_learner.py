@@ -166,7 +166,7 @@ class HasLearner:
                 f"{f' ({names})' if names else ''}: pass as many, in that order, or leave batch_transforms out"
             )
         completed = [
-            (each, arguments) if isinstance(each, type) and each.__qualname__ == name else each
+            (each, arguments()) if isinstance(each, type) and each.__qualname__ == name else each
             for each, (name, arguments) in zip(given, theirs, strict=True)
         ]
         return {**kwargs, "batch_transforms": completed}

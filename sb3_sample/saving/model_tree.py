@@ -6,7 +6,7 @@ import itertools
 import json
 import typing
 from collections import OrderedDict
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 import torch
@@ -215,26 +215,28 @@ class Content:
         except BadFile as error:
             raise BadFile(f"{self.name}: {error}") from error
 
-    def classes_in(self, name: str) -> list[tuple[str, Any]] | None:
+    def classes_in(self, name: str) -> list[tuple[str, Callable[[], Any]]] | None:
         """
         Read a sequence of classes, or pairs of one and its arguments, without asking for trust in the classes.
 
         :param name: the attribute
-        :return: the qualified names of the classes and their arguments; None if the file has no such thing
-        :raises BadFile: if the arguments are damaged, or name what is not trusted
+        :return: the qualified names of the classes, with functions that read their arguments (and raise ``BadFile`` if
+            they are damaged, or name what is not trusted); None if the file has no such thing
         """
-        entries = [_items(each) or [each] for each in _items(self.tree["attributes"].get(name)) or ()]
-        if _items(self.tree["attributes"].get(name)) is None or not all(
-            isinstance(entry[0], dict) and isinstance(entry[0].get("import"), str) and len(entry) <= 2
-            for entry in entries
-        ):
+        listed = _items(self.tree["attributes"].get(name))
+        entries = [_items(each) or [each] for each in listed or ()]
+        paths = [entry[0].get("import") if isinstance(entry[0], dict) else None for entry in entries]
+        if listed is None or not all(isinstance(path, str) for path in paths):
             return None
-        names = [entry[0]["import"].rpartition(":")[2] for entry in entries]
+        reads = [functools.partial(self._arguments, entry, name) for entry in entries]
+        return [(str(path).rpartition(":")[2], read) for path, read in zip(paths, reads, strict=True)]
+
+    def _arguments(self, entry: list[Any], name: str) -> Any:
+        """Arguments in a pair of a class and them."""
         try:
-            arguments = [self._decoded(entry[1], name) if len(entry) == 2 else {} for entry in entries]
+            return self._decoded(entry[1], name) if len(entry) == 2 else {}
         except NotTrusted as error:
             raise BadFile(f"{self.name}: {error}: {notice.need(self._cls, name, error.path, self._trusted)}") from error
-        return list(zip(names, arguments, strict=True))
 
     def check_policy_kwargs(self, given: Any) -> None:
         """

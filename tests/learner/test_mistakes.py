@@ -428,6 +428,12 @@ def test_transforms_at_loading(tmp_path: Path) -> None:
             ValueError, match=rf"batch_transforms has {len(given)} entries.* file has 2 transforms \(Jitter, Jitter\)"
         ):
             jitters(*given)
+    # Arguments that take the place of the file's are not read from it: no trust is asked for.
+    sac(batch_transforms=[(Jitter, {"jitter": Needs})]).save(tmp_path / "m")
+    assert jitters((Jitter, {"jitter": 1})) == [1]
+    with pytest.raises(ValueError, match=r"test_mistakes:Needs.*trusted_modules"):
+        jitters(Jitter)
+    assert jitters(Jitter, trusted_modules=[__name__]) == [Needs]
     sac().save(tmp_path / "m")
     assert jitters() == []
     with pytest.raises(ValueError, match="batch_transforms has 1 entries.* file has 0"):
