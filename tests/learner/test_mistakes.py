@@ -26,7 +26,7 @@ from sb3_sample.parts import (
     ValueHead,
     linear,
 )
-from tests.sac.common import MAKERS, differing, random_batch, sac, state, vec
+from tests.sac.common import COMPILES, MAKERS, differing, random_batch, sac, state, vec
 
 
 def rule(**methods: Any) -> type[Pessimism]:
@@ -171,6 +171,13 @@ SHAPES: list[tuple[dict[str, Any], str]] = [
 def test_wrong_shapes_are_errors_at_the_first_step(kwargs: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=re.escape(words)):
         sac(**kwargs).learn(30)
+
+
+@COMPILES
+def test_an_error_inside_of_a_compiled_step_is_named() -> None:
+    model = sac(pessimism=rule(update=lambda *_, **__: None), compile=True)
+    with pytest.raises(RuntimeError, match=r"it raises ValueError.*MyRule\.update must return a dict"):
+        model.learn(30)
 
 
 @pytest.mark.parametrize(
