@@ -377,6 +377,16 @@ def evaluate(agent: Agent, env: gym.Env, n_episodes: int = 5) -> float:
     return total / n_episodes
 
 
+def check_numbers(n_steps: int, seed: int, eval_every: int, config: Config) -> None:
+    """ValueError if there are too few steps to learn in, or to an evaluation, or the seed is none."""
+    if n_steps <= config.learning_starts:
+        raise ValueError(f"n_steps must be more than learning_starts={config.learning_starts}, not {n_steps}")
+    if seed < 0:
+        raise ValueError(f"seed must be at least 0, not {seed}")
+    if eval_every < 1:
+        raise ValueError(f"eval_every must be at least 1, not {eval_every}")
+
+
 def train(env_id: str, config: Config, n_steps: int, seed: int, eval_every: int) -> tuple[Agent, list[float]]:
     """
     :param env_id: of an environment that ``make_env`` takes
@@ -386,10 +396,7 @@ def train(env_id: str, config: Config, n_steps: int, seed: int, eval_every: int)
     :param eval_every: environment steps between two evaluations; another one comes at the end
     :return: the agent, and the mean return of every evaluation
     """
-    if n_steps <= config.learning_starts:
-        raise ValueError(f"n_steps must be more than learning_starts={config.learning_starts}, not {n_steps}")
-    if eval_every < 1:
-        raise ValueError(f"eval_every must be at least 1, not {eval_every}")
+    check_numbers(n_steps, seed, eval_every, config)
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
     env, eval_env = make_env(env_id), make_env(env_id)
@@ -426,6 +433,11 @@ def main() -> None:
     args = parser.parse_args()
     if args.env not in gym.registry:
         import sb3_sample  # noqa: F401 - registers DeepMind Control and other suites
+    try:
+        make_env(args.env).close()
+        check_numbers(args.steps, args.seed, args.eval_every, Config())
+    except (ValueError, ImportError, gym.error.Error) as error:
+        parser.error(str(error))
 
     blocks, width = MODEL_SIZES[args.model_size]
     fast = {"replay_ratio": 2, "resets": Config.resets[:1]} if args.fast else {}

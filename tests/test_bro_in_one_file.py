@@ -364,11 +364,35 @@ def test_what_it_refuses() -> None:
 def test_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[Any] = []
     monkeypatch.setattr(one_file, "train", lambda *args: calls.append(args))
-    for line in ("--steps 7 --seed 3", "--env Pendulum-v1 --model-size 0.55M --fast --eval-every 9"):
+    monkeypatch.setattr(one_file, "make_env", lambda env_id: one_file.gym.Env())
+    for line in ("--steps 2501 --seed 3", "--env Pendulum-v1 --model-size 0.55M --fast --eval-every 9"):
         monkeypatch.setattr(sys, "argv", ["bro_in_one_file.py", *line.split()])
         one_file.main()
     bro, fast = one_file.Config(), one_file.Config(critic_blocks=1, critic_width=128, replay_ratio=2, resets=(15_000,))
-    assert calls == [("dmc/cheetah-run-v0", bro, 7, 3, 5_000), ("Pendulum-v1", fast, 100_000, 0, 9)]
+    assert calls == [("dmc/cheetah-run-v0", bro, 2501, 3, 5_000), ("Pendulum-v1", fast, 100_000, 0, 9)]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (
+            "--env CartPole-v1",
+            "env must have a bounded Box with one axis as its action space; CartPole-v1 has",
+        ),
+        ("--env no-such-env-v0", "doesn't exist"),
+        ("--env a/b/c", "Malformed environment ID"),
+        ("--env Pendulum-v1 --steps 2500", "n_steps must be more than learning_starts=2500, not 2500"),
+        ("--env Pendulum-v1 --eval-every 0", "eval_every must be at least 1, not 0"),
+        ("--env Pendulum-v1 --seed -1", "seed must be at least 0, not -1"),
+        ("--model-size 3M", "invalid choice: '3M'"),
+    ],
+)
+def test_bad_arguments_are_one_line(line: str, words: str, monkeypatch: Any, capsys: Any) -> None:
+    monkeypatch.setattr(sys, "argv", ["bro_in_one_file.py", *line.split()])
+    with pytest.raises(SystemExit) as caught:
+        one_file.main()
+    *_, last = capsys.readouterr().err.splitlines()
+    assert caught.value.code == 2 and words in last and last.startswith("bro_in_one_file.py: error: ")
 
 
 def test_stands_alone() -> None:

@@ -232,6 +232,8 @@ class Execution:
         except _compilation_errors() as error:
             # Raised before anything of the step has been run.
             reason = str(error).strip().splitlines()[0]
+            if raised := re.search(r"raised exception (\w+\(.*\))", str(error)):
+                reason = f"it raises {raised[1]}"
             if "RecompileLimit" in type(error).__name__:
                 reason = "a setting that it reads changes again and again, and each change has it compiled anew"
             if not self.fall_back:

@@ -1,6 +1,7 @@
 """Exploration: choice of the actions in training. ``predict`` and evaluation are the pessimistic actor's alone."""
 
 import math
+from abc import abstractmethod
 from typing import Any
 
 import torch
@@ -125,6 +126,7 @@ class OptimisticExploration(Exploration):
     def optimizers(self) -> dict[str, Optimizer]:
         return {"actor_optimizer": self.actor_optimizer, "scalar_optimizer": self.scalar_optimizer}
 
+    @abstractmethod
     def _gaussian(
         self, observations: Any, features: torch.Tensor, mean: torch.Tensor, std: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -143,13 +145,16 @@ class OptimisticExploration(Exploration):
         """Divergence of the two Gaussians, (B, 1)."""
         return learner.actor.kl(*optimistic, *pessimistic)
 
+    @abstractmethod
     def _optimism(self, learner: Learning) -> torch.Tensor:
         """Optimism, a scalar with gradient."""
         raise NotImplementedError
 
+    @abstractmethod
     def _optimism_loss(self, learner: Learning, optimism: torch.Tensor, kl_gap: torch.Tensor) -> torch.Tensor:
         raise NotImplementedError
 
+    @abstractmethod
     def _kl_weight(self) -> torch.Tensor:
         """Weight of the divergence, a scalar with gradient."""
         raise NotImplementedError

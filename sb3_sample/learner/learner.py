@@ -13,12 +13,13 @@ import torch
 from torch import nn
 from torch.optim import Optimizer
 
-from sb3_sample.learner import losses
+from sb3_sample.learner import first_step, losses
 from sb3_sample.learner.batch import Batch, CriticStep, Extra, Noise
 from sb3_sample.learner.execution import Execution
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
-from sb3_sample.learner.parts import Part
+from sb3_sample.learner.observations import Observations
+from sb3_sample.learner.parts import Part, logged
 from sb3_sample.learner.pessimism import Pessimism, pessimistic_value
 from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.q_values import evaluate
@@ -39,6 +40,7 @@ class Networks(Protocol):
     not the actor itself.
     """
 
+    observation_space: Any
     actor: Any
     critic: Any
     critic_target: Any
@@ -155,6 +157,8 @@ class Learner:
             self.explorer = self.make_explorer()
             self.transforms: Any = nn.ModuleList(make(self).to(self.device) for make in make_transforms)
         self.plasticity, self.redo = plasticity, redo
+        if redo is not None:
+            redo.check(self)
         self.temperature_optimizer: AdamW | None = None
         if isinstance(self.temperature, LogScalar):
             betas = (temperature_beta1, 0.999)
@@ -163,6 +167,8 @@ class Learner:
         self._execution: Execution | None = None
         #: Whether ``.grad`` holds the gradients of another gradient step than the last, as a compiled one leaves none.
         self.gradients_are_stale = False
+        # Whether the shapes of a gradient step, and those of the explorer's actions, were checked.
+        self._checked_step = self._checked_actions = False
         # Whether a step was reported since the last gradient step.
         self._heard = False
         self._n_envs = 1
@@ -375,18 +381,35 @@ class Learner:
             finally:
                 self.set_training_mode(False)
 
-    def act(self, observations: Any, deterministic: bool = False) -> torch.Tensor:
+    def act(self, observations: Any, deterministic: bool = False) -> torch.Tensor | np.ndarray:
         """
         Choose actions.
 
-        :param observations: tensors on the learner's device, (B, O), or a dict of them
+        :param observations: tensors, or NumPy's arrays, (B, O) or a single one (O,); or a dict of either
         :param deterministic: the actor's mean action, as in evaluation, instead of the explorer's sample
-        :return: actions in [-1, 1], (B, A)
+        :return: actions in [-1, 1], (B, A), or (A,) for a single observation: a tensor on the learner's device for
+            tensors, an array for arrays
+        :raises ValueError: if the observations have other keys or shapes than the observation space
         """
+        given = Observations(observations, self.networks.observation_space, self.device)
         with self._random(), torch.inference_mode():
             if deterministic:
-                return self.actor(observations, deterministic=True)  # type: ignore[no-any-return]
-            return self.explorer.act(self, observations)
+                return given.actions(self.actor(given.batch, deterministic=True))
+            return given.actions(self.explore(given.batch))
+
+    def explore(self, observations: Any) -> torch.Tensor:
+        """
+        Have the explorer act.
+
+        :param observations: tensors on the learner's device, (B, O), or a dict of them
+        :return: actions in [-1, 1], (B, A)
+        :raises ValueError: if the explorer's first actions are something else
+        """
+        actions = self.explorer.act(self, observations)
+        if not self._checked_actions:
+            first_step.check_actions(self, observations, actions)
+            self._checked_actions = True
+        return actions
 
     def step(
         self, batch: Batch, noise: Noise | None = None, extra: Extra | None = None, eager: bool = False
@@ -404,24 +427,33 @@ class Learner:
         execution = self._execution or self.prepared_execution()
         if batch.discounts is None:
             batch = batch._replace(discounts=self.gamma)
+        if extra is not None and extra.batch.discounts is None:
+            extra = extra._replace(batch=extra.batch._replace(discounts=self.gamma))
+        if not self._checked_step:
+            first_step.check_batch("batch", batch)
         if self.transforms:
             batch, noise, extra = self._transformed(batch, noise, extra)
         subset = None if self.target_subset is None else (self.target_subset, self.critic.n_critics)
         noise = (noise or Noise()).completed(batch, extra, subset)
+        if not self._checked_step:
+            first_step.check(self, batch, extra)
+            self._checked_step = True
         self._counts._n_updates += 1
         moves_targets = self.n_updates % (self.target_update_interval or self.policy_delay) == 0
         moves_actor = self.n_updates % self.policy_delay == 0
         metrics = execution(self, batch, noise, extra, moves_targets, moves_actor, eager=eager)
         self.gradients_are_stale = not (eager or execution.leaves_gradients)
         for part in self.parts().values():
-            metrics.update(part.after_update(self, batch))
+            metrics.update(logged(part, "after_update", part.after_update(self, batch)))
         return metrics
 
     def _transformed(self, batch: Batch, noise: Noise | None, extra: Extra | None) -> tuple[Batch, Noise, Extra | None]:
         noise = noise or Noise()
         drawn = noise.transforms or tuple(transform.draw(batch) for transform in self.transforms)
         for transform, numbers in zip(self.transforms, drawn, strict=True):
-            batch = transform.transform(batch, numbers)
+            before, batch = batch, transform.transform(batch, numbers)
+            if not self._checked_step:
+                first_step.check_batch(f"what {type(transform).__name__}.transform returns", batch, before)
             if extra is not None:
                 extra = extra._replace(batch=transform.transform(extra.batch, transform.draw(extra.batch)))
         return batch, noise._replace(transforms=None), extra
@@ -471,7 +503,7 @@ class Learner:
                 self._follow(self.networks.actor_target, self.actor)
 
             # Explorer, on the new critics and the new actor.
-            metrics.update(self.explorer.update(self, batch, noise.exploration))
+            metrics.update(logged(self.explorer, "update", self.explorer.update(self, batch, noise.exploration)))
 
             # Temperature.
             if self.actor.has_entropy:
@@ -484,7 +516,8 @@ class Learner:
 
         # Pessimism.
         step = CriticStep(q.detach(), self.head.values(next_q), entropy_bonus, noise.subset)
-        metrics.update(self.pessimism_rule.update(self, batch, step, noise.pessimism, extra))
+        rule = self.pessimism_rule
+        metrics.update(logged(rule, "update", rule.update(self, batch, step, noise.pessimism, extra)))
         return {name: value.detach() for name, value in metrics.items()}
 
     def _actor_value(self, q: torch.Tensor) -> torch.Tensor:

@@ -131,6 +131,25 @@ class Learning(Protocol):
         """
 
 
+def logged(part: nn.Module, method: str, metrics: Any) -> dict[str, torch.Tensor]:
+    """
+    Check what a part gives to be logged.
+
+    :param part: the part
+    :param method: its method that gave it
+    :param metrics: what it gave
+    :return: the same
+    :raises ValueError: if it is no dict of scalar tensors
+    """
+    if not isinstance(metrics, dict):
+        raise ValueError(f"{type(part).__name__}.{method} must return a dict of what to log, not {metrics!r}")
+    for name, value in metrics.items():
+        if not isinstance(value, torch.Tensor) or value.numel() != 1:
+            shown = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, torch.Tensor) else repr(value)
+            raise ValueError(f"{type(part).__name__}.{method} must log scalar tensors; {name!r} is {shown}")
+    return metrics
+
+
 class Part(nn.Module):
     """Part of an off-policy learner; subclasses override what they need."""
 

@@ -127,6 +127,20 @@ class ReDo(Part):
             raise ValueError(f"redo_threshold must be at least 0, not {threshold}")
         self.period, self.threshold = period, threshold
 
+    def check(self, learner: Learning) -> None:
+        """
+        Check that there is something to recycle.
+
+        :param learner: the learner, its networks built
+        :raises ValueError: if the critics' network names no neurons that can be
+        """
+        trunk = learner.critic.trunk
+        if all(units.outgoing is None for units in trunk.hidden_units(learner.critic.head)):
+            raise ValueError(
+                f"redo_period={self.period} recycles hidden neurons that a network lists in hidden_units(head), and "
+                f"{type(trunk).__name__} lists none: define it, or leave redo_period out"
+            )
+
     def after_update(self, learner: Learning, batch: Batch) -> dict[str, torch.Tensor]:
         if learner.n_updates % self.period:
             return {}

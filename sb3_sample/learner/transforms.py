@@ -1,5 +1,7 @@
 """Batch transforms: changes to transitions between the replay and the gradient step."""
 
+from abc import abstractmethod
+
 import torch
 
 from sb3_sample.learner.batch import Batch
@@ -8,7 +10,7 @@ from sb3_sample.learner.parts import Learning, Part
 
 class BatchTransform(Part):
     """
-    Identity, and base class of transforms. A transform is told of the environment's steps as every part is, holds its
+    Base class of transforms. A transform is told of the environment's steps as every part is, holds its
     statistics in buffers, and is applied before the step to its batch and to the further transitions of a rule of
     pessimism.
 
@@ -27,6 +29,7 @@ class BatchTransform(Part):
         """
         return None
 
+    @abstractmethod
     def transform(self, batch: Batch, noise: torch.Tensor | None) -> Batch:
         """
         Transform a batch.
@@ -35,4 +38,4 @@ class BatchTransform(Part):
         :param noise: from :meth:`draw`
         :return: the transitions that are learned from
         """
-        return batch
+        raise NotImplementedError

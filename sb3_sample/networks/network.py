@@ -1,5 +1,6 @@
 """Base class of networks, and hidden neurons as a network lists them."""
 
+from abc import abstractmethod
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -39,6 +40,14 @@ class Network(nn.Module):
     #: Whether the copy of it in the target critics is in training mode during gradient steps, as dropout needs (DroQ).
     #: Batch norm is not: False has the targets use the running statistics.
     trains_in_target: ClassVar[bool] = True
+
+    @abstractmethod
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """
+        :param x: (B, in_features), or (E, B, in_features)
+        :return: (B, out_features), or (E, B, out_features) if there are copies
+        """
+        raise NotImplementedError
 
     def hidden_units(self, head: Dense | None) -> list[HiddenUnits]:
         """

@@ -188,7 +188,7 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
             assert self._last_obs is not None
             with torch.inference_mode():
                 observations, _ = self.policy.obs_to_tensor(self._last_obs)
-                actions = self.explorer.act(self.learner, observations)
+                actions = self.learner.explore(observations)
             scaled = actions.cpu().numpy().reshape((n_envs, *self.action_space.shape))
             if not np.isfinite(scaled).all():
                 check_finite_parameters(self)

@@ -1,8 +1,7 @@
 """Checks of the off-policy family's arguments: what does not go together, and what is more than a kind of value."""
 
-import inspect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -252,21 +251,6 @@ def check_rule(agent: Any) -> None:
             )
         if agent.action_noise is not None:
             raise ValueError("the segments of pessimism='opl' must be on-policy: leave action_noise out")
-
-
-def check_names(argument: str, choice: Any, make: Callable[..., Any], kwargs: dict[str, Any]) -> None:
-    """
-    :param argument: name of the argument that chose a part
-    :param choice: its value
-    :param make: what builds the part, from the learner and these arguments
-    :param kwargs: arguments for it
-    :raises ValueError: if one of them is none that it takes
-    """
-    # The first is the learner.
-    allowed = list(inspect.signature(make).parameters)[1:]
-    for name in kwargs:
-        if name not in allowed:
-            raise ValueError(f"{argument}_kwargs has {name!r}, but {argument}={choice!r} takes {allowed or 'none'}")
 
 
 def check_once(kwargs_name: str, kwargs: dict[str, Any] | None, arguments: dict[str, str]) -> None:

@@ -1,7 +1,7 @@
 """The learner of a model's own: ``BRO.learner(...)`` makes one, ``model.learner`` is the one inside a model."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,7 +11,8 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.utils import get_device
 from torch import nn
 
-from sb3_sample.kinds import chosen
+from sb3_sample import own_classes
+from sb3_sample.kinds import check_value, chosen, integer
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
 from sb3_sample.learner.heads import QuantileHead, ValueHead
 from sb3_sample.learner.learner import Counts, Learner
@@ -76,11 +77,15 @@ def _maker(cls: Any) -> Callable[..., Learner]:
                 f"{', '.join(of_training)}: a learner takes no arguments of training; what it learns from is up to its "
                 "caller"
             )
+        check_action_space(action_space, "action_space")
+        kinds = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Dict)
+        if not isinstance(observation_space, kinds):
+            names = ", ".join(kind.__name__ for kind in kinds)
+            raise ValueError(f"observation_space must be a space of Gymnasium's, {names}, not {observation_space!r}")
         if policy is None:
             policy = "MultiInputPolicy" if isinstance(observation_space, spaces.Dict) else "MlpPolicy"
         generators = OwnGenerators(seed, get_device(device))
         model = cls(policy, None, device=device, _init_setup_model=False, **arguments)
-        check_action_space(action_space)
         model.observation_space, model.action_space, model.n_envs = observation_space, action_space, 1
         model._check_arguments()
         model._setup_lr_schedule()
@@ -92,19 +97,23 @@ def _maker(cls: Any) -> Callable[..., Learner]:
     return learner
 
 
-def check_action_space(space: spaces.Space) -> None:
+def check_action_space(space: spaces.Space, argument: str = "env") -> None:
     """
     Check an action space.
 
     :param space: of actions
+    :param argument: where it comes from: "env", or the argument "action_space" itself
     :raises ValueError: if it is not a Box with finite bounds, low below high
     """
+    must = f"{argument} must have an action space" if argument == "env" else f"{argument} must be a space"
     if not isinstance(space, spaces.Box):
-        raise ValueError(f"env must have a bounded Box action space, not {space}")
+        must = "env must have a bounded Box action space" if argument == "env" else f"{argument} must be a bounded Box"
+        raise ValueError(f"{must}, not {space}")
     if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
-        raise ValueError(f"env must have a bounded action space: the bounds of {space} are not finite")
+        must = "env must have a bounded action space" if argument == "env" else f"{argument} must be bounded"
+        raise ValueError(f"{must}: the bounds of {space} are not finite")
     if not (space.low < space.high).all():
-        raise ValueError(f"env must have an action space with low < high in every dimension, not {space}")
+        raise ValueError(f"{must} with low < high in every dimension, not {space}")
 
 
 class HasLearner:
@@ -131,7 +140,7 @@ class HasLearner:
             make_explorer=self.make_explorer,
             plasticity=Resets(self.resets, self.reset_shrink, self.reset_gradient_steps),
             redo=None if self.redo_period is None else ReDo(self.redo_period, self.redo_threshold),
-            make_transforms=[functools.partial(_make_transform, each) for each in self.batch_transforms],
+            make_transforms=[functools.partial(_make_transform, *each) for each in enumerate(self.batch_transforms)],
             learning_rate=self.lr_schedule(1),
             temperature_beta1=self.temperature_beta1,
             target_entropy=self._target_entropy,
@@ -140,9 +149,29 @@ class HasLearner:
             **kwargs,
         )
 
+    @classmethod
+    def _completed(cls, content: Any, kwargs: dict[str, Any]) -> dict[str, Any]:
+        """Transforms without arguments of their own have those of the file's at the same place, if it is that class."""
+        given, theirs = kwargs.get("batch_transforms"), content.classes_in("batch_transforms")
+        if theirs is None or not isinstance(given, Sequence):
+            return kwargs
+        if len(given) != len(theirs):
+            names = ", ".join(name for name, _ in theirs)
+            raise ValueError(
+                f"batch_transforms has {len(given)} entries, but the model in the file has {len(theirs)} transforms"
+                f"{f' ({names})' if names else ''}: pass as many, in that order, or leave batch_transforms out"
+            )
+        completed = [
+            (each, arguments()) if isinstance(each, type) and each.__qualname__ == name else each
+            for each, (name, arguments) in zip(given, theirs, strict=True)
+        ]
+        return {**kwargs, "batch_transforms": completed}
+
     def _make_head(self: Any) -> ValueHead:
-        if self.value_head is not None:
-            return self.value_head(**(self.value_head_kwargs or {}))
+        if (cls := self.value_head) is not None:
+            head = own_classes.make("value_head", cls, cls, ValueHead, kwargs=self.value_head_kwargs or {})
+            check_value(f"{cls.__name__}.n_outputs", head.n_outputs, integer(1))
+            return head  # type: ignore[no-any-return]
         return ValueHead() if self.n_quantiles is None else QuantileHead(self.n_quantiles)
 
     def _make_networks(self: Any) -> SACPolicy:
@@ -200,8 +229,7 @@ class HasLearner:
         """
         make = chosen("exploration", self.exploration, EXPLORATIONS, Exploration)
         kwargs = self._full_exploration_kwargs()
-        checks.check_names("exploration", self.exploration, make, kwargs)
-        return make(learner, **kwargs)
+        return own_classes.make("exploration", self.exploration, make, Exploration, learner, kwargs=kwargs)  # type: ignore[no-any-return]
 
     def make_pessimism(self: Any, learner: Learner) -> Pessimism:
         """
@@ -212,8 +240,7 @@ class HasLearner:
             return Pessimism(self.pessimism)
         make = chosen("pessimism", self.pessimism, PESSIMISMS, Pessimism)
         kwargs = self._full_pessimism_kwargs()
-        checks.check_names("pessimism", self.pessimism, make, kwargs)
-        return make(learner, **kwargs)
+        return own_classes.make("pessimism", self.pessimism, make, Pessimism, learner, kwargs=kwargs)  # type: ignore[no-any-return]
 
     def _optimizers(self: Any) -> dict[str, torch.optim.Optimizer]:
         """Every optimizer by its path from the algorithm."""
@@ -291,6 +318,6 @@ class HasLearner:
         return self.learner.gradients_are_stale  # type: ignore[no-any-return]
 
 
-def _make_transform(choice: Any, learner: Learner) -> BatchTransform:
-    make, kwargs = transform_choice(choice)
-    return make(learner, **kwargs)  # type: ignore[no-any-return]
+def _make_transform(index: int, choice: Any, learner: Learner) -> BatchTransform:
+    cls, kwargs = transform_choice(choice)
+    return own_classes.make(f"batch_transforms[{index}]", cls, cls, BatchTransform, learner, kwargs=kwargs)  # type: ignore[no-any-return]

@@ -2,7 +2,6 @@
 
 import copy
 import functools
-import inspect
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
@@ -23,6 +22,7 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_sample import own_classes
 from sb3_sample.arguments import check_net_arch
 from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, DICT, check_value, chosen, integer
 from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
@@ -71,7 +71,7 @@ class Actor(BasePolicy):
         self._network_args = {"network": network, "network_kwargs": network_kwargs}
         self.features_dim = features_extractor.features_dim
         self.action_dim = get_action_dim(action_space)
-        self.trunk = network(self.features_dim, **network_kwargs)
+        self.trunk = _make_trunk("actor_network", network, self.features_dim, network_kwargs)
         self.mean = linear(self.trunk.out_features, self.action_dim, None)
         self.log_std = linear(self.trunk.out_features, self.action_dim, None, gain=1.0)
         #: Stable-Baselines3's distribution of the actions, for its own use: nothing here reads it.
@@ -334,7 +334,7 @@ class CriticEnsemble(BaseModel):
         self._network_args = {"network": network, "network_kwargs": network_kwargs, "n_outputs": n_outputs}
         self.n_critics = n_critics
         in_features = features_extractor.features_dim + get_action_dim(action_space)
-        self.trunk = network(in_features, n_copies=n_critics, **network_kwargs)
+        self.trunk = _make_trunk("critic_network", network, in_features, network_kwargs, n_copies=n_critics)
         self.head = linear(self.trunk.out_features, n_outputs, n_critics)
 
     def inputs(self, obs: PyTorchObs, actions: torch.Tensor) -> torch.Tensor:
@@ -684,8 +684,11 @@ def _network_args(
         if key in kwargs:
             raise ValueError(f"{name} and {who}_network_kwargs[{key!r}] say the same thing: give one of them")
         kwargs[key] = value
-    allowed = [name for name in inspect.signature(cls).parameters if name not in ("in_features", "n_copies")]
-    for name in kwargs:
-        if name not in allowed:
-            raise ValueError(f"{who}_network_kwargs has {name!r}, but {who}_network={network!r} takes {allowed}")
+    own_classes.check_arguments(f"{who}_network", network, cls, 1, kwargs=kwargs, n_copies=None)
     return cls, kwargs
+
+
+def _make_trunk(argument: str, cls: type[Network], in_features: int, kwargs: dict[str, Any], **copies: int) -> Network:
+    trunk: Network = own_classes.make(argument, cls, cls, Network, in_features, kwargs=kwargs, **copies)
+    check_value(f"{cls.__name__}.out_features", getattr(trunk, "out_features", None), integer(1))
+    return trunk

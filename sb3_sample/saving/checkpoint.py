@@ -188,10 +188,21 @@ class Checkpointer:
                     f"Nothing was changed. Train as then, or name another folder."
                 )
 
-    def resume(self) -> None:
-        """Restore the algorithm, if there is something to restore."""
+    def resume(self, total_timesteps: int) -> None:
+        """
+        Restore the algorithm, if there is something to restore.
+
+        :param total_timesteps: steps that the training is to have at its end; it is said if it has them already
+        """
         if self._resumed is None:
             return
+        if self._manifest["steps"] >= total_timesteps:
+            warnings.warn(
+                f"Nothing is left to train: the run in checkpoint={str(self._name)!r} has {self._manifest['steps']} "
+                f"steps already, of {total_timesteps}. The model is as it was saved. For more steps pass a larger "
+                "total_timesteps, for a new run another folder",
+                stacklevel=4,
+            )
         state, model = self._resumed, self._model
         safe_files: Any = model
         theirs, ours = self._manifest["circumstances"], training_state.circumstances(model.device)
@@ -349,7 +360,7 @@ class Checkpointer:
         finally:
             self._held.raise_kept()
         if leaves:
-            self._interrupts.leave()
+            self._interrupts.leave(saved_at=self._saved_at)
 
     def finish(self) -> None:
         """

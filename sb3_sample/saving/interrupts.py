@@ -61,15 +61,21 @@ class Interrupts:
         name = signal.Signals(number).name
         tell(f"\n{name}: finishing the turn, to save it in {self._folder}; once more to leave at once\n")
 
-    def leave(self, orderly: bool = True) -> None:
+    def leave(self, orderly: bool = True, saved_at: int | None = None) -> None:
         """
         :param orderly: whether this is between two turns
+        :param saved_at: environment steps of the latest checkpoint, which is said; None: nothing is
         :raises KeyboardInterrupt: after SIGINT
         :raises SystemExit: after SIGTERM
         """
         number = self.received
         assert number is not None
         self.restore(orderly)
+        if saved_at is not None:
+            tell(
+                f"{signal.Signals(number).name}: saved at {saved_at} steps in {self._folder}; the same program, "
+                "started again, goes on from there\n"
+            )
         if number == signal.SIGINT:
             raise KeyboardInterrupt
         raise SystemExit(128 + number)

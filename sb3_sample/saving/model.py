@@ -164,6 +164,7 @@ class SafeFiles(BaseAlgorithm):
                     ) from error
                 model._trusted_modules = trusted
                 return model
+            kwargs = cls._completed(content, kwargs)
             if print_system_info:
                 print("== CURRENT SYSTEM INFO ==")
                 get_system_info()
@@ -189,6 +190,16 @@ class SafeFiles(BaseAlgorithm):
         :return: attributes of the file that they take the place of besides, and by what
         """
         return {}
+
+    @classmethod
+    def _completed(cls, content: Content, kwargs: dict[str, Any]) -> dict[str, Any]:
+        """
+        :param content: of the file
+        :param kwargs: arguments that the caller of ``load`` has given
+        :return: the same, with what the file has to add to them
+        :raises ValueError: if they can be none of the model's in the file
+        """
+        return kwargs
 
     @classmethod
     def _made(

@@ -6,7 +6,7 @@ import itertools
 import json
 import typing
 from collections import OrderedDict
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 import torch
@@ -215,6 +215,29 @@ class Content:
         except BadFile as error:
             raise BadFile(f"{self.name}: {error}") from error
 
+    def classes_in(self, name: str) -> list[tuple[str, Callable[[], Any]]] | None:
+        """
+        Read a sequence of classes, or pairs of one and its arguments, without asking for trust in the classes.
+
+        :param name: the attribute
+        :return: the qualified names of the classes, with functions that read their arguments (and raise ``BadFile`` if
+            they are damaged, or name what is not trusted); None if the file has no such thing
+        """
+        listed = _items(self.tree["attributes"].get(name))
+        entries = [_items(each) or [each] for each in listed or ()]
+        paths = [entry[0].get("import") if isinstance(entry[0], dict) else None for entry in entries]
+        if listed is None or not all(isinstance(path, str) for path in paths):
+            return None
+        reads = [functools.partial(self._arguments, entry, name) for entry in entries]
+        return [(str(path).rpartition(":")[2], read) for path, read in zip(paths, reads, strict=True)]
+
+    def _arguments(self, entry: list[Any], name: str) -> Any:
+        """Arguments in a pair of a class and them."""
+        try:
+            return self._decoded(entry[1], name) if len(entry) == 2 else {}
+        except NotTrusted as error:
+            raise BadFile(f"{self.name}: {error}: {notice.need(self._cls, name, error.path, self._trusted)}") from error
+
     def check_policy_kwargs(self, given: Any) -> None:
         """
         :param given: policy_kwargs that take the place of the file's
@@ -360,6 +383,12 @@ class Content:
             return ""
         wanted = " or ".join(f"{name}=" for name in sorted(names))
         return f"{self.name} lacks {', '.join(sorted(names))}, for which the defaults stand (load takes {wanted}): "
+
+
+def _items(tree: Any) -> list[Any] | None:
+    """Entries of a list or a tuple in a file; None if it is none."""
+    inside = tree.get("tuple") if isinstance(tree, dict) else tree
+    return inside if isinstance(inside, list) else None
 
 
 def _agree(theirs: Any, given: Any, name: str) -> bool:

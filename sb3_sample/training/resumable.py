@@ -140,7 +140,7 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
         self._before_training()
         say_once(self, self._described(), stacklevel=4)
         with Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
-            checkpointer.resume()
+            checkpointer.resume(total_timesteps)
             self._before_turns()
             callback.on_training_start(locals(), globals())
             checkpointer.start()

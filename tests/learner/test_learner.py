@@ -257,7 +257,7 @@ def test_an_unknown_argument_is_an_error() -> None:
 
 @pytest.mark.parametrize("space", [spaces.Discrete(3), spaces.Box(-np.inf, np.inf, (2,)), spaces.Box(1, 1, (2,))])
 def test_action_spaces_are_checked(space: Any) -> None:
-    with pytest.raises(ValueError, match="action space"):
+    with pytest.raises(ValueError, match="action_space must be"):
         SAC.learner(OBSERVATIONS, space)
 
 

@@ -131,6 +131,7 @@ def test_the_update_does_not_wait(monkeypatch: pytest.MonkeyPatch) -> None:
         if maker != "VPLSAC":
             captured(model)
         model.set_logger(Logger(None, []))
+        model.train(1)  # The first step, before which shapes and the pessimism are looked at.
         with Fetches() as fetches:
             for _ in range(8):
                 model.train(2)

@@ -149,10 +149,11 @@ def test_every_pair_is_drawn() -> None:
         # Each critic is the constant of its number.
         model.critic_target.head.weight.zero_()
         model.critic_target.head.bias.copy_(torch.arange(5.0).view(5, 1, 1))
+    batch = random_batch(model)
+    model._update(batch)  # The first step, before which shapes are checked with all critics.
     pairs: list[tuple[int, ...]] = []
     value = model.pessimism_rule.value
     model.pessimism_rule.value = lambda q: pairs.append(tuple(int(x) for x in q[:, 0, 0].round())) or value(q)
-    batch = random_batch(model)
     for _ in range(150):
         model._update(batch)
     assert all(len(set(pair)) == 2 for pair in pairs), "twice the same critic"
@@ -274,6 +275,7 @@ def test_integer_discount(gamma: int) -> None:
 def test_update_makes_the_host_wait_for_nothing(maker: str) -> None:
     model = MAKERS[maker](learning_starts=20, replay_ratio=0.1).learn(20)
     batch = random_batch(model)
+    model._update(batch)  # The first step, before which shapes are checked.
     for _ in range(2):
         with NoSynchronisation():
             model._update(batch)

@@ -156,12 +156,19 @@ def test_a_finished_run_returns_at_once_with_its_state(tmp_path: Path) -> None:
     trained = bro().learn(33, checkpoint=tmp_path, **STEPS)
     assert steps_of(tmp_path) == [30, 33]
     again = bro(verbose=1)
-    again.learn(33, checkpoint=tmp_path, **STEPS)
+    with pytest.warns(
+        UserWarning, match=r"Nothing is left to train: .* has 33 steps already, of 33\. .* larger total_"
+    ):
+        again.learn(33, checkpoint=tmp_path, **STEPS)
+    with pytest.warns(UserWarning, match="has 33 steps already, of 20"):
+        assert bro().learn(20, checkpoint=tmp_path, **STEPS).num_timesteps == 33
     assert again.num_timesteps == 33 and not differing(state(trained), state(again))
     assert again._n_updates == trained._n_updates and again.replay_buffer.pos == 33
     assert steps_of(tmp_path) == [30, 33]
     # Longer than it was planned.
-    again = bro().learn(45, checkpoint=tmp_path, **STEPS)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="Nothing is left")
+        again = bro().learn(45, checkpoint=tmp_path, **STEPS)
     assert not differing(state(bro().learn(45)), state(again))
     assert steps_of(tmp_path) == [40, 45]
 

@@ -1,5 +1,6 @@
 """Signals, and what is printed, when nobody reads it: the turn is finished and saved all the same."""
 
+import contextlib
 import json
 import os
 import signal
@@ -95,6 +96,24 @@ def test_an_interrupt_that_nobody_reads_of_is_saved(how: str, number: int, tmp_p
         warnings.simplefilter("ignore")
         again = sac().learn(50, checkpoint=folder)
     assert not differing(state(sac().learn(50)), state(again))
+
+
+def speak(folder: Path, number: int) -> None:
+    descriptor = os.open(folder / "said", os.O_WRONLY | os.O_CREAT)
+    os.dup2(descriptor, 2)
+    with contextlib.suppress(KeyboardInterrupt, SystemExit):
+        sac().learn(50, Interrupted(number, 25), checkpoint=folder / "run", checkpoint_freq=10)
+    os._exit(0)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_line_says_where_the_run_was_saved(number: int, tmp_path: Path) -> None:
+    run(tmp_path, number, target=speak)
+    *_, last = (tmp_path / "said").read_text().splitlines()
+    name = signal.Signals(number).name
+    assert (
+        last == f"{name}: saved at 25 steps in {tmp_path / 'run'}; the same program, started again, goes on from there"
+    )
 
 
 def test_the_standard_error_is_known(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

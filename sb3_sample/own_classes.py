@@ -1,0 +1,128 @@
+"""Classes in the place of names: what they must define, how they are made, and errors that name class and argument."""
+
+import difflib
+import inspect
+import types
+import warnings
+import weakref
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from torch import nn
+
+#: Classes whose names were warned of.
+_told: weakref.WeakSet[type] = weakref.WeakSet()
+
+
+def make(
+    argument: str, choice: Any, cls: Callable[..., Any], base: type, *given: Any, kwargs: dict[str, Any], **fixed: Any
+) -> Any:
+    """
+    Make an object of a class that an argument has chosen.
+
+    :param argument: name of the argument
+    :param choice: its value
+    :param cls: the class
+    :param base: base class of the choices
+    :param given: what it is made of
+    :param kwargs: its arguments, those of the argument ``<argument>_kwargs``
+    :param fixed: what it is made of besides, by name
+    :return: the object
+    :raises ValueError: if the class lacks a method, does not take these arguments, or has not made its base
+    """
+    if isinstance(cls, type):
+        check(argument, cls, base)
+    check_arguments(argument, choice, cls, *given, kwargs=kwargs, **fixed)
+    try:
+        made = cls(*given, **fixed, **kwargs)
+    except AttributeError as error:
+        # Of torch, where something is assigned.
+        if "__init__() call" not in str(error):
+            raise
+        raise ValueError(_without_base(argument, cls)) from error
+    if isinstance(made, nn.Module) and "_modules" not in vars(made):
+        raise ValueError(_without_base(argument, type(made)))
+    return made
+
+
+def _without_base(argument: str, cls: Any) -> str:
+    return f"{argument}: {cls.__name__}.__init__ must call super().__init__(...) before anything else"
+
+
+def check(argument: str, cls: type, base: type) -> None:
+    """
+    Check what a class defines. Names that are nearly those of the base's, and that the class itself makes no use of,
+    are warned of.
+
+    :param argument: name of the argument that has chosen it
+    :param cls: the class
+    :param base: base class of the choices
+    :raises ValueError: if it lacks a method that its base leaves to it
+    """
+    for name in dir(cls):
+        if getattr(inspect.getattr_static(cls, name), "__isabstractmethod__", False):
+            raise ValueError(f"{argument}: {cls.__name__} must define {name}(), which {base.__name__} leaves to it")
+    if cls in _told:
+        return
+    _told.add(cls)
+    own = [c for c in cls.__mro__ if issubclass(c, base) and c.__module__.split(".")[0] != __name__.split(".")[0]]
+    defined = {name for c in own for name in vars(c)}
+    hooks = [name for name in dir(base) if not name.startswith("_") and not hasattr(nn.Module, name)]
+    hooks = [name for name in (*hooks, "forward", "get_extra_state", "set_extra_state") if name not in defined]
+    used = {name for c in own for value in vars(c).values() for name in _names_in(value)}
+    for c in own:
+        for name in vars(c):
+            near = difflib.get_close_matches(name, hooks, 1, 0.8)
+            if near and not name.startswith("_") and not hasattr(base, name) and name not in used:
+                warnings.warn(
+                    f"{c.__name__}.{name} is called by nobody; did you mean {near[0]}? ({argument}={c.__name__})",
+                    stacklevel=3,
+                )
+
+
+def _names_in(value: Any) -> Iterator[str]:
+    """Attributes and functions that a method makes use of."""
+    functions = (value.fget, value.fset) if isinstance(value, property) else (inspect.unwrap(_function_of(value)),)
+    codes = [function.__code__ for function in functions if isinstance(function, types.FunctionType)]
+    while codes:
+        code = codes.pop()
+        yield from code.co_names
+        codes += [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
+
+
+def _function_of(value: Any) -> Any:
+    return value.__func__ if isinstance(value, (classmethod, staticmethod)) else value
+
+
+def check_arguments(
+    argument: str, choice: Any, cls: Callable[..., Any], *given: Any, kwargs: dict[str, Any], **fixed: Any
+) -> None:
+    """
+    Check the arguments of a class against its signature.
+
+    :param argument: name of the argument that has chosen it
+    :param choice: its value
+    :param cls: the class
+    :param given: what it is made of
+    :param kwargs: its arguments, those of the argument ``<argument>_kwargs``
+    :param fixed: what it is made of besides, by name
+    :raises ValueError: if it takes other ones
+    """
+    signature = inspect.signature(cls)
+    kinds = {name: parameter.kind for name, parameter in signature.parameters.items()}
+    many = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    allowed = [name for name, kind in list(kinds.items())[len(given) :] if kind not in many and name not in fixed]
+    if inspect.Parameter.VAR_KEYWORD not in kinds.values():
+        for name in kwargs:
+            if name not in allowed:
+                where = argument if argument.endswith("]") else f"{argument}_kwargs"
+                raise ValueError(f"{where} has {name!r}, but {argument}={choice!r} takes {allowed or 'none'}")
+    try:
+        signature.bind(*given, **fixed, **kwargs)
+    except TypeError as error:
+        words = ", ".join(["learner" if not fixed else "in_features"] * len(given) + [f"{name}=..." for name in fixed])
+        name = getattr(cls, "__name__", repr(cls))
+        raise ValueError(
+            f"{argument}: {name} is made as {name}({words}) with the arguments {kwargs}, and its __init__ does not "
+            f"take that: {error}"
+        ) from error
