@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +25,8 @@ from sb3_sample.optim import AdamW
 from sb3_sample.sac import checks
 from sb3_sample.sac.arguments import transform_choice
 from sb3_sample.sac.policies import BACKBONES, Actor, CriticEnsemble, SACPolicy
+
+T = TypeVar("T")
 
 
 class LearnerOf:
@@ -116,11 +118,48 @@ def check_action_space(space: spaces.Space, argument: str = "env") -> None:
         raise ValueError(f"{must} with low < high in every dimension, not {space}")
 
 
+class OfLearner(Generic[T]):
+    """Descriptor: an attribute of the model's learner, by the same name. It can only be read."""
+
+    def __set_name__(self, cls: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, model: Any, cls: Any) -> T:
+        return self if model is None else getattr(model.learner, self._name)  # type: ignore[return-value]
+
+    def __set__(self, model: Any, value: Any) -> None:
+        raise AttributeError(f"{self._name} cannot be set: it is the learner's")
+
+
 class HasLearner:
     """A model's learner: how it is made of the arguments, and the model's names for what it has."""
 
     policy: SACPolicy
     learner = LearnerOf()
+    actor = OfLearner[Actor]()
+    """the actor, which acts in evaluation"""
+    critic = OfLearner[CriticEnsemble]()
+    """the critics"""
+    critic_target = OfLearner[CriticEnsemble]()
+    """the target critics"""
+    temperature = OfLearner[LogScalar | FixedScalar]()
+    """the entropy's weight"""
+    temperature_optimizer = OfLearner[AdamW | None]()
+    """optimizer of the temperature; None if it is fixed"""
+    pessimism_rule = OfLearner[Pessimism]()
+    """the rule of pessimism"""
+    explorer = OfLearner[Exploration]()
+    """explorer, which acts while training"""
+    plasticity = OfLearner[Resets]()
+    """resets"""
+    redo = OfLearner[ReDo | None]()
+    """recycling of dormant neurons; None for none"""
+    head = OfLearner[nn.Module]()
+    """value head of the critics"""
+    transforms = OfLearner[nn.ModuleList]()
+    """batch transforms, in their order"""
+    gradients_are_stale = OfLearner[bool]()
+    """whether ``.grad`` holds the gradients of another gradient step than the last"""
     #: The class of the learner.
     learner_class: ClassVar[type[Learner]] = Learner
     #: beta1 of the temperature's Adam.
@@ -256,66 +295,6 @@ class HasLearner:
         :param shrink: share of the old parameters that stays
         """
         self.learner.reinitialize(shrink)
-
-    @property
-    def actor(self) -> Actor:
-        """The actor, which acts in evaluation."""
-        return self.learner.actor  # type: ignore[no-any-return]
-
-    @property
-    def critic(self) -> CriticEnsemble:
-        """The critics."""
-        return self.learner.critic  # type: ignore[no-any-return]
-
-    @property
-    def critic_target(self) -> CriticEnsemble:
-        """The target critics."""
-        return self.learner.critic_target  # type: ignore[no-any-return]
-
-    @property
-    def temperature(self) -> LogScalar | FixedScalar:
-        """The entropy's weight."""
-        return self.learner.temperature  # type: ignore[no-any-return]
-
-    @property
-    def temperature_optimizer(self) -> AdamW | None:
-        """Optimizer of the temperature; None if it is fixed."""
-        return self.learner.temperature_optimizer  # type: ignore[no-any-return]
-
-    @property
-    def pessimism_rule(self) -> Pessimism:
-        """The rule of pessimism."""
-        return self.learner.pessimism_rule  # type: ignore[no-any-return]
-
-    @property
-    def explorer(self) -> Exploration:
-        """Explorer, which acts while training."""
-        return self.learner.explorer  # type: ignore[no-any-return]
-
-    @property
-    def plasticity(self) -> Resets:
-        """Resets."""
-        return self.learner.plasticity  # type: ignore[no-any-return]
-
-    @property
-    def redo(self) -> ReDo | None:
-        """Recycling of dormant neurons; None for none."""
-        return self.learner.redo  # type: ignore[no-any-return]
-
-    @property
-    def head(self) -> nn.Module:
-        """Value head of the critics."""
-        return self.learner.head  # type: ignore[no-any-return]
-
-    @property
-    def transforms(self) -> nn.ModuleList:
-        """Batch transforms, in their order."""
-        return self.learner.transforms  # type: ignore[no-any-return]
-
-    @property
-    def gradients_are_stale(self) -> bool:
-        """Whether ``.grad`` holds the gradients of another gradient step than the last."""
-        return self.learner.gradients_are_stale  # type: ignore[no-any-return]
 
 
 def _make_transform(index: int, choice: Any, learner: Learner) -> BatchTransform:
