@@ -82,7 +82,7 @@ class BRO(SAC):
     weight_decay: float = argument(default=1e-4, kind=AT_LEAST_0)
     """decoupled weight decay of critics and both actors"""
     exploration: str | type[Exploration] = argument(default="optimistic_shift")
-    """who acts while training: "optimistic_shift", "actor" for no optimistic actor, or another of ``SAC``'s"""
+    """policy that acts while training: "optimistic_shift", "actor" for no optimistic actor, or another of ``SAC``'s"""
     exploration_kwargs: dict[str, Any] | None = argument(default=None)
     """further arguments of the exploration"""
     resets: Sequence[int] | int = argument(default=BRO_RESETS)

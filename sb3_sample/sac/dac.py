@@ -60,7 +60,7 @@ class DAC(SAC):
     reinitialize_every: int | None = argument(default=25_000)
     """environment steps after which the optimistic actor starts anew; None for never"""
     exploration: str | type[Exploration] = argument(default="optimistic_actor")
-    """who acts while training: "optimistic_actor", or "actor", which makes it plain SAC"""
+    """policy that acts while training: "optimistic_actor", or "actor", which makes it plain SAC"""
 
     def _check_arguments(self) -> None:
         super()._check_arguments()

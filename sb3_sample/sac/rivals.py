@@ -120,7 +120,7 @@ class OAC(SAC):
     kl_radius: float = argument(default=3.69**2 / 2)
     """KL divergence to the actor, summed over the action's dimensions, that the shift may cost"""
     exploration: str | type[Exploration] = argument(default="oac")
-    """who acts while training: "oac", or another of ``SAC``'s"""
+    """policy that acts while training: "oac", or another of ``SAC``'s"""
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
