@@ -129,8 +129,8 @@ class SACArguments(Resumable):
     )
     """share of the transitions that is held out of training, in [0, 1); "vpl" learns from them"""
     exploration: str | type[Exploration] = argument(default="actor", kind=one_of(EXPLORATIONS, Exploration))
-    """policy that acts while training: "actor", "oac", "optimistic_actor" (DAC), "optimistic_shift" (BRO), or a class derived
-    from ``Exploration``"""
+    """policy that acts while training: "actor", "oac", "optimistic_actor" (DAC), "optimistic_shift" (BRO), or a class
+    derived from ``Exploration``"""
     exploration_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
     """its arguments"""
     backbone: str = argument(default="sac")
