@@ -42,6 +42,15 @@ class Batch(NamedTuple):
         )
 
 
+class Encoded(NamedTuple):
+    """
+    Observations in the form of the features that a shared encoder made of them, which actors and critics take in the
+    place of observations: ``features`` is (B, F), without gradient.
+    """
+
+    features: torch.Tensor
+
+
 def for_each(function: Callable[[Any], Any], values: Any) -> Any:
     """
     Apply a function to a tensor or array, or to each of a dict of them, as observations are.
