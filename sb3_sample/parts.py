@@ -15,6 +15,7 @@ from sb3_sample.learner.target import bootstrap, td_target, values
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.networks import NETWORKS, EnsembleLayerNorm, EnsembleLinear, HiddenUnits, Network, linear
 from sb3_sample.optim import AdamW
+from sb3_sample.replay.columns import Column, Step
 
 __all__ = [
     "EXPLORATIONS",
@@ -23,6 +24,7 @@ __all__ = [
     "AdamW",
     "Batch",
     "BatchTransform",
+    "Column",
     "CriticStep",
     "EnsembleLayerNorm",
     "EnsembleLinear",
@@ -38,6 +40,7 @@ __all__ = [
     "Part",
     "Pessimism",
     "QuantileHead",
+    "Step",
     "ValueHead",
     "bootstrap",
     "epistemic_std",
