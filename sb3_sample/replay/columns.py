@@ -237,7 +237,8 @@ def samples_of(buffer: Any, take: Callable[..., Any]) -> Any:
     samples: dict[str, Any] = {
         "observations": take(OBSERVATIONS, buffer.observations),
         "actions": take(ACTIONS, buffer.actions),
-        "next_observations": take(NEXT_OBSERVATIONS, buffer.next_observations),
+        # Stable-Baselines3's variant has them in the observations' next rows.
+        "next_observations": take(NEXT_OBSERVATIONS, getattr(buffer, NEXT_OBSERVATIONS.name, None)),
         # A time limit does not end the bootstrap.
         "dones": take(DONES, buffer.dones, but=buffer.timeouts),
         "rewards": take(REWARDS, buffer.rewards),
