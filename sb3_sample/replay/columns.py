@@ -160,6 +160,8 @@ class HasColumns:
     more_columns: ClassVar[tuple[Column, ...]] = ()
     #: Columns but the observations, base classes' included.
     plain_columns: ClassVar[tuple[Column, ...]] = _PLAIN
+    #: Whether batches have some of those that not every buffer has.
+    more_in_batch: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -172,6 +174,7 @@ class HasColumns:
                 raise ValueError(f"more_columns of {cls.__name__} has the name {column.name!r}, which is taken or none")
             taken.add(column.name)
         cls.plain_columns = (*_PLAIN, *more)
+        cls.more_in_batch = any(column.in_batch for column in more)
 
     def writers(self) -> tuple[tuple[str, Callable[[Given], Any]], ...]:
         """
@@ -202,10 +205,10 @@ def has_own_columns(cls: Any) -> bool:
     """
     Check whether a buffer's class declares columns of its own.
 
-    :param cls: class of a replay buffer, or None
+    :param cls: a replay buffer, its class, or None
     :return: whether batches of it have further columns
     """
-    return cls is not None and any(column.in_batch for column in _more(cls))
+    return getattr(cls, "more_in_batch", False)
 
 
 def _more(buffer: Any) -> tuple[Column, ...]:
@@ -234,19 +237,19 @@ def samples_of(buffer: Any, take: Callable[..., Any]) -> Any:
         (B, ...), (B, 1) if it is one number; 0 where its keyword argument ``but``, another array, is 1
     :return: the transitions, in the form of the buffer's ``sample``
     """
-    samples: dict[str, Any] = {
-        "observations": take(OBSERVATIONS, buffer.observations),
-        "actions": take(ACTIONS, buffer.actions),
+    samples = (
+        take(OBSERVATIONS, buffer.observations),
+        take(ACTIONS, buffer.actions),
         # Stable-Baselines3's variant has them in the observations' next rows.
-        "next_observations": take(NEXT_OBSERVATIONS, getattr(buffer, NEXT_OBSERVATIONS.name, None)),
+        take(NEXT_OBSERVATIONS, getattr(buffer, "next_observations", None)),
         # A time limit does not end the bootstrap.
-        "dones": take(DONES, buffer.dones, but=buffer.timeouts),
-        "rewards": take(REWARDS, buffer.rewards),
-    }
-    columns = {column.name: take(column, getattr(buffer, column.name)) for column in _more(buffer) if column.in_batch}
-    if columns:
-        return Samples(**samples, columns=columns)
-    return (DictReplayBufferSamples if isinstance(buffer.observations, dict) else ReplayBufferSamples)(**samples)
+        take(DONES, buffer.dones, but=buffer.timeouts),
+        take(REWARDS, buffer.rewards),
+    )
+    if has_own_columns(buffer):
+        columns = {c.name: take(c, getattr(buffer, c.name)) for c in _more(buffer) if c.in_batch}
+        return Samples(*samples, columns=columns)
+    return (DictReplayBufferSamples if isinstance(samples[0], dict) else ReplayBufferSamples)(*samples)
 
 
 def samples_at(

@@ -200,7 +200,9 @@ class CompactReplay(HasColumns):
         self.aside.clear()
 
     def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> Any:
-        # The environments are drawn as in Stable-Baselines3.
+        if not self.more_in_batch:
+            return super()._get_samples(batch_inds, env)  # type: ignore[misc]  # the buffer's
+        # The environments are drawn as there.
         env_indices = np.random.randint(0, high=self.n_envs, size=len(batch_inds))  # noqa: NPY002
         return samples_at(self, batch_inds, env_indices, env)  # type: ignore[arg-type]
 

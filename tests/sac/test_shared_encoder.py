@@ -18,6 +18,7 @@ from sb3_sample.learner.batch import Encoded, Noise
 from sb3_sample.networks.modes import evaluated
 from sb3_sample.optim import AdamW
 from tests.sac.common import COMPILES, MAKERS, REPRESENTATIVE, bro, differing, random_batch, sac, state, vec
+from tests.sac.test_execution import TOLERANCE, captured, largest_difference, updates
 
 IMAGE = spaces.Box(0, 255, (3, 36, 36), np.uint8)
 
@@ -34,6 +35,11 @@ class Encoder(BaseFeaturesExtractor):
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         return torch.tanh(self.norm(self.dense(observations)))
+
+
+class WithoutNorm(Encoder):
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        return torch.tanh(self.dense(observations))
 
 
 def shared(maker: str = "SAC", extractor: Any = Encoder, **kwargs: Any) -> Any:
@@ -203,6 +209,15 @@ def test_compiled_as_eager(maker: str) -> None:
     assert models[1].compiled and models[1].learner.seconds_compiling > 0
     for (name, a), b in zip(models[0].policy.state_dict().items(), models[1].policy.state_dict().values(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-5, msg=name)
+
+
+@pytest.mark.parametrize("maker", ["SAC", "BRO", "DAC", "BROTD3"])
+def test_captured_as_eager(maker: str) -> None:
+    model, other = (shared(maker, WithoutNorm).learn(20) for _ in range(2))
+    recorder = captured(other)
+    for each in (model, other):
+        updates(each, 20)
+    assert recorder.n_repetitions > 10 and largest_difference(model, other) < TOLERANCE
 
 
 # ---------------------------------------------------------------- it stays one
