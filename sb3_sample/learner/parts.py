@@ -84,6 +84,15 @@ class Learning(Protocol):
         :return: actions of a TD target in [-1, 1], (B, A), and their log-probability, (B, 1)
         """
 
+    def encoded(self, observations: Any) -> Any:
+        """
+        Encode observations once for actors and critics, where they share an encoder.
+
+        :param observations: (B, O), or a dict of them
+        :return: what actors and critics take in their place, without gradient to the encoder; the observations
+            themselves if nothing is shared
+        """
+
     def make_actor(self) -> Any:
         """
         Make an actor.

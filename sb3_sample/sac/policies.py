@@ -24,11 +24,12 @@ from torch import nn
 
 from sb3_sample import own_classes
 from sb3_sample.arguments import check_net_arch
-from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, DICT, check_value, chosen, integer
+from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, DICT, TRUE_OR_FALSE, check_value, chosen, integer
+from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
 from sb3_sample.learner.q_values import QValues
 from sb3_sample.networks import NETWORKS, Network, linear
-from sb3_sample.networks.modes import ModeSwitch
+from sb3_sample.networks.modes import ModeSwitch, evaluated
 from sb3_sample.optim import AdamW
 
 # The log standard deviation is squashed into this interval by a tanh.
@@ -46,11 +47,15 @@ class Actor(BasePolicy):
     :param network_kwargs: its arguments
     :param features_extractor: extractor of the observation's features
     :param normalize_images: whether images are divided by 255
+    :param shares_encoder: whether the extractor is the critics', whose features are read without gradient
     """
 
     action_space: spaces.Box
     #: Whether the policy is a distribution, with an entropy that can be rewarded.
     has_entropy: ClassVar[bool] = True
+    #: View in evaluation mode, for the actions of TD targets, if the trunk ``stacks_rows``.
+    at_rest: Any = None
+    _encoder: Any
 
     def __init__(
         self,
@@ -60,6 +65,7 @@ class Actor(BasePolicy):
         network_kwargs: dict[str, Any],
         features_extractor: BaseFeaturesExtractor,
         normalize_images: bool = True,
+        shares_encoder: bool = False,
     ):
         super().__init__(
             observation_space,
@@ -68,6 +74,9 @@ class Actor(BasePolicy):
             normalize_images=normalize_images,
             squash_output=True,
         )
+        self.shares_encoder = shares_encoder
+        if shares_encoder:
+            self.share(features_extractor)
         self._network_args = {"network": network, "network_kwargs": network_kwargs}
         self.features_dim = features_extractor.features_dim
         self.action_dim = get_action_dim(action_space)
@@ -76,30 +85,48 @@ class Actor(BasePolicy):
         self.log_std = linear(self.trunk.out_features, self.action_dim, None, gain=1.0)
         #: Stable-Baselines3's distribution of the actions, for its own use: nothing here reads it.
         self.action_dist = SquashedDiagGaussianDistribution(self.action_dim)
+        _keep_at_rest(self)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        own = {**self._network_args, "features_extractor": self.features_extractor}
-        return {**super()._get_constructor_parameters(), **own}
+        own = {"features_extractor": self.features_extractor, "shares_encoder": self.shares_encoder}
+        return {**super()._get_constructor_parameters(), **self._network_args, **own}
+
+    def share(self, encoder: nn.Module) -> None:
+        """
+        Read the features of another module's extractor, without a gradient to it and in evaluation mode: its running
+        statistics are moved by its owner's forward passes alone.
+
+        :param encoder: features extractor, which is in the parameters, the state and the modes of its owner only
+        """
+        self._modules.pop("features_extractor", None)
+        # Past nn.Module's own setattr, which would register them.
+        vars(self).update(features_extractor=encoder, _encoder=evaluated(encoder))
 
     def __getstate__(self) -> dict[str, Any]:
         # The last actions that somebody asked the distribution for go with no copy: they may have a gradient.
         fresh = SquashedDiagGaussianDistribution(self.action_dim)
         return {name: fresh if name == "action_dist" else value for name, value in vars(self).items()}
 
-    def features(self, obs: PyTorchObs) -> torch.Tensor:
+    def features(self, obs: PyTorchObs | Encoded) -> torch.Tensor:
         """
-        :param obs: observations, (B, O), or a dict of them
-        :return: their features, (B, F)
+        :param obs: observations, (B, O), or a dict of them, or their features
+        :return: their features, (B, F); without gradient if the encoder is shared
         """
+        if isinstance(obs, Encoded):
+            return obs.features
+        if self.shares_encoder:
+            with torch.no_grad():
+                return self.extract_features(obs, self._encoder)
         assert isinstance(self.features_extractor, BaseFeaturesExtractor)
         return self.extract_features(obs, self.features_extractor)
 
     def statistics(self) -> list[torch.Tensor]:
         """
-        :return: running statistics that a target actor takes over: those of features extractor and trunk
+        :return: running statistics that a target actor takes over: those of trunk and own features extractor
         """
         assert self.features_extractor is not None
-        return [*self.features_extractor.buffers(), *self.trunk.statistics()]
+        extractor = () if self.shares_encoder else self.features_extractor.buffers()
+        return [*extractor, *self.trunk.statistics()]
 
     def gaussian(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """
@@ -110,11 +137,11 @@ class Actor(BasePolicy):
         half_range = (LOG_STD_MAX - LOG_STD_MIN) / 2
         return self.mean(h), LOG_STD_MIN + half_range * (1 + torch.tanh(self.log_std(h)))
 
-    def sample(self, obs: PyTorchObs, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    def sample(self, obs: PyTorchObs | Encoded, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """
         Sample an action, reparameterised.
 
-        :param obs: observations, (B, O), or a dict of them
+        :param obs: observations, (B, O), or a dict of them, or their features
         :param noise: standard normal noise, (B, A); drawn if None
         :return: action in [-1, 1], (B, A), and its log-probability, (B, 1)
         """
@@ -228,6 +255,7 @@ class DeterministicActor(Actor):
             "target_noise_clip": target_noise_clip,
         }
         del self.log_std, self.action_dist
+        _keep_at_rest(self)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), **self._noise_args}
@@ -248,7 +276,7 @@ class DeterministicActor(Actor):
         mean = self.mean(self.trunk(features))
         return mean, torch.full_like(mean, self.log_exploration_noise)
 
-    def sample(self, obs: PyTorchObs, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    def sample(self, obs: PyTorchObs | Encoded, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """
         The action that the actor learns through: no noise, and 0 for the log-probability that it has not.
 
@@ -316,6 +344,8 @@ class CriticEnsemble(BaseModel):
     """
 
     action_space: spaces.Box
+    #: View in evaluation mode, for all but the critics' own step, if the trunk ``stacks_rows``.
+    at_rest: Any = None
 
     def __init__(
         self,
@@ -336,13 +366,16 @@ class CriticEnsemble(BaseModel):
         in_features = features_extractor.features_dim + get_action_dim(action_space)
         self.trunk = _make_trunk("critic_network", network, in_features, network_kwargs, n_copies=n_critics)
         self.head = linear(self.trunk.out_features, n_outputs, n_critics)
+        _keep_at_rest(self)
 
-    def inputs(self, obs: PyTorchObs, actions: torch.Tensor) -> torch.Tensor:
+    def inputs(self, obs: PyTorchObs | Encoded, actions: torch.Tensor) -> torch.Tensor:
         """
-        :param obs: observations, (B, O), or a dict of them
+        :param obs: observations, (B, O), or a dict of them, or their features
         :param actions: actions in [-1, 1], (B, A)
         :return: what the trunk takes, (B, F + A)
         """
+        if isinstance(obs, Encoded):
+            return torch.cat((obs.features, actions), dim=1)
         assert isinstance(self.features_extractor, BaseFeaturesExtractor)
         return torch.cat((self.extract_features(obs, self.features_extractor), actions), dim=1)
 
@@ -421,7 +454,7 @@ class SACPolicy(BasePolicy):
     :param actor_network_kwargs: its arguments
     :param n_critics: E, the number of critics
     :param n_outputs: outputs a critic, as the value head asks for
-    :param features_extractor_class: features extractor; actor and critics get one each
+    :param features_extractor_class: features extractor; actor and critics get one each, or share one
     :param features_extractor_kwargs: its arguments
     :param normalize_images: whether images are divided by 255
     :param backbone: "sac" for a tanh-Gaussian actor, "td3" for a deterministic one with a target actor
@@ -430,7 +463,12 @@ class SACPolicy(BasePolicy):
     :param optimizer_class: optimizer of actor and critics
     :param optimizer_kwargs: its arguments, but for the learning rate
     :param critic_optimizer_kwargs: arguments of the critics' optimizer alone, over ``optimizer_kwargs``
-    :param share_features_extractor: False, as in Stable-Baselines3 by default; True is refused
+    :param share_features_extractor: whether actor and critics share one features extractor, the encoder. As in
+        Stable-Baselines3, False by default. There the encoder is the actor's, trained by the actor's loss; here it
+        is the critics', trained by theirs, and the actors read its features without gradient, encoded anew after
+        the critics' step (SAC-AE, Yarats et al. 2021; DrQ, Kostrikov et al. 2021; DrQ-v2 reads those from before
+        the step). The actors read it in evaluation mode. The target critics have a Polyak average of it, which a
+        target actor reads too
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
@@ -462,11 +500,7 @@ class SACPolicy(BasePolicy):
         critic_optimizer_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = False,
     ):
-        if share_features_extractor:
-            raise ValueError(
-                "share_features_extractor must be False: actor and critics have a features extractor each, trained by "
-                "their own losses"
-            )
+        check_value("share_features_extractor", share_features_extractor, TRUE_OR_FALSE)
         super().__init__(
             observation_space,
             action_space,
@@ -508,17 +542,24 @@ class SACPolicy(BasePolicy):
             if name not in allowed:
                 raise ValueError(f"actor_kwargs has {name!r}, but backbone={backbone!r} takes {allowed or 'none'}")
         self._actor_class, self._actor_args = BACKBONES[backbone], (actor_args, actor_kwargs)
+        self.share_features_extractor = share_features_extractor
+        if share_features_extractor:
+            self.critic = critics()
         self.actor = self.make_actor()
         #: The actor of the TD targets: a Polyak average with "td3", the actor itself with "sac".
         self.actor_target: Actor | None = None
         if isinstance(self.actor, DeterministicActor):
             self.actor_target = copy.deepcopy(self.actor).requires_grad_(False)
             self.actor_target.set_training_mode(False)
-        self.critic = critics()
+        if not share_features_extractor:
+            self.critic = critics()
         self.critic_target = critics()
         self.critic_target.load_state_dict(self.critic.state_dict())
         self.critic_target.requires_grad_(False)
         self.critic_target.set_training_mode(False)
+        if share_features_extractor and self.actor_target is not None:
+            assert self.critic_target.features_extractor is not None
+            self.actor_target.share(self.critic_target.features_extractor)
         self.actor.optimizer = self.make_optimizer(self.actor.parameters(), lr_schedule(1))
         self.critic.optimizer = self.make_optimizer(
             self.critic.parameters(), lr_schedule(1), **(critic_optimizer_kwargs or {})
@@ -542,19 +583,23 @@ class SACPolicy(BasePolicy):
             optimizer_class=optimizer_class,
             optimizer_kwargs=self.optimizer_kwargs,
             critic_optimizer_kwargs=critic_optimizer_kwargs,
+            share_features_extractor=share_features_extractor,
         )
 
     def make_actor(self) -> Actor:
         """
-        :return: an actor of the policy's class and settings, with parameters of its own
+        :return: an actor of the policy's class and settings, with parameters of its own but for a shared encoder
         """
         args, kwargs = self._actor_args
+        shared = self.share_features_extractor
+        extractor: Any = self.critic.features_extractor if shared else self.make_features_extractor()
         return self._actor_class(
             self.observation_space,
             self.action_space,
             *args,
-            features_extractor=self.make_features_extractor(),
+            features_extractor=extractor,
             normalize_images=self.normalize_images,
+            shares_encoder=shared,
             **kwargs,
         )
 
@@ -568,6 +613,15 @@ class SACPolicy(BasePolicy):
         settings = {**self.optimizer_kwargs, **kwargs}
         return self.optimizer_class(parameters, lr=learning_rate, **settings)  # type: ignore[call-arg]
 
+    def encoded(self, obs: Any) -> Any:
+        """
+        Encode observations once for actors and critics.
+
+        :param obs: observations, (B, O), or a dict of them
+        :return: their features, without gradient, if there is a shared encoder; else the observations
+        """
+        return Encoded(self.actor.features(obs)) if self.share_features_extractor else obs
+
     def next_actions(self, obs: PyTorchObs, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """
         Actions of a TD target.
@@ -578,7 +632,8 @@ class SACPolicy(BasePolicy):
         """
         if isinstance(self.actor_target, DeterministicActor):
             return self.actor_target.smoothed(obs, noise)
-        return self.actor.sample(obs, noise)
+        actor = self.actor if self.actor.at_rest is None else self.actor.at_rest
+        return actor.sample(obs, noise)  # type: ignore[no-any-return]
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), **self._constructor_args}
@@ -660,6 +715,16 @@ class MultiInputPolicy(SACPolicy):
     def __init__(self, *args: Any, **kwargs: Any):
         kwargs.setdefault("features_extractor_class", CombinedExtractor)
         super().__init__(*args, **kwargs)
+
+
+def _keep_at_rest(owner: Any) -> None:
+    """Give an actor or critics, once complete, their view in evaluation mode if they stack rows."""
+    choice = owner.trunk.stacks_rows
+    if choice not in (None, "online", "target"):
+        raise ValueError(f"stacks_rows of a network must be None, 'online' or 'target', not {choice!r}")
+    if choice is not None:
+        # Past nn.Module's own setattr, which would register it.
+        vars(owner)["at_rest"] = evaluated(owner)
 
 
 def _network_args(
