@@ -6,7 +6,7 @@ Learner of the off-policy family: networks, targets, learned numbers, optimizers
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,35 +29,6 @@ from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
-
-
-class Networks(Protocol):
-    """
-    Actor, critics and their targets, an ``nn.Module``.
-
-    ``actor.optimizer`` and ``critic.optimizer`` are theirs; ``actor_target`` is the actor of the TD targets if it is
-    not the actor itself.
-    """
-
-    observation_space: Any
-    actor: Any
-    critic: Any
-    critic_target: Any
-    actor_target: Any
-
-    def next_actions(self, obs: Any, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]: ...
-
-    def encoded(self, obs: Any) -> Any: ...
-
-    def make_actor(self) -> Any: ...
-
-    def make_optimizer(self, parameters: Any, learning_rate: float) -> Optimizer: ...
-
-    def set_training_mode(self, mode: bool) -> None: ...
-
-    def state_dict(self) -> Any: ...
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any: ...
 
 
 class Counts:

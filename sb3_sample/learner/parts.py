@@ -7,7 +7,7 @@ calls the methods of :class:`Part` at the steps of the environment and at the gr
 class (``Pessimism.update``, ``Exploration.update``).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -157,6 +157,35 @@ def logged(part: nn.Module, method: str, metrics: Any) -> dict[str, torch.Tensor
             shown = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, torch.Tensor) else repr(value)
             raise ValueError(f"{type(part).__name__}.{method} must log scalar tensors; {name!r} is {shown}")
     return metrics
+
+
+class Networks(Protocol):
+    """
+    Actor, critics and their targets, an ``nn.Module``.
+
+    ``actor.optimizer`` and ``critic.optimizer`` are theirs; ``actor_target`` is the actor of the TD targets if it is
+    not the actor itself.
+    """
+
+    observation_space: Any
+    actor: Any
+    critic: Any
+    critic_target: Any
+    actor_target: Any
+
+    def next_actions(self, obs: Any, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]: ...
+
+    def encoded(self, obs: Any) -> Any: ...
+
+    def make_actor(self) -> Any: ...
+
+    def make_optimizer(self, parameters: Any, learning_rate: float) -> Optimizer: ...
+
+    def set_training_mode(self, mode: bool) -> None: ...
+
+    def state_dict(self) -> Any: ...
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any: ...
 
 
 class Part(nn.Module):
