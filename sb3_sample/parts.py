@@ -17,6 +17,7 @@ from sb3_sample.learner.target import bootstrap, td_target, values
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.networks import NETWORKS, EnsembleLayerNorm, EnsembleLinear, HiddenUnits, Network, linear
 from sb3_sample.optim import AdamW
+from sb3_sample.replay.columns import Column, Step
 
 __all__ = [
     "EXPLORATIONS",
@@ -25,6 +26,7 @@ __all__ = [
     "AdamW",
     "Batch",
     "BatchTransform",
+    "Column",
     "CriticStep",
     "EnsembleLayerNorm",
     "EnsembleLinear",
@@ -40,6 +42,7 @@ __all__ = [
     "Part",
     "Pessimism",
     "QuantileHead",
+    "Step",
     "ValueHead",
     "argument",
     "bootstrap",

@@ -1,6 +1,6 @@
 """Inputs of one gradient step."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -12,7 +12,7 @@ class Batch(NamedTuple):
 
     ``observations`` and ``next_observations`` are (B, O) or dicts of tensors; ``actions``, in [-1, 1], (B, A);
     ``dones``, 1 where the episode terminated (a time limit is 0), and ``rewards``, (B, 1); ``discounts`` a
-    number or (B, 1), None for the learner's own.
+    number or (B, 1), None for the learner's own; ``columns`` what the source has besides, by name, (B, ...) each.
     """
 
     observations: Any
@@ -21,6 +21,7 @@ class Batch(NamedTuple):
     dones: torch.Tensor
     rewards: torch.Tensor
     discounts: torch.Tensor | float | None = None
+    columns: Mapping[str, torch.Tensor] = {}
 
     @classmethod
     def of(cls, samples: Any, gamma: float) -> "Batch":
@@ -39,7 +40,17 @@ class Batch(NamedTuple):
             samples.dones,
             samples.rewards,
             gamma if discounts is None else discounts,
+            getattr(samples, "columns", {}),
         )
+
+
+class Encoded(NamedTuple):
+    """
+    Observations in the form of the features that a shared encoder made of them, which actors and critics take in the
+    place of observations: ``features`` is (B, F), without gradient.
+    """
+
+    features: torch.Tensor
 
 
 def for_each(function: Callable[[Any], Any], values: Any) -> Any:

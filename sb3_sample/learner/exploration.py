@@ -133,7 +133,7 @@ class OptimisticExploration(Exploration):
         """
         Compute the optimistic actor's Gaussian.
 
-        :param observations: (B, O) or a dict
+        :param observations: (B, O) or a dict, or as ``learner.encoded`` gives them
         :param features: the pessimistic actor's features of them, (B, F)
         :param mean: the pessimistic actor's pre-tanh mean, (B, A)
         :param std: its standard deviation, (B, A)
@@ -170,16 +170,17 @@ class OptimisticExploration(Exploration):
         return learner.actor.act(mean, self.std_multiplier * std, torch.randn_like(std))
 
     def update(self, learner: Learning, batch: Batch, noise: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+        observations = learner.encoded(batch.observations)
         with torch.no_grad():
-            features = learner.actor.features(batch.observations)
+            features = learner.actor.features(observations)
             mean, log_std = learner.actor.gaussian(features)
             std = log_std.exp()
         noise = torch.randn_like(mean) if noise is None else noise
         optimism, kl_weight = self._optimism(learner), self._kl_weight()
 
-        optimistic_mean, optimistic_std = self._gaussian(batch.observations, features, mean, std)
+        optimistic_mean, optimistic_std = self._gaussian(observations, features, mean, std)
         action = learner.actor.learned_action(optimistic_mean, self.std_multiplier * optimistic_std, noise)
-        q = values(learner, learner.critic, batch.observations, action)
+        q = values(learner, learner.critic, observations, action)
         q_mean, q_std = q.mean(dim=0), spread(q, self.uncertainty)
         kl = self._kl(learner, (optimistic_mean, optimistic_std), (mean, std))
         upper_value = q_mean + optimism.detach() * q_std

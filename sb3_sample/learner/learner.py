@@ -6,7 +6,7 @@ Learner of the off-policy family: networks, targets, learned numbers, optimizers
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,41 +22,13 @@ from sb3_sample.learner.observations import Observations
 from sb3_sample.learner.parts import Part, logged
 from sb3_sample.learner.pessimism import Pessimism, pessimistic_value
 from sb3_sample.learner.plasticity import ReDo, Resets
-from sb3_sample.learner.q_values import evaluate
 from sb3_sample.learner.randomness import OwnGenerators
 from sb3_sample.learner.scalars import FixedScalar, LogScalar
-from sb3_sample.learner.target import bootstrap, values
+from sb3_sample.learner.target import next_step, online_outputs, step_outputs, values
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
-
-
-class Networks(Protocol):
-    """
-    Actor, critics and their targets, an ``nn.Module``.
-
-    ``actor.optimizer`` and ``critic.optimizer`` are theirs; ``actor_target`` is the actor of the TD targets if it is
-    not the actor itself.
-    """
-
-    observation_space: Any
-    actor: Any
-    critic: Any
-    critic_target: Any
-    actor_target: Any
-
-    def next_actions(self, obs: Any, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]: ...
-
-    def make_actor(self) -> Any: ...
-
-    def make_optimizer(self, parameters: Any, learning_rate: float) -> Optimizer: ...
-
-    def set_training_mode(self, mode: bool) -> None: ...
-
-    def state_dict(self) -> Any: ...
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any: ...
 
 
 class Counts:
@@ -260,6 +232,16 @@ class Learner:
         :return: actions of a TD target in [-1, 1], (B, A), and their log-probability, (B, 1)
         """
         return self.networks.next_actions(observations, noise)  # type: ignore[no-any-return]
+
+    def encoded(self, observations: Any) -> Any:
+        """
+        Encode observations once for actors and critics, where they share an encoder.
+
+        :param observations: (B, O), or a dict of them
+        :return: what actors and critics take in their place, without gradient to the encoder; the observations
+            themselves if nothing is shared
+        """
+        return self.networks.encoded(observations)
 
     def parts(self) -> dict[str, Part]:
         """
@@ -474,15 +456,15 @@ class Learner:
         alpha = self.temperature()
 
         # Critics, towards the targets' value of the actor's next action.
-        next_q, entropy_bonus = bootstrap(self, batch, alpha, noise.critic, noise.subset)
+        next_actions, entropy_bonus = next_step(self, batch, alpha, noise.critic)
+        q, next_q = step_outputs(self, batch, next_actions, noise.subset)
         with torch.no_grad():
             target = self.head.target(batch, next_q, self.pessimism_rule.value, entropy_bonus)
-        q = evaluate(self.critic, batch.observations, batch.actions)
         critic_loss = self.head.loss(q, target)
         if self.sam_radius is None:
             self.minimize(self.critic.optimizer, critic_loss)
         else:
-            self._sharpness_aware_step(critic_loss, batch, target)
+            self._sharpness_aware_step(critic_loss, batch, next_actions, target)
         self.critic.trunk.project()
         q = self.head.values(q)
         metrics = {"train/critic_loss": critic_loss, "train/q_mean": q.mean()}
@@ -492,9 +474,10 @@ class Learner:
             self._follow(self.critic_target, self.critic)
 
         if moves_actor:
-            # Actor, on the new critics.
-            actions, log_prob = self.actor.sample(batch.observations, noise.actor)
-            value = self._actor_value(values(self, self.critic, batch.observations, actions))
+            # Actor, on the new critics, and on their new encoder if it is shared.
+            observations = self.encoded(batch.observations)
+            actions, log_prob = self.actor.sample(observations, noise.actor)
+            value = self._actor_value(values(self, self.critic, observations, actions))
             actor_loss = losses.actor_loss(log_prob, value, alpha.detach())
             self.minimize(self.actor.optimizer, actor_loss)
             self.actor.trunk.project()
@@ -535,14 +518,16 @@ class Learner:
             for ours, theirs in statistics:
                 ours.copy_(theirs)
 
-    def _sharpness_aware_step(self, loss: torch.Tensor, batch: Batch, target: torch.Tensor) -> None:
+    def _sharpness_aware_step(
+        self, loss: torch.Tensor, batch: Batch, next_actions: torch.Tensor, target: torch.Tensor
+    ) -> None:
         """Take one step of the critics' optimizer with the gradient at the point ``sam_radius`` uphill."""
         assert self.sam_radius is not None
         parameters = list(self.critic.parameters())
         copied = {id(p) for p in self.critic.copied_parameters()}
         gradients = sharpness_aware_gradients(
             loss,
-            lambda: self.head.loss(evaluate(self.critic, batch.observations, batch.actions), target),
+            lambda: self.head.loss(online_outputs(self, batch, next_actions)[0], target),
             parameters,
             self.sam_radius,
             [len(p) if id(p) in copied else None for p in parameters],

@@ -7,7 +7,7 @@ calls the methods of :class:`Part` at the steps of the environment and at the gr
 class (``Pessimism.update``, ``Exploration.update``).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -84,6 +84,15 @@ class Learning(Protocol):
         :return: actions of a TD target in [-1, 1], (B, A), and their log-probability, (B, 1)
         """
 
+    def encoded(self, observations: Any) -> Any:
+        """
+        Encode observations once for actors and critics, where they share an encoder.
+
+        :param observations: (B, O), or a dict of them
+        :return: what actors and critics take in their place, without gradient to the encoder; the observations
+            themselves if nothing is shared
+        """
+
     def make_actor(self) -> Any:
         """
         Make an actor.
@@ -148,6 +157,35 @@ def logged(part: nn.Module, method: str, metrics: Any) -> dict[str, torch.Tensor
             shown = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, torch.Tensor) else repr(value)
             raise ValueError(f"{type(part).__name__}.{method} must log scalar tensors; {name!r} is {shown}")
     return metrics
+
+
+class Networks(Protocol):
+    """
+    Actor, critics and their targets, an ``nn.Module``.
+
+    ``actor.optimizer`` and ``critic.optimizer`` are theirs; ``actor_target`` is the actor of the TD targets if it is
+    not the actor itself.
+    """
+
+    observation_space: Any
+    actor: Any
+    critic: Any
+    critic_target: Any
+    actor_target: Any
+
+    def next_actions(self, obs: Any, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]: ...
+
+    def encoded(self, obs: Any) -> Any: ...
+
+    def make_actor(self) -> Any: ...
+
+    def make_optimizer(self, parameters: Any, learning_rate: float) -> Optimizer: ...
+
+    def set_training_mode(self, mode: bool) -> None: ...
+
+    def state_dict(self) -> Any: ...
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any: ...
 
 
 class Part(nn.Module):

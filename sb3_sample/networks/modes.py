@@ -1,7 +1,34 @@
 """Training and evaluation mode of modules."""
 
+from typing import Any
+
 import torch
 from torch import nn
+
+
+def evaluated(module: nn.Module) -> Any:
+    """
+    Make a view of a module that stays in evaluation mode, whatever the mode of the module: running statistics are read
+    and not moved, dropout is off. Parameters and buffers are the module's own, also after it was moved to a device,
+    loaded or copied together with its view. A scripted module, which has one mode, is its own view.
+
+    :param module: the module
+    :return: a module of the same class; to be held where it is not registered
+    """
+    views: dict[int, nn.Module] = {}
+
+    def view(of: nn.Module) -> nn.Module:
+        if isinstance(of, torch.jit.ScriptModule):
+            return of
+        if id(of) not in views:
+            made = views[id(of)] = object.__new__(type(of))
+            # The dicts of parameters and buffers are shared, the one of modules is not.
+            vars(made).update(vars(of))
+            children = {name: None if child is None else view(child) for name, child in of._modules.items()}
+            vars(made).update(_modules=children, training=False)
+        return views[id(of)]
+
+    return view(module)
 
 
 class ModeSwitch:

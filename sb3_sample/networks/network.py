@@ -40,6 +40,12 @@ class Network(nn.Module):
     #: Whether the copy of it in the target critics is in training mode during gradient steps, as dropout needs (DroQ).
     #: Batch norm is not: False has the targets use the running statistics.
     trains_in_target: ClassVar[bool] = True
+    #: Whether the critics' step stacks the current and the next rows for one forward pass of 2B rows, so that batch
+    #: statistics are of both: "online" takes the next values from that pass (CrossQ, Bhatt et al. 2024, which has no
+    #: targets), "target" from the target critics' own pass over the same rows; None: a pass each. Where rows are
+    #: stacked, everything else (actors' objectives, rules of pessimism, TD targets' actions) sees the network in
+    #: evaluation mode, so that running statistics are those of the stacked rows alone.
+    stacks_rows: ClassVar[str | None] = None
 
     @abstractmethod
     def forward(self, x: torch.Tensor) -> torch.Tensor:

@@ -8,59 +8,24 @@ from typing import Any
 import numpy as np
 import torch
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_sample.replay.columns import (
+    HELD_OUT,
+    OF_EVERY_BUFFER,
+    Column,
+    HasColumns,
+    columns_of,
+    samples_at,
+    samples_of,
+)
 from sb3_sample.replay.compact import (
     CompactDictReplayBuffer,
     CompactReplay,
     CompactReplayBuffer,
 )
-from sb3_sample.replay.next_observations import NextObservations
-from sb3_sample.replay.rows import action_dtype, as_actions, as_observation, as_row, as_timeouts
-
-
-def samples_at(
-    buffer: ReplayBuffer, positions: np.ndarray, env_indices: np.ndarray, vec_normalize: VecNormalize | None = None
-) -> ReplayBufferSamples | DictReplayBufferSamples:
-    """
-    Transitions of a replay buffer at given places, each one step, without the changes that the buffer's own ``sample``
-    makes (n-step returns, relabelled goals).
-
-    :param buffer: Stable-Baselines3's replay buffer or a subclass
-    :param positions: places in the buffer, (N,)
-    :param env_indices: which environment's transition, (N,)
-    :param vec_normalize: normalises observations and rewards
-    :return: N transitions, in the form of the buffer's ``sample``
-    """
-
-    def rows(arrays: Any, at: np.ndarray) -> Any:
-        if isinstance(arrays, dict):
-            return {key: array[at, env_indices] for key, array in arrays.items()}
-        return arrays[at, env_indices]
-
-    def tensors(observations: Any) -> Any:
-        normalized = buffer._normalize_obs(observations, vec_normalize)
-        if isinstance(normalized, dict):
-            return {key: buffer.to_torch(array) for key, array in normalized.items()}
-        return buffer.to_torch(normalized)
-
-    if buffer.optimize_memory_usage:
-        next_observations = rows(buffer.observations, (positions + 1) % buffer.buffer_size)
-    else:
-        next_observations = rows(buffer.next_observations, positions)
-    dones = rows(buffer.dones, positions) * (1 - rows(buffer.timeouts, positions))
-    rewards = buffer._normalize_reward(rows(buffer.rewards, positions).reshape(-1, 1), vec_normalize)
-    columns: tuple[Any, ...] = (
-        tensors(rows(buffer.observations, positions)),
-        buffer.to_torch(rows(buffer.actions, positions)),
-        tensors(next_observations),
-        buffer.to_torch(dones.reshape(-1, 1)),
-        buffer.to_torch(rewards),
-    )
-    if isinstance(buffer.observations, dict):
-        return DictReplayBufferSamples(*columns)
-    return ReplayBufferSamples(*columns)
+from sb3_sample.replay.next_observations import ONLY, NextObservations
+from sb3_sample.replay.rows import action_dtype
 
 
 class ValidationSplit(CompactReplay):
@@ -76,11 +41,13 @@ class ValidationSplit(CompactReplay):
     :param validation_proportion: probability of the validation side, in (0, 1)
     """
 
+    more_columns = (HELD_OUT,)
+    #: Which transitions are held out, (buffer_size, n_envs).
+    held_out: np.ndarray
+
     def __init__(self, *args: Any, validation_proportion: float, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.validation_proportion = validation_proportion
-        #: Which transitions are held out, (buffer_size, n_envs).
-        self.held_out = np.zeros((self.buffer_size, self.n_envs), dtype=bool)
         # The places held out (position * n_envs + environment) as a ring, oldest first: the buffer overwrites them in
         # the same order. The two counters are never reduced.
         self._ring = np.zeros(self.buffer_size * self.n_envs, dtype=np.int64)
@@ -110,14 +77,6 @@ class ValidationSplit(CompactReplay):
         super().reset()
         self.held_out[...] = False
         self._first = self._last = 0
-
-    def columns(self) -> dict[str, np.ndarray]:
-        """
-        List the arrays of the rows.
-
-        :return: what a row holds, as of ``CompactReplayBuffer``, and ``held_out``
-        """
-        return super().columns() | {"held_out": self.held_out}
 
     def _restored(self) -> None:
         super()._restored()
@@ -203,7 +162,7 @@ def latest(buffer: ReplayBuffer, n_steps: int, vec_normalize: VecNormalize | Non
     return transitions, buffer.to_torch(buffer.dones[positions])
 
 
-class DeviceReplayBuffer(ReplayBuffer):
+class DeviceReplayBuffer(HasColumns, ReplayBuffer):
     """
     Replay buffer in the memory of the model's device: each transition is moved once, when it is stored, and batches
     are gathered where they are needed. For a GPU; on a CPU it is the plain buffer with other arrays.
@@ -218,13 +177,15 @@ class DeviceReplayBuffer(ReplayBuffer):
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
         store_float_actions(self)
-        for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
-            # The host's array was never written to, so that it took no memory.
-            setattr(
-                self,
-                name,
-                torch.from_numpy(getattr(self, name)[:0]).new_zeros(getattr(self, name).shape).to(self.device),
-            )
+        given = {column.name for column in OF_EVERY_BUFFER}
+        for name, column in columns_of(self).items():
+            if name in vars(self) and name not in given:
+                raise ValueError(f"more_columns of {type(self).__name__} has the name {name!r}, which is taken")
+            # In the place of the host's arrays, which were never written to, so that they took no memory.
+            shape, dtype = column.layout(self)[ONLY]
+            rows = (self.buffer_size, self.n_envs, *shape)
+            like = torch.from_numpy(np.empty(0, dtype))
+            setattr(self, name, torch.zeros(rows, dtype=like.dtype, device=self.device))
 
     def add(
         self,
@@ -240,40 +201,28 @@ class DeviceReplayBuffer(ReplayBuffer):
 
         :raises ValueError: if something has another shape than its space; nothing is stored then
         """
-        timeouts = as_timeouts(infos, self.n_envs) if self.handle_timeout_termination else np.zeros(self.n_envs)
-        shape = (self.n_envs, *self.obs_shape)
-        rows = [
-            (self.observations, as_observation("observation", obs, shape, self.observation_space)),
-            (self.next_observations, as_observation("next observation", next_obs, shape, self.observation_space)),
-            (self.actions, as_actions(action, (self.n_envs, self.action_dim), self.action_space)),
-            (self.rewards, as_row("reward", reward, (self.n_envs,))),
-            (self.dones, as_row("done", done, (self.n_envs,))),
-            (self.timeouts, timeouts),
-        ]
-        for store, row in rows:
-            target: Any = store[self.pos]
-            target.copy_(torch.as_tensor(row))
+        given = (obs, next_obs, action, reward, done, infos)
+        rows = [(name, write(given)) for name, write in self.writers()]
+        for name, row in rows:
+            target: Any = getattr(self, name)[self.pos]
+            target.copy_(torch.as_tensor(row[ONLY] if isinstance(row, dict) else row))
         self.pos += 1
         if self.pos == self.buffer_size:
             self.full, self.pos = True, 0
 
-    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> Any:
         if env is not None:
             raise ValueError("VecNormalize normalises on the host: use ReplayBuffer with it, not DeviceReplayBuffer")
         env_indices = np.random.randint(0, high=self.n_envs, size=len(batch_inds))
         places = torch.from_numpy(batch_inds * self.n_envs + env_indices).to(self.device)
 
-        def rows(array: Any) -> torch.Tensor:
-            return array.flatten(0, 1).index_select(0, places)
+        def take(column: Column, array: Any, but: Any = None) -> torch.Tensor:
+            rows = array.flatten(0, 1).index_select(0, places)
+            if but is not None:
+                rows = rows * (1 - but.flatten(0, 1).index_select(0, places))
+            return rows.unsqueeze(1) if rows.ndim == 1 else rows
 
-        dones = rows(self.dones) * (1 - rows(self.timeouts))
-        return ReplayBufferSamples(
-            rows(self.observations),
-            rows(self.actions),
-            rows(self.next_observations),
-            dones.unsqueeze(1),
-            rows(self.rewards).unsqueeze(1),
-        )
+        return samples_of(self, take)
 
     def to_torch(self, array: Any, copy: bool = True) -> torch.Tensor:
         """
@@ -321,10 +270,19 @@ def samples_as_its_class(buffer: ReplayBuffer) -> bool:
     Check that a buffer's draws are independent.
 
     :param buffer: a replay buffer
-    :return: whether it is one of ``INDEPENDENT_BUFFERS``, its sampling replaced neither in the class nor in the object
+    :return: whether it is one of ``INDEPENDENT_BUFFERS``, or adds columns to one, its sampling replaced neither in the
+        class nor in the object
     """
     present = [getattr(type(buffer), name, None) for name in _SAMPLING]
-    return _OWN_SAMPLING.get(type(buffer)) == present and vars(buffer).keys().isdisjoint(_SAMPLING)
+    return _OWN_SAMPLING.get(_without_columns(buffer)) == present and vars(buffer).keys().isdisjoint(_SAMPLING)
+
+
+def _without_columns(buffer: ReplayBuffer) -> Any:
+    """The class of a buffer; of one that declares columns of its own the one that it adds them to."""
+    cls = type(buffer)
+    while "more_columns" in vars(cls) and cls not in _OWN_SAMPLING:
+        cls = cls.__bases__[0]
+    return cls
 
 
 class BatchMemory:
@@ -346,10 +304,10 @@ class BatchMemory:
         :param vec_normalize: what normalises the samples
         :return: whether they can
         """
-        is_plain = type(buffer) in PLAIN_BUFFERS and samples_as_its_class(buffer)
+        is_plain = _without_columns(buffer) in PLAIN_BUFFERS and samples_as_its_class(buffer)
         return is_plain and not buffer.optimize_memory_usage and vec_normalize is None
 
-    def gather(self, buffer: ReplayBuffer, n: int) -> ReplayBufferSamples | DictReplayBufferSamples:
+    def gather(self, buffer: ReplayBuffer, n: int) -> Any:
         """
         Draw transitions to train on, uniformly with replacement: the same as ``buffer.sample(n)`` would.
 
@@ -366,7 +324,7 @@ class BatchMemory:
             self._moved.synchronize()
         to_cuda = buffer.device.type == "cuda"
 
-        def take(name: Any, array: Any, but: np.ndarray | None = None) -> torch.Tensor:
+        def gathered(name: Any, array: Any, but: np.ndarray | None = None) -> torch.Tensor:
             shape = array.shape[2:] or (1,)
             if name not in self._columns or len(self._columns[name]) < n:
                 dtype = torch.from_numpy(np.empty(0, array.dtype)).dtype
@@ -381,22 +339,14 @@ class BatchMemory:
                 out *= 1 - but.reshape(-1, 1).take(places, axis=0)
             return column.to(buffer.device, non_blocking=True) if to_cuda else column
 
-        def observations(name: str, arrays: Any) -> Any:
-            if isinstance(arrays, dict):
-                return {key: take((name, key), array) for key, array in arrays.items()}
-            return take(name, arrays)
+        def take(column: Column, array: Any, but: np.ndarray | None = None) -> Any:
+            if isinstance(array, dict):
+                return {key: gathered((column.name, key), part) for key, part in array.items()}
+            return gathered(column.name, array, but)
 
-        columns: tuple[Any, ...] = (
-            observations("observations", buffer.observations),
-            take("actions", buffer.actions),
-            observations("next_observations", buffer.next_observations),
-            # A time limit does not end the bootstrap.
-            take("dones", buffer.dones, but=buffer.timeouts),
-            take("rewards", buffer.rewards),
-        )
+        samples = samples_of(buffer, take)
         if to_cuda:
             # The memory is free again when the copies are done.
             self._moved = torch.cuda.Event()
             self._moved.record()
-        samples = DictReplayBufferSamples if isinstance(buffer.observations, dict) else ReplayBufferSamples
-        return samples(*columns)
+        return samples

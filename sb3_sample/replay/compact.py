@@ -15,8 +15,8 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 
 from sb3_sample.replay import memory_map as files
+from sb3_sample.replay.columns import NEXT_OBSERVATIONS, OBSERVATIONS, HasColumns, samples_at
 from sb3_sample.replay.next_observations import NEXT_ROW, ONLY, NextObservations, SideStore
-from sb3_sample.replay.rows import action_dtype, as_actions, as_observation, as_row, as_timeouts
 
 try:  # As in Stable-Baselines3: without it the free memory is not checked.
     import psutil
@@ -28,7 +28,7 @@ def _file_name(column: str, key: str) -> str:
     return f"{column}/{key}" if key else column
 
 
-class CompactReplay:
+class CompactReplay(HasColumns):
     """
     Replay buffer that stores one observation a step.
 
@@ -56,6 +56,7 @@ class CompactReplay:
     observations: Any
     observation_space: Any
     memory_map: str | None
+    #: Where the next observation is: in the next row, or aside, in this slot; (buffer_size, n_envs).
     slot: np.ndarray
     aside: SideStore
 
@@ -78,14 +79,13 @@ class CompactReplay:
         self.optimize_memory_usage = False
         self.handle_timeout_termination = handle_timeout_termination
         rows = (self.buffer_size, self.n_envs)
-        is_dict = isinstance(observation_space, spaces.Dict)
-        one: dict[str, tuple[tuple[int, ...], Any]] = {ONLY: (self.obs_shape, observation_space.dtype)}
-        if isinstance(observation_space, spaces.Dict):
-            shapes: Any = self.obs_shape
-            one = {key: (shapes[key], space.dtype) for key, space in observation_space.spaces.items()}
+        one = OBSERVATIONS.layout(self)
         layout = {key: ((*rows, *shape), dtype) for key, (shape, dtype) in one.items()}
-        actions = ((*rows, self.action_dim), action_dtype(action_space))
-        needed = sum(files.n_bytes(*array) for array in [*layout.values(), actions, *[(rows, np.float32)] * 4])
+        plain = {column.name: column.layout(self)[ONLY] for column in self.plain_columns}
+        columns = {name: ((*rows, *shape), dtype) for name, (shape, dtype) in plain.items()} | {
+            "slot": (rows, np.int32)
+        }
+        needed = sum(files.n_bytes(*array) for array in [*layout.values(), *columns.values()])
         #: The folder that holds the arrays; None if the memory does.
         self.memory_map = None if memory_map is None else files.check_folder(memory_map, needed)
         if memory_map is None and psutil is not None and needed > (available := psutil.virtual_memory().available):
@@ -96,11 +96,11 @@ class CompactReplay:
             )
         zeros = functools.partial(files.zeros, self.memory_map)
         stored = {key: zeros(*array) for key, array in layout.items()}
-        self.observations = stored if is_dict else stored[ONLY]
-        self.actions = zeros(*actions)
-        self.rewards, self.dones, self.timeouts = (zeros(rows, np.float32) for _ in range(3))
-        #: Where the next observation is: in the next row, or aside, in this slot; (buffer_size, n_envs).
-        self.slot = zeros(rows, np.int32)
+        self.observations = stored if isinstance(observation_space, spaces.Dict) else stored[ONLY]
+        for name, array in columns.items():
+            if name in vars(self):
+                raise ValueError(f"more_columns of {type(self).__name__} has the name {name!r}, which is taken")
+            setattr(self, name, zeros(*array))
         self.slot[...] = NEXT_ROW
         self.aside = SideStore(one, self.n_envs, self.memory_map)
 
@@ -112,7 +112,7 @@ class CompactReplay:
         self.memory_map = files.check_folder(self.memory_map, sum(array.nbytes for array in self.stored().values()))
         stored = {key: files.moved(self.memory_map, array) for key, array in self.stored().items()}
         self.observations = stored if isinstance(self.observations, dict) else stored[ONLY]
-        for name in ("actions", "rewards", "dones", "timeouts", "slot"):
+        for name in (*(column.name for column in self.plain_columns), "slot"):
             setattr(self, name, files.moved(self.memory_map, getattr(self, name)))
         self.aside.arrays = {key: files.moved(self.memory_map, array) for key, array in self.aside.arrays.items()}
 
@@ -151,10 +151,9 @@ class CompactReplay:
         :raises ValueError: if something has another shape than its space; nothing is stored then
         """
         assert isinstance(self, ReplayBuffer)
-        now, after = self._as_stored("observation", obs), self._as_stored("next observation", next_obs)
-        action = as_actions(action, (self.n_envs, self.action_dim), self.action_space)
-        reward, done = (as_row(name, row, (self.n_envs,)) for name, row in (("reward", reward), ("done", done)))
-        timeouts = as_timeouts(infos, self.n_envs) if self.handle_timeout_termination else None
+        given = (obs, next_obs, action, reward, done, infos)
+        writers = self.writers()
+        now, after, *rows = [write(given) for _, write in writers]
         pos = self.pos
         if self.size() > 0 and self.buffer_size > 1:
             self._settle((pos - 1) % self.buffer_size, now)
@@ -164,23 +163,12 @@ class CompactReplay:
         for key, array in self.stored().items():
             array[pos] = now[key]
         self._set_newest(pos, after)
-        self.actions[pos] = action
-        self.rewards[pos] = reward
-        self.dones[pos] = done
-        if timeouts is not None:
-            self.timeouts[pos] = timeouts
+        own = vars(self)
+        for (name, _), row in zip(writers[2:], rows):  # noqa: B905  # as many, by the line above
+            own[name][pos] = row
         self.pos = pos + 1
         if self.pos == self.buffer_size:
             self.full, self.pos = True, 0
-
-    def _as_stored(self, name: str, given: Any) -> dict[str, np.ndarray]:
-        """Observations of all environments in the form in which they are stored, (n_envs, O) each."""
-        if not isinstance(self.observations, dict):
-            return {ONLY: as_observation(name, given, self.observations.shape[1:], self.observation_space)}
-        return {
-            key: as_observation(f"{name} {key!r}", given[key], array.shape[1:], self.observation_space[key])
-            for key, array in self.observations.items()
-        }
 
     def _replacing(self, row: int) -> None:
         """Called when a step is about to be stored in a row."""
@@ -211,6 +199,13 @@ class CompactReplay:
         self.slot[...] = NEXT_ROW
         self.aside.clear()
 
+    def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> Any:
+        if not self.more_in_batch:
+            return super()._get_samples(batch_inds, env)  # type: ignore[misc]  # the buffer's
+        # The environments are drawn as there.
+        env_indices = np.random.randint(0, high=self.n_envs, size=len(batch_inds))  # noqa: NPY002
+        return samples_at(self, batch_inds, env_indices, env)  # type: ignore[arg-type]
+
     # ---------------------------------------------------------------- to and from files
 
     def columns(self) -> dict[str, np.ndarray]:
@@ -221,13 +216,13 @@ class CompactReplay:
             observations are ``observations``, or ``observations/<key>``
         """
         assert isinstance(self, ReplayBuffer)
-        columns = {_file_name("observations", key): array for key, array in self.stored().items()}
-        return columns | {name: getattr(self, name) for name in ("actions", "rewards", "dones", "timeouts")}
+        columns = {_file_name(OBSERVATIONS.name, key): array for key, array in self.stored().items()}
+        return columns | {column.name: getattr(self, column.name) for column in self.plain_columns}
 
     def _apart(self, index: np.ndarray, places: np.ndarray) -> dict[str, np.ndarray]:
         """Next observations that are not the next row's, by ``index``, in the layout of files."""
         values = self._following(places)
-        return {"next_index": index} | {_file_name("next_observations", key): value for key, value in values.items()}
+        return {"next_index": index} | {_file_name(NEXT_OBSERVATIONS.name, key): value for key, value in values.items()}
 
     def new_rows(self, n: int) -> dict[str, np.ndarray]:
         """
@@ -288,7 +283,7 @@ class CompactReplay:
             following = self._following(before * self.n_envs + np.arange(self.n_envs))
             self.aside.free(self.slot[before])
             self._set_newest(before, following)
-            self._settle(before, {key: piece[_file_name("observations", key)][0] for key in self.stored()})
+            self._settle(before, {key: piece[_file_name(OBSERVATIONS.name, key)][0] for key in self.stored()})
         self.aside.free(self.slot[rows].reshape(-1))
         self._put(rows, piece, len(rows) - 1)
 
@@ -304,7 +299,7 @@ class CompactReplay:
             array[rows] = piece[name]
         self.slot[rows] = NEXT_ROW
         steps, envs = np.divmod(piece["next_index"], self.n_envs)
-        values = {key: piece[_file_name("next_observations", key)] for key in self.stored()}
+        values = {key: piece[_file_name(NEXT_OBSERVATIONS.name, key)] for key in self.stored()}
         last = steps == newest
         slots = self.aside.put({key: value[~last] for key, value in values.items()})
         self.slot[rows[steps[~last]], envs[~last]] = slots
@@ -322,7 +317,7 @@ class CompactReplay:
         shapes = {name: ((n, *array.shape[1:]), array.dtype) for name, array in self.columns().items()}
         index = piece.get("next_index", np.zeros(0, np.int64))
         shapes |= {
-            _file_name("next_observations", key): ((len(index), *array.shape[2:]), array.dtype)
+            _file_name(NEXT_OBSERVATIONS.name, key): ((len(index), *array.shape[2:]), array.dtype)
             for key, array in self.stored().items()
         }
         if piece.keys() != {*shapes, "next_index"}:

@@ -1,5 +1,6 @@
 """Fixed data sets of transitions as a source of batches."""
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ class Dataset:
     :param observation_space: of the observations
     :param action_space: of the actions as an environment takes them
     :param seed: of the generator that the batches are drawn from
+    :param columns: further columns of the batches by name, (N, ...) each
     """
 
     def __init__(
@@ -35,14 +37,19 @@ class Dataset:
         observation_space: spaces.Space,
         action_space: spaces.Box,
         seed: int = 0,
+        columns: Mapping[str, np.ndarray] | None = None,
     ):
         self.observation_space, self.action_space = observation_space, action_space
-        self._columns = (
+        self._rows = Batch(
             for_each(torch.from_numpy, observations),
             torch.from_numpy(actions),
             for_each(torch.from_numpy, next_observations),
             torch.from_numpy(terminations).unsqueeze(1),
             torch.from_numpy(rewards).unsqueeze(1),
+            columns={
+                name: torch.from_numpy(values.reshape(len(values), -1) if values.ndim == 1 else values)
+                for name, values in (columns or {}).items()
+            },
         )
         self._generator = torch.Generator().manual_seed(seed)
 
@@ -59,6 +66,7 @@ class Dataset:
         observation_space: spaces.Space | None = None,
         action_space: spaces.Box | None = None,
         seed: int = 0,
+        columns: Mapping[str, Any] | None = None,
     ) -> "Dataset":
         """
         Make a data set of N steps in the order in which they were taken, episode after episode.
@@ -75,6 +83,7 @@ class Dataset:
         :param observation_space: of the observations; None: unbounded, of their shape
         :param action_space: of the actions; None: [-1, 1]
         :param seed: of the generator that the batches are drawn from
+        :param columns: further columns of the batches by name, such as the number of a task: numbers, (N,) or (N, ...)
         :return: the data set, its actions scaled to [-1, 1]
         :raises ValueError: if the arrays are not of one length, not of the spaces, or not finite
         """
@@ -88,10 +97,11 @@ class Dataset:
         given = {}
         if next_observations is not None:
             given["next_observations"] = _rows("next_observations", next_observations)
+        more = {name: _numbers(f"columns[{name!r}]", values, 1) for name, values in (columns or {}).items()}
         n = len(rewards)
         if n == 0:
             raise ValueError("rewards must have at least one step, not 0")
-        for name, value in {"observations": observations, "actions": actions, **flags, **given}.items():
+        for name, value in {"observations": observations, "actions": actions, **flags, **given, **more}.items():
             for part in value.values() if isinstance(value, dict) else (value,):
                 if len(part) != n:
                     raise ValueError(f"{name} must have as many steps as rewards, {n}, not {len(part)}")
@@ -128,10 +138,11 @@ class Dataset:
             observation_space,
             action_space,
             seed,
+            _take(more, kept),
         )
 
     def __len__(self) -> int:
-        return len(self._columns[1])
+        return len(self._rows.actions)
 
     def to(self, device: torch.device | str) -> "Dataset":
         """
@@ -140,10 +151,15 @@ class Dataset:
         :param device: device of the transitions, and so of the batches
         :return: the data set
         """
-        self._columns = tuple(  # type: ignore[assignment]
-            for_each(lambda tensor: tensor.to(device), column) for column in self._columns
-        )
+        self._rows = self._rows_by(lambda tensor: tensor.to(device))
         return self
+
+    def _rows_by(self, function: Callable[[torch.Tensor], torch.Tensor]) -> Batch:
+        """The rows, their tensors changed by a function."""
+        changed: dict[str, Any] = {
+            name: None if value is None else for_each(function, value) for name, value in self._rows._asdict().items()
+        }
+        return Batch(**changed)
 
     def sample(self, batch_size: int) -> Batch:
         """
@@ -155,8 +171,8 @@ class Dataset:
         """
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1, not {batch_size}")
-        rows = torch.randint(len(self), (batch_size,), generator=self._generator).to(self._columns[1].device)
-        return Batch(*(_take(column, rows) for column in self._columns))
+        rows = torch.randint(len(self), (batch_size,), generator=self._generator).to(self._rows.actions.device)
+        return self._rows_by(lambda tensor: tensor[rows])
 
 
 def _take(columns: Any, rows: Any) -> Any:
@@ -167,8 +183,12 @@ def _rows(name: str, values: Any) -> Arrays:
     """Convert arrays to their stored form: floats as float32."""
     if isinstance(values, dict):
         return {key: _rows(f"{name}[{key!r}]", value) for key, value in values.items()}  # type: ignore[misc]
+    return _numbers(name, values, 2)
+
+
+def _numbers(name: str, values: Any, least_axes: int) -> np.ndarray:
     array = np.asarray(values)
-    if array.dtype.kind not in "fiub" or array.ndim < 2:
+    if array.dtype.kind not in "fiub" or array.ndim < least_axes:
         raise ValueError(f"{name} must be numbers of shape (N, ...), not {array.dtype} of shape {array.shape}")
     if array.dtype.kind != "f":
         return array

@@ -35,15 +35,19 @@ class Mixture:
         """
         :param batch_size: B
         :return: transitions of all sources
-        :raises ValueError: if the batch size is below 1
+        :raises ValueError: if the batch size is below 1, or the sources have other columns each
         """
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1, not {batch_size}")
         sizes = [round(share * batch_size) for share in self.shares[:-1]]
         sizes.append(batch_size - sum(sizes))
         drawn = [source.sample(n) for source, n in zip(self.sources, sizes, strict=True) if n > 0]
-        columns: list[Any] = [_joined([getattr(batch, name) for batch in drawn]) for name in Batch._fields[:-1]]
-        return Batch(*columns)._replace(discounts=_discounts(drawn))
+        columns = [sorted(batch.columns) for batch in drawn]
+        if any(names != columns[0] for names in columns):
+            raise ValueError(f"sources must have the same columns to be mixed, not {columns}")
+        names = [name for name in Batch._fields if name != "discounts"]
+        joined = {name: _joined([getattr(batch, name) for batch in drawn]) for name in names}
+        return Batch(**joined, discounts=_discounts(drawn))
 
 
 def _joined(columns: list[Any]) -> Any:

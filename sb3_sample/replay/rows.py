@@ -5,8 +5,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+FLOAT32 = np.dtype(np.float32)
 
-def as_row(name: str, given: Any, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
+
+def as_row(name: str, given: Any, shape: tuple[int, ...], dtype: Any = FLOAT32) -> np.ndarray:
     """
     Convert values to a row of the buffer by the rules of array assignment: repeated along axes that are missing or of
     length one, as in Stable-Baselines3, and never reordered.
@@ -15,12 +17,12 @@ def as_row(name: str, given: Any, shape: tuple[int, ...], dtype: Any = np.float3
     :param given: one value, or one of each environment
     :param shape: of a row, (n_envs, ...)
     :param dtype: of a row
-    :return: the row, of that shape and type
+    :return: the row, of that shape and type, or what was given if it is one
     :raises ValueError: if it has another shape
     """
     given = np.asarray(given)
     if given.shape == shape:
-        return np.ascontiguousarray(given, dtype=dtype)
+        return given if given.dtype is dtype else np.ascontiguousarray(given, dtype=dtype)
     own = given.shape
     while len(own) > len(shape) and own[0] == 1:
         own = own[1:]
@@ -91,7 +93,10 @@ def as_timeouts(infos: Any, n_envs: int) -> np.ndarray:
     :raises ValueError: if there are flags of another number of environments
     """
     flags: Any = [info.get("TimeLimit.truncated", False) for info in infos]
-    if not all(flag is True or flag is False for flag in flags):
+    if all(flag is True or flag is False for flag in flags):
+        if len(flags) == n_envs:
+            return np.array(flags, FLOAT32)
+    else:
         flags = np.concatenate([np.ravel(flag) for flag in flags])
     return as_row("flags TimeLimit.truncated of the infos", flags, (n_envs,))
 

@@ -36,6 +36,7 @@ from sb3_sample.replay.buffers import (
     ValidationSplit,
     store_float_actions,
 )
+from sb3_sample.replay.columns import has_own_columns
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
 from sb3_sample.replay.sources import ReplaySource
 from sb3_sample.sac import checks
@@ -138,7 +139,8 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         super()._complete_arguments()
         is_dict = isinstance(self.observation_space, spaces.Dict)
         if self.validation_proportion > 0:
-            self.replay_buffer_class = ValidationDictReplayBuffer if is_dict else ValidationReplayBuffer
+            if not has_own_columns(self.replay_buffer_class):
+                self.replay_buffer_class = ValidationDictReplayBuffer if is_dict else ValidationReplayBuffer
             self.replay_buffer_kwargs = {
                 **self.replay_buffer_kwargs,
                 "validation_proportion": self.validation_proportion,

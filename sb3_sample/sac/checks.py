@@ -18,7 +18,8 @@ from sb3_sample.kinds import (
 )
 from sb3_sample.learner.exploration import EXPLORATIONS
 from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
-from sb3_sample.replay.buffers import DeviceReplayBuffer
+from sb3_sample.replay.buffers import DeviceReplayBuffer, ValidationSplit
+from sb3_sample.replay.columns import has_own_columns
 from sb3_sample.replay.compact import CompactReplay
 
 
@@ -162,6 +163,15 @@ def _check_buffer_class(agent: Any) -> None:
 
 
 def _check_replay(agent: Any) -> None:
+    if has_own_columns(agent.replay_buffer_class):
+        cls, is_split = agent.replay_buffer_class, issubclass(agent.replay_buffer_class, ValidationSplit)
+        if is_split != (agent.validation_proportion > 0):
+            base, which = ("CompactReplayBuffer", "is") if is_split else ("ValidationReplayBuffer", "is not")
+            raise ValueError(
+                f"validation_proportion={agent.validation_proportion}, but replay_buffer_class={cls.__name__}, which "
+                f"has columns of its own, {which} one that holds transitions out: derive it from {base}, or its "
+                "variant for dicts"
+            )
     if agent.validation_proportion > 0:
         cls = agent.replay_buffer_class
         if cls is not None and cls not in (ReplayBuffer, DictReplayBuffer) and not issubclass(cls, CompactReplay):

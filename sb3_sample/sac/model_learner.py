@@ -23,8 +23,10 @@ from sb3_sample.learner.scalars import FixedScalar, LogScalar
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.optim import AdamW
 from sb3_sample.sac import checks
+from sb3_sample.sac.actors import BACKBONES, Actor
 from sb3_sample.sac.arguments import transform_choice
-from sb3_sample.sac.policies import BACKBONES, Actor, CriticEnsemble, SACPolicy
+from sb3_sample.sac.critics import CriticEnsemble
+from sb3_sample.sac.policies import SACPolicy
 
 T = TypeVar("T")
 

@@ -12,6 +12,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her import HerReplayBuffer
 
+from sb3_sample.replay.columns import columns_of
 from sb3_sample.saving import container, notice, paths
 from sb3_sample.saving.classes import PACKAGES, check_trusted, has_state, may_be_set, path_of, within
 from sb3_sample.saving.container import BadFile, PickledFile
@@ -33,7 +34,6 @@ _NOT_SAVED = ("device", "env")
 #: Arguments with which a buffer is made again that gives and takes its own state.
 _ARGUMENTS = ("buffer_size", "n_envs", "handle_timeout_termination", "validation_proportion")
 _ARRAYS = (np.ndarray, torch.Tensor)
-_COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
 class SafeReplayBuffers(OffPolicyAlgorithm):
@@ -247,7 +247,7 @@ def _with_state(
     size, n_envs = arguments["buffer_size"], arguments["n_envs"]
     _check_size(size, n_envs, cls, model)
     state = decode(tree["state"], tensors, "replay_buffer", trusted)
-    check_values({key: value for key, value in state.items() if isinstance(value, _ARRAYS)}, "replay_buffer")
+    check_values({key: value for key, value in state.items() if isinstance(value, _ARRAYS)}, "replay_buffer", cls)
     own: Any = getattr(model, "replay_buffer", None)
     buffer = own
     if type(own) is not cls or any(getattr(own, name, None) != value for name, value in arguments.items()):
@@ -290,13 +290,13 @@ def _with_attributes(
     for name, value in vars(buffer).items():
         if isinstance(value, torch.Tensor):
             vars(buffer)[name] = value.to(model.device)
-    for name in _COLUMNS:
+    for name in columns_of(cls):
         # With optimize_memory_usage the next observations are those of the next row.
         columns = {} if name == "next_observations" and buffer.optimize_memory_usage else getattr(buffer, name)
         for column in columns.values() if isinstance(columns, dict) else [columns]:
             if column.shape[:2] != (size, n_envs):
                 raise BadFile(f"{name} is of shape {tuple(column.shape)}, not of {size} rows of {n_envs} environments")
-            check_values({name: column[:filled]}, "replay_buffer")
+            check_values({name: column[:filled]}, "replay_buffer", cls)
     check_episodes(buffer, "replay_buffer")
     _check_spaces(buffer, model)
     return buffer

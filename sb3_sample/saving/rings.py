@@ -13,41 +13,44 @@ import numpy as np
 import torch
 from stable_baselines3.common.buffers import ReplayBuffer
 
+from sb3_sample.replay.columns import columns_of
 from sb3_sample.replay.compact import CompactReplay
 from sb3_sample.saving.untrusted import BadFile
 
-#: What a buffer of Stable-Baselines3 keeps of each row.
-COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "ep_start")
-#: Of these, what is measured and what is yes or no.
-_NUMBERS, _FLAGS = ("observations", "next_observations", "actions", "rewards"), ("dones", "timeouts", "held_out")
+#: What hindsight keeps of each row besides the columns.
+_OF_HINDSIGHT = ("ep_start",)
 #: What changes in rows that are there already, or is no row; written anew each time.
 _SMALL = ("ep_length", "_current_ep_start")
 #: Never used (infos, without copy_info_dict), or never changes; and what follows from the rows of a compact buffer.
-_DERIVED = ("infos", "obs_shape", "device", "observation_space", "action_space", "env", "slot", "held_out", "_ring")
+_DERIVED = ("infos", "obs_shape", "device", "observation_space", "action_space", "env", "slot", "_ring")
 
 
-def check_values(columns: Mapping[str, Any], name: str) -> None:
+def check_values(columns: Mapping[str, Any], name: str, buffer: Any) -> None:
     """
     Look at the rows of a replay buffer, whatever else is among them.
 
     :param columns: arrays or tensors by the column's name
     :param name: where they are from, for messages
+    :param buffer: the replay buffer that they are for, or its class, which knows its columns
     :raises BadFile: if observations, actions or rewards are not finite, or flags are neither 0 nor 1: none are stored
         in a training
     """
+    known = columns_of(buffer)
     for column, values in columns.items():
-        kind = column.split("/")[0]
+        declared = known.get(column.split("/")[0])
         if isinstance(values, torch.Tensor):
             values = values.cpu().numpy()
         if isinstance(values, Mapping):
-            check_values({f"{column}/{key}": inside for key, inside in values.items()}, name)
-        elif kind in _NUMBERS and values.dtype.kind == "f" and values.size > 0:
+            check_values({f"{column}/{key}": inside for key, inside in values.items()}, name, buffer)
+        elif declared is None or values.size == 0:
+            continue
+        elif not declared.is_flag and values.dtype.kind == "f":
             # What is not finite is the smallest or the largest of them, without a copy.
             low, high = values.min(), values.max()
             if not (np.isfinite(low) and np.isfinite(high)):
                 bad = low if not np.isfinite(low) else high
                 raise BadFile(f"{name}: {column} hold {bad}, which is not finite, and no training stores it")
-        elif kind in _FLAGS and values.size > 0 and (wrong := values[(values != 0) & (values != 1)]).size > 0:
+        elif declared.is_flag and (wrong := values[(values != 0) & (values != 1)]).size > 0:
             raise BadFile(f"{name}: {column} hold {wrong[0]!r:.50}, but must be 0 or 1")
 
 
@@ -86,7 +89,7 @@ class Ring:
                 "replay_buffer_kwargs: copy_info_dict=True keeps what environments say as Python objects, which a "
                 "checkpoint cannot hold: leave it out, or train without checkpoint"
             )
-        known = (*COLUMNS, *_SMALL, *_DERIVED)
+        known = (*columns_of(buffer), *_OF_HINDSIGHT, *_SMALL, *_DERIVED)
         for name, value in vars(buffer).items():
             if name not in known and isinstance(value, (np.ndarray, torch.Tensor, list, dict, set)):
                 raise ValueError(
@@ -135,7 +138,7 @@ class Ring:
     def _columns(self) -> dict[str, Any]:
         """The arrays (or tensors) whose first axis is that of the rows, by name."""
         found: dict[str, Any] = {}
-        for name in COLUMNS:
+        for name in (*columns_of(self.buffer), *_OF_HINDSIGHT):
             value = getattr(self.buffer, name, None)
             if isinstance(value, dict):
                 found.update({f"{name}/{key}": array for key, array in value.items()})
@@ -168,7 +171,7 @@ class Ring:
         n_rows, size = small.get("n_rows"), small.get("size")
         if type(n_rows) is not int or type(size) is not int or not 0 <= size <= n_rows < 2**63:
             raise ValueError(f"of the buffer's rows {size!r:.50} of {n_rows!r:.50} are to be there")
-        followed = _Followed(pieces)
+        followed = _Followed(pieces, self.buffer)
         if isinstance(self.buffer, CompactReplay):
             self.buffer.restore_rows(followed)
         else:
@@ -212,7 +215,7 @@ class Ring:
             head = self.buffer.observations[self.buffer.pos]
             if np.shape(small["head"]) != head.shape:
                 raise ValueError(f"the buffer's observations are {head.shape}, the last one {np.shape(small['head'])}")
-            check_values({"observations": np.asarray(small["head"])}, "the last row")
+            check_values({"observations": np.asarray(small["head"])}, "the last row", self.buffer)
             head[...] = small["head"]
         check_episodes(self.buffer, "the buffer")
 
@@ -242,17 +245,18 @@ class _Followed:
     Pieces, with where the first begins and the last ends.
 
     :param pieces: first row and rows, oldest first
+    :param buffer: the replay buffer that they are for
     """
 
-    def __init__(self, pieces: Iterable[tuple[int, dict[str, np.ndarray]]]):
-        self._pieces = pieces
+    def __init__(self, pieces: Iterable[tuple[int, dict[str, np.ndarray]]], buffer: ReplayBuffer):
+        self._pieces, self._buffer = pieces, buffer
         self.begin = self.end = 0
 
     def __iter__(self) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
         for number, (first, rows) in enumerate(self._pieces):
             if not (isinstance(rows, dict) and all(isinstance(value, np.ndarray) for value in rows.values())):
                 raise ValueError(f"the rows from {first} on are no arrays")
-            check_values(rows, f"the rows from {first} on")
+            check_values(rows, f"the rows from {first} on", self._buffer)
             if number == 0:
                 self.begin = first
             elif not self.begin <= first <= self.end:

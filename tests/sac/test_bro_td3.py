@@ -11,7 +11,7 @@ import torch
 from sb3_sample import BROTD3
 from sb3_sample.learner.batch import Noise
 from sb3_sample.learner.exploration import Exploration, OptimisticShift
-from sb3_sample.sac.policies import DeterministicActor
+from sb3_sample.sac.actors import DeterministicActor
 from tests.sac.common import bro, differing, random_batch, sac, state, vec
 
 

@@ -222,15 +222,6 @@ def test_arguments_of_zoo_files(maker: str, tmp_path: Path) -> None:
         type(model).load(tmp_path / "m", use_sde=True)
 
 
-def test_a_shared_features_extractor_is_refused() -> None:
-    for make in (sac, bro):
-        given = make().policy_kwargs
-        model = make(policy_kwargs={**given, "share_features_extractor": False}).learn(15)
-        assert model.actor.features_extractor is not model.critic.features_extractor
-        with pytest.raises(ValueError, match="share_features_extractor must be False"):
-            make(policy_kwargs={**given, "share_features_extractor": True})
-
-
 def test_every_argument_of_stable_baselines3_is_there() -> None:
     theirs = inspect.signature(stable_baselines3.SAC).parameters
     assert theirs.keys() <= inspect.signature(SAC).parameters.keys()

@@ -46,7 +46,6 @@ REASONS = (
     "`n_steps` with a buffer of one's own",
     "Memory of the replay buffer",
     "Schedules in files",
-    "Features extractors",
     "`tau=0`",
     "Weight decay",
     "What can be simulated",
@@ -86,11 +85,6 @@ _OFF_POLICY = (
         "test_n_step_replay::test_n_steps_with_dict_obs[HerReplayBuffer]",
     ),
     *_excluded("Memory of the replay buffer", "assert 0 == 1", "test_save_load::test_warn_buffer[True-*]"),
-    *_excluded(
-        "Features extractors",
-        "share_features_extractor must be False",
-        "test_cnn::test_features_extractor_target_net[True-*]",
-    ),
     *_excluded("`tau=0`", "tau must lie in (0, 1], not 0", "test_train_eval_mode::test_sac_train_with_batch_norm"),
     *_excluded("The test", "IndexError: list index out of range", "test_save_load::test_save_load[*]"),
     *_excluded(
@@ -149,11 +143,6 @@ _MBMA = (
 _PLAIN = _excluded("The test", "trying to run PPO on the GPU", "test_run::test_ppo_warnings")
 _TQC = (
     *_excluded("State-dependent exploration", "use_sde=True is not supported", "test_run::test_sde[*]"),
-    *_excluded(
-        "Features extractors",
-        "share_features_extractor must be False",
-        "test_cnn::test_feature_extractor_target_net[True-*]",
-    ),
     *_excluded("`tau=0`", "tau must lie in (0, 1], not 0", "test_train_eval_mode::test_tqc_train_with_batch_norm"),
     *_excluded("The test", "IndexError: list index out of range", "test_save_load::test_save_load[*]"),
 )

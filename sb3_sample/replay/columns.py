@@ -1,0 +1,283 @@
+"""
+Columns of a transition, declared once: what replay buffers store, what batches have and what files hold follows.
+
+A buffer of one's own adds a column by naming it: ``more_columns = (Column("task", lambda step: ...),)``.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_sample.learner.batch import for_each
+from sb3_sample.replay.next_observations import ONLY
+from sb3_sample.replay.rows import action_dtype, as_actions, as_observation, as_row, as_timeouts
+
+
+class Step(NamedTuple):
+    """One step of all environments, as ``add`` of a replay buffer is given it."""
+
+    observation: Any
+    next_observation: Any
+    action: np.ndarray
+    reward: np.ndarray
+    done: np.ndarray
+    infos: list[dict[str, Any]]
+
+
+#: The same as an ordinary tuple, which is made in a third of the time.
+Given = tuple[Any, Any, Any, Any, Any, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """
+    A column of a transition. It is stored under ``name`` in the buffer, as (buffer_size, n_envs, ...), and in files; a
+    batch has it in ``columns[name]``, (B, ...), or (B, 1) if it is one number.
+
+    :param name: its name
+    :param read: gives the values of a step, one for each environment; None if the buffer itself writes it
+    :param shape: of one environment's value
+    :param dtype: of the values; a float must be finite
+    :param is_flag: whether it is 0 or 1
+    :param in_batch: whether batches have it
+    """
+
+    name: str
+    read: Callable[[Step], Any] | None
+    shape: tuple[int, ...] = ()
+    dtype: Any = np.float32
+    is_flag: bool = False
+    in_batch: bool = True
+
+    @property
+    def label(self) -> str:
+        """The name in the singular, for messages."""
+        return self.name.removesuffix("s").replace("_", " ")
+
+    def layout(self, buffer: Any) -> dict[str, tuple[tuple[int, ...], Any]]:
+        """
+        Shape and type of one environment's value.
+
+        :param buffer: the buffer that stores it
+        :return: both, by the key of an observation, or under ``ONLY``
+        """
+        return {ONLY: (self.shape, self.dtype)}
+
+    def writer(self, buffer: Any) -> Callable[[Given], Any]:
+        """
+        Make what turns a step into a row.
+
+        :param buffer: the buffer, which the result does not hold
+        :return: from a step to its values in the form in which they are stored, (n_envs, ...). It raises a ValueError
+            if they have another shape, or are not finite
+        """
+        name, read, shape, dtype = self.name, self.read, (buffer.n_envs, *self.shape), np.dtype(self.dtype)
+        assert read is not None
+
+        def write(given: Given) -> np.ndarray:
+            row = as_row(name, read(Step(*given)), shape, dtype)
+            if row.dtype.kind == "f" and not np.isfinite(row).all():
+                raise ValueError(f"the column {name!r} must be finite, not {row[~np.isfinite(row)][0]}")
+            return row
+
+        return write
+
+
+# Those of every buffer, whose place in a step is known: each transition passes through them.
+class _Observations(Column):
+    def layout(self, buffer: Any) -> dict[str, tuple[tuple[int, ...], Any]]:
+        space = buffer.observation_space
+        if isinstance(space, spaces.Dict):
+            return {key: (buffer.obs_shape[key], part.dtype) for key, part in space.spaces.items()}
+        return {ONLY: (buffer.obs_shape, space.dtype)}
+
+    def writer(self, buffer: Any) -> Callable[[Given], dict[str, np.ndarray]]:
+        """The values by the key of the observation, (n_envs, O) each."""
+        space, place = buffer.observation_space, Step._fields.index(self.label.replace(" ", "_"))
+        shapes = {key: (buffer.n_envs, *shape) for key, (shape, _) in self.layout(buffer).items()}
+        if not isinstance(space, spaces.Dict):
+            label, only = self.label, shapes[ONLY]
+            return lambda given: {ONLY: as_observation(label, given[place], only, space)}
+        parts = [(key, f"{self.label} {key!r}", shapes[key], part) for key, part in space.spaces.items()]
+        return lambda given: {
+            key: as_observation(name, given[place][key], shape, part) for key, name, shape, part in parts
+        }
+
+
+class _Actions(Column):
+    def layout(self, buffer: Any) -> dict[str, tuple[tuple[int, ...], Any]]:
+        return {ONLY: ((buffer.action_dim,), action_dtype(buffer.action_space))}
+
+    def writer(self, buffer: Any) -> Callable[[Given], np.ndarray]:
+        shape, space = (buffer.n_envs, buffer.action_dim), buffer.action_space
+        return lambda given: as_actions(given[2], shape, space)
+
+
+class _Number(Column):
+    def writer(self, buffer: Any) -> Callable[[Given], np.ndarray]:
+        # Whether it is finite is looked at where it comes from the environment.
+        label, place, shape = self.label, Step._fields.index(self.label), (buffer.n_envs,)
+        return lambda given: as_row(label, given[place], shape)
+
+
+class _Timeouts(Column):
+    def writer(self, buffer: Any) -> Callable[[Given], Any]:
+        n_envs = buffer.n_envs
+        return (lambda given: as_timeouts(given[5], n_envs)) if buffer.handle_timeout_termination else lambda given: 0
+
+
+OBSERVATIONS = _Observations("observations", lambda step: step.observation)
+NEXT_OBSERVATIONS = _Observations("next_observations", lambda step: step.next_observation)
+ACTIONS = _Actions("actions", lambda step: step.action)
+REWARDS = _Number("rewards", lambda step: step.reward)
+#: Ends of episodes, and which of them are time limits. A batch's ``dones`` are those that are none.
+DONES = _Number("dones", lambda step: step.done, is_flag=True)
+TIMEOUTS = _Timeouts("timeouts", lambda step: step.infos, is_flag=True)
+#: Transitions of the validation side.
+HELD_OUT = Column("held_out", None, dtype=bool, is_flag=True, in_batch=False)
+
+#: Of every replay buffer, in the order in which a step is looked at: Stable-Baselines3's attributes.
+OF_EVERY_BUFFER = (OBSERVATIONS, NEXT_OBSERVATIONS, ACTIONS, REWARDS, DONES, TIMEOUTS)
+#: Of these, all but the observations.
+_PLAIN = OF_EVERY_BUFFER[2:]
+
+
+class HasColumns:
+    """What a replay buffer gains that stores columns of its own."""
+
+    # Beside the attributes, since it can neither be copied nor saved, and follows from them.
+    __slots__ = ("_writers",)
+    _writers: tuple[tuple[str, Callable[[Given], Any]], ...]
+
+    #: Columns besides those of every replay buffer and of the base classes.
+    more_columns: ClassVar[tuple[Column, ...]] = ()
+    #: Columns but the observations, base classes' included.
+    plain_columns: ClassVar[tuple[Column, ...]] = _PLAIN
+    #: Whether batches have some of those that not every buffer has.
+    more_in_batch: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        more = [column for base in reversed(cls.__mro__) for column in vars(base).get("more_columns", ())]
+        taken = {column.name for column in OF_EVERY_BUFFER}
+        for column in more:
+            if not isinstance(column, Column):
+                raise TypeError(f"more_columns of {cls.__name__} must be of Column, not {column!r}")
+            if not column.name.isidentifier() or column.name in taken or hasattr(cls, column.name):
+                raise ValueError(f"more_columns of {cls.__name__} has the name {column.name!r}, which is taken or none")
+            taken.add(column.name)
+        cls.plain_columns = (*_PLAIN, *more)
+        cls.more_in_batch = any(column.in_batch for column in more)
+
+    def writers(self) -> tuple[tuple[str, Callable[[Given], Any]], ...]:
+        """
+        What turns a step into rows.
+
+        :return: by the name of a column, those of the observations first: from the arguments of ``add`` to its row
+        """
+        try:
+            return self._writers
+        except AttributeError:
+            columns = (c for c in columns_of(self).values() if c.read is not None)
+            self._writers = tuple((column.name, column.writer(self)) for column in columns)
+            return self._writers
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self)
+
+
+def columns_of(buffer: Any) -> dict[str, Column]:
+    """
+    :param buffer: a replay buffer of any class, or the class
+    :return: its columns by name
+    """
+    return {column.name: column for column in (*OF_EVERY_BUFFER, *_more(buffer))}
+
+
+def has_own_columns(cls: Any) -> bool:
+    """
+    Check whether a buffer's class declares columns of its own.
+
+    :param cls: a replay buffer, its class, or None
+    :return: whether batches of it have further columns
+    """
+    return getattr(cls, "more_in_batch", False)
+
+
+def _more(buffer: Any) -> tuple[Column, ...]:
+    """Columns that not every buffer has."""
+    return getattr(buffer, "plain_columns", _PLAIN)[len(_PLAIN) :]  # type: ignore[no-any-return]
+
+
+class Samples(NamedTuple):
+    """Transitions as Stable-Baselines3's buffers give them, and the columns that a buffer has besides."""
+
+    observations: Any
+    actions: torch.Tensor
+    next_observations: Any
+    dones: torch.Tensor
+    rewards: torch.Tensor
+    discounts: torch.Tensor | None = None
+    columns: Mapping[str, torch.Tensor] = {}
+
+
+def samples_of(buffer: Any, take: Callable[..., Any]) -> Any:
+    """
+    Put transitions together, the only place where it is said which column becomes what.
+
+    :param buffer: replay buffer
+    :param take: called with a column and the buffer's array of it (or dict of arrays) gives tensors of the rows wanted,
+        (B, ...), (B, 1) if it is one number; 0 where its keyword argument ``but``, another array, is 1
+    :return: the transitions, in the form of the buffer's ``sample``
+    """
+    samples = (
+        take(OBSERVATIONS, buffer.observations),
+        take(ACTIONS, buffer.actions),
+        # Stable-Baselines3's variant has them in the observations' next rows.
+        take(NEXT_OBSERVATIONS, getattr(buffer, "next_observations", None)),
+        # A time limit does not end the bootstrap.
+        take(DONES, buffer.dones, but=buffer.timeouts),
+        take(REWARDS, buffer.rewards),
+    )
+    if has_own_columns(buffer):
+        columns = {c.name: take(c, getattr(buffer, c.name)) for c in _more(buffer) if c.in_batch}
+        return Samples(*samples, columns=columns)
+    return (DictReplayBufferSamples if isinstance(samples[0], dict) else ReplayBufferSamples)(*samples)
+
+
+def samples_at(
+    buffer: ReplayBuffer, positions: np.ndarray, env_indices: np.ndarray, vec_normalize: VecNormalize | None = None
+) -> Any:
+    """
+    Transitions of a replay buffer at given places, each one step, without the changes that the buffer's own ``sample``
+    makes (n-step returns, relabelled goals).
+
+    :param buffer: Stable-Baselines3's replay buffer or a subclass
+    :param positions: places in the buffer, (N,)
+    :param env_indices: which environment's transition, (N,)
+    :param vec_normalize: normalises observations and rewards
+    :return: N transitions, in the form of the buffer's ``sample``
+    """
+
+    def take(column: Column, array: Any, but: Any = None) -> Any:
+        at = positions
+        if column is NEXT_OBSERVATIONS and buffer.optimize_memory_usage:
+            array, at = buffer.observations, (positions + 1) % buffer.buffer_size
+        if isinstance(column, _Observations):
+            given = for_each(lambda part: part[at, env_indices], array)
+            return for_each(buffer.to_torch, buffer._normalize_obs(given, vec_normalize))
+        rows = array[at, env_indices]
+        if but is not None:
+            rows = rows * (1 - but[at, env_indices])
+        if rows.ndim == 1:
+            rows = rows.reshape(-1, 1)
+        return buffer.to_torch(buffer._normalize_reward(rows, vec_normalize) if column is REWARDS else rows)
+
+    return samples_of(buffer, take)

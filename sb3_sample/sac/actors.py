@@ -1,0 +1,322 @@
+"""Actors of the off-policy family, as Stable-Baselines3 policies."""
+
+import math
+from typing import Any, ClassVar
+
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+)
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, check_value
+from sb3_sample.learner.batch import Encoded
+from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
+from sb3_sample.networks import Network, linear
+from sb3_sample.networks.modes import evaluated
+from sb3_sample.sac.trunks import keep_at_rest, make_trunk
+
+# The log standard deviation is squashed into this interval by a tanh.
+LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
+
+
+class Actor(BasePolicy):
+    """
+    Tanh-Gaussian actor: ``a = tanh(mean + std * noise)``, the log standard deviation squashed by a tanh into
+    [-10, 2] (BRO, section B.1; bounds and squashing as in the published code).
+
+    :param observation_space: observation space
+    :param action_space: action space, a bounded Box; the actor works on [-1, 1]
+    :param network: class of the trunk
+    :param network_kwargs: its arguments
+    :param features_extractor: extractor of the observation's features
+    :param normalize_images: whether images are divided by 255
+    :param shares_encoder: whether the extractor is the critics', whose features are read without gradient
+    """
+
+    action_space: spaces.Box
+    #: Whether the policy is a distribution, with an entropy that can be rewarded.
+    has_entropy: ClassVar[bool] = True
+    #: View in evaluation mode, for the actions of TD targets, if the trunk ``stacks_rows``.
+    at_rest: Any = None
+    _encoder: Any
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        network: type[Network],
+        network_kwargs: dict[str, Any],
+        features_extractor: BaseFeaturesExtractor,
+        normalize_images: bool = True,
+        shares_encoder: bool = False,
+    ):
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+            squash_output=True,
+        )
+        self.shares_encoder = shares_encoder
+        if shares_encoder:
+            self.share(features_extractor)
+        self._network_args = {"network": network, "network_kwargs": network_kwargs}
+        self.features_dim = features_extractor.features_dim
+        self.action_dim = get_action_dim(action_space)
+        self.trunk = make_trunk("actor_network", network, self.features_dim, network_kwargs)
+        self.mean = linear(self.trunk.out_features, self.action_dim, None)
+        self.log_std = linear(self.trunk.out_features, self.action_dim, None, gain=1.0)
+        #: Stable-Baselines3's distribution of the actions, for its own use: nothing here reads it.
+        self.action_dist = SquashedDiagGaussianDistribution(self.action_dim)
+        keep_at_rest(self)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = {"features_extractor": self.features_extractor, "shares_encoder": self.shares_encoder}
+        return {**super()._get_constructor_parameters(), **self._network_args, **own}
+
+    def share(self, encoder: nn.Module) -> None:
+        """
+        Read the features of another module's extractor, without a gradient to it and in evaluation mode: its running
+        statistics are moved by its owner's forward passes alone.
+
+        :param encoder: features extractor, which is in the parameters, the state and the modes of its owner only
+        """
+        self._modules.pop("features_extractor", None)
+        # Past nn.Module's own setattr, which would register them.
+        vars(self).update(features_extractor=encoder, _encoder=evaluated(encoder))
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The last actions that somebody asked the distribution for go with no copy: they may have a gradient.
+        fresh = SquashedDiagGaussianDistribution(self.action_dim)
+        return {name: fresh if name == "action_dist" else value for name, value in vars(self).items()}
+
+    def features(self, obs: PyTorchObs | Encoded) -> torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them, or their features
+        :return: their features, (B, F); without gradient if the encoder is shared
+        """
+        if isinstance(obs, Encoded):
+            return obs.features
+        if self.shares_encoder:
+            with torch.no_grad():
+                return self.extract_features(obs, self._encoder)
+        assert isinstance(self.features_extractor, BaseFeaturesExtractor)
+        return self.extract_features(obs, self.features_extractor)
+
+    def statistics(self) -> list[torch.Tensor]:
+        """
+        :return: running statistics that a target actor takes over: those of trunk and own features extractor
+        """
+        assert self.features_extractor is not None
+        extractor = () if self.shares_encoder else self.features_extractor.buffers()
+        return [*extractor, *self.trunk.statistics()]
+
+    def gaussian(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        :param features: (B, F)
+        :return: mean and log standard deviation of the pre-tanh Gaussian, (B, A) each
+        """
+        h = self.trunk(features)
+        half_range = (LOG_STD_MAX - LOG_STD_MIN) / 2
+        return self.mean(h), LOG_STD_MIN + half_range * (1 + torch.tanh(self.log_std(h)))
+
+    def sample(self, obs: PyTorchObs | Encoded, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        Sample an action, reparameterised.
+
+        :param obs: observations, (B, O), or a dict of them, or their features
+        :param noise: standard normal noise, (B, A); drawn if None
+        :return: action in [-1, 1], (B, A), and its log-probability, (B, 1)
+        """
+        mean, log_std = self.gaussian(self.features(obs))
+        noise = torch.randn_like(mean) if noise is None else noise
+        x = mean + log_std.exp() * noise
+        return torch.tanh(x), tanh_gaussian_log_prob(x, noise, log_std)
+
+    def get_action_dist_params(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        """
+        As in Stable-Baselines3.
+
+        :param obs: observations, (B, O), or a dict of them
+        :return: mean and log standard deviation of the pre-tanh Gaussian, (B, A) each, and no other arguments
+        """
+        mean, log_std = self.gaussian(self.features(obs))
+        return mean, log_std, {}
+
+    def action_log_prob(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        :meth:`sample` as Stable-Baselines3 has it; sets ``action_dist``.
+
+        :param obs: observations, (B, O), or a dict of them
+        :return: sampled actions in [-1, 1], (B, A), and their log-probability, (B,)
+        """
+        mean, log_std, _ = self.get_action_dist_params(obs)
+        noise = torch.randn_like(mean)
+        x = mean + log_std.exp() * noise
+        self.action_dist.proba_distribution(mean, log_std).gaussian_actions = x
+        return torch.tanh(x), tanh_gaussian_log_prob(x, noise, log_std).squeeze(1)
+
+    def act(self, mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """
+        The action that a Gaussian stands for while exploring.
+
+        :param mean: pre-tanh mean, (B, A)
+        :param std: (B, A)
+        :param noise: standard normal noise, (B, A)
+        :return: action in [-1, 1], (B, A)
+        """
+        return torch.tanh(mean + std * noise)
+
+    def learned_action(self, mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """
+        The action through which an actor's gradient goes.
+
+        :param mean: pre-tanh mean, (B, A)
+        :param std: (B, A)
+        :param noise: standard normal noise, (B, A)
+        :return: action in [-1, 1], (B, A)
+        """
+        return self.act(mean, std, noise)
+
+    def kl(
+        self, mean: torch.Tensor, std: torch.Tensor, reference_mean: torch.Tensor, reference_std: torch.Tensor
+    ) -> torch.Tensor:
+        """
+        KL divergence of two such policies, between their pre-tanh Gaussians (the same as between the actions).
+
+        :param mean: pre-tanh mean, (B, A)
+        :param std: (B, A)
+        :param reference_mean: pre-tanh mean of the other one, (B, A)
+        :param reference_std: (B, A)
+        :return: summed over the dimensions, (B, 1)
+        """
+        return gaussian_kl(mean, std, reference_mean, reference_std)
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them
+        :param deterministic: the mean action instead of a sample
+        :return: actions in [-1, 1], (B, A)
+        """
+        mean, log_std = self.gaussian(self.features(obs))
+        return torch.tanh(mean) if deterministic else self.act(mean, log_std.exp(), torch.randn_like(mean))
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
+        return self(observation, deterministic)
+
+
+class DeterministicActor(Actor):
+    """
+    Deterministic actor ``a = tanh(mean)`` of TD3 (Fujimoto et al. 2018): exploration adds Gaussian noise to the
+    action, the TD target's action is smoothed by clipped noise, and there is no entropy.
+
+    :param exploration_noise: standard deviation of the noise while exploring, in actions of [-1, 1]
+    :param target_noise: standard deviation of the noise on the target's action
+    :param target_noise_clip: bound of that noise
+    :raises ValueError: if one of them is out of range
+    """
+
+    has_entropy: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        *args: Any,
+        exploration_noise: float = 0.1,
+        target_noise: float = 0.2,
+        target_noise_clip: float = 0.5,
+        **kwargs: Any,
+    ):
+        super().__init__(*args, **kwargs)
+        check_value("exploration_noise", exploration_noise, ABOVE_0)
+        check_value("target_noise", target_noise, AT_LEAST_0)
+        check_value("target_noise_clip", target_noise_clip, AT_LEAST_0)
+        self.log_exploration_noise = math.log(exploration_noise)
+        self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
+        self._noise_args = {
+            "exploration_noise": exploration_noise,
+            "target_noise": target_noise,
+            "target_noise_clip": target_noise_clip,
+        }
+        del self.log_std, self.action_dist
+        keep_at_rest(self)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), **self._noise_args}
+
+    def get_action_dist_params(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        """
+        :raises AttributeError: always; as with Stable-Baselines3's TD3, there is no distribution
+        """
+        raise AttributeError("a deterministic actor (backbone='td3') has no distribution of its actions")
+
+    def action_log_prob(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        :raises AttributeError: always; as with Stable-Baselines3's TD3, there is no distribution
+        """
+        raise AttributeError("a deterministic actor (backbone='td3') has no distribution of its actions")
+
+    def gaussian(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        mean = self.mean(self.trunk(features))
+        return mean, torch.full_like(mean, self.log_exploration_noise)
+
+    def sample(self, obs: PyTorchObs | Encoded, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        The action that the actor learns through: no noise, and 0 for the log-probability that it has not.
+
+        :param obs: observations, (B, O), or a dict of them
+        :param noise: ignored, there is none
+        :return: action in [-1, 1], (B, A), and zeros, (B, 1)
+        """
+        action = torch.tanh(self.mean(self.trunk(self.features(obs))))
+        return action, action.new_zeros(action.shape[0], 1)
+
+    def smoothed(self, obs: PyTorchObs, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        The action of a TD target (TD3's target policy smoothing).
+
+        :param obs: observations, (B, O), or a dict of them
+        :param noise: standard normal noise, (B, A); drawn if None
+        :return: action in [-1, 1], (B, A), and zeros, (B, 1)
+        """
+        action, log_prob = self.sample(obs)
+        noise = torch.randn_like(action) if noise is None else noise
+        smoothing = (self.target_noise * noise).clamp(-self.target_noise_clip, self.target_noise_clip)
+        return (action + smoothing).clamp(-1, 1), log_prob
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them
+        :param deterministic: without meaning, the actor always is, as in stable_baselines3's TD3
+        :return: actions in [-1, 1], (B, A)
+        """
+        return self.sample(obs)[0]
+
+    def act(self, mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        return (torch.tanh(mean) + std * noise).clamp(-1, 1)
+
+    def learned_action(self, mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        return torch.tanh(mean)
+
+    def kl(
+        self, mean: torch.Tensor, std: torch.Tensor, reference_mean: torch.Tensor, reference_std: torch.Tensor
+    ) -> torch.Tensor:
+        """
+        KL divergence of two such policies, between Gaussians of the exploration noise around the actions.
+
+        :param mean: pre-tanh mean, (B, A)
+        :param std: of the exploration noise, (B, A)
+        :param reference_mean: pre-tanh mean of the other one, (B, A)
+        :param reference_std: (B, A)
+        :return: summed over the dimensions, (B, 1)
+        """
+        return gaussian_kl(torch.tanh(mean), std, torch.tanh(reference_mean), reference_std)
+
+
+#: The actor's class by the name that the policy's ``backbone`` takes.
+BACKBONES: dict[str, type[Actor]] = {"sac": Actor, "td3": DeterministicActor}

@@ -1,0 +1,128 @@
+"""Ensemble of critics, and of target critics, of the off-policy family."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+)
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_sample.learner.batch import Encoded
+from sb3_sample.learner.q_values import QValues
+from sb3_sample.networks import Network, linear
+from sb3_sample.sac.trunks import keep_at_rest, make_trunk
+
+
+class CriticEnsemble(BaseModel):
+    """
+    E critics with K outputs each, evaluated at once.
+
+    :param observation_space: observation space
+    :param action_space: action space
+    :param network: class of the trunk
+    :param network_kwargs: its arguments
+    :param features_extractor: extractor of the observation's features, shared by the critics
+    :param n_critics: E
+    :param n_outputs: K, the number of quantiles, or 1
+    :param normalize_images: whether images are divided by 255
+    """
+
+    action_space: spaces.Box
+    #: View in evaluation mode, for all but the critics' own step, if the trunk ``stacks_rows``.
+    at_rest: Any = None
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        network: type[Network],
+        network_kwargs: dict[str, Any],
+        features_extractor: BaseFeaturesExtractor,
+        n_critics: int = 2,
+        n_outputs: int = 1,
+        normalize_images: bool = True,
+    ):
+        super().__init__(
+            observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
+        )
+        self._network_args = {"network": network, "network_kwargs": network_kwargs, "n_outputs": n_outputs}
+        self.n_critics = n_critics
+        in_features = features_extractor.features_dim + get_action_dim(action_space)
+        self.trunk = make_trunk("critic_network", network, in_features, network_kwargs, n_copies=n_critics)
+        self.head = linear(self.trunk.out_features, n_outputs, n_critics)
+        keep_at_rest(self)
+
+    def inputs(self, obs: PyTorchObs | Encoded, actions: torch.Tensor) -> torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them, or their features
+        :param actions: actions in [-1, 1], (B, A)
+        :return: what the trunk takes, (B, F + A)
+        """
+        if isinstance(obs, Encoded):
+            return torch.cat((obs.features, actions), dim=1)
+        assert isinstance(self.features_extractor, BaseFeaturesExtractor)
+        return torch.cat((self.extract_features(obs, self.features_extractor), actions), dim=1)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = {**self._network_args, "features_extractor": self.features_extractor, "n_critics": self.n_critics}
+        return {**super()._get_constructor_parameters(), **own}
+
+    def q_values(self, obs: PyTorchObs, actions: torch.Tensor) -> torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them
+        :param actions: actions in [-1, 1], (B, A)
+        :return: (E, B, K)
+        """
+        return self.head(self.trunk(self.inputs(obs, actions)))
+
+    def forward(self, obs: PyTorchObs, actions: torch.Tensor) -> QValues | torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them
+        :param actions: actions in [-1, 1], (B, A)
+        :return: Stable-Baselines3's tuple of E tensors, (B, K) each, that is a tensor (E, B, K) too; where it is being
+            compiled, the tensor alone
+        """
+        q = self.q_values(obs, actions)
+        return q if torch.compiler.is_compiling() else QValues(q)
+
+    def q1_forward(self, obs: PyTorchObs, actions: torch.Tensor) -> torch.Tensor:
+        """
+        As in Stable-Baselines3, but that all critics are evaluated.
+
+        :param obs: observations, (B, O), or a dict of them
+        :param actions: actions in [-1, 1], (B, A)
+        :return: the first critic's value, the mean of its quantiles if it has some, (B, 1)
+        """
+        return self.q_values(obs, actions)[0].mean(dim=1, keepdim=True)
+
+    @property
+    def q_networks(self) -> list[Callable[[torch.Tensor], torch.Tensor]]:
+        """
+        Each critic as a function of features and actions, (B, F + A) to (B, K). They are no modules as in
+        Stable-Baselines3: the parameters of all lie together, (E, ...).
+        """
+
+        def network(index: int, inputs: torch.Tensor) -> torch.Tensor:
+            return self.head(self.trunk(inputs))[index]
+
+        return [functools.partial(network, index) for index in range(self.n_critics)]
+
+    def statistics(self) -> list[torch.Tensor]:
+        """
+        :return: running statistics that the target critics take over: those of features extractor and trunk
+        """
+        assert self.features_extractor is not None
+        return [*self.features_extractor.buffers(), *self.trunk.statistics()]
+
+    def copied_parameters(self) -> list[nn.Parameter]:
+        """
+        :return: the parameters that each critic has a copy of, (E, ...) each: all but the features extractor's
+        """
+        return [*self.trunk.parameters(), *self.head.parameters()]

@@ -1,0 +1,52 @@
+"""Trunks of actors and critics: their arguments, how they are made, and their modes."""
+
+from typing import Any
+
+from torch import nn
+
+from sb3_sample import own_classes
+from sb3_sample.kinds import DICT, check_value, chosen, integer
+from sb3_sample.networks import NETWORKS, Network
+from sb3_sample.networks.modes import evaluated
+
+
+def network_args(
+    who: str,
+    network: str | type[Network],
+    kwargs: dict[str, Any] | None,
+    net_arch: list[int] | None,
+    activation_fn: type[nn.Module] | None,
+) -> tuple[type[Network], dict[str, Any]]:
+    """Class and arguments of a trunk, from its name and from Stable-Baselines3's shorthand."""
+    check_value(f"{who}_network_kwargs", kwargs, DICT)
+    cls = chosen(f"{who}_network", network, NETWORKS, Network)
+    kwargs = dict(kwargs or {})
+    for name, key, value in (("net_arch", "hidden_sizes", net_arch), ("activation_fn", "activation_fn", activation_fn)):
+        if value is None:
+            continue
+        if network != "mlp":
+            raise ValueError(
+                f"{name} describes an MLP, but {who}_network is {network!r}: use {who}_network_kwargs, "
+                f"or {who}_network='mlp'"
+            )
+        if key in kwargs:
+            raise ValueError(f"{name} and {who}_network_kwargs[{key!r}] say the same thing: give one of them")
+        kwargs[key] = value
+    own_classes.check_arguments(f"{who}_network", network, cls, 1, kwargs=kwargs, n_copies=None)
+    return cls, kwargs
+
+
+def make_trunk(argument: str, cls: type[Network], in_features: int, kwargs: dict[str, Any], **copies: int) -> Network:
+    trunk: Network = own_classes.make(argument, cls, cls, Network, in_features, kwargs=kwargs, **copies)
+    check_value(f"{cls.__name__}.out_features", getattr(trunk, "out_features", None), integer(1))
+    return trunk
+
+
+def keep_at_rest(owner: Any) -> None:
+    """Give an actor or critics, once complete, their view in evaluation mode if they stack rows."""
+    choice = owner.trunk.stacks_rows
+    if choice not in (None, "online", "target"):
+        raise ValueError(f"stacks_rows of a network must be None, 'online' or 'target', not {choice!r}")
+    if choice is not None:
+        # Past nn.Module's own setattr, which would register it.
+        vars(owner)["at_rest"] = evaluated(owner)
