@@ -105,7 +105,7 @@ def _declared(cls: type) -> dict[str, Argument]:
     for base in reversed(cls.__mro__[1:]):
         arguments |= vars(base).get("constructor_arguments", {})
     names = {known.attribute: name for name, known in arguments.items()}
-    annotations, meanings = inspect.get_annotations(cls), _strings_below(cls)
+    annotations, meanings = _annotations(cls), _strings_below(cls)
     for attribute, value in list(vars(cls).items()):
         # A method or a property of that name is none of the constructor's, unless it is annotated.
         is_default = attribute in names and (attribute in annotations or not hasattr(type(value), "__get__"))
@@ -132,6 +132,15 @@ def _declared(cls: type) -> dict[str, Argument]:
         arguments[new.name] = new
         delattr(cls, attribute)
     return arguments
+
+
+def _annotations(cls: type) -> dict[str, Any]:
+    """Types of a class's attributes; where Python evaluates them late, a name that is not there yet is no error."""
+    if sys.version_info >= (3, 14):
+        import annotationlib
+
+        return annotationlib.get_annotations(cls, format=annotationlib.Format.FORWARDREF)
+    return inspect.get_annotations(cls)
 
 
 @functools.cache
