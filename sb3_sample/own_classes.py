@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from torch import nn
+from torch.optim import Optimizer
 
 #: Classes whose names were warned of.
 _told: weakref.WeakSet[type] = weakref.WeakSet()
@@ -28,7 +29,8 @@ def make(
     :param kwargs: its arguments, those of the argument ``<argument>_kwargs``
     :param fixed: what it is made of besides, by name
     :return: the object
-    :raises ValueError: if the class lacks a method, does not take these arguments, or has not made its base
+    :raises ValueError: if the class lacks a method, does not take these arguments, has not made its base, or does not
+        list an optimizer that it has
     """
     if isinstance(cls, type):
         check(argument, cls, base)
@@ -42,7 +44,21 @@ def make(
         raise ValueError(_without_base(argument, cls)) from error
     if isinstance(made, nn.Module) and "_modules" not in vars(made):
         raise ValueError(_without_base(argument, type(made)))
+    _check_optimizers(argument, made)
     return made
+
+
+def _check_optimizers(argument: str, made: Any) -> None:
+    """Optimizers that a part does not list are neither saved nor started anew at a reset."""
+    if not hasattr(made, "optimizers"):
+        return
+    listed = {id(optimizer) for optimizer in made.optimizers().values()}
+    for name, value in vars(made).items():
+        if isinstance(value, Optimizer) and id(value) not in listed:
+            raise ValueError(
+                f"{argument}: {type(made).__name__}.optimizers() must list self.{name}, so that it is saved: "
+                f"return {{{name!r}: self.{name}}}"
+            )
 
 
 def _without_base(argument: str, cls: Any) -> str:
@@ -69,7 +85,7 @@ def check(argument: str, cls: type, base: type) -> None:
     defined = {name for c in own for name in vars(c)}
     hooks = [name for name in dir(base) if not name.startswith("_") and not hasattr(nn.Module, name)]
     hooks = [name for name in (*hooks, "forward", "get_extra_state", "set_extra_state") if name not in defined]
-    used = {name for c in own for value in vars(c).values() for name in _names_in(value)}
+    used = {name for c in own for value in vars(c).values() for name in names_in(value)}
     for c in own:
         for name in vars(c):
             near = difflib.get_close_matches(name, hooks, 1, 0.8)
@@ -80,7 +96,7 @@ def check(argument: str, cls: type, base: type) -> None:
                 )
 
 
-def _names_in(value: Any) -> Iterator[str]:
+def names_in(value: Any) -> Iterator[str]:
     """Attributes and functions that a method makes use of."""
     functions = (value.fget, value.fset) if isinstance(value, property) else (inspect.unwrap(_function_of(value)),)
     codes = [function.__code__ for function in functions if isinstance(function, types.FunctionType)]

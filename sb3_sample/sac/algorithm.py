@@ -50,6 +50,7 @@ from sb3_sample.saving.encoding import Lenient
 from sb3_sample.saving.kept import Kept
 from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.replay import SafeReplayBuffers, encode_buffer
+from sb3_sample.saving.unsaved import plain_attributes
 from sb3_sample.training.resumable import Resumable
 
 Self = TypeVar("Self", bound="SAC")
@@ -85,6 +86,7 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         "_learner": Kept.NOWHERE,
         "_source": Kept.NOWHERE,
         "_watch": Kept.NOWHERE,
+        "_plain_attributes": Kept.NOWHERE,
         # For the log of a run that goes on.
         "_metrics": Kept.IN_CHECKPOINTS,
         # An argument that changes with every step.
@@ -130,6 +132,7 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         self._source = ReplaySource(self)
         self.learner = self._make_learner(networks=self.policy, counts=self)
         checks.check_rule(self)
+        self._plain_attributes = plain_attributes(self)
         self._watch = MetricWatch(self.device)
 
     def _check_arguments(self) -> None:

@@ -13,7 +13,7 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
 
-from sb3_sample.saving import container, notice
+from sb3_sample.saving import container, notice, unsaved
 from sb3_sample.saving.checks import (
     NEVER,
     ParametersDoNotFit,
@@ -64,6 +64,7 @@ class Description:
                 self.attributes[name] = self._attribute(value, name, name in schedules, name in always)
                 self._tensors[name] = list(itertools.islice(self.encoder.tensors, n_before, None))
         self._keep_small()
+        self.encoder.left_out.update(unsaved.changed(model, vars(model).get("_plain_attributes", {})))
 
     def _attribute(self, value: Any, name: str, is_schedule: bool, is_derived: bool) -> Any:
         if name in NEVER:

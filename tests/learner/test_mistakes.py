@@ -297,6 +297,13 @@ class Needs(Pessimism):
         super().__init__(rate)
 
 
+class Unlisted(Pessimism):
+    def __init__(self, learner: Any):
+        super().__init__(1.0)
+        self.weight = nn.Parameter(torch.tensor(1.0))
+        self.optimizer = learner.make_optimizer([self.weight])
+
+
 class AnyKwargs(Pessimism):
     def __init__(self, learner: Any, **kwargs: Any):
         super().__init__(**kwargs)
@@ -340,6 +347,7 @@ class Head(ValueHead):
         ({"pessimism": NoLearner}, "pessimism: NoLearner is made as NoLearner(learner) with the arguments {}, and its"),
         ({"pessimism": Needs}, "missing a required argument: 'rate'"),
         ({"pessimism": AnyKwargs}, "beta"),
+        ({"pessimism": Unlisted}, "pessimism: Unlisted.optimizers() must list self.optimizer, so that it is saved"),
         (
             {"batch_transforms": [Jitter, (Jitter, {"jiter": 1})]},
             "batch_transforms[1] has 'jiter', but batch_transforms[1]=",
@@ -527,3 +535,97 @@ def test_further_transitions_have_the_learners_discount(loss: str) -> None:
     second = learners[1].update(step, extra=Extra(further._replace(discounts=0.9)))
     assert first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
     assert "pessimism/loss" in first
+
+
+# ---------------------------------------------------------------- what is not saved
+
+
+class Counter:
+    def __init__(self) -> None:
+        self.n = 0
+
+
+class Counts(Pessimism):
+    """Counts in a plain attribute, in an object, in an array; constants, and a reference to the learner."""
+
+    def __init__(self, learner: Any):
+        super().__init__(1.0)
+        self.learner_of_mine, self.constant, self.names = (learner,), 0.5, ["a"]
+        self.k, self.counter, self.seen = 0, Counter(), np.zeros(2)
+        self.optimizer = learner.make_optimizer([nn.Parameter(torch.tensor(1.0))])
+
+    def optimizers(self) -> dict[str, Any]:
+        return {"optimizer": self.optimizer}
+
+    def after_update(self, learner: Any, batch: Batch) -> dict[str, torch.Tensor]:
+        self.count()
+        return {}
+
+    def count(self) -> None:
+        self.k += 1
+        self.counter.n += 1
+        self.seen[0] += 1
+
+
+class Saves(Counts):
+    def get_extra_state(self) -> Any:
+        return {"k": self.k}
+
+    def set_extra_state(self, state: Any) -> None:
+        self.k = state["k"]
+
+
+class Buffered(Counts):
+    """The remedy: a buffer."""
+
+    def __init__(self, learner: Any):
+        super().__init__(learner)
+        self.register_buffer("n", torch.tensor(0))
+
+    def count(self) -> None:
+        self.n += 1
+
+
+def messages(caught: list[warnings.WarningMessage]) -> list[str]:
+    return [str(each.message) for each in caught if "changes and is no buffer" in str(each.message)]
+
+
+@pytest.mark.parametrize("checkpoint", [False, True])
+def test_what_changes_and_is_in_no_file_is_warned_of(checkpoint: bool, tmp_path: Path) -> None:
+    model = sac(pessimism=Counts, policy_kwargs={"critic_network": Counting, "actor_network": Counting})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.learn(
+            30, checkpoint=tmp_path / "run" if checkpoint else None, **{"checkpoint_freq": 15} if checkpoint else {}
+        )
+        assert bool(messages(caught)) is checkpoint
+        model.save(tmp_path / "m")
+        model.save(tmp_path / "m")
+    said = messages(caught)
+    assert len(said) == 1
+    for name in ("Counts.k", "Counts.counter", "Counts.seen", "Counting.n_calls"):
+        assert said[0].count(f"{name} changes and is no buffer: use register_buffer") == 1
+    for name in ("constant", "names", "learner_of_mine", "optimizer", "latest"):
+        assert f".{name} changes" not in said[0]
+
+
+@pytest.mark.parametrize("cls", [Saves, Buffered])
+def test_what_is_saved_is_not(cls: type, tmp_path: Path) -> None:
+    model = sac(pessimism=cls)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.learn(30).save(tmp_path / "m")
+    assert messages(caught) == []
+    loaded = SAC.load(tmp_path / "m", pessimism=cls)
+    assert (loaded.pessimism_rule.k, getattr(loaded.pessimism_rule, "n", None)) == (
+        model.pessimism_rule.k,
+        getattr(model.pessimism_rule, "n", None),
+    )
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_nor_is_anything_of_this_package(maker: str, tmp_path: Path) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        MAKERS[maker]().learn(30).save(tmp_path / "m")
+    assert messages(caught) == []
