@@ -4,7 +4,7 @@ import functools
 import hashlib
 import inspect
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import torch
@@ -29,14 +29,20 @@ def plain_attributes(model: Any) -> dict[str, str]:
     """
     found = {}
     for path, module in _foreign_modules(model):
-        listed = {id(optimizer) for optimizer in getattr(module, "optimizers", dict)().values()}
+        cls: Any = type(module)
+        of_libraries = _of_libraries(cls)
+        listed = {id(optimizer) for optimizer in _listed(module)}
         for name, value in vars(module).items():
-            if name in _OF_EVERY_MODULE or name in _of_libraries(type(module)) or id(value) in listed:
+            if name in _OF_EVERY_MODULE or name in of_libraries or id(value) in listed:
                 continue
             digest = _digest(value)
             if digest is not None:
                 found[f"{path}.{name}"] = digest
     return found
+
+
+def _listed(module: Any) -> Iterable[Optimizer]:
+    return module.optimizers().values() if hasattr(module, "optimizers") else ()
 
 
 def changed(model: Any, before: dict[str, str]) -> dict[str, str]:
