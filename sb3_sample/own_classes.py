@@ -73,17 +73,20 @@ def check(argument: str, cls: type, base: type) -> None:
     :param argument: name of the argument that has chosen it
     :param cls: the class
     :param base: base class of the choices
-    :raises ValueError: if it lacks a method that its base leaves to it
+    :raises ValueError: if it lacks a method that its base leaves to it, or one takes other arguments than the base's
     """
     for name in dir(cls):
         if getattr(inspect.getattr_static(cls, name), "__isabstractmethod__", False):
             raise ValueError(f"{argument}: {cls.__name__} must define {name}(), which {base.__name__} leaves to it")
-    if cls in _told:
-        return
-    _told.add(cls)
     own = [c for c in cls.__mro__ if issubclass(c, base) and c.__module__.split(".")[0] != __name__.split(".")[0]]
     defined = {name for c in own for name in vars(c)}
     hooks = [name for name in dir(base) if not name.startswith("_") and not hasattr(nn.Module, name)]
+    for name in (*hooks, "forward"):
+        if name in defined:
+            _check_signature(argument, cls, base, name)
+    if cls in _told:
+        return
+    _told.add(cls)
     hooks = [name for name in (*hooks, "forward", "get_extra_state", "set_extra_state") if name not in defined]
     used = {name for c in own for value in vars(c).values() for name in names_in(value)}
     for c in own:
@@ -94,6 +97,23 @@ def check(argument: str, cls: type, base: type) -> None:
                     f"{c.__name__}.{name} is called by nobody; did you mean {near[0]}? ({argument}={c.__name__})",
                     stacklevel=3,
                 )
+
+
+def _check_signature(argument: str, cls: type, base: type, name: str) -> None:
+    """Check that a method takes what the base's is called with, all of it by position."""
+    own, wanted = inspect.getattr_static(cls, name), inspect.getattr_static(base, name, None)
+    if not (isinstance(own, types.FunctionType) and isinstance(wanted, types.FunctionType)):
+        return
+    signature, expected = inspect.signature(own), inspect.signature(wanted)
+    try:
+        signature.bind(*expected.parameters)
+    except TypeError as error:
+        words = ", ".join(
+            str(each.replace(annotation=inspect.Parameter.empty)) for each in expected.parameters.values()
+        )
+        raise ValueError(
+            f"{argument}: {cls.__name__}.{name} must take ({words}), as {base.__name__}.{name} does: {error}"
+        ) from error
 
 
 def names_in(value: Any) -> Iterator[str]:

@@ -403,7 +403,8 @@ class Content:
 
 
 def _below(cls: type) -> Iterator[type]:
-    for each in cls.__subclasses__():
+    classes: list[type] = cls.__subclasses__()
+    for each in classes:
         yield each
         yield from _below(each)
 

@@ -173,6 +173,52 @@ def test_wrong_shapes_are_errors_at_the_first_step(kwargs: dict[str, Any], words
         sac(**kwargs).learn(30)
 
 
+class NaiveNorm(Network):
+    """Batch norm as for a single network."""
+
+    def __init__(self, in_features: int, n_copies: int | None = None):
+        super().__init__()
+        self.out_features = 8
+        self.dense, self.norm = linear(in_features, 8, n_copies), nn.BatchNorm1d(8)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.norm(self.dense(x))
+
+
+def raising(*_: Any) -> Any:
+    raise KeyError("x")
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "note"),
+    [
+        (
+            critics(NaiveNorm),
+            RuntimeError,
+            r"in NaiveNorm\.forward, called with n_copies=2 and x \(B, in_features\) = \(\d, 5\), before the first",
+        ),
+        (
+            {"policy_kwargs": {"actor_network": network(raising)}},
+            KeyError,
+            r"in MyNet\.forward, called with x \(B, in_features\) = \(\d, 3\)",
+        ),
+        (
+            {"value_head": head(loss=lambda self, q, target: (q - target[:3]).mean())},
+            RuntimeError,
+            r"in MyHead\.loss, called with q \(E, B, n_outputs\), target \(B, n_outputs\) = \(2, \d, 1\), \(\d, 1\)",
+        ),
+        ({"value_head": head(values=raising)}, KeyError, r"in MyHead\.values, called with outputs \(E, B, n_outputs\)"),
+        ({"pessimism": rule(beta=raising)}, KeyError, r"in MyRule\.beta, before the first gradient step"),
+        ({"pessimism": rule(value=raising)}, KeyError, r"in MyRule\.value, called with q \(E, B, K\) = \(2, \d, 1\)"),
+    ],
+)
+def test_an_error_that_a_part_raises_has_a_note_of_where(kwargs: dict[str, Any], error: Any, note: str) -> None:
+    model = sac(**kwargs)
+    with pytest.raises(error) as raised:
+        model._update(random_batch(model))
+    assert [re.match(note, each) is not None for each in raised.value.__notes__] == [True]
+
+
 @COMPILES
 def test_an_error_inside_of_a_compiled_step_is_named() -> None:
     model = sac(pessimism=rule(update=lambda *_, **__: None), compile=True)
@@ -357,6 +403,26 @@ class Head(ValueHead):
         (
             {"value_head": Head, "value_head_kwargs": {"width": 0}},
             "Head.n_outputs must be an integer of at least 1, not 0",
+        ),
+        (
+            {"pessimism": rule(update=lambda self, learner, batch: {})},
+            "pessimism: MyRule.update must take (self, learner, batch, step, noise=None, extra=None), as Pessimism.upd",
+        ),
+        (
+            {"exploration": type("Fast", (Exploration,), {"act": lambda self, observations: observations})},
+            "exploration: Fast.act must take (self, learner, observations), as Exploration.act does: too many",
+        ),
+        (
+            {"value_head": head(target=lambda self, batch, next_q, value: batch.rewards)},
+            "value_head: MyHead.target must take (self, batch, next_q, value, entropy_bonus), as",
+        ),
+        (
+            {"batch_transforms": [type("Short", (BatchTransform,), {"transform": lambda self, batch: batch})]},
+            "batch_transforms[0]: Short.transform must take (self, batch, noise), as",
+        ),
+        (
+            critics(type("Two", (Network,), {"forward": lambda self, x, y: x})),
+            "critic_network: Two.forward must take (self, x), as Network.forward does: missing a required argument:",
         ),
         (
             critics(NoCopies),
