@@ -37,11 +37,15 @@ def make(
     check_arguments(argument, choice, cls, *given, kwargs=kwargs, **fixed)
     try:
         made = cls(*given, **fixed, **kwargs)
-    except AttributeError as error:
+    except Exception as error:
         # Of torch, where something is assigned.
-        if "__init__() call" not in str(error):
-            raise
-        raise ValueError(_without_base(argument, cls)) from error
+        if isinstance(error, AttributeError) and "__init__() call" in str(error):
+            raise ValueError(_without_base(argument, cls)) from error
+        name = next(iter(inspect.signature(cls).parameters), "")
+        # What it is made of, taken for one of its arguments.
+        if not fixed and name != _first(fixed) and any(type(each).__name__ in str(error) for each in given):
+            raise ValueError(f"{_without_first(argument, cls, fixed)}, not {name} ({error})") from error
+        raise
     if isinstance(made, nn.Module) and "_modules" not in vars(made):
         raise ValueError(_without_base(argument, type(made)))
     _check_optimizers(argument, made)
@@ -130,6 +134,31 @@ def _function_of(value: Any) -> Any:
     return value.__func__ if isinstance(value, (classmethod, staticmethod)) else value
 
 
+def _first(fixed: dict[str, Any]) -> str:
+    """What a part is made of, and a network."""
+    return "in_features" if fixed else "learner"
+
+
+def _without_first(argument: str, cls: Any, fixed: dict[str, Any]) -> str:
+    return f"{argument}: {cls.__name__}.__init__ must take {', '.join(['self', _first(fixed), *fixed])} first"
+
+
+def _check_first(
+    argument: str,
+    cls: Callable[..., Any],
+    signature: inspect.Signature,
+    *given: Any,
+    kwargs: dict[str, Any],
+    fixed: dict[str, Any],
+) -> None:
+    """Check that what a part is made of does not take the place of one of its arguments."""
+    first = next(iter(signature.parameters.values()), None)
+    if not given or (first is not None and first.name == _first(fixed)):
+        return
+    if first is None or first.name in kwargs or first.default is not first.empty:
+        raise ValueError(f"{_without_first(argument, cls, fixed)}, not {'nothing' if first is None else first.name}")
+
+
 def check_arguments(
     argument: str, choice: Any, cls: Callable[..., Any], *given: Any, kwargs: dict[str, Any], **fixed: Any
 ) -> None:
@@ -145,6 +174,7 @@ def check_arguments(
     :raises ValueError: if it takes other ones
     """
     signature = inspect.signature(cls)
+    _check_first(argument, cls, signature, *given, kwargs=kwargs, fixed=fixed)
     kinds = {name: parameter.kind for name, parameter in signature.parameters.items()}
     many = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     allowed = [name for name, kind in list(kinds.items())[len(given) :] if kind not in many and name not in fixed]
@@ -156,7 +186,7 @@ def check_arguments(
     try:
         signature.bind(*given, **fixed, **kwargs)
     except TypeError as error:
-        words = ", ".join(["learner" if not fixed else "in_features"] * len(given) + [f"{name}=..." for name in fixed])
+        words = ", ".join([_first(fixed)] * len(given) + [f"{name}=..." for name in fixed])
         name = getattr(cls, "__name__", repr(cls))
         raise ValueError(
             f"{argument}: {name} is made as {name}({words}) with the arguments {kwargs}, and its __init__ does not "

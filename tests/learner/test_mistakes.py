@@ -338,6 +338,26 @@ class NoLearner(Pessimism):
         super().__init__(1.0)
 
 
+class OnlyStart(Pessimism):
+    def __init__(self, start: float):
+        super().__init__(start)
+
+
+class OnlyDefault(Pessimism):
+    def __init__(self, start: float = 1.0):
+        super().__init__(1.0)
+        self.start = start
+
+
+class NoInit(Pessimism):
+    pass
+
+
+class OtherName(Pessimism):
+    def __init__(self, of: Any, weight: float = 0.5):
+        super().__init__(weight)
+
+
 class Needs(Pessimism):
     def __init__(self, learner: Any, rate: float):
         super().__init__(rate)
@@ -388,9 +408,28 @@ class Head(ValueHead):
         (critics(NoForward), "critic_network: NoForward must define forward(), which Network leaves to it"),
         ({"batch_transforms": [NoTransform]}, "batch_transforms[0]: NoTransform must define transform()"),
         ({"exploration": NoGaussian}, "exploration: NoGaussian must define _gaussian()"),
+        (
+            {"policy_kwargs": {"critic_net": "mlp"}},
+            "policy_kwargs has 'critic_net', which is no argument of SACPolicy. Did you mean 'critic_network'?",
+        ),
+        (
+            {"policy_kwargs": {"qqq": 1}},
+            "policy_kwargs has 'qqq', which is no argument of SACPolicy. It takes ['activation_fn', 'actor_kwargs',",
+        ),
         ({"pessimism": NoSuper}, "pessimism: NoSuper.__init__ must call super().__init__(...) before"),
         ({"batch_transforms": [NoSuperPlain]}, "batch_transforms[0]: NoSuperPlain.__init__ must call super().__init__"),
-        ({"pessimism": NoLearner}, "pessimism: NoLearner is made as NoLearner(learner) with the arguments {}, and its"),
+        ({"pessimism": NoLearner}, "pessimism: NoLearner.__init__ must take self, learner first, not nothing"),
+        (
+            {"pessimism": NoLearner, "pessimism_kwargs": {"start": 1}},
+            "pessimism: NoLearner.__init__ must take self, learner first, not nothing",
+        ),
+        ({"pessimism": OnlyStart}, "pessimism: OnlyStart.__init__ must take self, learner first, not start (pessimism"),
+        (
+            {"pessimism": OnlyStart, "pessimism_kwargs": {"start": 1}},
+            "pessimism: OnlyStart.__init__ must take self, learner first, not start",
+        ),
+        ({"pessimism": OnlyDefault}, "pessimism: OnlyDefault.__init__ must take self, learner first, not start"),
+        ({"pessimism": NoInit}, "pessimism: NoInit.__init__ must take self, learner first, not beta (pessimism must"),
         ({"pessimism": Needs}, "missing a required argument: 'rate'"),
         ({"pessimism": AnyKwargs}, "beta"),
         ({"pessimism": Unlisted}, "pessimism: Unlisted.optimizers() must list self.optimizer, so that it is saved"),
@@ -438,6 +477,10 @@ class Head(ValueHead):
 def test_what_is_missing_is_an_error_at_construction(kwargs: dict[str, Any], words: str) -> None:
     with pytest.raises((ValueError, TypeError), match=re.escape(words)):
         sac(**kwargs)
+
+
+def test_the_learner_may_have_another_name() -> None:
+    assert sac(pessimism=OtherName, pessimism_kwargs={"weight": 0.25}).pessimism_rule.beta() == 0.25
 
 
 def test_arguments_that_a_class_hands_on() -> None:
