@@ -21,11 +21,12 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFr
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_program, default_of
+from sb3_sample.console import say
 from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, not_finite
 from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.learner.execution import (
     PAYS_FROM,
-    has_foreign_parts,
+    foreign_parts,
     old_torch,
     warn_not_compiled,
     why_not_compiled,
@@ -311,7 +312,11 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
             n_updates = n_steps if self.gradient_steps < 0 else self.gradient_steps * n_calls
         # What keeps the step from being compiled is worth a warning only where it was asked for, but for an old torch,
         # which is easily renewed.
-        pays = n_updates >= PAYS_FROM and not has_foreign_parts(self.learner)
+        foreign = foreign_parts(self.learner) if n_updates >= PAYS_FROM else []
+        if foreign and self.verbose >= 1:
+            verb = "does" if len(foreign) == 1 else "do"
+            say(f"The gradient step is not compiled: {', '.join(foreign)} {verb} not declare compilable = True")
+        pays = n_updates >= PAYS_FROM and not foreign
         reason = why_not_compiled(self.learner) if pays else None
         self.compiled = pays and reason is None
         if reason is not None and reason == old_torch():

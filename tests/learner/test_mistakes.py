@@ -220,9 +220,20 @@ def test_an_error_that_a_part_raises_has_a_note_of_where(kwargs: dict[str, Any],
 
 
 @COMPILES
-def test_an_error_inside_of_a_compiled_step_is_named() -> None:
-    model = sac(pessimism=rule(update=lambda *_, **__: None), compile=True)
-    with pytest.raises(RuntimeError, match=r"it raises ValueError.*MyRule\.update must return a dict"):
+@pytest.mark.parametrize("compile", [True, "auto"])
+@pytest.mark.parametrize(
+    ("update", "error", "words"),
+    [
+        (lambda *_, **__: None, ValueError, r"^MyRule\.update must return a dict"),
+        (lambda self, *_, **__: self.nothing, AttributeError, "'MyRule' object has no attribute 'nothing'"),
+    ],
+)
+def test_an_error_inside_of_a_compiled_step_is_the_parts_own(
+    update: Any, error: Any, words: str, compile: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sb3_sample.sac.algorithm.PAYS_FROM", 5)
+    model = sac(pessimism=rule(update=update, compilable=True), compile=compile)
+    with pytest.raises(error, match=words):
         model.learn(30)
 
 
