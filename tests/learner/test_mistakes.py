@@ -12,7 +12,7 @@ import torch
 from gymnasium import spaces
 from torch import nn
 
-from sb3_sample import BRO, DAC, SAC
+from sb3_sample import BRO, DAC, SAC, Dataset
 from sb3_sample.learner import first_step
 from sb3_sample.parts import (
     Batch,
@@ -261,6 +261,15 @@ def test_a_batch_of_ones_own_is_checked(change: dict[str, Any], words: str) -> N
     assert model.learner.n_updates == 0
 
 
+def test_a_data_set_is_no_batch() -> None:
+    model = sac().learn(20)
+    data = Dataset.from_arrays(np.zeros((8, 3)), np.zeros((8, 2)), *np.zeros((3, 8)))
+    learner = SAC.learner(data.observation_space, data.action_space, policy_kwargs={"net_arch": [8]})
+    for each in (learner, model.learner):
+        with pytest.raises(ValueError, match=r"batch must be a Batch, not .*Dataset.*: data\.sample\(n\) of a Dataset"):
+            each.update(data)
+
+
 def test_a_batch_that_is_as_long_as_something_else_is_not_confused() -> None:
     """As many transitions as critics: a head that exchanges the two has the right shape."""
     model = sac(value_head=head(values=lambda self, q: q.transpose(0, 1)))
@@ -369,6 +378,14 @@ class OtherName(Pessimism):
         super().__init__(weight)
 
 
+class Stacked(NoForward):
+    stacks_rows = "target"
+    trains_in_target = False
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x
+
+
 class Needs(Pessimism):
     def __init__(self, learner: Any, rate: float):
         super().__init__(rate)
@@ -426,6 +443,14 @@ class Head(ValueHead):
         (
             {"policy_kwargs": {"qqq": 1}},
             "policy_kwargs has 'qqq', which is no argument of SACPolicy. It takes ['activation_fn', 'actor_kwargs',",
+        ),
+        (
+            {"pessimism_kwargs": {"a": 1}},
+            "pass pessimism as one of ['gpl', 'opl', 'top', 'vpl'], or as a class derived from Pessimism",
+        ),
+        (
+            critics(Stacked),
+            "Stacked: stacks_rows='target' has the targets use statistics of the stacked rows",
         ),
         ({"pessimism": NoSuper}, "pessimism: NoSuper.__init__ must call super().__init__(...) before"),
         ({"batch_transforms": [NoSuperPlain]}, "batch_transforms[0]: NoSuperPlain.__init__ must call super().__init__"),
