@@ -1,0 +1,17 @@
+"""Many runs as one table, their statistics, and the figures of the papers' studies."""
+
+from sb3_sample.envs.scores import Score
+from sb3_sample.study.aggregate import aggregate, performance_profiles, probability_of_improvement
+from sb3_sample.study.table import load, published_curves, published_runs, read, write
+
+__all__ = [
+    "Score",
+    "aggregate",
+    "load",
+    "performance_profiles",
+    "probability_of_improvement",
+    "published_curves",
+    "published_runs",
+    "read",
+    "write",
+]
