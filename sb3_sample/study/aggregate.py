@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import trim_mean
 
 from sb3_sample.envs.scores import SCORED, Score, score_of
 from sb3_sample.envs.suites import DAC_NAMED
@@ -250,9 +249,10 @@ def iqm(*blocks: np.ndarray) -> np.ndarray:
     :return: (steps,)
     """
     if len(blocks) == 1:
-        block = blocks[0]
-        found: np.ndarray = trim_mean(block.reshape(-1, *block.shape[2:]), 0.25, axis=0)
-        return found
+        scores = blocks[0].reshape(-1, blocks[0].shape[-1])
+        first, last = len(scores) // 4, len(scores) - len(scores) // 4
+        middle: np.ndarray = np.partition(scores, (first, last - 1), axis=0)[first:last]
+        return middle.mean(axis=0)  # type: ignore[no-any-return]
     pooled = np.concatenate([block.reshape(-1, block.shape[-1]) for block in blocks])
     weights = np.concatenate([np.full(block.shape[0] * block.shape[1], 1 / block.shape[0]) for block in blocks])
     order = np.argsort(pooled, axis=0)

@@ -40,6 +40,9 @@ STATISTICS = ("mean", "std", "min", "max", "iqm", "n_seeds")
 _EVALUATED = {"return": "results", "success_rate": "successes", "episode_length": "ep_lengths"}
 _MONITORED = {"return": "r", "success_rate": "is_success", "episode_length": "l"}
 _RECORD, _LOG = "run.json", "progress.jsonl"
+_SECONDS = "time/time_elapsed"
+#: A line of the log, as far as the time.
+_TIMED = re.compile(rb'\{"step": (\d{1,15}), [^\n]*?"time/time_elapsed": (\d{1,15}(?:\.\d+)?)[,}]')
 #: In the folder of a study: its list of runs, and the folder of them, ``runs/<agent and grid>/<task>/<seed>``.
 _LIST, _RUNS = "study.json", "runs"
 #: Bytes of a run's log, of a file of settings, and values in such a file.
@@ -239,7 +242,7 @@ def _measured(folder: Path, run: _Run, metrics: Sequence[str]) -> dict[str, tupl
     if "episode_length" in found:
         found["episode_length"] = (steps, found["episode_length"][1] * run.repeat)
     logged = _logged(folder / _LOG, run.repeat * run.skip, metrics)
-    seconds = logged.pop("time/time_elapsed", None)
+    seconds = logged.pop(_SECONDS, None)
     if seconds is None and _matches("hours", metrics):
         monitored = read_monitors(folder) if monitored is None and any(folder.glob("*monitor.csv")) else monitored
         if monitored is not None and len(monitored):
@@ -268,16 +271,23 @@ def _hours(logged: np.ndarray, seconds: np.ndarray, steps: np.ndarray) -> tuple[
 
 
 def _logged(path: Path, repeat: int, metrics: Sequence[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """What the lines of a log hold, by name; and "time/time_elapsed". A last line that is not whole is left out."""
+    """What the lines of a log hold, by name, and ``_SECONDS``. A last line that is not whole is left out."""
     values: dict[str, dict[int, float]] = {}
     try:
-        lines = read_regular(path, _MAX_LOG).splitlines(keepends=True)
+        data = read_regular(path, _MAX_LOG)
     except FileNotFoundError:
         return {}
-    kept = functools.cache(lambda name: name == "time/time_elapsed" or _matches(name, metrics))
-    for number, text in enumerate(lines, 1):
+    kept = functools.cache(lambda name: name == _SECONDS or _matches(name, metrics))
+    # Most lines have nothing of what is asked for but the time, and parsing takes most of the reading.
+    beginnings = {b'"' + re.split(r"[*?[]", pattern)[0].encode() for pattern in metrics}
+    beginnings = {beginning for beginning in beginnings if beginning in data}
+    for number, text in enumerate(data.splitlines(keepends=True), 1):
         if not text.endswith(b"\n"):
             break
+        timed = None if any(beginning in text for beginning in beginnings) else _TIMED.match(text)
+        if timed is not None:
+            values.setdefault(_SECONDS, {})[int(timed[1])] = float(timed[2])
+            continue
         line = parse_json(text, f"line {number} of {path}")
         step = line.get("step") if isinstance(line, dict) else None
         if type(step) is not int or not 0 <= step < 2**53:
