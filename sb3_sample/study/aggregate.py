@@ -7,6 +7,7 @@ performance profiles and the probability of improvement.
 import contextlib
 import itertools
 import json
+import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -243,7 +244,7 @@ def blocks_of(rows: pd.DataFrame) -> list[np.ndarray]:
 def iqm(*blocks: np.ndarray) -> np.ndarray:
     """
     Interquartile mean over all runs of all tasks together: a quarter of them, rounded down, cut at both ends. Where
-    tasks have different numbers of runs, a run weighs as much as makes all tasks weigh the same.
+    tasks have different numbers of runs, it is as if each run were there so often that all tasks have the same number.
 
     :param blocks: scores (runs, tasks, steps), each of other tasks
     :return: (steps,)
@@ -257,7 +258,8 @@ def iqm(*blocks: np.ndarray) -> np.ndarray:
     weights = np.concatenate([np.full(block.shape[0] * block.shape[1], 1 / block.shape[0]) for block in blocks])
     order = np.argsort(pooled, axis=0)
     pooled, weights = np.take_along_axis(pooled, order, axis=0), weights[order] / weights.sum()
-    cut = len(pooled) // 4 / len(pooled)
+    n = math.lcm(*(len(block) for block in blocks)) * sum(block.shape[1] for block in blocks)
+    cut = n // 4 / n
     ends = np.cumsum(weights, axis=0)
     kept = np.clip(np.minimum(ends, 1 - cut) - np.maximum(ends - weights, cut), 0, None)
     return (kept * pooled).sum(axis=0) / kept.sum(axis=0)  # type: ignore[no-any-return]

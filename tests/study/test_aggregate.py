@@ -151,8 +151,12 @@ def test_tasks_with_different_numbers_of_runs_weigh_the_same() -> None:
     assert row["mean"] == row["median"] == pytest.approx(0.5) and row["iqm"] == pytest.approx(0.5)
 
 
-def test_weights_that_are_equal_change_nothing() -> None:
+def test_weights_are_those_of_repeated_runs() -> None:
     rng = np.random.default_rng(0)
+    two, three = rng.random((2, 3, 2)), rng.random((3, 4, 2))
+    repeated = np.concatenate([np.repeat(two, 3, axis=0), np.repeat(three, 2, axis=0)], axis=1)
+    direct = [metrics.aggregate_iqm(repeated[:, :, i]) for i in range(2)]
+    np.testing.assert_allclose(iqm(two, three), direct)
     for n in (1, 2, 3, 5, 10):
         blocks = [rng.random((n, 3, 2)), rng.random((n, 4, 2))]
         np.testing.assert_allclose(iqm(*blocks), iqm(np.concatenate(blocks, axis=1)))
