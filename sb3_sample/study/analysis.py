@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 from sb3_sample.study.aggregate import (
     REPS,
@@ -174,7 +173,7 @@ def marginalize(
             f"order must be a whole number from 1 to {len(factors)}, the number of factors ({', '.join(factors)}), not "
             f"{order!r}"
         )
-    clash = set(factors) & {*by, "group", "mean", "standard_error", "iqm", "low", "high", "tasks", "runs"}
+    clash = set(factors) & {*by, *runs, "group", "mean", "standard_error", "iqm", "low", "high", "tasks", "runs"}
     if clash:
         raise ValueError(f"factors must have other names than the table's columns, not {', '.join(sorted(clash))}")
     for name in by:
@@ -291,7 +290,9 @@ def correlate(
 def _spearman(x: pd.Series, y: pd.Series) -> tuple[float, float]:
     if len(x) < 3 or x.nunique() < 2 or y.nunique() < 2:
         return math.nan, math.nan
-    found = stats.spearmanr(x, y)
+    from scipy.stats import spearmanr  # takes longer to import than the rest of this package's studies
+
+    found = spearmanr(x, y)
     return float(found.statistic), float(found.pvalue)
 
 
@@ -317,6 +318,8 @@ def regress(
         are fewer than three runs, or all have the same value
     :raises ValueError: no run has recorded a metric, or an argument is out of range
     """
+    from scipy.stats import linregress
+
     runs = final(table, metrics, last=last, scores=scores)
     rows: list[dict[str, Any]] = []
     for task, of_task in runs.groupby("task", sort=False):
@@ -327,7 +330,7 @@ def regress(
             row = {"task": task, "metric": metric, "log": is_log}
             fit = [math.nan] * 5
             if len(both) >= 3 and len(np.unique(x)) > 1:
-                found = stats.linregress(x, both["score"])
+                found = linregress(x, both["score"])
                 fit = [found.slope, found.stderr, found.intercept, found.rvalue**2, found.pvalue]
             row |= dict(zip(("slope", "standard_error", "intercept", "r_squared", "p"), fit, strict=True))
             rho, p = _spearman(both[metric], both["score"])

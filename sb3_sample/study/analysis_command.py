@@ -140,13 +140,16 @@ def _add_ends(parser: argparse.ArgumentParser) -> None:
 def _read(options: argparse.Namespace, *more: str) -> pd.DataFrame:
     if options.output is not None and options.output.suffix not in options.endings:
         raise ValueError(f"output must end in {', '.join(options.endings)}, not {str(options.output)!r}")
-    if not options.sources and not options.published:
+    curves = getattr(options, "curves", [])
+    if not options.sources and not options.published and not curves:
         raise ValueError("sources must be at least one folder or table, or --published runs")
     parts = []
     if options.sources:
         parts.append(tables.read(options.sources, (*tables.METRICS, *more)))
     if options.published:
         parts.append(tables.published_runs(options.published))
+    if curves:
+        parts.append(tables.published_curves(curves))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -218,6 +221,13 @@ def _put(table: pd.DataFrame, output: Path | None, draw: Callable[[], "Figure"] 
 def _add_table(parser: argparse.ArgumentParser) -> None:
     _add_sources(parser)
     parser.add_argument(
+        "--curves",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="published curves besides, of which there are statistics over seeds only, e.g. SAC, SimBa, TD-MPC2",
+    )
+    parser.add_argument(
         "--metrics",
         nargs="+",
         default=[],
@@ -238,6 +248,7 @@ def _run_table(options: argparse.Namespace) -> None:
         print(markdown(summary))
         if options.output is not None:
             if options.output.suffix == ".md":
+                options.output.parent.mkdir(parents=True, exist_ok=True)
                 options.output.write_text(markdown(summary) + "\n")
             else:
                 tables.write(table, options.output)

@@ -50,6 +50,7 @@ def test_a_table_of_runs(run: Run, tmp_path: Path) -> None:
     assert "| bro | dmc/cheetah-run-v0 | return | 2 | 6 | 3,000 |" in out and "train/x | 2 | 2 | 3,000 |" in out
     pd.testing.assert_frame_equal(study.load("x.csv"), study.read(["runs"], [*study.table.METRICS, "train/*"]))
     assert "| me | dmc/cheetah-run-v0 | return | 2 |" in run("table", "me=runs")
+    assert "| TD7 | dmc/cheetah-run-v0 | return/mean |" in run("table", "--curves", "TD7")
 
 
 def test_aggregates(run: Run) -> None:
