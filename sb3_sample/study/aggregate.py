@@ -53,9 +53,6 @@ def scored(table: pd.DataFrame, scores: Scores | None = None) -> pd.DataFrame:
     Returns of DeepMind Control over 1,000; success rates of Meta-World, MyoSuite and Fetch as they are; returns of
     MuJoCo's HalfCheetah, Walker2d, Ant and Humanoid over 8,500, 4,500, 6,625 and 6,125. Nothing is clipped.
 
-    Where the runs of an agent on one task were made with different arguments, the agent is named by those that differ
-    as well, e.g. "bro (replay_ratio=2)".
-
     :param table: of :func:`~sb3_sample.study.read`
     :param scores: of other tasks, by their ids: a :class:`Score`, or the return whose score is 1
     :return: columns agent, arguments, task, seed, step, score, sorted by step within a run, the runs in their order
@@ -103,7 +100,7 @@ def scored(table: pd.DataFrame, scores: Scores | None = None) -> pd.DataFrame:
             f"table must have numbers, not NaN, as of {row['agent']}, {row['task']}, seed {row['seed']} at "
             f"{row['step']:,}"
         )
-    return named_apart(found).reset_index(drop=True)
+    return found.reset_index(drop=True)
 
 
 def named_apart(table: pd.DataFrame) -> pd.DataFrame:
@@ -171,30 +168,37 @@ def at_steps(scores: pd.DataFrame, steps: Sequence[int] | None) -> tuple[pd.Data
     :param scores: of :func:`scored`
     :param steps: simulator steps; None for those that all runs have or, where they have none in common, those of the
         run with the fewest as far as all runs reach
-    :return: a row a run, indexed by agent, task and number of the run; a column a step: the score there, by linear
+    :return: a row a run, indexed by agent and task; a column a step: the score there, by linear
         interpolation between two evaluations of the run, NaN before its first and after its last; and the steps
     :raises ValueError: there are no such steps
     """
-    runs = [
-        ((head[0], head[2]), rows["step"].to_numpy(), rows["score"].to_numpy())
-        for head, rows in scores.sort_values("step", kind="stable").groupby(RUN, sort=False, dropna=False)
-    ]
+    numbers = scores.groupby(RUN, sort=False, dropna=False).ngroup().to_numpy()
+    order = np.lexsort((scores["step"], numbers))
+    starts = np.flatnonzero(np.diff(numbers[order], prepend=-1))
+    heads = scores[["agent", "task"]].iloc[order[starts]]
+    runs = list(
+        zip(
+            np.split(scores["step"].to_numpy()[order], starts[1:]),
+            np.split(scores["score"].to_numpy()[order], starts[1:]),
+            strict=True,
+        )
+    )
     if steps is None:
-        common = runs[0][1]
-        for _, own, _ in runs[1:]:
+        common = runs[0][0]
+        for own, _ in runs[1:]:
             common = np.intersect1d(common, own)
         if not len(common):
-            common = min((own for _, own, _ in runs), key=len)
-            first, last = max(own[0] for _, own, _ in runs), min(own[-1] for _, own, _ in runs)
+            common = min((own for own, _ in runs), key=len)
+            first, last = max(own[0] for own, _ in runs), min(own[-1] for own, _ in runs)
             common = common[(first <= common) & (common <= last)]
         if not len(common):
             raise ValueError("steps must be given: the runs do not overlap")
         steps = [int(step) for step in common]
     elif not len(steps) or any(step != int(step) or step < 0 for step in steps) or len(set(steps)) < len(steps):
         raise ValueError(f"steps must be whole numbers from 0 on, each once, not {list(steps)}")
-    heads = pd.MultiIndex.from_tuples([head for head, _, _ in runs], names=["agent", "task"])
-    values = [np.interp(steps, own, score, left=np.nan, right=np.nan) for _, own, score in runs]
-    return pd.DataFrame(values, index=heads, columns=list(steps)), [int(step) for step in steps]
+    values = [np.interp(steps, own, score, left=np.nan, right=np.nan) for own, score in runs]
+    matrix = pd.DataFrame(values, index=pd.MultiIndex.from_frame(heads), columns=list(steps))
+    return matrix, [int(step) for step in steps]
 
 
 def _warn_of_gaps(matrix: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> None:
@@ -362,6 +366,9 @@ def aggregate(
     """
     Scores of agents over tasks and seeds, at some steps or along the training.
 
+    Where the runs of an agent on one task were made with different arguments, they are several agents, named by those
+    that differ as well, e.g. "bro (replay_ratio=2)".
+
     :param table: of :func:`~sb3_sample.study.read`
     :param steps: simulator steps. A run's score at a step is its evaluation there, or between two evaluations the
         linear interpolation; runs that do not reach it are left out there, with a warning. None: a curve, at the steps
@@ -380,7 +387,7 @@ def aggregate(
     :raises ImportError: rliable is not installed
     """
     check_samples(reps, confidence)
-    found = scored(table, scores)
+    found = named_apart(scored(table, scores))
     if common:
         found = _common_tasks(found)
     matrix, steps = at_steps(found, steps)
@@ -536,7 +543,7 @@ def _at_step(
 
     :param common: None where the tasks are compared pair by pair
     """
-    found = scored(table, scores)
+    found = named_apart(scored(table, scores))
     if common:
         found = _common_tasks(found)
     matrix, _ = at_steps(found, [step])

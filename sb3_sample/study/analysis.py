@@ -67,7 +67,6 @@ def final(
     """
     if type(last) is not int or last < 1:
         raise ValueError(f"last must be a whole number from 1 on, not {last!r}")
-    table = named_apart(table)
     rows = scored(table, scores).sort_values("step", kind="stable")
     found = rows.groupby(RUN, sort=False, dropna=False).agg(step=("step", "last")).join(_ends(rows, "score", last))
     steps = found["step"]
@@ -92,11 +91,13 @@ def _ends(rows: pd.DataFrame, column: str, last: int) -> pd.Series:
 
 def argument(runs: pd.DataFrame, name: str) -> list[str]:
     """
-    :param runs: with a column ``arguments``
-    :param name: of an argument; a dot looks into a dict, ``policy_kwargs.net_arch``
+    :param runs: with columns ``agent`` and ``arguments``
+    :param name: of an argument, a dot looks into a dict, ``policy_kwargs.net_arch``; or "agent"
     :return: its value as text for each row, :data:`DEFAULT` where a run was not given it
     :raises ValueError: no run was given it
     """
+    if name == "agent":
+        return list(runs["agent"])
     values: dict[str, Any] = {}
     for text in runs["arguments"].unique():
         value: Any = json.loads(text)
@@ -146,8 +147,8 @@ def marginalize(
     combination by itself.
 
     :param table: of :func:`~sb3_sample.study.read`
-    :param factors: arguments by name of the factor; None for those that are not the same for all runs of one task,
-        those of ``by`` apart, each a factor
+    :param factors: arguments by name of the factor, of which "agent", the name, is one; None for those that are not the
+        same for all runs of one task, those of ``by`` apart, each a factor
     :param order: how many factors are fixed, 1 to the number of factors
     :param by: arguments by which the runs are parted, e.g. ``["replay_ratio"]``
     :param groups: of tasks, see :func:`~sb3_sample.study.aggregate`
@@ -173,7 +174,8 @@ def marginalize(
             f"order must be a whole number from 1 to {len(factors)}, the number of factors ({', '.join(factors)}), not "
             f"{order!r}"
         )
-    clash = set(factors) & {*by, *runs, "group", "mean", "standard_error", "iqm", "low", "high", "tasks", "runs"}
+    taken = {*by, *runs, "group", "mean", "standard_error", "iqm", "low", "high", "tasks", "runs"} - {"agent"}
+    clash = taken & set(factors) | {"agent"} & set(factors) & set(by)
     if clash:
         raise ValueError(f"factors must have other names than the table's columns, not {', '.join(sorted(clash))}")
     for name in by:
@@ -365,7 +367,7 @@ def heatmap(
     :return: values of ``y`` as index and of ``x`` as columns, both sorted; NaN where there is no run
     :raises ValueError: no run was given an argument, has recorded the metric, or reaches the step
     """
-    rows = scored(table, scores) if value == "score" else named_apart(table[table["metric"] == value])
+    rows = scored(table, scores) if value == "score" else table[table["metric"] == value]
     if not len(rows):
         raise ValueError(f"value must be score or of {', '.join(sorted(table['metric'].unique()))}, not {value!r}")
     rows = rows.rename(columns={"value": "score"})

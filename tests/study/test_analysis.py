@@ -96,6 +96,16 @@ def test_several_arguments_can_be_one_choice() -> None:
     assert found["both"].iloc[0] == "critic=cdq, network=layer_norm" and len(found) == 4
 
 
+def test_the_agent_can_be_a_factor() -> None:
+    table = pd.concat([grid(), grid().assign(agent="b", value=lambda rows: rows["value"] + 50)])
+    found = study.marginalize(table, {"agent": ["agent"], "critic": ["critic"]}, groups=["all"], reps=2)
+    assert found.set_index(["agent", "critic"])["mean"].to_dict() == pytest.approx(
+        {("a", ""): 0.171, ("b", ""): 0.221, ("", "cdq"): 0.256, ("", "none"): 0.136}
+    )
+    of_b = study.marginalize(table, by=["agent"], groups=["all"], reps=2)
+    np.testing.assert_allclose(of_b[of_b["agent"] == "b"]["mean"], [0.281, 0.161, 0.241, 0.201])
+
+
 def test_missing_combinations_are_said() -> None:
     with pytest.warns(UserWarning, match=r"1 of 8 combinations of choices and tasks have no run in 'all'"):
         study.marginalize(grid(leave_out=[("cdq", "none", WALKER)]), groups=["all"], reps=2)
