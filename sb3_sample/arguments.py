@@ -1,5 +1,6 @@
 """Arguments of the algorithms' constructors and of ``learn``, of both families."""
 
+import difflib
 import inspect
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -58,7 +59,8 @@ def check_every(agent: Any) -> None:
     environment.
 
     :param agent: an algorithm whose arguments are stored and whose networks do not exist yet
-    :raises ValueError: if one of them is of another kind, or the policy is not one for the observations
+    :raises ValueError: if one of them is of another kind, or the policy is not one for the observations, or takes none
+        of an entry's name in ``policy_kwargs``
     """
     if not hasattr(agent, "observation_space"):
         raise ValueError(f"env must {_ENVIRONMENT.words}, not None")
@@ -71,6 +73,7 @@ def check_every(agent: Any) -> None:
     for name, kind in EVERY_POLICY.items():
         if name in kwargs:
             check_value(f"policy_kwargs[{name!r}]", kwargs[name], kind)
+    _check_names(kwargs, agent.policy_class)
     policy = named_policy(agent)
     if policy is None or "features_extractor_class" in kwargs:
         return
@@ -83,6 +86,22 @@ def check_every(agent: Any) -> None:
             "policy='CnnPolicy' needs images, of integers in [0, 255] (with policy_kwargs={'normalize_images': False} "
             f"of any numbers), not {space}: use 'MlpPolicy' for vectors"
         )
+
+
+def _check_names(policy_kwargs: Mapping[str, Any], policy: type) -> None:
+    """Check that a policy takes the arguments of these names."""
+    allowed: set[str] = set()
+    for base in policy.__mro__:
+        if "__init__" in vars(base):
+            parameters = list(inspect.signature(vars(base)["__init__"]).parameters.values())
+            allowed |= {each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
+            if not any(each.kind is each.VAR_KEYWORD for each in parameters):
+                break
+    allowed -= {"self", "observation_space", "action_space", "lr_schedule"}
+    for name in policy_kwargs.keys() - allowed:
+        near = difflib.get_close_matches(str(name), allowed, 1)
+        meant = f"Did you mean {near[0]!r}?" if near else f"It takes {sorted(allowed)}"
+        raise ValueError(f"policy_kwargs has {name!r}, which is no argument of {policy.__name__}. {meant}")
 
 
 def named_policy(agent: Any) -> str | None:

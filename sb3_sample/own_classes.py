@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from torch import nn
+from torch.optim import Optimizer
 
 #: Classes whose names were warned of.
 _told: weakref.WeakSet[type] = weakref.WeakSet()
@@ -28,21 +29,40 @@ def make(
     :param kwargs: its arguments, those of the argument ``<argument>_kwargs``
     :param fixed: what it is made of besides, by name
     :return: the object
-    :raises ValueError: if the class lacks a method, does not take these arguments, or has not made its base
+    :raises ValueError: if the class lacks a method, does not take these arguments, has not made its base, or does not
+        list an optimizer that it has
     """
     if isinstance(cls, type):
         check(argument, cls, base)
     check_arguments(argument, choice, cls, *given, kwargs=kwargs, **fixed)
     try:
         made = cls(*given, **fixed, **kwargs)
-    except AttributeError as error:
+    except Exception as error:
         # Of torch, where something is assigned.
-        if "__init__() call" not in str(error):
-            raise
-        raise ValueError(_without_base(argument, cls)) from error
+        if isinstance(error, AttributeError) and "__init__() call" in str(error):
+            raise ValueError(_without_base(argument, cls)) from error
+        name = next(iter(inspect.signature(cls).parameters), "")
+        # What it is made of, taken for one of its arguments.
+        if not fixed and name != _first(fixed) and any(type(each).__name__ in str(error) for each in given):
+            raise ValueError(f"{_without_first(argument, cls, fixed)}, not {name} ({error})") from error
+        raise
     if isinstance(made, nn.Module) and "_modules" not in vars(made):
         raise ValueError(_without_base(argument, type(made)))
+    _check_optimizers(argument, made)
     return made
+
+
+def _check_optimizers(argument: str, made: Any) -> None:
+    """Optimizers that a part does not list are neither saved nor started anew at a reset."""
+    if not hasattr(made, "optimizers"):
+        return
+    listed = {id(optimizer) for optimizer in made.optimizers().values()}
+    for name, value in vars(made).items():
+        if isinstance(value, Optimizer) and id(value) not in listed:
+            raise ValueError(
+                f"{argument}: {type(made).__name__}.optimizers() must list self.{name}, so that it is saved: "
+                f"return {{{name!r}: self.{name}}}"
+            )
 
 
 def _without_base(argument: str, cls: Any) -> str:
@@ -57,19 +77,22 @@ def check(argument: str, cls: type, base: type) -> None:
     :param argument: name of the argument that has chosen it
     :param cls: the class
     :param base: base class of the choices
-    :raises ValueError: if it lacks a method that its base leaves to it
+    :raises ValueError: if it lacks a method that its base leaves to it, or one takes other arguments than the base's
     """
     for name in dir(cls):
         if getattr(inspect.getattr_static(cls, name), "__isabstractmethod__", False):
             raise ValueError(f"{argument}: {cls.__name__} must define {name}(), which {base.__name__} leaves to it")
-    if cls in _told:
-        return
-    _told.add(cls)
     own = [c for c in cls.__mro__ if issubclass(c, base) and c.__module__.split(".")[0] != __name__.split(".")[0]]
     defined = {name for c in own for name in vars(c)}
     hooks = [name for name in dir(base) if not name.startswith("_") and not hasattr(nn.Module, name)]
+    for name in (*hooks, "forward"):
+        if name in defined:
+            _check_signature(argument, cls, base, name)
+    if cls in _told:
+        return
+    _told.add(cls)
     hooks = [name for name in (*hooks, "forward", "get_extra_state", "set_extra_state") if name not in defined]
-    used = {name for c in own for value in vars(c).values() for name in _names_in(value)}
+    used = {name for c in own for value in vars(c).values() for name in names_in(value)}
     for c in own:
         for name in vars(c):
             near = difflib.get_close_matches(name, hooks, 1, 0.8)
@@ -80,7 +103,24 @@ def check(argument: str, cls: type, base: type) -> None:
                 )
 
 
-def _names_in(value: Any) -> Iterator[str]:
+def _check_signature(argument: str, cls: type, base: type, name: str) -> None:
+    """Check that a method takes what the base's is called with, all of it by position."""
+    own, wanted = inspect.getattr_static(cls, name), inspect.getattr_static(base, name, None)
+    if not (isinstance(own, types.FunctionType) and isinstance(wanted, types.FunctionType)):
+        return
+    signature, expected = inspect.signature(own), inspect.signature(wanted)
+    try:
+        signature.bind(*expected.parameters)
+    except TypeError as error:
+        words = ", ".join(
+            str(each.replace(annotation=inspect.Parameter.empty)) for each in expected.parameters.values()
+        )
+        raise ValueError(
+            f"{argument}: {cls.__name__}.{name} must take ({words}), as {base.__name__}.{name} does: {error}"
+        ) from error
+
+
+def names_in(value: Any) -> Iterator[str]:
     """Attributes and functions that a method makes use of."""
     functions = (value.fget, value.fset) if isinstance(value, property) else (inspect.unwrap(_function_of(value)),)
     codes = [function.__code__ for function in functions if isinstance(function, types.FunctionType)]
@@ -92,6 +132,31 @@ def _names_in(value: Any) -> Iterator[str]:
 
 def _function_of(value: Any) -> Any:
     return value.__func__ if isinstance(value, (classmethod, staticmethod)) else value
+
+
+def _first(fixed: dict[str, Any]) -> str:
+    """What a part is made of, and a network."""
+    return "in_features" if fixed else "learner"
+
+
+def _without_first(argument: str, cls: Any, fixed: dict[str, Any]) -> str:
+    return f"{argument}: {cls.__name__}.__init__ must take {', '.join(['self', _first(fixed), *fixed])} first"
+
+
+def _check_first(
+    argument: str,
+    cls: Callable[..., Any],
+    signature: inspect.Signature,
+    *given: Any,
+    kwargs: dict[str, Any],
+    fixed: dict[str, Any],
+) -> None:
+    """Check that what a part is made of does not take the place of one of its arguments."""
+    first = next(iter(signature.parameters.values()), None)
+    if not given or (first is not None and first.name == _first(fixed)):
+        return
+    if first is None or first.name in kwargs or first.default is not first.empty:
+        raise ValueError(f"{_without_first(argument, cls, fixed)}, not {'nothing' if first is None else first.name}")
 
 
 def check_arguments(
@@ -109,6 +174,7 @@ def check_arguments(
     :raises ValueError: if it takes other ones
     """
     signature = inspect.signature(cls)
+    _check_first(argument, cls, signature, *given, kwargs=kwargs, fixed=fixed)
     kinds = {name: parameter.kind for name, parameter in signature.parameters.items()}
     many = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     allowed = [name for name, kind in list(kinds.items())[len(given) :] if kind not in many and name not in fixed]
@@ -120,7 +186,7 @@ def check_arguments(
     try:
         signature.bind(*given, **fixed, **kwargs)
     except TypeError as error:
-        words = ", ".join(["learner" if not fixed else "in_features"] * len(given) + [f"{name}=..." for name in fixed])
+        words = ", ".join([_first(fixed)] * len(given) + [f"{name}=..." for name in fixed])
         name = getattr(cls, "__name__", repr(cls))
         raise ValueError(
             f"{argument}: {name} is made as {name}({words}) with the arguments {kwargs}, and its __init__ does not "

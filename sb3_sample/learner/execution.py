@@ -102,18 +102,25 @@ def why_not_compiled(learner: Any) -> str | None:
     return None
 
 
-def has_foreign_parts(learner: Any) -> bool:
+def foreign_parts(learner: Any) -> list[str]:
     """
-    Check for code from outside of this package that may not be fit to be compiled.
+    Look for code from outside of this package that may not be fit to be compiled.
 
     :param learner: the learner
-    :return: whether it has parts, networks or a gradient step from outside of this package without the declaration
-        ``compilable = True``: a number that changes at every step, for example, causes a compilation at every step
+    :return: its parts, networks and gradient step from outside of this package without the declaration ``compilable =
+        True``, as "argument=class": a number that changes at every step, for example, causes a compilation at every
+        step
     """
-    objects = [learner.explorer, learner.pessimism_rule, learner.head, learner.actor.trunk, learner.critic.trunk]
+    objects = {
+        "exploration": learner.explorer,
+        "pessimism": learner.pessimism_rule,
+        "value_head": learner.head,
+        "actor_network": learner.actor.trunk,
+        "critic_network": learner.critic.trunk,
+    }
     if not _is_ours(type(learner).gradient_step):
-        objects.append(learner)
-    return not all(_is_compilable(type(one)) for one in objects)
+        objects["learner_class"] = learner
+    return [f"{name}={type(one).__name__}" for name, one in objects.items() if not _is_compilable(type(one))]
 
 
 def _is_ours(thing: Any) -> bool:
@@ -183,7 +190,7 @@ class Execution:
                 warn_not_compiled(learner, reason)
                 learner.compiled = False
         # Parts of one's own may look at values on the host: captured only when asked for.
-        asked = learner.compile is True or (learner.compile == "auto" and not has_foreign_parts(learner))
+        asked = learner.compile is True or (learner.compile == "auto" and not foreign_parts(learner))
         captures = learner.device.type == "cuda" and asked and not _foreign_optimizers(learner)
         return cls(learner, bool(learner.compiled), learner.compile == "auto", cuda_graph if captures else None)
 
@@ -237,6 +244,9 @@ class Execution:
             if "RecompileLimit" in type(error).__name__:
                 reason = "a setting that it reads changes again and again, and each change has it compiled anew"
             if not self.fall_back:
+                if raised:
+                    # Eagerly it is raised as it is, from its place.
+                    type(learner).gradient_step(learner, *inputs)
                 raise RuntimeError(
                     f"compile=True, but the gradient step cannot be compiled: {reason}. Pass compile=False, or 'auto'"
                 ) from error

@@ -104,12 +104,14 @@ def _try(learner: Any, batch: Batch) -> None:
     # Networks: whatever they return is read by a dense layer, which takes one output for all copies as well.
     trunk, inputs = critic.trunk, critic.inputs(batch.observations, batch.actions)
     shape = (n_critics, n, trunk.out_features)
-    _check(trunk, "forward", trunk(inputs), "outputs of critics", shape, "(E, B, out_features)")
+    outputs = _called(trunk, "forward", inputs, letters=f"n_copies={n_critics} and x (B, in_features)")
+    _check(trunk, "forward", outputs, "outputs of critics", shape, "(E, B, out_features)")
     actor = learner.actor
-    outputs = actor.trunk(actor.features(batch.observations))
+    features = actor.features(batch.observations)
+    outputs = _called(actor.trunk, "forward", features, letters="x (B, in_features)")
     _check(actor.trunk, "forward", outputs, "outputs of an actor", (n, actor.trunk.out_features), "(B, out_features)")
 
-    beta = rule.beta()
+    beta = _called(rule, "beta")
     value = beta.item() if _is_tensor(beta) and beta.dim() == 0 else beta
     if not is_number(value):
         raise ValueError(f"{_name(rule)}.beta must return a number or a tensor of shape (), not {_shown(beta)}")
@@ -117,25 +119,39 @@ def _try(learner: Any, batch: Batch) -> None:
         raise ValueError(f"{_name(rule)}.beta must return a number of at least 0 and finite, not {value}")
 
     q = evaluate(critic, batch.observations, batch.actions)
-    values = head.values(q)
+    values = _called(head, "values", q, letters="outputs (E, B, n_outputs)")
     if not _is_tensor(values) or values.dim() != 3 or values.shape[:2] != (n_critics, n):
         raise ValueError(
             f"{_name(head)}.values must return values of shape (E, B, K) = ({n_critics}, {n}, K), not {_shown(values)}"
         )
-    _check(rule, "value", rule.value(values), "the ensemble's value", (n, values.shape[2]), "(B, K)")
+    value = _called(rule, "value", values, letters="q (E, B, K)")
+    _check(rule, "value", value, "the ensemble's value", (n, values.shape[2]), "(B, K)")
 
     next_q, entropy_bonus = bootstrap(learner, batch, learner.temperature(), torch.zeros_like(batch.actions))
     with torch.no_grad():
-        target = head.target(batch, next_q, rule.value, entropy_bonus)
+        target = _called(
+            head, "target", batch, next_q, rule.value, entropy_bonus, letters="next_q (E, B, n_outputs), bonus (B, 1)"
+        )
     if not _is_tensor(target) or n not in target.shape[:2]:
         raise ValueError(f"{_name(head)}.target must return a target with B = {n} rows, not {_shown(target)}")
     if type(head).loss is ValueHead.loss:
         # A squared error takes whatever broadcasts.
         _check(head, "target", target, "a target", (n, q.shape[2]), "(B, n_outputs)")
-    loss = head.loss(q, target)
+    loss = _called(head, "loss", q, target, letters="q (E, B, n_outputs), target (B, n_outputs)")
     _check(head, "loss", loss, "a loss", (), "()")
     if not loss.requires_grad:
         raise ValueError(f"{_name(head)}.loss must return a loss through which a gradient goes, not a constant")
+
+
+def _called(part: Any, method: str, *arguments: Any, letters: str = "") -> Any:
+    """What a method gives; an error that it raises has a note of where, and of the shapes that it was called with."""
+    try:
+        return part(*arguments) if method == "forward" else getattr(part, method)(*arguments)
+    except Exception as error:
+        shapes = ", ".join(str(tuple(each.shape)) for each in arguments if _is_tensor(each))
+        words = f", called with {letters} = {shapes}" if shapes else ""
+        error.add_note(f"in {_name(part)}.{method}{words}, before the first gradient step")
+        raise
 
 
 def _new_size(roots: Iterable[nn.Module], batch: Batch) -> int:

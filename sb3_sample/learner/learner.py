@@ -352,7 +352,10 @@ class Learner:
         :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly
         :param extra: further transitions for a rule of pessimism that learns from some, from its ``draw``
         :return: what to log, by name, scalars on the learner's device
+        :raises ValueError: if the batch is none
         """
+        if not isinstance(batch, Batch):
+            raise ValueError(f"batch must be a Batch, not {batch!r:.100}: data.sample(n) of a Dataset gives one")
         with self._random():
             if self._heard:
                 self.before_updates()

@@ -76,13 +76,22 @@ class Column:
 
         :param buffer: the buffer, which the result does not hold
         :return: from a step to its values in the form in which they are stored, (n_envs, ...). It raises a ValueError
-            if they have another shape, or are not finite
+            if they have another shape, are a single value, or not finite
         """
         name, read, shape, dtype = self.name, self.read, (buffer.n_envs, *self.shape), np.dtype(self.dtype)
         assert read is not None
 
+        where = f"the column {name!r} of {type(buffer).__name__}"
+
         def write(given: Given) -> np.ndarray:
-            row = as_row(name, read(Step(*given)), shape, dtype)
+            try:
+                values = np.asarray(read(Step(*given)))
+            except Exception as error:
+                error.add_note(f"in read of {where}")
+                raise
+            if values.ndim == 0:
+                raise ValueError(f"read of {where} must give a list, one value for each environment, not {values}")
+            row = as_row(name, values, shape, dtype)
             if row.dtype.kind == "f" and not np.isfinite(row).all():
                 raise ValueError(f"the column {name!r} must be finite, not {row[~np.isfinite(row)][0]}")
             return row
@@ -165,6 +174,8 @@ class HasColumns:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        if not isinstance(cls.more_columns, (tuple, list)):
+            raise TypeError(f"more_columns of {cls.__name__} must be a tuple of Column, not {cls.more_columns!r}")
         more = [column for base in reversed(cls.__mro__) for column in vars(base).get("more_columns", ())]
         taken = {column.name for column in OF_EVERY_BUFFER}
         for column in more:

@@ -21,11 +21,12 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFr
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_program, default_of
+from sb3_sample.console import say
 from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, not_finite
 from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.learner.execution import (
     PAYS_FROM,
-    has_foreign_parts,
+    foreign_parts,
     old_torch,
     warn_not_compiled,
     why_not_compiled,
@@ -50,6 +51,7 @@ from sb3_sample.saving.encoding import Lenient
 from sb3_sample.saving.kept import Kept
 from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.replay import SafeReplayBuffers, encode_buffer
+from sb3_sample.saving.unsaved import plain_attributes
 from sb3_sample.training.resumable import Resumable
 
 Self = TypeVar("Self", bound="SAC")
@@ -85,6 +87,7 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         "_learner": Kept.NOWHERE,
         "_source": Kept.NOWHERE,
         "_watch": Kept.NOWHERE,
+        "_plain_attributes": Kept.NOWHERE,
         # For the log of a run that goes on.
         "_metrics": Kept.IN_CHECKPOINTS,
         # An argument that changes with every step.
@@ -130,6 +133,7 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         self._source = ReplaySource(self)
         self.learner = self._make_learner(networks=self.policy, counts=self)
         checks.check_rule(self)
+        self._plain_attributes = plain_attributes(self)
         self._watch = MetricWatch(self.device)
 
     def _check_arguments(self) -> None:
@@ -308,7 +312,11 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
             n_updates = n_steps if self.gradient_steps < 0 else self.gradient_steps * n_calls
         # What keeps the step from being compiled is worth a warning only where it was asked for, but for an old torch,
         # which is easily renewed.
-        pays = n_updates >= PAYS_FROM and not has_foreign_parts(self.learner)
+        foreign = foreign_parts(self.learner) if n_updates >= PAYS_FROM else []
+        if foreign and self.verbose >= 1:
+            verb = "does" if len(foreign) == 1 else "do"
+            say(f"The gradient step is not compiled: {', '.join(foreign)} {verb} not declare compilable = True")
+        pays = n_updates >= PAYS_FROM and not foreign
         reason = why_not_compiled(self.learner) if pays else None
         self.compiled = pays and reason is None
         if reason is not None and reason == old_torch():

@@ -124,7 +124,8 @@ def _check_pessimism(agent: Any) -> None:
         if agent.pessimism_kwargs:
             raise ValueError(
                 f"pessimism_kwargs={agent.pessimism_kwargs} are arguments of a rule that moves pessimism, but "
-                f"pessimism={agent.pessimism} is fixed: pass pessimism as one of {sorted(PESSIMISMS)}"
+                f"pessimism={agent.pessimism} is fixed: pass pessimism as one of {sorted(PESSIMISMS)}, or as "
+                "a class derived from Pessimism"
             )
     if agent.actor_pessimism is not None:
         check_beta("actor_pessimism", agent.actor_pessimism)

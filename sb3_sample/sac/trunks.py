@@ -47,6 +47,11 @@ def keep_at_rest(owner: Any) -> None:
     choice = owner.trunk.stacks_rows
     if choice not in (None, "online", "target"):
         raise ValueError(f"stacks_rows of a network must be None, 'online' or 'target', not {choice!r}")
+    if choice == "target" and not owner.trunk.trains_in_target:
+        raise ValueError(
+            f"{type(owner.trunk).__name__}: stacks_rows='target' has the targets use statistics of the stacked rows, "
+            "and trains_in_target=False the running ones: leave one of them out"
+        )
     if choice is not None:
         # Past nn.Module's own setattr, which would register it.
         vars(owner)["at_rest"] = evaluated(owner)

@@ -176,6 +176,11 @@ class SafeFiles(BaseAlgorithm):
             _forget_folder(attributes, warn=env is not None)
             model = cls._made(content, attributes, kwargs, custom_objects, env, device, force_reset)
             model._trusted_modules = trusted
+            dropped = [name for name in content.without_place() if name not in custom_objects]
+            if dropped:
+                warnings.warn(
+                    f"{content.another_class()}A {cls.__name__} makes no use of {', '.join(dropped)}", stacklevel=2
+                )
             if content.left_out:
                 shown = ", ".join(f"{name} ({reason:.200})" for name, reason in content.left_out.items())
                 warnings.warn(

@@ -6,14 +6,15 @@ import itertools
 import json
 import typing
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Any
 
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
 
-from sb3_sample.saving import container, notice
+from sb3_sample.own_classes import names_in
+from sb3_sample.saving import container, notice, unsaved
 from sb3_sample.saving.checks import (
     NEVER,
     ParametersDoNotFit,
@@ -64,6 +65,7 @@ class Description:
                 self.attributes[name] = self._attribute(value, name, name in schedules, name in always)
                 self._tensors[name] = list(itertools.islice(self.encoder.tensors, n_before, None))
         self._keep_small()
+        self.encoder.left_out.update(unsaved.changed(model, vars(model).get("_plain_attributes", {})))
 
     def _attribute(self, value: Any, name: str, is_schedule: bool, is_derived: bool) -> Any:
         if name in NEVER:
@@ -176,6 +178,21 @@ class Content:
             return ""
         name = theirs.rpartition(":")[2]
         return f"{self.name} holds a model of {name}, not of {self._cls.__name__}: load it with {name}.load. "
+
+    def without_place(self) -> list[str]:
+        """
+        :return: of a file of a class below the one that is loaded, the arguments that it has in addition; where this
+            program does not have that class, the attributes that the methods of the loaded one make no use of
+        """
+        path = self.tree["classes"][0]
+        if path_of(self._cls) not in self.tree["classes"][1:]:
+            return []
+        known, theirs = argument_names(self._cls), next((c for c in _below(self._cls) if path_of(c) == path), None)
+        if theirs is None:
+            methods = (value for base in self._cls.__mro__ for value in vars(base).values())
+            known |= {name for method in methods for name in names_in(method)}
+            return [name for name in self.tree["attributes"] if name not in known]
+        return [name for name in self.tree["attributes"] if name in argument_names(theirs) - known]
 
     def attributes(self, given: Collection[str], custom_objects: dict[str, Any]) -> dict[str, Any]:
         """
@@ -383,6 +400,13 @@ class Content:
             return ""
         wanted = " or ".join(f"{name}=" for name in sorted(names))
         return f"{self.name} lacks {', '.join(sorted(names))}, for which the defaults stand (load takes {wanted}): "
+
+
+def _below(cls: type) -> Iterator[type]:
+    classes: list[type] = cls.__subclasses__()
+    for each in classes:
+        yield each
+        yield from _below(each)
 
 
 def _items(tree: Any) -> list[Any] | None:

@@ -32,9 +32,11 @@ def need(cls: type, name: str, path: str, trusted: Sequence[str] = ()) -> str:
     """
     argument = argument_for(cls, name)
     module = path.partition(":")[0]
-    wanted = [] if "<locals>" in path or within(module, trusted) else [f"trusted_modules=[{module!r:.200}]"]
+    # Of a script another program has another one, or none.
+    is_named = "<locals>" not in path and module != "__main__"
+    wanted = [f"trusted_modules=[{module!r:.200}]"] if is_named and not within(module, trusted) else []
     if argument is None:
-        return f"load_replay_buffer needs {wanted[0] if wanted else 'a model that has it as its replay_buffer_class'}"
+        return f"load_replay_buffer needs {' or '.join([*wanted, 'a model that has it as its replay_buffer_class'])}"
     return f"load needs {' or '.join([*wanted, argument])}"
 
 

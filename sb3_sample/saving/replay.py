@@ -216,10 +216,10 @@ def decode_buffer(
     :raises ValueError: if it is the buffer of other spaces
     """
     try:
-        own, path = type(getattr(model, "replay_buffer", None)), tree["class"]
-        # What was made inside of a function is found nowhere, but the model may have it.
-        is_own = isinstance(path, str) and "<locals>" in path and path == path_of(own)
-        cls = own if is_own else decode({"import": path}, {}, "replay_buffer", trusted)
+        path, classes = tree["class"], [type(getattr(model, "replay_buffer", None)), model.replay_buffer_class]
+        # The program's own classes need no trust, nor to be found where a path leads: one may be made in a function.
+        own = next((cls for cls in classes if cls is not None and path == path_of(cls)), None)
+        cls = decode({"import": path}, {}, "replay_buffer", trusted) if own is None else own
         if not (isinstance(cls, type) and issubclass(cls, ReplayBuffer)):
             raise BadFile(f"it holds a {cls.__name__}, which is no replay buffer")
         if has_state(cls):

@@ -12,7 +12,7 @@ import torch
 from gymnasium import spaces
 from torch import nn
 
-from sb3_sample import BRO, DAC, SAC
+from sb3_sample import BRO, DAC, SAC, Dataset
 from sb3_sample.learner import first_step
 from sb3_sample.parts import (
     Batch,
@@ -173,10 +173,67 @@ def test_wrong_shapes_are_errors_at_the_first_step(kwargs: dict[str, Any], words
         sac(**kwargs).learn(30)
 
 
+class NaiveNorm(Network):
+    """Batch norm as for a single network."""
+
+    def __init__(self, in_features: int, n_copies: int | None = None):
+        super().__init__()
+        self.out_features = 8
+        self.dense, self.norm = linear(in_features, 8, n_copies), nn.BatchNorm1d(8)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.norm(self.dense(x))
+
+
+def raising(*_: Any) -> Any:
+    raise KeyError("x")
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "note"),
+    [
+        (
+            critics(NaiveNorm),
+            RuntimeError,
+            r"in NaiveNorm\.forward, called with n_copies=2 and x \(B, in_features\) = \(\d, 5\), before the first",
+        ),
+        (
+            {"policy_kwargs": {"actor_network": network(raising)}},
+            KeyError,
+            r"in MyNet\.forward, called with x \(B, in_features\) = \(\d, 3\)",
+        ),
+        (
+            {"value_head": head(loss=lambda self, q, target: (q - target[:3]).mean())},
+            RuntimeError,
+            r"in MyHead\.loss, called with q \(E, B, n_outputs\), target \(B, n_outputs\) = \(2, \d, 1\), \(\d, 1\)",
+        ),
+        ({"value_head": head(values=raising)}, KeyError, r"in MyHead\.values, called with outputs \(E, B, n_outputs\)"),
+        ({"pessimism": rule(beta=raising)}, KeyError, r"in MyRule\.beta, before the first gradient step"),
+        ({"pessimism": rule(value=raising)}, KeyError, r"in MyRule\.value, called with q \(E, B, K\) = \(2, \d, 1\)"),
+    ],
+)
+def test_an_error_that_a_part_raises_has_a_note_of_where(kwargs: dict[str, Any], error: Any, note: str) -> None:
+    model = sac(**kwargs)
+    with pytest.raises(error) as raised:
+        model._update(random_batch(model))
+    assert [re.match(note, each) is not None for each in raised.value.__notes__] == [True]
+
+
 @COMPILES
-def test_an_error_inside_of_a_compiled_step_is_named() -> None:
-    model = sac(pessimism=rule(update=lambda *_, **__: None), compile=True)
-    with pytest.raises(RuntimeError, match=r"it raises ValueError.*MyRule\.update must return a dict"):
+@pytest.mark.parametrize("compile", [True, "auto"])
+@pytest.mark.parametrize(
+    ("update", "error", "words"),
+    [
+        (lambda *_, **__: None, ValueError, r"^MyRule\.update must return a dict"),
+        (lambda self, *_, **__: self.nothing, AttributeError, "'MyRule' object has no attribute 'nothing'"),
+    ],
+)
+def test_an_error_inside_of_a_compiled_step_is_the_parts_own(
+    update: Any, error: Any, words: str, compile: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sb3_sample.sac.algorithm.PAYS_FROM", 5)
+    model = sac(pessimism=rule(update=update, compilable=True), compile=compile)
+    with pytest.raises(error, match=words):
         model.learn(30)
 
 
@@ -202,6 +259,15 @@ def test_a_batch_of_ones_own_is_checked(change: dict[str, Any], words: str) -> N
     with pytest.raises(ValueError, match=re.escape("extra." + words)):
         model.learner.update(random_batch(model), extra=extra)
     assert model.learner.n_updates == 0
+
+
+def test_a_data_set_is_no_batch() -> None:
+    model = sac().learn(20)
+    data = Dataset.from_arrays(np.zeros((8, 3)), np.zeros((8, 2)), *np.zeros((3, 8)))
+    learner = SAC.learner(data.observation_space, data.action_space, policy_kwargs={"net_arch": [8]})
+    for each in (learner, model.learner):
+        with pytest.raises(ValueError, match=r"batch must be a Batch, not .*Dataset.*: data\.sample\(n\) of a Dataset"):
+            each.update(data)
 
 
 def test_a_batch_that_is_as_long_as_something_else_is_not_confused() -> None:
@@ -292,9 +358,44 @@ class NoLearner(Pessimism):
         super().__init__(1.0)
 
 
+class OnlyStart(Pessimism):
+    def __init__(self, start: float):
+        super().__init__(start)
+
+
+class OnlyDefault(Pessimism):
+    def __init__(self, start: float = 1.0):
+        super().__init__(1.0)
+        self.start = start
+
+
+class NoInit(Pessimism):
+    pass
+
+
+class OtherName(Pessimism):
+    def __init__(self, of: Any, weight: float = 0.5):
+        super().__init__(weight)
+
+
+class Stacked(NoForward):
+    stacks_rows = "target"
+    trains_in_target = False
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x
+
+
 class Needs(Pessimism):
     def __init__(self, learner: Any, rate: float):
         super().__init__(rate)
+
+
+class Unlisted(Pessimism):
+    def __init__(self, learner: Any):
+        super().__init__(1.0)
+        self.weight = nn.Parameter(torch.tensor(1.0))
+        self.optimizer = learner.make_optimizer([self.weight])
 
 
 class AnyKwargs(Pessimism):
@@ -335,11 +436,39 @@ class Head(ValueHead):
         (critics(NoForward), "critic_network: NoForward must define forward(), which Network leaves to it"),
         ({"batch_transforms": [NoTransform]}, "batch_transforms[0]: NoTransform must define transform()"),
         ({"exploration": NoGaussian}, "exploration: NoGaussian must define _gaussian()"),
+        (
+            {"policy_kwargs": {"critic_net": "mlp"}},
+            "policy_kwargs has 'critic_net', which is no argument of SACPolicy. Did you mean 'critic_network'?",
+        ),
+        (
+            {"policy_kwargs": {"qqq": 1}},
+            "policy_kwargs has 'qqq', which is no argument of SACPolicy. It takes ['activation_fn', 'actor_kwargs',",
+        ),
+        (
+            {"pessimism_kwargs": {"a": 1}},
+            "pass pessimism as one of ['gpl', 'opl', 'top', 'vpl'], or as a class derived from Pessimism",
+        ),
+        (
+            critics(Stacked),
+            "Stacked: stacks_rows='target' has the targets use statistics of the stacked rows",
+        ),
         ({"pessimism": NoSuper}, "pessimism: NoSuper.__init__ must call super().__init__(...) before"),
         ({"batch_transforms": [NoSuperPlain]}, "batch_transforms[0]: NoSuperPlain.__init__ must call super().__init__"),
-        ({"pessimism": NoLearner}, "pessimism: NoLearner is made as NoLearner(learner) with the arguments {}, and its"),
+        ({"pessimism": NoLearner}, "pessimism: NoLearner.__init__ must take self, learner first, not nothing"),
+        (
+            {"pessimism": NoLearner, "pessimism_kwargs": {"start": 1}},
+            "pessimism: NoLearner.__init__ must take self, learner first, not nothing",
+        ),
+        ({"pessimism": OnlyStart}, "pessimism: OnlyStart.__init__ must take self, learner first, not start (pessimism"),
+        (
+            {"pessimism": OnlyStart, "pessimism_kwargs": {"start": 1}},
+            "pessimism: OnlyStart.__init__ must take self, learner first, not start",
+        ),
+        ({"pessimism": OnlyDefault}, "pessimism: OnlyDefault.__init__ must take self, learner first, not start"),
+        ({"pessimism": NoInit}, "pessimism: NoInit.__init__ must take self, learner first, not beta (pessimism must"),
         ({"pessimism": Needs}, "missing a required argument: 'rate'"),
         ({"pessimism": AnyKwargs}, "beta"),
+        ({"pessimism": Unlisted}, "pessimism: Unlisted.optimizers() must list self.optimizer, so that it is saved"),
         (
             {"batch_transforms": [Jitter, (Jitter, {"jiter": 1})]},
             "batch_transforms[1] has 'jiter', but batch_transforms[1]=",
@@ -349,6 +478,26 @@ class Head(ValueHead):
         (
             {"value_head": Head, "value_head_kwargs": {"width": 0}},
             "Head.n_outputs must be an integer of at least 1, not 0",
+        ),
+        (
+            {"pessimism": rule(update=lambda self, learner, batch: {})},
+            "pessimism: MyRule.update must take (self, learner, batch, step, noise=None, extra=None), as Pessimism.upd",
+        ),
+        (
+            {"exploration": type("Fast", (Exploration,), {"act": lambda self, observations: observations})},
+            "exploration: Fast.act must take (self, learner, observations), as Exploration.act does: too many",
+        ),
+        (
+            {"value_head": head(target=lambda self, batch, next_q, value: batch.rewards)},
+            "value_head: MyHead.target must take (self, batch, next_q, value, entropy_bonus), as",
+        ),
+        (
+            {"batch_transforms": [type("Short", (BatchTransform,), {"transform": lambda self, batch: batch})]},
+            "batch_transforms[0]: Short.transform must take (self, batch, noise), as",
+        ),
+        (
+            critics(type("Two", (Network,), {"forward": lambda self, x, y: x})),
+            "critic_network: Two.forward must take (self, x), as Network.forward does: missing a required argument:",
         ),
         (
             critics(NoCopies),
@@ -364,6 +513,10 @@ class Head(ValueHead):
 def test_what_is_missing_is_an_error_at_construction(kwargs: dict[str, Any], words: str) -> None:
     with pytest.raises((ValueError, TypeError), match=re.escape(words)):
         sac(**kwargs)
+
+
+def test_the_learner_may_have_another_name() -> None:
+    assert sac(pessimism=OtherName, pessimism_kwargs={"weight": 0.25}).pessimism_rule.beta() == 0.25
 
 
 def test_arguments_that_a_class_hands_on() -> None:
@@ -527,3 +680,97 @@ def test_further_transitions_have_the_learners_discount(loss: str) -> None:
     second = learners[1].update(step, extra=Extra(further._replace(discounts=0.9)))
     assert first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
     assert "pessimism/loss" in first
+
+
+# ---------------------------------------------------------------- what is not saved
+
+
+class Counter:
+    def __init__(self) -> None:
+        self.n = 0
+
+
+class Counts(Pessimism):
+    """Counts in a plain attribute, in an object, in an array; constants, and a reference to the learner."""
+
+    def __init__(self, learner: Any):
+        super().__init__(1.0)
+        self.learner_of_mine, self.constant, self.names = (learner,), 0.5, ["a"]
+        self.k, self.counter, self.seen = 0, Counter(), np.zeros(2)
+        self.optimizer = learner.make_optimizer([nn.Parameter(torch.tensor(1.0))])
+
+    def optimizers(self) -> dict[str, Any]:
+        return {"optimizer": self.optimizer}
+
+    def after_update(self, learner: Any, batch: Batch) -> dict[str, torch.Tensor]:
+        self.count()
+        return {}
+
+    def count(self) -> None:
+        self.k += 1
+        self.counter.n += 1
+        self.seen[0] += 1
+
+
+class Saves(Counts):
+    def get_extra_state(self) -> Any:
+        return {"k": self.k}
+
+    def set_extra_state(self, state: Any) -> None:
+        self.k = state["k"]
+
+
+class Buffered(Counts):
+    """The remedy: a buffer."""
+
+    def __init__(self, learner: Any):
+        super().__init__(learner)
+        self.register_buffer("n", torch.tensor(0))
+
+    def count(self) -> None:
+        self.n += 1
+
+
+def messages(caught: list[warnings.WarningMessage]) -> list[str]:
+    return [str(each.message) for each in caught if "changes and is no buffer" in str(each.message)]
+
+
+@pytest.mark.parametrize("checkpoint", [False, True])
+def test_what_changes_and_is_in_no_file_is_warned_of(checkpoint: bool, tmp_path: Path) -> None:
+    model = sac(pessimism=Counts, policy_kwargs={"critic_network": Counting, "actor_network": Counting})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.learn(
+            30, checkpoint=tmp_path / "run" if checkpoint else None, **{"checkpoint_freq": 15} if checkpoint else {}
+        )
+        assert bool(messages(caught)) is checkpoint
+        model.save(tmp_path / "m")
+        model.save(tmp_path / "m")
+    said = messages(caught)
+    assert len(said) == 1
+    for name in ("Counts.k", "Counts.counter", "Counts.seen", "Counting.n_calls"):
+        assert said[0].count(f"{name} changes and is no buffer: use register_buffer") == 1
+    for name in ("constant", "names", "learner_of_mine", "optimizer", "latest"):
+        assert f".{name} changes" not in said[0]
+
+
+@pytest.mark.parametrize("cls", [Saves, Buffered])
+def test_what_is_saved_is_not(cls: type, tmp_path: Path) -> None:
+    model = sac(pessimism=cls)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.learn(30).save(tmp_path / "m")
+    assert messages(caught) == []
+    loaded = SAC.load(tmp_path / "m", pessimism=cls)
+    assert (loaded.pessimism_rule.k, getattr(loaded.pessimism_rule, "n", None)) == (
+        model.pessimism_rule.k,
+        getattr(model.pessimism_rule, "n", None),
+    )
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_nor_is_anything_of_this_package(maker: str, tmp_path: Path) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        MAKERS[maker]().learn(30).save(tmp_path / "m")
+    assert messages(caught) == []

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from sb3_sample import BRO, DAC, SAC, DiagnosticsCallback
-from sb3_sample.learner.execution import has_foreign_parts
+from sb3_sample.learner.execution import foreign_parts
 from sb3_sample.parts import (
     Batch,
     BatchTransform,
@@ -298,19 +298,32 @@ class Refusing(Rule):
 @pytest.mark.parametrize(
     ("kwargs", "foreign"),
     [
-        ({}, False),
-        ({"pessimism": Rule}, False),
-        ({"pessimism": Silent}, False),
-        ({"pessimism": Refusing}, True),
-        ({"exploration": Uniform}, True),
-        ({"policy_kwargs": {"critic_network": Unit}}, False),
-        ({"policy_kwargs": {"critic_network": BatchNorm}}, True),
-        ({"policy_kwargs": {"actor_network": BatchNorm}}, True),
-        ({"value_head": TwoHot}, False),
+        ({}, []),
+        ({"pessimism": Rule}, []),
+        ({"pessimism": Silent}, []),
+        ({"pessimism": Refusing}, ["pessimism=Refusing"]),
+        ({"pessimism": Refusing, "exploration": Uniform}, ["exploration=Uniform", "pessimism=Refusing"]),
+        ({"policy_kwargs": {"critic_network": Unit}}, []),
+        ({"policy_kwargs": {"critic_network": BatchNorm}}, ["critic_network=BatchNorm"]),
+        ({"policy_kwargs": {"actor_network": BatchNorm}}, ["actor_network=BatchNorm"]),
+        ({"value_head": TwoHot}, []),
     ],
 )
-def test_which_parts_are_compiled_unasked(kwargs: dict[str, Any], foreign: bool) -> None:
-    assert has_foreign_parts(sac(**kwargs).learner) == foreign
+def test_which_parts_are_compiled_unasked(
+    kwargs: dict[str, Any], foreign: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert foreign_parts(sac(**kwargs).learner) == foreign
+    if not foreign:
+        return
+    sac(**kwargs, verbose=1).learn(12)
+    assert "not compiled" not in capsys.readouterr().out  # few steps, which would not be compiled anyway
+    monkeypatch.setattr("sb3_sample.sac.algorithm.PAYS_FROM", 1)
+    sac(**kwargs, verbose=1).learn(12)
+    does = "does" if len(foreign) == 1 else "do"
+    line = f"The gradient step is not compiled: {', '.join(foreign)} {does} not declare compilable = True\n"
+    assert line in capsys.readouterr().out
+    sac(**kwargs, verbose=0).learn(12)
+    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.slow

@@ -80,6 +80,11 @@ WRONG_ARGUMENTS: list[tuple[str, Any, str]] = [
     ("tensorboard_log", 1, "tensorboard_log must be the path of a folder, or None, not 1"),
     ("policy_kwargs", [("net_arch", [8])], r"policy_kwargs must be a dict, or None, not \[\("),
     ("policy_kwargs", "net_arch", "policy_kwargs must be a dict, or None, not 'net_arch'"),
+    (
+        "policy_kwargs",
+        {"net_arhc": [64]},
+        "policy_kwargs has 'net_arhc', which is no argument of .*Policy. Did you mean 'net_arch'",
+    ),
     ("policy_kwargs", {"net_arch": "64"}, "net_arch must be a list of widths, .*, not '64'"),
     ("policy_kwargs", {"net_arch": 64}, "net_arch must be .*, not 64"),
     ("policy_kwargs", {"net_arch": [8.0]}, r"net_arch must be .*, not \[8.0\]"),

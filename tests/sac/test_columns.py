@@ -230,12 +230,19 @@ def test_names_that_are_taken(column: Column, words: str) -> None:
         make(type("Pos", (CompactReplayBuffer,), {"more_columns": (Column("pos", None),)}))
     with pytest.raises(TypeError, match="more_columns of Wrong must be of Column, not 'task'"):
         type("Wrong", (CompactReplayBuffer,), {"more_columns": ("task",)})
+    with pytest.raises(TypeError, match=r"more_columns of Wrong must be a tuple of Column, not Column\(name='task'"):
+        type("Wrong", (CompactReplayBuffer,), {"more_columns": TASK})
 
 
 def test_values_that_are_none() -> None:
     def with_values(read: Any) -> Any:
         return make(type("Local", (CompactReplayBuffer,), {"more_columns": (Column("x", read),)}), vec()).learn
 
+    with pytest.raises(ValueError, match="read of the column 'x' of Local must give a list, one value .* not 1"):
+        with_values(lambda step: 1.0)(5)
+    with pytest.raises(KeyError, match="nothing") as raised:
+        with_values(lambda step: [info["nothing"] for info in step.infos])(5)
+    assert raised.value.__notes__ == ["in read of the column 'x' of Local"]
     with pytest.raises(ValueError, match="the column 'x' must be finite, not nan"):
         with_values(lambda step: [np.nan])(5)
     with pytest.raises(ValueError, match=r"could not broadcast the x of shape \(2,\) into shape \(1,\)"):

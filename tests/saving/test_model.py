@@ -22,8 +22,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_sample import BRO, MBMAPPO, BROFast
+from sb3_sample.parts import Pessimism, argument
 from sb3_sample.sac import DAC, SAC
-from sb3_sample.saving import BadFile, container, load_vec_normalize, save_vec_normalize
+from sb3_sample.saving import BadFile, container, load_vec_normalize, model_tree, save_vec_normalize
 from sb3_sample.saving.container import PickledFile
 from tests.ppo.common import ALGORITHMS, tiny
 from tests.sac.common import MAKERS, bro, differing, sac, state, vec
@@ -519,3 +520,55 @@ def test_a_model_of_stable_baselines3_is_refused_by_its_reason(tmp_path: Path) -
         SAC.load(tmp_path / "m")
     with pytest.raises(ValueError, match="no model of SAC.*loaded by its own class"):
         SAC.load(tmp_path / "m", allow_pickle=True)
+
+
+class Decaying(Pessimism):
+    def __init__(self, learner: Any, rate: float = 0.99):
+        super().__init__(1.0)
+        self.rate = rate
+
+
+class DecayAgent(SAC):
+    """An agent with an argument of its own, and an attribute that is none."""
+
+    pessimism: Any = argument(default=Decaying)
+    decay_rate: float = argument(default=0.5)
+
+    def _full_pessimism_kwargs(self) -> dict[str, Any]:
+        return {"rate": self.decay_rate}
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_a_base_class_says_which_arguments_it_drops(
+    is_known: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sac(cls=DecayAgent, decay_rate=0.9).learn(20).save(tmp_path / "m")
+    if not is_known:
+        # As in a program that has no such class.
+        monkeypatch.setattr(model_tree, "_below", lambda cls: iter(()))
+    words = "holds a model of DecayAgent, not of SAC: load it with DecayAgent.load. A SAC makes no use of decay_rate$"
+    with pytest.warns(UserWarning, match=words):
+        loaded = SAC.load(tmp_path / "m", pessimism=Decaying)
+    assert loaded.pessimism_rule.rate == 0.99
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert DecayAgent.load(tmp_path / "m", pessimism=Decaying).pessimism_rule.rate == 0.9
+
+
+@pytest.mark.parametrize("maker", MAKE)
+def test_models_of_one_class_lose_no_arguments(maker: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor does the guess where a file's class is not known take something for lost that is not."""
+    model = MAKE[maker]().learn(20)
+    model.save(tmp_path / "m")
+
+    class Same(type(model)):  # type: ignore[misc]
+        pass
+
+    other = Same("MlpPolicy", None, _init_setup_model=False)
+    vars(other).update(vars(model))
+    other.save(tmp_path / "other")
+    monkeypatch.setattr(model_tree, "_below", lambda cls: iter(()))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        type(model).load(tmp_path / "m")
+        type(model).load(tmp_path / "other")

@@ -235,9 +235,11 @@ def test_classes_and_spaces(tmp_path: Path) -> None:
     ):
         model.learn(12)
     model.save_replay_buffer(tmp_path / "b")
+    # A class that the model itself has is the program's, and trusted; that of another model is not.
+    model.load_replay_buffer(tmp_path / "b")
     with pytest.raises(BadFile, match="b.buffer.zip: .*not trusted"):
-        model.load_replay_buffer(tmp_path / "b")
-    model.load_replay_buffer(tmp_path / "b", trusted_modules=[__name__])
+        sac().load_replay_buffer(tmp_path / "b")
+    sac().load_replay_buffer(tmp_path / "b", trusted_modules=[__name__])
     for kind in (ReplayBuffer, None):
         wide = sac(vec(action_space=spaces.Box(-1, 1, (3,))), replay_buffer_class=kind).learn(12)
         wide.save_replay_buffer(tmp_path / "wide")
