@@ -36,6 +36,7 @@ class Argument:
         a learner has nothing
     :param annotation: its type
     :param meaning: the string below its declaration
+    :param keeps_place: whether ``kw_only`` is the inherited one's, if there is one
     """
 
     name: str
@@ -46,13 +47,14 @@ class Argument:
     of_training: bool
     annotation: Any = REQUIRED
     meaning: str = ""
+    keeps_place: bool = False
 
 
 def argument(
     *,
     default: Any = REQUIRED,
     kind: Kind | None = None,
-    kw_only: bool = True,
+    kw_only: bool | None = None,
     of_training: bool = False,
     alias: str | None = None,
 ) -> Any:
@@ -61,14 +63,15 @@ def argument(
     inherited one only its default and what is given here change.
 
     :param default: default; none if left out
-    :param kind: the kind of its values
-    :param kw_only: whether it is passed by name only
+    :param kind: the kind of its values, of ``sb3_sample.kinds``; None for that of the inherited one, or no check
+    :param kw_only: whether it is passed by name only; None: as the inherited one, else by name only. Type checkers take
+        None for True
     :param of_training: whether a learner has nothing of it
     :param alias: name of the argument, if the declaration needs another: one whose type differs from that of the
         object's attribute of this name
     :return: the declaration
     """
-    return Argument(alias or "", "", default, kind, kw_only, of_training)
+    return Argument(alias or "", "", default, kind, kw_only is not False, of_training, keeps_place=kw_only is None)
 
 
 @dataclass_transform(kw_only_default=True, eq_default=False, field_specifiers=(argument,))
@@ -118,6 +121,7 @@ def _declared(cls: type) -> dict[str, Argument]:
                 new,
                 name=inherited.name,
                 kind=new.kind or inherited.kind,
+                kw_only=inherited.kw_only if new.keeps_place else new.kw_only,
                 of_training=new.of_training or inherited.of_training,
                 annotation=inherited.annotation,
                 meaning=inherited.meaning,

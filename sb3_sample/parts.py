@@ -6,6 +6,7 @@ A part is a class, accepted where a name is: ``pessimism=``, ``exploration=``, `
 arguments by ``argument``. docs/parts.md says what each has to have.
 """
 
+from sb3_sample import kinds
 from sb3_sample.constructor import argument
 from sb3_sample.learner.batch import Batch, CriticStep, Extra, Noise
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration, OptimisticExploration
@@ -47,6 +48,7 @@ __all__ = [
     "argument",
     "bootstrap",
     "epistemic_std",
+    "kinds",
     "linear",
     "pessimistic_value",
     "td_target",

@@ -92,14 +92,30 @@ def published_curves(env_id: str) -> pd.DataFrame:
         suite, task = published_key(env_id)
     except ValueError:  # of no published suite
         suite, task = "", ""
-    data = _all_published()
+    data = all_published_curves()
     rows = data[(data["suite"] == suite) & (data["task"] == task)]
     return rows[["algorithm", "metric", *COLUMNS]].reset_index(drop=True)
 
 
 @functools.cache
-def _all_published() -> pd.DataFrame:
+def all_published_curves() -> pd.DataFrame:
+    """
+    :return: those of all tasks, as ``data/README.md`` describes them. Not to be changed: it is read once
+    """
     return pd.read_csv(DATA)
+
+
+def named_algorithms(name: str, available: Sequence[str]) -> list[str]:
+    """
+    :param name: e.g. "BRO (RR=10)" or, without the bracket, "BRO", which means all of that name unless one is called
+        just so; "all"
+    :param available: the algorithms that there are
+    :return: those that it names
+    """
+    exact = [algorithm for algorithm in available if name.lower() == algorithm.lower()]
+    return exact or [
+        algorithm for algorithm in available if name.lower() in ("all", algorithm.partition(" (")[0].lower())
+    ]
 
 
 def _published_task(env_id: str) -> str:
@@ -128,9 +144,7 @@ def select_published(env_id: str, names: Sequence[str] | None, metric: str) -> l
     available = list(data["algorithm"].unique())
     chosen: list[str] = []
     for name in PUBLISHED if names is None else names:
-        matches = [algorithm for algorithm in available if name.lower() == algorithm.lower()] or [
-            algorithm for algorithm in available if name.lower() in ("all", algorithm.partition(" (")[0].lower())
-        ]
+        matches = named_algorithms(name, available)
         if not matches and names is not None:
             raise ValueError(
                 f"published must be of {', '.join(available) or 'nothing: there are no curves'} "

@@ -198,11 +198,23 @@ def test_rliable_plots_take_success_rates_as_they_are(rliable) -> None:
 def test_rliable_plots_of_raw_returns_are_refused(rliable) -> None:
     with pytest.raises(SystemExit, match="metaworld-push-v3 are returns.* all_plots --key successes"):
         rliable(["metaworld/push-v3"], "--rliable")
-    with pytest.raises(SystemExit, match="for Pendulum-v1 there is no score to normalise by.*--skip-envs"):
+    with pytest.raises(SystemExit, match="for Pendulum-v1 there is no score to .*--skip-envs.* study aggregate"):
         rliable(["dmc/cheetah-run-v0", "Pendulum-v1"], "--rliable")
     for leaving_out in (["--skip-envs", "Pendulum-v1"], ["--keep-envs", "dmc/cheetah-run-v0"]):
         scores = rliable(["dmc/cheetah-run-v0", "Pendulum-v1"], "--rliable", *leaving_out)[-1]
         assert scores["BRO-logs"].shape == (3, 1) and scores["BRO-logs"].max() < 1
+
+
+@pytest.mark.parametrize(("task", "unit"), [("HalfCheetah-v5", 8_500), ("Ant-v4", 6_625), ("FetchReach-v4", 1)])
+def test_tasks_of_gymnasium_are_normalised_by_their_ids(task: str, unit: float) -> None:
+    pytest.importorskip("rl_zoo3")
+    from sb3_sample.zoo.files import RunError
+    from sb3_sample.zoo.scores import _unit
+
+    assert _unit(task, {"mean": np.array([0.5]), "last_evals": np.array([[1.0]])}) == unit
+    for pybullet in ("Half", "Ant"):
+        with pytest.raises(RunError, match=f"zoo's for '{pybullet}' are those of PyBullet's.* study aggregate"):
+            _unit(pybullet, {})
 
 
 def test_without_rliable_scores_are_as_they_were(rliable) -> None:

@@ -161,15 +161,41 @@ def test_a_method_of_an_arguments_name_is_no_default() -> None:
     assert inspect.signature(Strange).parameters["tau"].default == 0.005
 
 
-def test_the_agent_of_the_documentation() -> None:
+def _documented(name: str, before: str = "") -> dict[str, Any]:
+    """Run the program of docs/parts.md that has a class, on a small environment."""
     text = (ROOT / "docs" / "parts.md").read_text()
-    (program,) = [block for block in re.findall(r"```python\n(.*?)```", text, re.S) if "class REDQ(SAC)" in block]
+    (program,) = [block for block in re.findall(r"```python\n(.*?)```", text, re.S) if f"class {name}(" in block]
     environment = '"dmc/cheetah-run-v0", '
     assert environment in program
     names: dict[str, Any] = {"vec": vec, "__name__": "documentation"}
-    exec(program.replace(environment, "vec(), buffer_size=100, "), names)
-    model = names["model"]
+    exec(before + program.replace(environment, "vec(), buffer_size=100, "), names)
+    return names
+
+
+def test_the_agents_of_the_documentation() -> None:
+    model = _documented("REDQ")["model"]
     assert (model.replay_ratio, model.target_subset, model.actor_pessimism, model.critic.n_critics) == (20, 2, 0, 10)
+    rule = (
+        "from sb3_sample.parts import Pessimism\n\nclass Annealed(Pessimism):\n"
+        "    def __init__(self, learner, steps):\n        super().__init__(1.0)\n        self.steps = steps\n"
+    )
+    names = _documented("AnnealedSAC", rule)
+    assert names["model"].pessimism_rule.steps == 50_000
+    with pytest.raises(ValueError, match="annealing_steps must be an integer of at least 1, not 0"):
+        names["AnnealedSAC"]("MlpPolicy", vec(), buffer_size=100, annealing_steps=0)
+    assert ":param annealing_steps:" not in (SAC.__doc__ or "")
+
+
+def test_another_default_leaves_an_argument_in_its_place() -> None:
+    class Small(SAC):
+        batch_size: int = argument(default=32)
+        gamma: float = argument(default=0.9, kw_only=True)
+
+    parameters = inspect.signature(Small).parameters
+    assert parameters["batch_size"].kind is inspect.Parameter.POSITIONAL_OR_KEYWORD
+    assert parameters["gamma"].kind is inspect.Parameter.KEYWORD_ONLY
+    model = Small("MlpPolicy", vec(), 3e-4, 1000, 100, 7)
+    assert (model.batch_size, model.tau, model.gamma) == (7, 0.005, 0.9)
 
 
 def test_a_required_argument_has_no_default() -> None:

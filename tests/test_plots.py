@@ -49,8 +49,8 @@ def test_published_curves_are_those_of_the_task() -> None:
     assert not len(plots.published_curves("Pendulum-v1"))
 
 
-def test_the_data_file_is_small() -> None:
-    assert sum(file.stat().st_size for file in plots.DATA.parent.iterdir()) < 500_000
+def test_the_data_files_are_small() -> None:
+    assert sum(file.stat().st_size for file in plots.DATA.parent.iterdir()) < 550_000
 
 
 def test_bro_has_its_ten_seeds_where_its_authors_published_them() -> None:

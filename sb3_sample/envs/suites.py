@@ -193,3 +193,16 @@ def published_key(env_id: str) -> tuple[str, str]:
         "env_id must be a versioned id of dmc/, metaworld/ or myosuite/, of HumanoidBench (h1-..., h1hand-...), or of "
         f"{', '.join(_GYMNASIUM)}, got {env_id!r}"
     )
+
+
+def published_id(suite: str, task: str) -> str:
+    """
+    The other way round: the id of today's environment. Meta-World's curves are of v2, of which this package has v3.
+
+    :param suite: of the published curves
+    :param task: likewise
+    :return: id, e.g. ``"metaworld/push-v3"``; :func:`published_key` of it is the suite and the task
+    """
+    if suite in ("dmc", "metaworld", "myosuite"):
+        return f"{suite}/{task.removeprefix('myo-')}-v{3 if suite == 'metaworld' else 0}"
+    return task

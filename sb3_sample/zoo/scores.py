@@ -11,12 +11,15 @@ from typing import IO, Any
 
 import numpy as np
 
+from sb3_sample.envs.scores import SCORED, score_of
 from sb3_sample.zoo.files import PlottedRuns, RunError
 
 #: Tasks, by their names in the zoo's tables, that its command normalises itself.
-ZOO_REFERENCES = frozenset({"Half", "Ant", "Hopper", "Walker", "LunarLanderContinuous", "BipedalWalker"})
-#: The largest return of a task of DeepMind Control: at most 1 in each of 1,000 steps.
-DMC_RETURN = 1_000.0
+ZOO_REFERENCES = frozenset({"LunarLanderContinuous", "BipedalWalker"})
+#: Parts of names that it normalises by the scores of PyBullet's tasks, whosever runs they are.
+PYBULLET = frozenset({"Half", "Ant", "Hopper", "Walker"})
+#: What averages other tasks.
+_OURS = "sb3-sample study aggregate averages runs of any tasks (--score TASK=HIGH)"
 
 
 def rliable_options(arguments: Sequence[str]) -> tuple[bool, list[str], list[str]]:
@@ -65,30 +68,43 @@ class NormalizedRuns(PlottedRuns):
 
 def _unit(task: str, runs: dict[str, Any]) -> float:
     """What a task's scores are divided by."""
-    suite = task.replace("/", "-").partition("-")[0]
-    if suite == "dmc":
-        return DMC_RETURN
-    if suite in ("metaworld", "myosuite"):
+    score = score_of(_env_id(task))
+    if score is not None and score.metric == "success_rate":
         scores = np.concatenate([np.ravel(runs["mean"]), np.ravel(runs["last_evals"])])
         if not ((scores >= 0) & (scores <= 1)).all():
             raise RunError(
                 f"--rliable draws scores between 0 and 1, and those of {task} are returns, which have no common scale "
                 "there: gather success rates, with all_plots --key successes"
             )
-        return 1.0
+    if score is not None:
+        return score.high
     if task in ZOO_REFERENCES:
         return 1.0
+    if task in PYBULLET:
+        raise RunError(
+            f"--rliable draws scores between 0 and 1, and the zoo's for {task!r} are those of PyBullet's task. Give "
+            f"all_plots the whole id, as HalfCheetah-v5. There are scores for {SCORED}; {_OURS}"
+        )
     raise RunError(
         f"--rliable draws scores between 0 and 1, and for {task} there is no score to normalise by. There is one for "
-        "the tasks of dmc/ (returns), of metaworld/ and myosuite/ (success rates), by their whole ids, and for the "
-        f"zoo's own {', '.join(sorted(ZOO_REFERENCES))}: leave {task} out with --skip-envs, or draw without --rliable"
+        f"{SCORED}, by their whole ids, and for the zoo's own {', '.join(sorted(ZOO_REFERENCES))}: leave {task} out "
+        f"with --skip-envs, or draw without --rliable; {_OURS}"
     )
+
+
+def _env_id(task: str) -> str:
+    """The id of a task of the zoo's tables, in which a dash stands for the slash."""
+    suite, dash, name = task.partition("-")
+    return f"{suite}/{name}" if dash and suite in ("dmc", "metaworld", "myosuite") else task
 
 
 @contextlib.contextmanager
 def saying_so() -> Iterator[None]:
     """Around the zoo's command, which warns that it does not know the scale of tasks that are normalised already."""
-    print("Scores are normalised: returns of DeepMind Control over 1,000, success rates as they are")
+    print(
+        "Scores are normalised: returns of DeepMind Control over 1,000, success rates as they are, returns of MuJoCo's "
+        "HalfCheetah, Walker2d, Ant and Humanoid over 8,500, 4,500, 6,625 and 6,125"
+    )
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".* not found for normalizing scores")
         yield

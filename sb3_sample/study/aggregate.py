@@ -1,0 +1,558 @@
+"""
+Scores over tasks and seeds, by rliable (Agarwal et al. 2021, "Deep reinforcement learning at the edge of the
+statistical precipice"): interquartile mean, mean, median and optimality gap with stratified bootstrap intervals,
+performance profiles and the probability of improvement.
+"""
+
+import contextlib
+import itertools
+import json
+import math
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sb3_sample.envs.scores import SCORED, Score, score_of
+from sb3_sample.envs.suites import DAC_NAMED
+from sb3_sample.extras import install
+from sb3_sample.study.table import RUN
+
+#: Scores of tasks that have no common one, or another: ``score_of`` for the rest.
+Scores = Mapping[str, Score | float]
+#: Groups of tasks: names of :data:`GROUPS`, or tasks by the group's name.
+Groups = Sequence[str] | Mapping[str, Sequence[str]]
+
+_DOGS = tuple(task for task in DAC_NAMED if task.startswith("dmc/dog-"))
+#: The groups of tasks that have a name.
+GROUPS: dict[str, Callable[[str], bool]] = {
+    "all": lambda task: True,
+    "dmc": lambda task: task.startswith("dmc/"),
+    "metaworld": lambda task: task.startswith("metaworld/"),
+    "myosuite": lambda task: task.startswith("myosuite/"),
+    "dog & humanoid": lambda task: task in DAC_NAMED,
+    "dogs": lambda task: task in _DOGS,
+    "dmc without dogs": lambda task: task.startswith("dmc/") and task not in _DOGS,
+}
+#: Those of BRO's table 9, which are shown unless others are asked for.
+DEFAULT_GROUPS = ("all", "dmc", "metaworld", "myosuite", "dog & humanoid")
+#: Bootstrap samples.
+REPS = 2_000
+_STATISTICS = ("iqm", "mean", "median", "optimality_gap")
+
+
+# ---------------------------------------------------------------- scores
+
+
+def scored(table: pd.DataFrame, scores: Scores | None = None) -> pd.DataFrame:
+    """
+    The scores of a table's runs: of each task the one metric that counts, on a scale on which tasks are averaged.
+
+    Returns of DeepMind Control over 1,000; success rates of Meta-World, MyoSuite and Fetch as they are; returns of
+    MuJoCo's HalfCheetah, Walker2d, Ant and Humanoid over 8,500, 4,500, 6,625 and 6,125. Nothing is clipped.
+
+    :param table: of :func:`~sb3_sample.study.read`
+    :param scores: of other tasks, by their ids: a :class:`Score`, or the return whose score is 1
+    :return: columns agent, arguments, task, seed, step, score, sorted by step within a run, the runs in their order
+    :raises ValueError: a task has no score, or its runs have not recorded what it is made of
+    """
+    measured = table[~table["metric"].str.contains("/") & (table["metric"] != "hours")]
+    given = {
+        task: score if isinstance(score, Score) else Score("return", float(score))
+        for task, score in (scores or {}).items()
+    }
+    parts = []
+    for task, rows in measured.groupby("task", sort=False):
+        score = given.get(task) or score_of(task)
+        if score is None:
+            raise ValueError(
+                f"scores must say how {task} is scored: there is a common scale for {SCORED} only. Give the return "
+                f"whose score is 1, scores={{{task!r}: 1000.0}} (--score {task}=1000), or Score(metric, high, low) "
+                f"(--score {task}=LOW:HIGH)"
+            )
+        if score.high == score.low:
+            raise ValueError(f"scores must have a high that is not low, not {task} {score}")
+        rows = rows[rows["metric"] == score.metric]
+        without = measured[measured["task"] == task].merge(rows[RUN].drop_duplicates(), how="left", indicator=True)
+        without = without[without["_merge"] == "left_only"]
+        if len(without):
+            raise ValueError(
+                f"{task} is scored by {score.metric}, which the runs of {', '.join(without['agent'].unique())} there "
+                "have not recorded; scores (--score) can name another metric"
+            )
+        parts.append(rows.assign(score=(rows["value"] - score.low) / (score.high - score.low)))
+    if not parts:
+        raise ValueError("table must have returns or success rates of runs, and has none")
+    columns = [*RUN, "step", "score"]
+    found = pd.concat(parts)[columns].sort_index(kind="stable")
+    twice = found.duplicated([*RUN, "step"])
+    if twice.any():
+        row = found[twice].iloc[0]
+        raise ValueError(
+            f"table must have one value a run and step: there are two of {row['agent']}, {row['task']}, seed "
+            f"{row['seed']} at {row['step']:,}"
+        )
+    if found["score"].isna().any():
+        row = found[found["score"].isna()].iloc[0]
+        raise ValueError(
+            f"table must have numbers, not NaN, as of {row['agent']}, {row['task']}, seed {row['seed']} at "
+            f"{row['step']:,}"
+        )
+    return found.reset_index(drop=True)
+
+
+def named_apart(table: pd.DataFrame) -> pd.DataFrame:
+    """
+    :param table: columns agent, arguments, task and any others
+    :return: the same, where agents whose arguments differ on one and the same task have these in their names
+    """
+    kinds = table[["agent", "task", "arguments"]].drop_duplicates()
+    names: dict[tuple[str, str], str] = {}
+    for agent, rows in kinds.groupby("agent", sort=False):
+        differing = differing_arguments(rows)
+        if differing:
+            for text in rows["arguments"].unique():
+                arguments = json.loads(text)
+                words = ", ".join(f"{name}={_word(arguments.get(name))}" for name in differing)
+                names[agent, text] = f"{agent} ({words})"
+    if not names:
+        return table
+    pairs = zip(table["agent"], table["arguments"], strict=True)
+    return table.assign(agent=[names.get(pair, pair[0]) for pair in pairs])
+
+
+def differing_arguments(runs: pd.DataFrame) -> list[str]:
+    """
+    :param runs: columns task and arguments
+    :return: the arguments that are not the same for all runs of one task, sorted
+    """
+    differing: set[str] = set()
+    for _, texts in runs.groupby("task")["arguments"]:
+        found = [json.loads(text) for text in texts.unique()]
+        names = set().union(*found)
+        differing |= {name for name in names if any(each.get(name) != found[0].get(name) for each in found)}
+    return sorted(differing)
+
+
+def _word(value: Any) -> str:
+    return value if isinstance(value, str) else "default" if value is None else json.dumps(value)
+
+
+def group_tasks(groups: Groups | None, tasks: Sequence[str]) -> dict[str, list[str]]:
+    """
+    :param groups: names of :data:`GROUPS`, or tasks by name of the group; None for :data:`DEFAULT_GROUPS`
+    :param tasks: of a table
+    :return: those of each group; groups of :data:`GROUPS` without any are left out
+    :raises ValueError: there is no such group, or a task is not in the table
+    """
+    if isinstance(groups, Mapping):
+        unknown = sorted(set(itertools.chain(*groups.values())) - set(tasks))
+        if unknown:
+            raise ValueError(f"groups must be of tasks in the table, not {', '.join(unknown)}")
+        return {name: [task for task in tasks if task in members] for name, members in groups.items()}
+    names = DEFAULT_GROUPS if groups is None else [groups] if isinstance(groups, str) else groups
+    for name in names:
+        if name not in GROUPS:
+            raise ValueError(f"groups must be of {', '.join(GROUPS)}, or tasks by name of the group, not {name!r}")
+    found = {name: [task for task in tasks if GROUPS[name](task)] for name in names}
+    return {name: members for name, members in found.items() if members}
+
+
+# ---------------------------------------------------------------- scores at common steps
+
+
+def at_steps(scores: pd.DataFrame, steps: Sequence[int] | None) -> tuple[pd.DataFrame, list[int]]:
+    """
+    :param scores: of :func:`scored`
+    :param steps: simulator steps; None for those that all runs have or, where they have none in common, those of the
+        run with the fewest as far as all runs reach
+    :return: a row a run, indexed by agent and task; a column a step: the score there, by linear
+        interpolation between two evaluations of the run, NaN before its first and after its last; and the steps
+    :raises ValueError: there are no such steps
+    """
+    numbers = scores.groupby(RUN, sort=False, dropna=False).ngroup().to_numpy()
+    order = np.lexsort((scores["step"], numbers))
+    starts = np.flatnonzero(np.diff(numbers[order], prepend=-1))
+    heads = scores[["agent", "task"]].iloc[order[starts]]
+    runs = list(
+        zip(
+            np.split(scores["step"].to_numpy()[order], starts[1:]),
+            np.split(scores["score"].to_numpy()[order], starts[1:]),
+            strict=True,
+        )
+    )
+    if steps is None:
+        common = runs[0][0]
+        for own, _ in runs[1:]:
+            common = np.intersect1d(common, own)
+        if not len(common):
+            common = min((own for own, _ in runs), key=len)
+            first, last = max(own[0] for own, _ in runs), min(own[-1] for own, _ in runs)
+            common = common[(first <= common) & (common <= last)]
+        if not len(common):
+            raise ValueError("steps must be given: the runs do not overlap")
+        steps = [int(step) for step in common]
+    elif not len(steps) or any(step != int(step) or step < 0 for step in steps) or len(set(steps)) < len(steps):
+        raise ValueError(f"steps must be whole numbers from 0 on, each once, not {list(steps)}")
+    values = [np.interp(steps, own, score, left=np.nan, right=np.nan) for own, score in runs]
+    matrix = pd.DataFrame(values, index=pd.MultiIndex.from_frame(heads), columns=list(steps))
+    return matrix, [int(step) for step in steps]
+
+
+def _warn_of_gaps(matrix: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> None:
+    """Say where an average is not over the same tasks, or the same runs, for all agents and steps."""
+    for step in matrix:
+        left_out = int(matrix[step].isna().sum())
+        if left_out:
+            warnings.warn(
+                f"{left_out} of {len(matrix)} runs have no evaluations around step {step:,} and are left out there",
+                stacklevel=3,
+            )
+    by_agent = {agent: set(rows.index.get_level_values("task")) for agent, rows in matrix.groupby("agent", sort=False)}
+    for name, members in groups.items():
+        counts = {agent: len(tasks & set(members)) for agent, tasks in by_agent.items() if tasks & set(members)}
+        if any(by_agent[agent] & set(members) != set(members) for agent in counts):
+            found = ", ".join(f"{agent} {n}" for agent, n in counts.items())
+            warnings.warn(
+                f"agents have not the same tasks of the {len(members)} of {name!r} ({found}): common=True (--common) "
+                "compares them on those that all have",
+                stacklevel=3,
+            )
+
+
+def _common_tasks(scores: pd.DataFrame) -> pd.DataFrame:
+    tasks = [set(found) for _, found in scores.groupby("agent")["task"]]
+    common = set.intersection(*tasks)
+    if not common:
+        raise ValueError("common: there is no task that all agents have")
+    return scores[scores["task"].isin(common)]
+
+
+# ---------------------------------------------------------------- statistics
+
+
+def blocks_of(rows: pd.DataFrame) -> list[np.ndarray]:
+    """
+    :param rows: of one agent, indexed by task; without NaN
+    :return: arrays (runs, tasks, steps), one for the tasks with the same number of runs
+    """
+    values = {task: group.to_numpy() for task, group in rows.groupby("task", sort=False)}
+    by_runs: dict[int, list[np.ndarray]] = {}
+    for each in values.values():
+        by_runs.setdefault(len(each), []).append(each)
+    return [np.stack(by_runs[n], axis=1) for n in sorted(by_runs)]
+
+
+def iqm(*blocks: np.ndarray) -> np.ndarray:
+    """
+    Interquartile mean over all runs of all tasks together: a quarter of them, rounded down, cut at both ends. Where
+    tasks have different numbers of runs, it is as if each run were there so often that all tasks have the same number.
+
+    :param blocks: scores (runs, tasks, steps), each of other tasks
+    :return: (steps,)
+    """
+    if len(blocks) == 1:
+        scores = blocks[0].reshape(-1, blocks[0].shape[-1])
+        first, last = len(scores) // 4, len(scores) - len(scores) // 4
+        middle: np.ndarray = np.partition(scores, (first, last - 1), axis=0)[first:last]
+        return middle.mean(axis=0)  # type: ignore[no-any-return]
+    pooled = np.concatenate([block.reshape(-1, block.shape[-1]) for block in blocks])
+    weights = np.concatenate([np.full(block.shape[0] * block.shape[1], 1 / block.shape[0]) for block in blocks])
+    order = np.argsort(pooled, axis=0)
+    pooled, weights = np.take_along_axis(pooled, order, axis=0), weights[order] / weights.sum()
+    n = math.lcm(*(len(block) for block in blocks)) * sum(block.shape[1] for block in blocks)
+    cut = n // 4 / n
+    ends = np.cumsum(weights, axis=0)
+    kept = np.clip(np.minimum(ends, 1 - cut) - np.maximum(ends - weights, cut), 0, None)
+    return (kept * pooled).sum(axis=0) / kept.sum(axis=0)  # type: ignore[no-any-return]
+
+
+def _of_tasks(*blocks: np.ndarray) -> np.ndarray:
+    """Means over the runs of each task, (tasks, steps)."""
+    return np.concatenate([block.mean(axis=0) for block in blocks])
+
+
+def _all_statistics(*blocks: np.ndarray) -> np.ndarray:
+    """``_STATISTICS`` by step, one after the other, as rliable takes what it draws intervals of."""
+    tasks = _of_tasks(*blocks)
+    gap = 1 - _of_tasks(*(np.minimum(block, 1) for block in blocks)).mean(axis=0)
+    return np.concatenate([iqm(*blocks), tasks.mean(axis=0), np.median(tasks, axis=0), gap])
+
+
+@contextlib.contextmanager
+def _seeded(seed: int) -> Iterator[None]:
+    """NumPy's global generator, which rliable draws from, seeded and afterwards as it was."""
+    state = np.random.get_state()  # noqa: NPY002
+    np.random.seed(seed)  # noqa: NPY002
+    try:
+        yield
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+
+
+def bootstrap(
+    statistic: Callable[..., np.ndarray], blocks: Sequence[np.ndarray], reps: int, confidence: float, seed: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    A statistic and its percentile interval, by rliable's stratified bootstrap, which redraws the runs of each task.
+
+    :param statistic: of arrays (runs, tasks, steps) gives (n,)
+    :param blocks: the arrays
+    :param reps: bootstrap samples
+    :param confidence: share of them in the interval
+    :param seed: of the samples
+    :return: statistic, lower and upper end, (n,) each; the ends NaN where no task has a second run
+    :raises ImportError: rliable is not installed
+    """
+    point = statistic(*blocks)
+    if all(len(block) < 2 for block in blocks):
+        return point, np.full_like(point, np.nan), np.full_like(point, np.nan)
+    library = _rliable()
+    score = blocks[0] if len(blocks) == 1 else list(blocks)
+    with _seeded(seed):
+        _, intervals = library.get_interval_estimates(
+            {"": score}, statistic, reps=reps, confidence_interval_size=confidence
+        )
+    low, high = intervals[""]
+    return point, low, high
+
+
+def _rliable() -> Any:
+    try:
+        import rliable.library
+    except ImportError as error:  # also of what it imports itself, with another pandas
+        raise ImportError(f"intervals need rliable ({error}). Install it with: {install('study')}") from error
+    return rliable.library
+
+
+def check_samples(reps: int, confidence: float) -> None:
+    """
+    :param reps: bootstrap samples
+    :param confidence: of an interval
+    :raises ValueError: one is out of range
+    """
+    if type(reps) is not int or reps < 1:
+        raise ValueError(f"reps must be a whole number from 1 on, not {reps!r}")
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence must be between 0 and 1, not {confidence!r}")
+
+
+def _complete(rows: pd.DataFrame) -> Iterator[tuple[list[int], pd.DataFrame]]:
+    """The runs of an agent by steps: those that have the same runs are together. Steps without any are left out."""
+    there = rows.notna()
+    for _, steps in itertools.groupby(
+        sorted(rows, key=lambda step: there[step].to_numpy().tobytes()),
+        key=lambda step: there[step].to_numpy().tobytes(),
+    ):
+        found = list(steps)
+        kept = rows.loc[there[found[0]].to_numpy(), found]
+        if len(kept):
+            yield found, kept
+
+
+def aggregate(
+    table: pd.DataFrame,
+    steps: Sequence[int] | None = None,
+    groups: Groups | None = None,
+    *,
+    scores: Scores | None = None,
+    common: bool = False,
+    reps: int = REPS,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> pd.DataFrame:
+    """
+    Scores of agents over tasks and seeds, at some steps or along the training.
+
+    Where the runs of an agent on one task were made with different arguments, they are several agents, named by those
+    that differ as well, e.g. "bro (replay_ratio=2)".
+
+    :param table: of :func:`~sb3_sample.study.read`
+    :param steps: simulator steps. A run's score at a step is its evaluation there, or between two evaluations the
+        linear interpolation; runs that do not reach it are left out there, with a warning. None: a curve, at the steps
+        that all runs have
+    :param groups: names of :data:`GROUPS`, or tasks by name of the group; None for :data:`DEFAULT_GROUPS`. Groups
+        without a task in the table are left out
+    :param scores: see :func:`scored`
+    :param common: only the tasks that all agents have
+    :param reps: bootstrap samples
+    :param confidence: of the intervals
+    :param seed: of the bootstrap
+    :return: a row an agent, group and step: ``agent``, ``group``, ``step``; ``iqm`` with its interval ``low`` and
+        ``high``; ``mean``, ``median`` and ``optimality_gap`` with theirs (``mean_low``, ...); ``tasks`` and ``runs``,
+        how many it is over. Intervals are NaN where no task has a second run
+    :raises ValueError: a task has no score, an argument is out of range, or no run reaches a step
+    :raises ImportError: rliable is not installed
+    """
+    check_samples(reps, confidence)
+    found = named_apart(scored(table, scores))
+    if common:
+        found = _common_tasks(found)
+    matrix, steps = at_steps(found, steps)
+    for step in steps:
+        if matrix[step].isna().all():
+            raise ValueError(f"steps must be within those of the runs, {_extent(found)}, not {step:,}")
+    members = group_tasks(groups, list(found["task"].unique()))
+    _warn_of_gaps(matrix, members)
+    rows = []
+    for agent, of_agent in matrix.groupby("agent", sort=False):
+        for group, tasks in members.items():
+            of_group = of_agent[of_agent.index.get_level_values("task").isin(tasks)]
+            by_step: dict[int, dict[str, Any]] = {}
+            for some, runs in _complete(of_group):
+                estimates = np.stack(bootstrap(_all_statistics, blocks_of(runs), reps, confidence, seed))
+                estimates = estimates.reshape(3, len(_STATISTICS), len(some))
+                n_tasks = runs.index.get_level_values("task").nunique()
+                for i, step in enumerate(some):
+                    by_step[step] = _row(agent, group, step, estimates[:, :, i], n_tasks, len(runs))
+            rows += [by_step[step] for step in steps if step in by_step]
+    return pd.DataFrame(rows)
+
+
+def _extent(scores: pd.DataFrame) -> str:
+    return f"{scores['step'].min():,} to {scores['step'].max():,}"
+
+
+def _row(agent: str, group: str, step: int, estimates: np.ndarray, tasks: int, runs: int) -> dict[str, Any]:
+    row: dict[str, Any] = {"agent": agent, "group": group, "step": step}
+    for name, (value, low, high) in zip(_STATISTICS, estimates.T, strict=True):
+        prefix = "" if name == "iqm" else f"{name}_"
+        row |= {name: value, f"{prefix}low": low, f"{prefix}high": high}
+    return row | {"tasks": tasks, "runs": runs}
+
+
+# ---------------------------------------------------------------- profiles and improvement
+
+
+def performance_profiles(
+    table: pd.DataFrame,
+    step: int,
+    thresholds: Sequence[float] | None = None,
+    groups: Groups | None = None,
+    *,
+    scores: Scores | None = None,
+    common: bool = False,
+    reps: int = REPS,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> pd.DataFrame:
+    """
+    The share of an agent's runs whose score is above a threshold, tasks weighing the same (rliable's score
+    distribution).
+
+    :param table: see :func:`aggregate`, also for the other arguments
+    :param step: simulator step
+    :param thresholds: scores; None for 0, 0.01, ..., 1
+    :return: columns ``agent``, ``group``, ``step``, ``threshold``, ``share``, ``low``, ``high``
+    """
+    check_samples(reps, confidence)
+    taus = np.linspace(0, 1, 101) if thresholds is None else np.asarray(thresholds, float)
+
+    def profile(*blocks: np.ndarray) -> np.ndarray:
+        above = [(block[:, :, :1] > taus).mean(axis=0) for block in blocks]
+        shares: np.ndarray = np.concatenate(above).mean(axis=0)
+        return shares
+
+    parts = []
+    for agent, group, runs in _at_step(table, step, groups, scores, common):
+        share, low, high = bootstrap(profile, blocks_of(runs), reps, confidence, seed)
+        values = {"threshold": taus, "share": share, "low": low, "high": high}
+        parts.append(pd.DataFrame({"agent": agent, "group": group, "step": step, **values}))
+    return pd.concat(parts, ignore_index=True)
+
+
+def probability_of_improvement(
+    table: pd.DataFrame,
+    step: int,
+    groups: Groups | None = None,
+    *,
+    pairs: Sequence[tuple[str, str]] | None = None,
+    scores: Scores | None = None,
+    reps: int = REPS,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> pd.DataFrame:
+    """
+    How likely a run of one agent scores more than a run of another on the same task, averaged over the tasks that both
+    have; a tie counts a half (rliable's ``probability_of_improvement``).
+
+    :param table: see :func:`aggregate`, also for the other arguments
+    :param step: simulator step
+    :param pairs: agents x and y; every pair once, in the table's order, if None
+    :return: columns ``x``, ``y``, ``group``, ``step``, ``probability``, ``low``, ``high``, ``tasks``
+    :raises ValueError: an agent of a pair is not in the table, or the two have no task in common
+    """
+    check_samples(reps, confidence)
+    by_group: dict[str, dict[str, pd.DataFrame]] = {}
+    agents: list[str] = []
+    for agent, group, runs in _at_step(table, step, groups, scores, None):
+        by_group.setdefault(group, {})[agent] = runs
+        agents += [] if agent in agents else [agent]
+    for agent in itertools.chain(*(pairs or [])):
+        if agent not in agents:
+            raise ValueError(f"pairs must be of {', '.join(agents)}, not {agent!r}")
+    rows = []
+    for group, found in by_group.items():
+        for x, y in itertools.combinations(agents, 2) if pairs is None else pairs:
+            if x not in found or y not in found:
+                continue
+            ours, theirs = (
+                {task: each[step].to_numpy() for task, each in found[agent].groupby("task", sort=False)}
+                for agent in (x, y)
+            )
+            tasks = [task for task in ours if task in theirs]
+            if not tasks:
+                continue
+            # Tasks with the same numbers of runs together; the two agents are redrawn each by itself.
+            alike: dict[tuple[int, int], list[str]] = {}
+            for task in tasks:
+                alike.setdefault((len(ours[task]), len(theirs[task])), []).append(task)
+            arrays = [np.stack([side[t] for t in some], axis=1) for side in (ours, theirs) for some in alike.values()]
+            probability, low, high = bootstrap(_improvement, arrays, reps, confidence, seed)
+            rows.append(
+                {
+                    "x": x, "y": y, "group": group, "step": step, "probability": probability[0], "low": low[0],
+                    "high": high[0], "tasks": len(tasks),
+                }
+            )  # fmt: skip
+    if not rows:
+        raise ValueError("pairs must be of agents that have a task in common at that step")
+    return pd.DataFrame(rows)
+
+
+def _improvement(*arrays: np.ndarray) -> np.ndarray:
+    """
+    :param arrays: (runs, tasks) of one agent, then of the other for the same tasks
+    :return: (1,)
+    """
+    n = len(arrays) // 2
+    shares = []
+    for ours, theirs in zip(arrays[:n], arrays[n:], strict=True):
+        difference = ours[:, None] - theirs[None]
+        shares.append(((difference > 0) + (difference == 0) / 2).mean(axis=(0, 1)))
+    return np.array([np.concatenate(shares).mean()])
+
+
+def _at_step(
+    table: pd.DataFrame, step: int, groups: Groups | None, scores: Scores | None, common: bool | None
+) -> Iterator[tuple[str, str, pd.DataFrame]]:
+    """
+    The runs of each agent and group that reach a step.
+
+    :param common: None where the tasks are compared pair by pair
+    """
+    found = named_apart(scored(table, scores))
+    if common:
+        found = _common_tasks(found)
+    matrix, _ = at_steps(found, [step])
+    if matrix[step].isna().all():
+        raise ValueError(f"step must be within those of the runs, {_extent(found)}, not {step:,}")
+    members = group_tasks(groups, list(found["task"].unique()))
+    _warn_of_gaps(matrix, {} if common is None else members)
+    matrix = matrix.dropna()
+    for group, tasks in members.items():
+        in_group = matrix[matrix.index.get_level_values("task").isin(tasks)]
+        for agent, runs in in_group.groupby("agent", sort=False):
+            yield agent, group, runs

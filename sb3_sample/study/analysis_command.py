@@ -1,0 +1,466 @@
+"""``sb3-sample study table``, ``aggregate``, ``marginalize``, ``correlate``, ``heatmap`` and ``cost``."""
+
+import argparse
+import contextlib
+import math
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from sb3_sample.envs.scores import Score
+from sb3_sample.exits import refuse
+from sb3_sample.plots import needing_matplotlib
+from sb3_sample.study import analysis
+from sb3_sample.study import table as tables
+from sb3_sample.study.aggregate import (
+    DEFAULT_GROUPS,
+    GROUPS,
+    REPS,
+    aggregate,
+    performance_profiles,
+    probability_of_improvement,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Endings of the files that commands write.
+_TABLES, _PICTURES = (".csv", ".parquet", ".md"), (".png", ".svg")
+
+
+# ---------------------------------------------------------------- arguments
+
+
+def _steps(text: str) -> int:
+    """A number of steps: 100000, 100_000, 100k, 1.5M."""
+    digits = text.replace("_", "")
+    factor = {"k": 1_000, "M": 1_000_000}.get(digits[-1:], 1)
+    try:
+        number = float(digits if factor == 1 else digits[:-1]) * factor
+    except ValueError:
+        number = math.nan
+    if not number >= 0 or number != round(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of steps, as 100000, 100k or 1M")
+    return round(number)
+
+
+def _score(text: str) -> tuple[str, Score]:
+    task, equals, value = text.rpartition("=")
+    metric = "return"
+    if value.startswith("success:") or value == "success":
+        metric, value = "success_rate", value.removeprefix("success").removeprefix(":") or "1"
+    low, colon, high = value.rpartition(":")
+    try:
+        score = Score(metric, float(high), float(low) if colon else 0.0)
+    except ValueError:
+        equals = ""
+    if not task or not equals:
+        raise argparse.ArgumentTypeError(f"{text!r} is no TASK=HIGH, TASK=LOW:HIGH or TASK=success")
+    return task, score
+
+
+def _factor(text: str) -> tuple[str, list[str]]:
+    name, equals, arguments = text.partition("=")
+    names = arguments.split(",") if equals else [name]
+    if not name or not all(names):
+        raise argparse.ArgumentTypeError(f"{text!r} is no ARGUMENT or NAME=ARGUMENT,...")
+    return name, names
+
+
+def _add_sources(parser: argparse.ArgumentParser, pictures: bool = False) -> None:
+    parser.add_argument(
+        "sources",
+        nargs="*",
+        metavar="[LABEL=]FOLDER",
+        help="folder of a study or with runs at any depth, or a table (.csv, .parquet) that the table command has "
+        "written. A label names the agent",
+    )
+    parser.add_argument(
+        "-p",
+        "--published",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="published runs besides, every seed of them: BRO, 'BRO Fast'",
+    )
+    endings = _TABLES + (_PICTURES if pictures else ())
+    parser.add_argument("-o", "--output", type=Path, help=f"file to write ({', '.join(endings)})")
+    parser.set_defaults(endings=endings)
+
+
+def _add_scores(parser: argparse.ArgumentParser, groups: bool = True) -> None:
+    parser.add_argument(
+        "--score",
+        nargs="+",
+        default=[],
+        type=_score,
+        metavar="TASK=HIGH",
+        help="return whose score is 1, LOW:HIGH for those of 0 and 1, or 'success', for tasks without a common scale",
+    )
+    if groups:
+        parser.add_argument(
+            "--groups",
+            nargs="+",
+            metavar="GROUP",
+            help=f"groups of tasks, of {', '.join(GROUPS)} (default: {', '.join(DEFAULT_GROUPS)})",
+        )
+
+
+def _add_intervals(parser: argparse.ArgumentParser, reps: int = REPS) -> None:
+    parser.add_argument("--reps", type=int, default=reps, help=f"bootstrap samples (default: {reps:,})")
+    parser.add_argument("--confidence", type=float, default=0.95, help="of the intervals (default: 0.95)")
+    parser.add_argument("--seed", type=int, default=0, help="of the bootstrap (default: 0)")
+
+
+def _add_steps(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--steps",
+        nargs="+",
+        type=_steps,
+        metavar="STEP",
+        help="simulator steps, as 100k or 1M (default: all that the runs have in common)",
+    )
+    parser.add_argument("--common", action="store_true", help="only the tasks that all agents have")
+
+
+def _add_ends(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--last",
+        type=int,
+        default=analysis.LAST,
+        help=f"evaluations at the end of a run that are averaged (default: {analysis.LAST})",
+    )
+    parser.add_argument("--by", nargs="+", default=[], metavar="ARGUMENT", help="arguments by which runs are parted")
+
+
+def _read(options: argparse.Namespace, *more: str) -> pd.DataFrame:
+    if options.output is not None and options.output.suffix not in options.endings:
+        raise ValueError(f"output must end in {', '.join(options.endings)}, not {str(options.output)!r}")
+    curves = getattr(options, "curves", [])
+    if not options.sources and not options.published and not curves:
+        raise ValueError("sources must be at least one folder or table, or --published runs")
+    parts = []
+    if options.sources:
+        parts.append(tables.read(options.sources, (*tables.METRICS, *more)))
+    if options.published:
+        parts.append(tables.published_runs(options.published))
+    if curves:
+        parts.append(tables.published_curves(curves))
+    return pd.concat(parts, ignore_index=True)
+
+
+def _shared(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+    return {"scores": dict(options.score), **{name: getattr(options, name) for name in names}}
+
+
+_INTERVALS = ("reps", "confidence", "seed")
+
+
+# ---------------------------------------------------------------- output
+
+
+@contextlib.contextmanager
+def _refusing(command: str) -> Iterator[None]:
+    """Errors of arguments, files and missing extras end the command with one line; warnings are a line each."""
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        print(f"sb3-sample study {command}: {message}", file=sys.stderr)
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", UserWarning)
+            warnings.showwarning = show
+            yield
+    except (ValueError, ImportError, OSError) as error:
+        refuse(f"study {command}", error)
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """
+    :param table: any
+    :return: the same as Markdown, numbers to three digits after the point, steps with separators, gaps as "-"
+    """
+    rows = [[_cell(name, value) for name, value in row.items()] for row in table.to_dict("records")]
+    numeric = [pd.api.types.is_numeric_dtype(table[name]) for name in table]
+    lines = [[str(name) for name in table], ["---:" if right else "---" for right in numeric], *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _cell(name: Any, value: Any) -> str:
+    if isinstance(value, float):
+        if math.isnan(value):
+            return "-"
+        return f"{value:.3f}" if abs(value) < 1_000 and (abs(value) >= 5e-4 or value == 0) else f"{value:.3g}"
+    if isinstance(value, int) and not isinstance(value, bool):
+        return f"{value:,}"
+    return str(value).replace("|", "\\|")
+
+
+def _put(table: pd.DataFrame, output: Path | None, draw: Callable[[], "Figure"] | None = None) -> None:
+    print(markdown(table))
+    if output is None:
+        return
+    output.parent.mkdir(parents=True, exist_ok=True)
+    if output.suffix == ".md":
+        output.write_text(markdown(table) + "\n")
+    elif output.suffix in _PICTURES:
+        assert draw is not None
+        draw().savefig(output)
+    else:
+        tables.write(table, output)
+    print(f"\nSaved to {output}")
+
+
+# ---------------------------------------------------------------- commands
+
+
+def _add_table(parser: argparse.ArgumentParser) -> None:
+    _add_sources(parser)
+    parser.add_argument(
+        "--curves",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="published curves besides, of which there are statistics over seeds only, e.g. SAC, SimBa, TD-MPC2",
+    )
+    parser.add_argument(
+        "--metrics",
+        nargs="+",
+        default=[],
+        metavar="PATTERN",
+        help=f"metrics besides {', '.join(tables.METRICS)}, as 'train/*' of the runs' logs",
+    )
+
+
+def _run_table(options: argparse.Namespace) -> None:
+    with _refusing("table"):
+        table = _read(options, *options.metrics)
+        runs = table.groupby([*tables.RUN, "metric"], sort=False, dropna=False)["step"].agg(["count", "max"])
+        summary = (
+            runs.groupby(["agent", "task", "metric"], sort=False)
+            .agg(runs=("count", "size"), rows=("count", "sum"), last_step=("max", "max"))
+            .reset_index()
+        )
+        print(markdown(summary))
+        if options.output is not None:
+            if options.output.suffix == ".md":
+                options.output.parent.mkdir(parents=True, exist_ok=True)
+                options.output.write_text(markdown(summary) + "\n")
+            else:
+                tables.write(table, options.output)
+            print(f"\nSaved to {options.output}")
+
+
+def _add_aggregate(parser: argparse.ArgumentParser) -> None:
+    _add_sources(parser)
+    _add_steps(parser)
+    _add_scores(parser)
+    _add_intervals(parser)
+    parser.add_argument(
+        "--improvement", action="store_true", help="the probability that one agent is better than another, by pair"
+    )
+    parser.add_argument(
+        "--profile",
+        nargs="+",
+        type=float,
+        metavar="SCORE",
+        help="the share of runs whose score is above these, in the place of the averages",
+    )
+
+
+def _run_aggregate(options: argparse.Namespace) -> None:
+    with _refusing("aggregate"):
+        if (options.improvement or options.profile) and (options.steps is None or len(options.steps) != 1):
+            raise ValueError(f"steps must be one step for --improvement and --profile, not {options.steps}")
+        if options.improvement and options.profile:
+            raise ValueError("--improvement and --profile are two tables: ask for one of them")
+        if options.improvement and options.common:
+            raise ValueError("--common is not of --improvement, which compares each pair on the tasks that both have")
+        table = _read(options)
+        shared = _shared(options, *_INTERVALS)
+        if options.improvement:
+            found = probability_of_improvement(table, options.steps[0], options.groups, **shared)
+        elif options.profile:
+            found = performance_profiles(
+                table, options.steps[0], options.profile, options.groups, common=options.common, **shared
+            )
+        else:
+            found = aggregate(table, options.steps, options.groups, common=options.common, **shared)
+        _put(found, options.output)
+
+
+def _add_marginalize(parser: argparse.ArgumentParser) -> None:
+    _add_sources(parser)
+    parser.add_argument(
+        "--factor",
+        nargs="+",
+        type=_factor,
+        dest="factors",
+        metavar="[NAME=]ARGUMENT[,...]",
+        help="arguments of which one choice each was made, several that are one choice under a name (default: each "
+        "argument in which the runs of a task differ)",
+    )
+    parser.add_argument("--order", type=int, default=1, help="how many factors are fixed (default: 1)")
+    _add_ends(parser)
+    _add_scores(parser)
+    _add_intervals(parser, analysis.STUDY_REPS)
+
+
+def _run_marginalize(options: argparse.Namespace) -> None:
+    with _refusing("marginalize"):
+        factors = None if options.factors is None else dict(options.factors)
+        shared = _shared(options, "by", "groups", "last", *_INTERVALS)
+        _put(analysis.marginalize(_read(options), factors, options.order, **shared), options.output)
+
+
+def _add_correlate(parser: argparse.ArgumentParser) -> None:
+    _add_sources(parser, pictures=True)
+    parser.add_argument(
+        "--metrics",
+        nargs="+",
+        default=list(analysis.VARIABLES),
+        metavar="METRIC",
+        help=f"variables beside the score (default: {', '.join(analysis.VARIABLES)})",
+    )
+    parser.add_argument("--level", type=float, default=0.05, help="blank above this p (default: 0.05)")
+    parser.add_argument(
+        "--regress", action="store_true", help="least squares of the score on each metric, task by task, instead"
+    )
+    _add_ends(parser)
+    _add_scores(parser)
+
+
+def _run_correlate(options: argparse.Namespace) -> None:
+    with _refusing("correlate"):
+        if options.regress and (
+            options.by or options.groups or (options.output and options.output.suffix in _PICTURES)
+        ):
+            raise ValueError("--regress is task by task, a table: it has no --by, no --groups and no picture")
+        table = _read(options, *options.metrics)
+        shared = _shared(options, "last")
+        if options.regress:
+            _put(analysis.regress(table, options.metrics, **shared), options.output)
+            return
+        found = analysis.correlate(
+            table, options.metrics, by=options.by, groups=options.groups, level=options.level, **shared
+        )
+        _put(found, options.output, lambda: _draw_correlations(found, options.by))
+
+
+def _add_heatmap(parser: argparse.ArgumentParser) -> None:
+    _add_sources(parser, pictures=True)
+    parser.add_argument("-x", required=True, metavar="ARGUMENT", help="argument of the columns, as model_size")
+    parser.add_argument("-y", required=True, metavar="ARGUMENT", help="argument of the rows, as replay_ratio")
+    parser.add_argument(
+        "--value", default="score", metavar="METRIC", help="score, or a metric as hours (default: score)"
+    )
+    parser.add_argument("--step", type=_steps, help="simulator step (default: the last that all runs reach)")
+    parser.add_argument("--group", default="all", help=f"of tasks, of {', '.join(GROUPS)} (default: all)")
+    _add_scores(parser, groups=False)
+
+
+def _run_heatmap(options: argparse.Namespace) -> None:
+    with _refusing("heatmap"):
+        table = _read(options, *([] if options.value == "score" else [options.value]))
+        shared = _shared(options, "value", "step", "group")
+        found = analysis.heatmap(table, options.x, options.y, **shared)
+        shown = found.reset_index().rename(columns={options.y: f"{options.y} \\ {options.x}"})
+        _put(shown, options.output, lambda: _draw_heatmap(found, options.value))
+
+
+def _add_cost(parser: argparse.ArgumentParser) -> None:
+    _add_sources(parser, pictures=True)
+    _add_steps(parser)
+    _add_scores(parser)
+    _add_intervals(parser)
+
+
+def _run_cost(options: argparse.Namespace) -> None:
+    with _refusing("cost"):
+        shared = _shared(options, "common", *_INTERVALS)
+        found = analysis.cost(_read(options), options.steps, options.groups, **shared)
+        _put(found, options.output, lambda: _draw_cost(found))
+
+
+# ---------------------------------------------------------------- pictures
+
+
+def _figure(width: float, height: float) -> "Figure":
+    with needing_matplotlib():
+        from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained", dpi=150)
+
+
+def _draw_grid(axes: Any, values: pd.DataFrame, **kwargs: Any) -> Any:
+    image = axes.imshow(values.to_numpy(float), aspect="auto", **kwargs)
+    axes.set_xticks(range(values.shape[1]), [str(name) for name in values.columns], rotation=45, ha="right")
+    axes.set_yticks(range(values.shape[0]), [str(name) for name in values.index])
+    low, high = image.get_clim()
+    for (row, column), value in _cells(values):
+        dark = not math.isnan(value) and 0.3 < (value - low) / ((high - low) or 1) < 0.7
+        text = "" if math.isnan(value) else f"{value:.3g}"
+        axes.text(column, row, text, ha="center", va="center", color="black" if dark else "white", fontsize=8)
+    return image
+
+
+def _cells(values: pd.DataFrame) -> Iterator[tuple[tuple[int, int], float]]:
+    for row in range(values.shape[0]):
+        for column in range(values.shape[1]):
+            yield (row, column), float(values.iloc[row, column])
+
+
+def _draw_heatmap(values: pd.DataFrame, name: str) -> "Figure":
+    figure = _figure(2 + 0.9 * values.shape[1], 1.5 + 0.6 * values.shape[0])
+    axes = figure.add_subplot()
+    figure.colorbar(_draw_grid(axes, values, cmap="viridis"), label="IQM of the scores" if name == "score" else name)
+    axes.set_xlabel(values.columns.name)
+    axes.set_ylabel(values.index.name)
+    return figure
+
+
+def _draw_correlations(found: pd.DataFrame, by: list[str]) -> "Figure":
+    parts = list(found.groupby(["group", *by], sort=False))
+    variables = list(found["x"].unique())
+    size = 1.5 + 0.7 * len(variables)
+    figure = _figure((size + 0.5) * len(parts), size)
+    for axes, (head, part) in zip(figure.subplots(1, len(parts), squeeze=False)[0], parts, strict=True):
+        matrix = part.pivot(index="x", columns="y", values="spearman").loc[variables, variables]
+        matrix = matrix.rename(index=_last_word, columns=_last_word)
+        _draw_grid(axes, matrix, cmap="RdBu_r", vmin=-1, vmax=1)
+        axes.set_title(", ".join(map(str, head)))
+    return figure
+
+
+def _last_word(metric: str) -> str:
+    return metric.rpartition("/")[2].replace("_", " ")
+
+
+def _draw_cost(found: pd.DataFrame) -> "Figure":
+    groups = list(found["group"].unique())
+    figure = _figure(4.5 * len(groups), 4)
+    for axes, group in zip(figure.subplots(1, len(groups), squeeze=False)[0], groups, strict=True):
+        for agent, rows in found[found["group"] == group].dropna(subset="hours").groupby("agent", sort=False):
+            lines = axes.plot(rows["hours"], rows["iqm"], marker="o" if len(rows) < 3 else None, label=agent)
+            axes.fill_between(rows["hours"], rows["low"], rows["high"], alpha=0.2, color=lines[0].get_color())
+        axes.set_title(group)
+        axes.set_xlabel("hours")
+        axes.set_ylabel("IQM of the scores")
+        axes.grid(alpha=0.3)
+    axes.legend(frameon=False)
+    return figure
+
+
+#: The commands by name: help, what adds the arguments, and what runs it.
+COMMANDS: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace], None]]] = {
+    "table": ("read runs into one table", _add_table, _run_table),
+    "aggregate": ("scores over tasks and seeds, with intervals", _add_aggregate, _run_aggregate),
+    "marginalize": ("what a choice does, whatever is chosen besides", _add_marginalize, _run_marginalize),
+    "correlate": ("rank correlations of score and diagnostics, or regressions", _add_correlate, _run_correlate),
+    "heatmap": ("a score over two arguments", _add_heatmap, _run_heatmap),
+    "cost": ("scores against hours", _add_cost, _run_cost),
+}

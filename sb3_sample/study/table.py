@@ -1,0 +1,550 @@
+"""
+One table of many runs: one row a run, step and metric.
+
+Columns (:data:`COLUMNS`): ``agent``; ``arguments``, its hyperparameters as JSON with sorted names; ``task``, an
+environment's id; ``seed``; ``step``, in steps of the simulator whatever the action repeat; ``metric``; ``value``.
+"""
+
+import ast
+import fnmatch
+import functools
+import json
+import math
+import re
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import yaml
+
+from sb3_sample.envs.registration import PACKAGE
+from sb3_sample.envs.suites import published_id, published_key
+from sb3_sample.extras import install
+from sb3_sample.plots import DATA, all_published_curves, find_runs, named_algorithms, run_env_id
+from sb3_sample.run_logs import EVALUATIONS, read_evaluations, read_monitors
+from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
+
+COLUMNS = ["agent", "arguments", "task", "seed", "step", "metric", "value"]
+#: Columns that make a run.
+RUN = ["agent", "arguments", "task", "seed"]
+#: The metrics that are read unless others are asked for. Patterns as of file names.
+METRICS = ("return", "success_rate", "hours", "diagnostics/*")
+#: Every seed of the authors' runs of BRO and BRO Fast on their 40 tasks.
+SEEDS = DATA.parent / "published_seeds.npz"
+#: What a published curve is made of, as the metrics ``return/mean``, ... of the table.
+STATISTICS = ("mean", "std", "min", "max", "iqm", "n_seeds")
+
+_EVALUATED = {"return": "results", "success_rate": "successes", "episode_length": "ep_lengths"}
+_MONITORED = {"return": "r", "success_rate": "is_success", "episode_length": "l"}
+_RECORD, _LOG = "run.json", "progress.jsonl"
+_SECONDS = "time/time_elapsed"
+#: A line of the log, as far as the time.
+_TIMED = re.compile(rb'\{"step": (\d{1,15}), [^\n]*?"time/time_elapsed": (\d{1,15}(?:\.\d+)?)[,}]')
+#: In the folder of a study: its list of runs, and the folder of them, ``runs/<agent and grid>/<task>/<seed>``.
+_LIST, _RUNS = "study.json", "runs"
+#: Bytes of a run's log, of a file of settings, and values in such a file.
+_MAX_LOG, _MAX_SETTINGS, _MAX_VALUES = 256 * 2**20, 2**18, 5_000
+#: Bytes of a study's list of runs.
+_MAX_LIST = 2**28
+#: Settings of a run that say nothing of the agent.
+_OF_THE_RUN = {
+    "algo", "env", "seed", "trained_agent", "truncate_last_trajectory", "vec_env", "eval_env_kwargs", "eval_freq",
+    "eval_episodes", "n_eval_envs", "save_freq", "n_timesteps", "callback",
+}  # fmt: skip
+#: Wrappers of the zoo's settings that hold an action for several steps, and for how many by default.
+_SKIPPING = {"FrameSkip": 4, "MaxAndSkipEnv": 4, "MaxAndSkipObservation": 4}
+
+
+class _Rows:
+    """A table in the making: a block of rows for each metric of each run."""
+
+    def __init__(self) -> None:
+        self._heads: list[tuple[Any, ...]] = []
+        self._steps: list[np.ndarray] = []
+        self._values: list[np.ndarray] = []
+
+    def add(
+        self,
+        agent: str,
+        arguments: str,
+        task: str,
+        seed: int | None,
+        metric: str,
+        steps: np.ndarray,
+        values: np.ndarray,
+    ) -> None:
+        self._heads.append((agent, arguments, task, pd.NA if seed is None else seed, metric))
+        self._steps.append(np.asarray(steps, np.int64))
+        self._values.append(np.asarray(values, float))
+
+    def table(self) -> pd.DataFrame:
+        heads = pd.DataFrame(self._heads, columns=["agent", "arguments", "task", "seed", "metric"], dtype=object)
+        table = heads.loc[heads.index.repeat([len(steps) for steps in self._steps])].reset_index(drop=True)
+        table["step"] = np.concatenate([np.empty(0, np.int64), *self._steps])
+        table["value"] = np.concatenate([np.empty(0), *self._values])
+        return table.astype({"seed": "Int64"})[COLUMNS]
+
+
+def to_json(arguments: Mapping[str, Any]) -> str:
+    """
+    :param arguments: plain values by name
+    :return: the text of them in the table
+    """
+    return json.dumps(arguments, sort_keys=True)
+
+
+# ---------------------------------------------------------------- runs
+
+
+class _Run(NamedTuple):
+    """
+    :param agent: name; None if the run's files do not say
+    :param arguments: of the agent
+    :param task: id of the environment; None if the files do not say
+    :param seed: None if they do not say
+    :param repeat: simulator steps of a step of the environment
+    :param skip: steps of the environment, as Monitor counts them, of a step of the agent
+    """
+
+    agent: str | None
+    arguments: dict[str, Any]
+    task: str | None
+    seed: int | None
+    repeat: int = 1
+    skip: int = 1
+
+
+def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = METRICS) -> pd.DataFrame:
+    """
+    The table of runs: of this package (``--run-dir``), of the zoo, and of folders with Monitor files only.
+
+    A run's values are those of its evaluations, the mean over the episodes of each. A run without evaluations has its
+    training episodes instead, a row an episode, at the step at which it ended; a warning says so. ``hours`` is the time
+    that the run had taken, and ``diagnostics/...`` what it has logged of itself.
+
+    :param sources: folders of runs, or folders with runs at any depth, or tables as :func:`write` writes them.
+        ``"LABEL=FOLDER"`` names the agent; else it has the name of the study's plan or, outside of a study, of its
+        algorithm or, where no file says that, of the folder above the run's
+    :param metrics: patterns of the metrics to keep: "return", "success_rate", "episode_length", "hours" and whatever
+        ``progress.jsonl`` has, e.g. "train/*"
+    :return: columns :data:`COLUMNS`, in the order of the sources. Where a run's files do not say its seed, it is its
+        number among the runs of that agent and task, from 0 on
+    :raises ValueError: there is no run in a source, a file is damaged, a run does not say its task, or two runs have
+        the same agent, arguments, task and seed
+    :raises OSError: if a file cannot be read
+    """
+    given = [sources] if isinstance(sources, (str, Path)) else list(sources)
+    if not given:
+        raise ValueError("sources must be at least one folder or table, not none")
+    tables, rows = [], _Rows()
+    seen: dict[tuple[Any, ...], Path] = {}
+    numbered: dict[tuple[str, str], int] = {}
+    training: list[Path] = []
+    named = functools.cache(_agents_of_study)
+    for source in given:
+        label, path = _labelled(source)
+        if path.suffix in (".csv", ".parquet") and path.is_file():
+            table = load(path)
+            tables.append(table if label is None else table.assign(agent=label))
+            continue
+        for folder in find_runs(path):
+            run = _described(folder)
+            if run.task is None:
+                raise ValueError(
+                    f"{folder} does not say which task it is of: it has no {_RECORD}, no args.yml of the zoo, and no "
+                    "environment's id in its Monitor files"
+                )
+            agent = label or _agent_of_study(folder, named) or run.agent or folder.resolve().parent.name
+            seed = run.seed
+            if seed is None:
+                seed = numbered.get((agent, run.task), 0)
+                numbered[agent, run.task] = seed + 1
+            arguments = to_json(run.arguments)
+            key = (agent, arguments, run.task, seed)
+            if key in seen:
+                raise ValueError(
+                    f"runs must differ in agent, arguments, task or seed, and {folder} has those of {seen[key]}: "
+                    f"{agent}, {run.task}, seed {seed}. LABEL=FOLDER names one otherwise"
+                )
+            seen[key] = folder
+            if not (folder / EVALUATIONS).exists():
+                training.append(folder)
+            for metric, (steps, values) in _measured(folder, run, metrics).items():
+                rows.add(agent, arguments, run.task, seed, metric, steps, values)
+    if training:
+        warnings.warn(
+            f"{len(training)} runs have no {EVALUATIONS} ({training[0]}, ...): their rows are training episodes, which "
+            "explore",
+            stacklevel=2,
+        )
+    table = rows.table()
+    table = pd.concat([table, *tables], ignore_index=True) if len(table) else pd.concat(tables or [table])
+    if tables and table.duplicated([*RUN, "metric", "step"]).any():
+        twice = table[table.duplicated([*RUN, "metric", "step"])].iloc[0]
+        raise ValueError(
+            f"tables must have one value a run, step and metric: there are two of {twice['agent']}, {twice['task']}, "
+            f"seed {twice['seed']}, {twice['metric']} at {twice['step']:,}"
+        )
+    return table.reset_index(drop=True)
+
+
+def _agent_of_study(folder: Path, named: Callable[[Path], dict[str, str]]) -> str | None:
+    """
+    :param folder: a run's
+    :param named: gives the agents by the beginning of their folders' names
+    :return: the agent's name in the plan; None outside of a study
+    """
+    above = folder.absolute().parents
+    if len(above) < 4 or above[2].name != _RUNS or not (above[3] / _LIST).is_file():
+        return None
+    return named(above[3]).get(above[1].name.partition(",")[0])
+
+
+def _agents_of_study(folder: Path) -> dict[str, str]:
+    path = folder / _LIST
+    found = parse_json(read_regular(path, _MAX_LIST), str(path))
+    runs = found.get("runs") if isinstance(found, dict) else None
+    if not isinstance(runs, list) or not all(
+        isinstance(run, dict) and isinstance(run.get("agent"), str) for run in runs
+    ):
+        raise BadFile(f"{path} is no list of a study's runs")
+    return {re.sub(r"[^\w.,=+()-]+", "-", run["agent"]): run["agent"] for run in runs}
+
+
+def _labelled(source: str | Path) -> tuple[str | None, Path]:
+    label, equals, path = str(source).partition("=")
+    if isinstance(source, Path) or not equals or Path(source).exists():
+        return None, Path(source)
+    if not label:
+        raise ValueError(f"sources must be FOLDER or LABEL=FOLDER, not {source!r}")
+    return label, Path(path)
+
+
+def _measured(folder: Path, run: _Run, metrics: Sequence[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Simulator steps and values of a run by metric. Each of its files is read once, and only if it is needed."""
+    found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    monitored: pd.DataFrame | None = None
+    if (folder / EVALUATIONS).exists():
+        data = read_evaluations(folder / EVALUATIONS)
+        steps = data["timesteps"] * run.repeat * run.skip
+        for metric, key in _EVALUATED.items():
+            if key in data:
+                found[metric] = steps, data[key].astype(float).reshape(len(steps), -1).mean(axis=1)
+    else:
+        monitored = read_monitors(folder)
+        steps = monitored["l"].cumsum().to_numpy() * run.repeat
+        for metric, column in _MONITORED.items():
+            if column in monitored and len(monitored):
+                found[metric] = steps, monitored[column].to_numpy(float)
+    if "episode_length" in found:
+        found["episode_length"] = (steps, found["episode_length"][1] * run.repeat)
+    logged = _logged(folder / _LOG, run.repeat * run.skip, metrics)
+    seconds = logged.pop(_SECONDS, None)
+    if seconds is None and _matches("hours", metrics):
+        monitored = read_monitors(folder) if monitored is None and any(folder.glob("*monitor.csv")) else monitored
+        if monitored is not None and len(monitored):
+            seconds = monitored["l"].cumsum().to_numpy() * run.repeat, monitored["t"].to_numpy(float)
+    if seconds is not None:
+        found["hours"] = _hours(*seconds, steps)
+    found = {metric: pair for metric, pair in found.items() if _matches(metric, metrics)}
+    return found | {metric: pair for metric, pair in logged.items() if metric not in found}
+
+
+def _matches(metric: str, patterns: Sequence[str]) -> bool:
+    return any(fnmatch.fnmatchcase(metric, pattern) for pattern in patterns)
+
+
+def _hours(logged: np.ndarray, seconds: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Hours at the steps of the evaluations. Those after the last time that was logged, one log's interval at most, are
+    reached at the run's mean speed.
+    """
+    logged, seconds = np.append(0, logged), np.append(0.0, seconds)
+    hours = np.interp(steps, logged, seconds)
+    late = steps > logged[-1]
+    if logged[-1] > 0:
+        hours[late] = seconds[-1] * steps[late] / logged[-1]
+    return steps, hours / 3_600
+
+
+def _logged(path: Path, repeat: int, metrics: Sequence[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """What the lines of a log hold, by name, and ``_SECONDS``. A last line that is not whole is left out."""
+    values: dict[str, dict[int, float]] = {}
+    try:
+        data = read_regular(path, _MAX_LOG)
+    except FileNotFoundError:
+        return {}
+    kept = functools.cache(lambda name: name == _SECONDS or _matches(name, metrics))
+    # Most lines have nothing of what is asked for but the time, and parsing takes most of the reading.
+    beginnings = {b'"' + re.split(r"[*?[]", pattern)[0].encode() for pattern in metrics}
+    beginnings = {beginning for beginning in beginnings if beginning in data}
+    for number, text in enumerate(data.splitlines(keepends=True), 1):
+        if not text.endswith(b"\n"):
+            break
+        timed = None if any(beginning in text for beginning in beginnings) else _TIMED.match(text)
+        if timed is not None:
+            values.setdefault(_SECONDS, {})[int(timed[1])] = float(timed[2])
+            continue
+        line = parse_json(text, f"line {number} of {path}")
+        step = line.get("step") if isinstance(line, dict) else None
+        if type(step) is not int or not 0 <= step < 2**53:
+            raise BadFile(f"{path} is no log of a run: its line {number} has no step, or {step!r:.100}")
+        for name, value in line.items():
+            if kept(name) and name != "step" and type(value) in (int, float):
+                values.setdefault(name, {})[step] = value
+    return {
+        name: (np.fromiter(found, np.int64) * repeat, np.fromiter(found.values(), float))
+        for name, found in values.items()
+    }
+
+
+# ---------------------------------------------------------------- what a run is of
+
+
+def _described(folder: Path) -> _Run:
+    if (folder / _RECORD).exists():
+        record = parse_json(read_regular(folder / _RECORD, _MAX_SETTINGS), str(folder / _RECORD))
+        if not isinstance(record, dict) or not isinstance(record.get("settings"), dict):
+            raise BadFile(f"{folder / _RECORD} is no record of a run")
+        settings = {name: _literal(text) for name, text in record["settings"].items()}
+        return _of_settings(settings, record, folder / _RECORD)
+    files = sorted(folder.glob("*/args.yml"))
+    if files:
+        arguments = _yaml(files[0])
+        config = files[0].with_name("config.yml")
+        settings = {"env_kwargs": arguments.get("env_kwargs"), **(_yaml(config) if config.exists() else {})}
+        return _of_settings(settings, arguments, files[0])
+    env_id = run_env_id(folder)
+    return _Run(None, {}, None if env_id is None else _task(env_id), None)
+
+
+def _of_settings(settings: dict[str, Any], head: Mapping[str, Any], path: Path) -> _Run:
+    """
+    :param settings: the agent's and those of ``_OF_THE_RUN``
+    :param head: has "algo", "env" and "seed"
+    :param path: the file, for messages
+    """
+    algo, env, seed = (head.get(name) for name in ("algo", "env", "seed"))
+    if not isinstance(algo, str) or not isinstance(env, str) or type(seed) is not int:
+        raise BadFile(f"{path} is no record of a run: algo is {algo!r:.50}, env {env!r:.50}, seed {seed!r:.50}")
+    arguments = {name: value for name, value in settings.items() if name not in _OF_THE_RUN and value is not None}
+    env_kwargs = settings.get("env_kwargs") or {}
+    repeat = env_kwargs.get("action_repeat", 1) if isinstance(env_kwargs, dict) else 1
+    if type(repeat) is not int or repeat < 1:
+        raise BadFile(f"{path}: action_repeat is {repeat!r:.50}, not a whole number from 1 on")
+    return _Run(algo, arguments, _task(env), seed, repeat, _skipped(settings.get("env_wrapper")))
+
+
+def _skipped(wrappers: Any) -> int:
+    skip = 1
+    for entry in wrappers if isinstance(wrappers, list) else [wrappers]:
+        ((path, arguments),) = entry.items() if isinstance(entry, dict) and len(entry) == 1 else [(entry, {})]
+        default = _SKIPPING.get(str(path).rpartition(".")[2])
+        if default is not None:
+            count = arguments.get("skip", default) if isinstance(arguments, dict) else default
+            skip *= count if type(count) is int and count >= 1 else 1
+    return skip
+
+
+def _task(env_id: str) -> str:
+    return env_id.removeprefix(f"{PACKAGE}:")
+
+
+def _literal(text: Any) -> Any:
+    """The value of a setting as ``repr`` has written it; the text itself where that is no plain value."""
+    try:
+        value = ast.literal_eval(text)
+        return _plain(value, [_MAX_VALUES])
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
+        return str(text)
+
+
+def _plain(value: Any, left: list[int]) -> Any:
+    """
+    :param value: of a file of settings
+    :param left: how many values there may still be, since an alias in YAML stands for many
+    :return: the same of what JSON knows
+    """
+    left[0] -= 1
+    if left[0] < 0:
+        raise BadFile(f"settings hold more than {_MAX_VALUES:,} values")
+    if isinstance(value, dict):
+        return {str(name): _plain(each, left) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(each, left) for each in value]
+    if value is None or isinstance(value, (bool, int, str)) or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    return str(value)
+
+
+class _Settings(yaml.CSafeLoader if hasattr(yaml, "CSafeLoader") else yaml.SafeLoader):  # type: ignore[misc]
+    """Makes plain values only: a class is its name, and nothing is imported or called."""
+
+
+def _named(_: Any, name: str, __: Any) -> str:
+    return name
+
+
+def _tuple(loader: Any, node: Any) -> list[Any]:
+    return loader.construct_sequence(node, deep=True)  # type: ignore[no-any-return]
+
+
+def _ordered(loader: Any, node: Any) -> dict[Any, Any]:
+    (pairs,) = loader.construct_sequence(node, deep=True)
+    return dict(pairs)
+
+
+_PYTHON = "tag:yaml.org,2002:python"
+_Settings.add_multi_constructor(f"{_PYTHON}/name:", _named)
+_Settings.add_constructor(f"{_PYTHON}/tuple", _tuple)
+_Settings.add_constructor(f"{_PYTHON}/object/apply:collections.OrderedDict", _ordered)
+
+
+def _yaml(path: Path) -> dict[str, Any]:
+    data = read_regular(path, _MAX_SETTINGS)
+    try:
+        settings = yaml.load(data, _Settings)  # a safe loader
+    except Exception as error:  # PyYAML's constructors raise whatever they meet
+        raise BadFile(f"{path} is no YAML file of the zoo: {type(error).__name__}: {error}") from error
+    if not isinstance(settings, dict):
+        raise BadFile(f"{path} does not hold settings by name")
+    return _plain(settings, [_MAX_VALUES])  # type: ignore[no-any-return]
+
+
+# ---------------------------------------------------------------- published
+
+
+def published_runs(agents: Sequence[str] | None = None, tasks: Sequence[str] | None = None) -> pd.DataFrame:
+    """
+    Every seed of published runs: BRO and BRO Fast on BRO's 40 tasks, ten seeds, 40 evaluations to a million steps
+    (naumix/BiggerRegularizedOptimistic, MIT; ``data/README.md``).
+
+    Meta-World's are of the v2 tasks, under the ids of v3.
+
+    :param agents: names, as "BRO" or "BRO (RR=10)"; all if None. The table has them as they were asked for, without
+        brackets
+    :param tasks: ids of environments; all if None
+    :return: columns :data:`COLUMNS`
+    :raises ValueError: there are no runs of that name or task
+    """
+    with np.load(SEEDS) as data:
+        names, steps, seeds = list(data["algorithm"]), data["env_steps"], data["seed"]
+        keys = list(zip(data["suite"], data["task"], strict=True))
+        returns = data["returns"].astype(float)
+    rows = _Rows()
+    chosen = _chosen_tasks(tasks, {(str(suite), str(task)) for suite, task in keys})
+    for asked in names if agents is None else agents:
+        found = named_algorithms(asked, names)
+        if len(found) != 1:
+            raise ValueError(f"agents must be of {', '.join(names)} (or without the brackets), not {asked!r}")
+        i = names.index(found[0])
+        arguments = to_json({"replay_ratio": {"BRO (RR=10)": 10, "BRO Fast (RR=2)": 2}[found[0]]})
+        for j, key in enumerate(keys):
+            for task in chosen.get(key, ()):
+                metric = "return" if key[0] == "dmc" else "success_rate"
+                for k, seed in enumerate(seeds):
+                    rows.add(_bare(asked), arguments, task, int(seed), metric, steps, returns[i, j, k])
+    return rows.table()
+
+
+def published_curves(agents: Sequence[str] | None = None, tasks: Sequence[str] | None = None) -> pd.DataFrame:
+    """
+    The published curves, of which only statistics over the seeds are there: metrics ``return/mean``, ``return/iqm``,
+    ... or ``success_rate/mean``, ..., so that none is taken for a run (:data:`STATISTICS`), and no seed.
+
+    :param agents: names, as of ``sb3-sample plot --published``; all if None. The table has a name as it was asked for,
+        without brackets, where it is one algorithm's, and the whole names where it is those of several
+    :param tasks: ids of environments, which the table has as they are asked for; all if None
+    :return: columns :data:`COLUMNS`
+    :raises ValueError: there are no curves of that name or task
+    """
+    curves = all_published_curves()
+    names = list(curves["algorithm"].unique())
+    asked: dict[str, str] = {}
+    for name in ["all"] if agents is None else agents:
+        found = named_algorithms(name, names)
+        if not found:
+            raise ValueError(f"agents must be of {', '.join(names)} (or without the brackets), not {name!r}")
+        asked |= {found[0]: _bare(name)} if len(found) == 1 else {each: each for each in found}
+    chosen = _chosen_tasks(tasks, set(zip(curves["suite"], curves["task"], strict=True)))
+    rows = _Rows()
+    curves = curves[curves["algorithm"].isin(list(asked))]
+    for (algorithm, suite, name, metric), part in curves.groupby(["algorithm", "suite", "task", "metric"], sort=False):
+        for task in chosen.get((suite, name), ()):
+            for statistic in STATISTICS:
+                rows.add(asked[algorithm], "{}", task, None, f"{metric}/{statistic}", part["env_step"], part[statistic])
+    return rows.table()
+
+
+def _bare(name: str) -> str:
+    return name.partition(" (")[0]
+
+
+def _chosen_tasks(tasks: Sequence[str] | None, available: set[tuple[str, str]]) -> dict[tuple[str, str], list[str]]:
+    """The ids of the table by suite and task of what is published."""
+    if tasks is None:
+        return {key: [published_id(*key)] for key in available}
+    chosen: dict[tuple[str, str], list[str]] = {}
+    for task in tasks:
+        key = published_key(task)
+        if key not in available:
+            raise ValueError(f"tasks must be of those that were published, not {task!r}")
+        chosen.setdefault(key, []).append(_task(task))
+    return chosen
+
+
+# ---------------------------------------------------------------- files
+
+
+def write(table: pd.DataFrame, path: str | Path) -> None:
+    """
+    :param table: any
+    :param path: .csv, which keeps every digit, or .parquet
+    :raises ValueError: it has another ending
+    :raises ImportError: .parquet without pyarrow
+    """
+    path = Path(path)
+    if path.suffix not in (".csv", ".parquet"):
+        raise ValueError(f"output must end in .csv or .parquet, not {str(path)!r}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".csv":
+        table.to_csv(path, index=False)
+    else:
+        _check_parquet()
+        table.to_parquet(path, index=False)
+
+
+def load(path: str | Path) -> pd.DataFrame:
+    """
+    :param path: of a table of runs, as :func:`write` writes it
+    :return: the table, of columns :data:`COLUMNS`
+    :raises ValueError: it is none
+    :raises ImportError: .parquet without pyarrow
+    """
+    path = Path(path)
+    text = dict.fromkeys(("agent", "arguments", "task", "metric"), str)
+    try:
+        if path.suffix == ".parquet":
+            _check_parquet()
+            table = pd.read_parquet(path)
+        else:
+            missing = {"seed": [""], "value": [""]}
+            table = pd.read_csv(
+                path, dtype=text, keep_default_na=False, na_values=missing, float_precision="round_trip"
+            )
+        table = table[COLUMNS].astype({**text, "seed": "Int64", "step": np.int64, "value": float})
+    except KeyError as error:
+        raise BadFile(f"{path} is no table of runs: {error}. It must have {', '.join(COLUMNS)}") from error
+    except (ValueError, TypeError) as error:
+        raise BadFile(f"{path} is no table of runs: {error}") from error
+    return table
+
+
+def _check_parquet() -> None:
+    try:
+        import pyarrow  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ImportError(f".parquet needs pyarrow ({error}). Install it with: {install('study')}") from error

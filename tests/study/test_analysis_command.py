@@ -1,0 +1,163 @@
+"""The commands on tables: what they print, what they write and what they refuse."""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from sb3_sample import study
+from sb3_sample.study.analysis_command import COMMANDS, markdown
+from tests.study.made_up import made_up, write_run
+from tests.study.test_analysis import CHEETAH, correlated, grid, sized
+
+pytest.importorskip("rliable.library")
+Run = Callable[..., str]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Runs a command as the command line does; gives what it prints. ``t.csv`` is the table."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: str, table: pd.DataFrame | None = None) -> str:
+        if table is not None:
+            study.write(table, "t.csv")
+        _, add, command = COMMANDS[arguments[0]]
+        parser = argparse.ArgumentParser()
+        add(parser)
+        capsys.readouterr()
+        command(parser.parse_args(arguments[1:]))
+        return capsys.readouterr().out
+
+    return run
+
+
+def test_the_commands_have_a_help_and_no_arguments_in_common_with_it() -> None:
+    assert list(COMMANDS) == ["table", "aggregate", "marginalize", "correlate", "heatmap", "cost"]
+    for words, add, _ in COMMANDS.values():
+        parser = argparse.ArgumentParser()
+        add(parser)
+        assert words and "--output" in parser.format_help()
+
+
+def test_a_table_of_runs(run: Run, tmp_path: Path) -> None:
+    for seed in (0, 1):
+        write_run(tmp_path / "runs" / str(seed), seed=seed, log=[{"step": 3_000, "train/x": 1}])
+    out = run("table", "runs", "--metrics", "train/*", "-o", "x.csv")
+    assert "| agent | task | metric | runs | rows | last_step |" in out
+    assert "| bro | dmc/cheetah-run-v0 | return | 2 | 6 | 3,000 |" in out and "train/x | 2 | 2 | 3,000 |" in out
+    pd.testing.assert_frame_equal(study.load("x.csv"), study.read(["runs"], [*study.table.METRICS, "train/*"]))
+    assert "| me | dmc/cheetah-run-v0 | return | 2 |" in run("table", "me=runs")
+    assert "| TD7 | dmc/cheetah-run-v0 | return/mean |" in run("table", "--curves", "TD7")
+
+
+def test_aggregates(run: Run) -> None:
+    arguments = ("aggregate", "-p", "BRO", "BRO Fast", "--steps", "100k", "1M", "--groups", "all", "dmc", "--reps", "5")
+    out = run(*arguments, "-o", "x/t.md")
+    assert "| BRO | all | 100,000 | 0.254 |" in out and "| BRO Fast | dmc | 1,000,000 | 0.794 |" in out
+    assert Path("x/t.md").read_text() in out
+    run(*arguments, "-o", "t.csv")
+    assert list(pd.read_csv("t.csv")["step"].unique()) == [100_000, 1_000_000]
+
+
+def test_profiles_and_improvement(run: Run) -> None:
+    shared = ("aggregate", "-p", "BRO", "BRO Fast", "--groups", "myosuite", "--reps", "3", "--steps", "200_000")
+    assert "| BRO | BRO Fast | myosuite | 200,000 | 0.6" in run(*shared, "--improvement")
+    assert "| BRO | myosuite | 200,000 | 0.500 | 0." in run(*shared, "--profile", "0.5")
+
+
+def test_marginalisation(run: Run) -> None:
+    out = run("marginalize", "t.csv", "--groups", "all", "--reps", "3", table=grid())
+    assert "| group | critic | network | mean |" in out and "| all | cdq |  | 0.231 |" in out
+    out = run(
+        "marginalize", "t.csv", "--groups", "all", "--order", "2", "--factor", "a=critic", "network", "--last", "1"
+    )
+    assert "| all | cdq | layer_norm | 0.261 |" in out
+    assert "| all | cdq | none |" in run("marginalize", "t.csv", "--groups", "all", "--by", "critic", "--reps", "3")
+
+
+def test_correlations(run: Run) -> None:
+    shared = ("correlate", "t.csv", "--metrics", "diagnostics/over", "diagnostics/dormant_critic")
+    out = run(*shared, "--groups", "dmc", "-o", "c.png", table=correlated())
+    assert "| dmc | score | diagnostics/over | -0.900 | 0.037 | 5 |" in out
+    assert Path("c.png").read_bytes().startswith(b"\x89PNG")
+    assert "| dmc | score | diagnostics/over | - | 0.037 | 5 |" in run(*shared, "--groups", "dmc", "--level", "0.01")
+    assert "| dmc/cheetah-run-v0 | diagnostics/over | True |" in run(*shared, "--regress")
+
+
+def test_heatmaps_and_costs(run: Run) -> None:
+    out = run("heatmap", "t.csv", "-x", "model_size", "-y", "replay_ratio", "-o", "h.svg", table=sized())
+    assert "| replay_ratio \\ model_size | 0.55M | 4.92M | 26.3M |" in out and "| 2 | 0.302 | 0.402 | - |" in out
+    assert "<svg" in Path("h.svg").read_text()
+    assert "| 10 | 20.500 |" in run("heatmap", "t.csv", "-x", "model_size", "-y", "replay_ratio", "--value", "hours")
+    out = run("cost", "t.csv", "--steps", "200", "--groups", "all", "--reps", "3", "-o", "c.png")
+    assert "| hours | steps_per_second |" in out and "a (model_size=4.92M, replay_ratio=10)" in out
+    assert Path("c.png").exists()
+
+
+def test_scores_of_the_user(run: Run) -> None:
+    rows = [("a", {}, "Pendulum-v1", seed, 1, "return", -600.0) for seed in (0, 1)]
+    table = made_up([*rows, *[("a", {}, "My/T-v0", seed, 1, "success_rate", 0.25) for seed in (0, 1)]])
+    out = run("aggregate", "t.csv", "--score", "Pendulum-v1=-1200:-200", "My/T-v0=success", "--reps", "3", table=table)
+    assert "| a | all | 1 | 0.425 |" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["aggregate"], "sources must be at least one"),
+        (["aggregate", "nowhere"], "runs must be folders"),
+        (["aggregate", "t.csv", "--groups", "gym"], "groups must be of all"),
+        (["aggregate", "t.csv", "-o", "t.txt"], "output must end in .csv, .parquet, .md, not 't.txt'"),
+        (["aggregate", "t.csv", "--improvement"], "steps must be one step"),
+        (["aggregate", "t.csv", "--steps", "1", "--improvement", "--profile", "1"], "ask for one of them"),
+        (["aggregate", "t.csv", "--steps", "1", "--improvement", "--common"], "--common is not of"),
+        (["aggregate", "-p", "SAC"], "agents must be of BRO"),
+        (["marginalize", "t.csv", "--order", "3"], "order must be"),
+        (["correlate", "t.csv"], "metrics must be of return, not 'diagnostics/overestimation'"),
+        (["correlate", "t.csv", "--metrics", "return", "--regress", "--by", "x"], "--regress is task by task"),
+        (["heatmap", "t.csv", "-x", "size", "-y", "critic"], "arguments must be of those"),
+        (["cost", "t.csv"], "'hours' of at least one run"),
+    ],
+)
+def test_refusals_are_one_line(
+    run: Run, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    with pytest.raises(SystemExit) as error:
+        run(*arguments, table=grid())
+    assert error.value.code == 2
+    told = capsys.readouterr().err.strip()
+    assert told.startswith(f"sb3-sample study {arguments[0]}: ") and message in told and "\n" not in told
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--steps", "-1"], ["--steps", "1.5"], ["--steps", "x"], ["--score", "x"], ["--score", "x=y"]]
+)
+def test_bad_options(run: Run, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        run("aggregate", *arguments)
+    assert f"{arguments[1]!r} is no " in capsys.readouterr().err
+
+
+def test_warnings_are_lines(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    table = made_up([(a, {}, CHEETAH, s, 10 * s, "return", 1.0) for a in "ab" for s in (1, 2)])
+    with pytest.raises(SystemExit):
+        run("aggregate", "t.csv", table=table)  # no step in common
+    study.write(table, "t.csv")
+    parser = argparse.ArgumentParser()
+    COMMANDS["aggregate"][1](parser)
+    COMMANDS["aggregate"][2](parser.parse_args(["t.csv", "--steps", "10", "--reps", "3"]))
+    told = capsys.readouterr().err.splitlines()
+    assert "sb3-sample study aggregate: 2 of 4 runs have no evaluations around step 10 and are left out there" in told
+
+
+def test_numbers_as_markdown() -> None:
+    table = pd.DataFrame({"a": [1.0, float("nan")], "b": [12_345, 1], "c": ["x|y", "z"], "d": [1e-9, 123_456.0]})
+    assert markdown(table).splitlines() == [
+        "| a | b | c | d |",
+        "| ---: | ---: | --- | ---: |",
+        "| 1.000 | 12,345 | x\\|y | 1e-09 |",
+        "| - | 1 | z | 1.23e+05 |",
+    ]

@@ -1,0 +1,67 @@
+"""
+BRO at 25 replay ratios and sizes, against the tables made of the same runs with other code.
+
+The runs may not be shipped: ``SB3_SAMPLE_REFERENCE`` names the folder with ``bro_grid.npz`` and ``bro_grid.md``, else
+it is looked for beside the checkout.
+"""
+
+import os
+import re
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sb3_sample import study
+
+ROOT = Path(__file__).parents[2]
+REFERENCE = Path(os.environ.get("SB3_SAMPLE_REFERENCE", ROOT.parent / "shared" / "reference"))
+STEPS = (100_000, 200_000, 500_000, 1_000_000)
+
+pytestmark = pytest.mark.skipif(
+    not (REFERENCE / "bro_grid.npz").exists(), reason=f"{REFERENCE} has no bro_grid.npz (SB3_SAMPLE_REFERENCE)"
+)
+
+
+@pytest.fixture(scope="module")
+def grid() -> pd.DataFrame:
+    found: pd.DataFrame = runpy.run_path(str(ROOT / "studies" / "published_grid.py"))["read_grid"](
+        REFERENCE / "bro_grid.npz"
+    )
+    return found[found["step"].isin(STEPS)]
+
+
+def published(heading: str) -> dict[tuple[str, str], list[float]]:
+    """The IQM of a table of ``bro_grid.md`` by replay ratio and size, at four steps."""
+    lines = (REFERENCE / "bro_grid.md").read_text().partition(f"**{heading}")[2].split("\n\n")[1].splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+    return {(row[0], row[1]): [float(re.split(r" ", cell)[0]) for cell in row[2:]] for row in rows}
+
+
+@pytest.mark.parametrize(
+    ("group", "heading", "unit", "digit"),
+    [
+        ("dmc", "15 DeepMind Control tasks (return, 0 to 1,000): IQM", 1_000, 1.0),
+        ("metaworld", "15 Meta-World v2 tasks (success rate in percent): IQM", 100, 0.1),
+        ("myosuite", "10 MyoSuite tasks (success rate in percent): IQM", 100, 0.1),
+    ],
+)
+def test_the_grid_of_bro(grid: pd.DataFrame, group: str, heading: str, unit: float, digit: float) -> None:
+    expected = published(heading)
+    assert len(expected) == 25
+    for i, step in enumerate(STEPS):
+        found = study.heatmap(grid, "model_size", "replay_ratio", step=step, group=group)
+        assert list(found.index) == ["1", "2", "5", "10", "15"]
+        for (ratio, size), values in expected.items():
+            difference = abs(found.loc[ratio, size] * unit - values[i])
+            assert difference <= 0.51 * digit, (ratio, size, step, found.loc[ratio, size] * unit, values[i])
+
+
+def test_the_grids_published_agents_are_those_of_the_package(grid: pd.DataFrame) -> None:
+    ours = study.published_runs(["BRO Fast"])
+    ours = ours[ours["step"].isin(STEPS)]
+    theirs = grid[grid["arguments"] == '{"model_size": "4.92M", "replay_ratio": 2}']
+    key = ["task", "seed", "step"]
+    np.testing.assert_allclose(theirs.sort_values(key)["value"], ours.sort_values(key)["value"], rtol=1e-5, atol=1e-5)
