@@ -187,9 +187,14 @@ def read_plan(path: str | Path) -> Plan:
 class _Loader(yaml.SafeLoader):
     """Plain values; ``1e6`` is a number, as everywhere but in YAML 1.1."""
 
+    def construct_yaml_float(self, node: yaml.ScalarNode) -> float:
+        if _EXPONENT.match(node.value):
+            return float(node.value)
+        return super().construct_yaml_float(node)
+
 
 _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+0123456789"))
-_Loader.add_constructor("tag:yaml.org,2002:float", lambda loader, node: float(str(node.value).replace("_", "")))
+_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_yaml_float)
 
 
 class _Entry(NamedTuple):
@@ -334,7 +339,7 @@ class _Reader:
             if "algo" not in entries:
                 raise self._fail(key, f"agent {name!r} needs algo, one of {', '.join(algorithms)}")
             algo = self._plain(entries["algo"].value)
-            if algo not in algorithms:
+            if not isinstance(algo, str) or algo not in algorithms:
                 raise self._fail(
                     entries["algo"].value,
                     f"algo must be one of {', '.join(algorithms)}, not {algo!r}{_meant(str(algo), algorithms, False)}",
@@ -369,16 +374,16 @@ class _Reader:
             return {}
         grid: dict[str, list[Any]] = {}
         for name, (key, node) in self._mapping(entries["grid"].value, "grid").items():
+            for agent in agents:
+                if name in agent.arguments:
+                    raise self._fail(
+                        key,
+                        f"grid crosses {name!r}, which agent {agent.name!r} has fixed at {agent.arguments[name]!r} on "
+                        f"line {agent.entries[name].key.start_mark.line + 1}: leave it out of one of the two",
+                    )
             values: list[Any] = []
             for each in self._list(node, f"{name!r} of grid"):
                 for agent in agents:
-                    if name in agent.arguments:
-                        raise self._fail(
-                            key,
-                            f"grid crosses {name!r}, which agent {agent.name!r} has fixed at "
-                            f"{agent.arguments[name]!r} on line {agent.entries[name].key.start_mark.line + 1}: leave "
-                            "it out of one of the two",
-                        )
                     self._argument(agent.algo, name, key, each, f"grid, for agent {agent.name!r},")
                 value = self._plain(each)
                 if _key(value) in map(_key, values):

@@ -34,6 +34,13 @@ class StudyError(ValueError):
     """A study that cannot be made or read as asked."""
 
 
+def this_process() -> str:
+    """
+    :return: machine and process, in words
+    """
+    return f"{socket.gethostname()}, process {os.getpid()}"
+
+
 class Outcome(NamedTuple):
     """
     What became of a run.
@@ -151,6 +158,17 @@ class StudyFolder:
         path.parent.mkdir(parents=True, exist_ok=True)
         return take(path)
 
+    def holder(self, run: Run) -> str:
+        """
+        :param run: a run that a process has claimed
+        :return: the process, as it has said
+        """
+        try:
+            found = read_regular(self._beside(run, ".lock"), 1000).decode(errors="replace")
+        except (OSError, BadFile):
+            return ""
+        return "".join(letter for letter in found if letter.isprintable())
+
     def is_claimed(self, run: Run) -> bool:
         """
         :param run: a run
@@ -185,15 +203,17 @@ class StudyFolder:
             return Outcome(False)
         return outcome
 
-    def write_outcome(self, run: Run, outcome: Outcome) -> None:
+    def write_outcome(self, run: Run, outcome: Outcome) -> Outcome:
         """
         :param run: a run that this process has claimed
         :param outcome: what became of it
+        :return: the same, with machine and time
         """
         whole = outcome._replace(
             traceback=outcome.traceback[-MAX_TRACEBACK:], host=socket.gethostname(), finished=time.time()
         )
         _write(self._beside(run, ".json"), json.dumps(whole._asdict(), indent=1))
+        return whole
 
     def progress(self, run: Run) -> Progress:
         """

@@ -335,8 +335,7 @@ class Scheduler:
         with lock:
             steps = checkpointed(self._folder.place(run))
             outcome = outcome._replace(attempts=outcome.attempts + 1, traceback=worker.why_ended(), steps=steps)
-            self._folder.write_outcome(run, outcome)
-        return outcome
+            return self._folder.write_outcome(run, outcome)
 
     def _judge(self, run: Run, outcome: Outcome) -> None:
         """Decide whether a run is done, is tried again or has failed."""

@@ -109,7 +109,9 @@ class Status:
         lines = [self.line()]
         for run, found in self.progress():
             last = "" if found.last_return is None else f", last return {found.last_return:.1f}"
-            lines.append(f"running: {run.title}: {found.steps:,} of {run.steps:,} steps{last}")
+            lines.append(
+                f"running: {run.title}: {found.steps:,} of {run.steps:,} steps{last} ({self.folder.holder(run)})"
+            )
         for each in self.of(FAILED):
             lines.append(f"failed after {_times(each.outcome.attempts)}: {each.run.title}")
             lines.append("    " + each.outcome.traceback.rstrip().replace("\n", "\n    "))

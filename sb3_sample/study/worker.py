@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from sb3_sample.study.plan import Run
-from sb3_sample.study.runs import Outcome, StudyFolder, checkpointed
+from sb3_sample.study.runs import Outcome, StudyFolder, checkpointed, this_process
 
 #: Makes a run: the run, its folder, and options of ``sb3-sample train``.
 Train = Callable[[Run, Path, list[str]], None]
@@ -87,6 +87,7 @@ def _answer(folder: StudyFolder, order: dict[str, Any], make: Train) -> dict[str
     if lock is None:
         return {"taken": True}
     with lock:
+        lock.write(this_process())
         before = folder.outcome(run)
         if before.done:  # by another process, since the scheduler has looked
             return before._asdict()
@@ -111,8 +112,7 @@ def _answer(folder: StudyFolder, order: dict[str, Any], make: Train) -> dict[str
             last_return=progress.last_return,
         )
         outcome = outcome._replace(steps_made=max(outcome.steps - first, 0))
-        folder.write_outcome(run, outcome)
-        return outcome._asdict()
+        return folder.write_outcome(run, outcome)._asdict()
 
 
 @contextlib.contextmanager
