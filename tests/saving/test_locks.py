@@ -46,17 +46,20 @@ def test_a_forked_process_does_not_have_it(tmp_path: Path) -> None:
     lock = take(tmp_path / "lock")
     assert lock is not None
     reading, writing = os.pipe()
+    hearing, saying = os.pipe()
     child = os.fork()
     if child == 0:
         os.close(writing)
+        os.write(saying, b"here")
         os.read(reading, 1)  # as long as the parent asks
         os._exit(0)
+    os.read(hearing, 4)
     lock.release()
     again = take(tmp_path / "lock")
     assert again is not None
     again.release()
-    os.close(writing)
-    os.close(reading)
+    for each in (writing, reading, hearing, saying):
+        os.close(each)
     os.waitpid(child, 0)
 
 

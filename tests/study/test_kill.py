@@ -77,23 +77,21 @@ def test_killed_studies_end_where_an_undisturbed_one_does(tmp_path: Path) -> Non
     plan.write_text(PLAN)
     finish(start(plan, whole))
 
-    # The process that makes the first run is killed: the scheduler has another one go on.
+    # The process that makes the first run is killed.
     scheduler = start(plan, killed)
     first = process_of(killed, 3, 600, scheduler)
     os.kill(first, signal.SIGKILL)
-    second = process_of(killed, 3, 900, scheduler)
-    assert second != first
-    # Then, in the second run, both at once, as in a power cut.
-    third = process_of(killed, 4, 300, scheduler)
+    # Another one makes the second run meanwhile, which is killed with the scheduler, as in a power cut.
+    second = process_of(killed, 4, 300, scheduler)
     scheduler.kill()
-    os.kill(third, signal.SIGKILL)
+    os.kill(second, signal.SIGKILL)
     scheduler.wait()
     found = study.status(killed)
-    assert [each.state for each in found.runs] == ["done", "waiting"]
-    assert found.runs[0].outcome.attempts == 1 and found.runs[0].outcome.done
+    assert [each.state for each in found.runs] == ["failed", "waiting"]
+    assert found.failures[found.runs[0].run.title] == "the process that made the run was ended by SIGKILL"
     # Then the scheduler alone, ...
     scheduler = start(plan, killed)
-    fourth = process_of(killed, 4, 600, scheduler)
+    third = process_of(killed, 3, 900, scheduler)
     scheduler.kill()
     scheduler.wait()
     end = time.monotonic() + 60
@@ -101,8 +99,8 @@ def test_killed_studies_end_where_an_undisturbed_one_does(tmp_path: Path) -> Non
         assert time.monotonic() < end
     # ... and at last there is Ctrl-C.
     scheduler = start(plan, killed)
-    fifth = process_of(killed, 4, 900, scheduler)
-    assert len({third, fourth, fifth}) == 3
+    fourth = process_of(killed, 4, 900, scheduler)
+    assert len({first, second, third, fourth}) == 4
     scheduler.send_signal(signal.SIGINT)
     said = scheduler.communicate(timeout=100)[0]
     assert scheduler.returncode == 130 and "the same command goes on" in said

@@ -84,7 +84,7 @@ def test_anchors_and_merges(plan_of) -> None:
 
 # What is changed in the plan above, the line that the message names, and what else it says.
 BAD = [
-    ("    learning_starts: 500", "    learning_start: 500", 4, "'learning_start' of .*'learning_starts'. Allowed are .*gamma"),
+    ("    learning_starts: 500", "    learning_start: 500", 4, "'learning_start' .*'learning_starts'. Allowed .*gamma"),
     ("    learning_starts: 500", "    seed: 500", 4, "'seed' of agent 'SAC' is no argument of sac_sample"),
     ("    learning_starts: 500", "    learning_starts: -1", 4, "learning_starts must be an integer of at least 0,"),
     ("0.55M", "0.56M", 5, "agent 'BRO Fast' with replay_ratio=1 of grid .*: model_size must be one of .*'0.55M'"),
