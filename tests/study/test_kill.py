@@ -61,6 +61,15 @@ def process_of(folder: Path, seed: int, checkpoint: int, scheduler: subprocess.P
     return int((folder / f"state/SAC/Pendulum-v1/{seed}.lock").read_text().split()[-1])
 
 
+def settled(folder: Path) -> study.Status:
+    """The status when no process has a run any more."""
+    end = time.monotonic() + 60
+    while (found := study.status(folder)).counts["running"]:
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    return found
+
+
 def outcome(folder: Path, seed: int) -> Iterator[tuple[str, Any]]:
     run = folder / f"runs/SAC/Pendulum-v1/{seed}"
     model = SAC.load(run / "Pendulum-v1.zip", device="cpu")
@@ -86,7 +95,7 @@ def test_killed_studies_end_where_an_undisturbed_one_does(tmp_path: Path) -> Non
     scheduler.kill()
     os.kill(second, signal.SIGKILL)
     scheduler.wait()
-    found = study.status(killed)
+    found = settled(killed)
     assert [each.state for each in found.runs] == ["failed", "waiting"]
     assert found.failures[found.runs[0].run.title] == "the process that made the run was ended by SIGKILL"
     # Then the scheduler alone, ...
@@ -94,9 +103,7 @@ def test_killed_studies_end_where_an_undisturbed_one_does(tmp_path: Path) -> Non
     third = process_of(killed, 3, 900, scheduler)
     scheduler.kill()
     scheduler.wait()
-    end = time.monotonic() + 60
-    while study.status(killed).counts["running"]:  # it writes a checkpoint, and ends
-        assert time.monotonic() < end
+    settled(killed)  # the process writes a checkpoint, and ends
     # ... and at last there is Ctrl-C.
     scheduler = start(plan, killed)
     fourth = process_of(killed, 4, 900, scheduler)
