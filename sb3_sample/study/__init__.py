@@ -1,10 +1,10 @@
 """Studies: a plan of many runs, made on as many cores as are free and on as many machines as share a folder."""
 
-from sb3_sample.study.estimate import Estimate, estimate
+from sb3_sample.study.dry_run import Estimate, estimate
 from sb3_sample.study.plan import Plan, PlanError, Run, read_plan
 from sb3_sample.study.runs import Outcome, StudyError
 from sb3_sample.study.schedule import Stopped, run
-from sb3_sample.study.status import RunStatus, Status, status
+from sb3_sample.study.states import RunStatus, Status, status
 
 __all__ = [
     "Estimate",

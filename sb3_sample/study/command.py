@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from sb3_sample.exits import refuse
-from sb3_sample.study.estimate import estimate
+from sb3_sample.study.dry_run import estimate
 from sb3_sample.study.plan import PlanError, read_plan
 from sb3_sample.study.runs import StudyError
 from sb3_sample.study.schedule import Stopped, free_cores, run
-from sb3_sample.study.status import RUNNING, STATES, Status, status
+from sb3_sample.study.states import RUNNING, STATES, Status, status
 
 #: Seconds between two lines of counts where there is no terminal.
 LINE_EVERY = 60.0

@@ -14,6 +14,7 @@ import itertools
 import json
 import math
 import re
+from collections import deque
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,6 +38,8 @@ CHECKPOINT_FREQ = 10_000
 NOT_OF_AGENTS = {"_init_setup_model", "device", "env", "seed", "tensorboard_log", "verbose"}
 #: Characters of a plan, and of one part of a folder's name.
 MAX_PLAN, MAX_NAME = 2**20, 120
+#: Values in one entry, where an alias counts as what it stands for.
+MAX_VALUES = 10_000
 _AGENT = re.compile(r"\w[\w .+()-]*")
 _EXPONENT = re.compile(r"[-+]?(\d[\d_]*)(\.\d*)?[eE][-+]?\d+$")
 
@@ -215,6 +218,8 @@ class _Agent(NamedTuple):
 class _Reader:
     def __init__(self, path: Path):
         self._path = path
+        #: Mappings that have been looked at: reading them puts what they merge among their own.
+        self._checked: set[int] = set()
 
     def _fail(self, node: yaml.Node, message: str) -> PlanError:
         return PlanError(f"{self._path}, line {node.start_mark.line + 1}: {message}")
@@ -282,6 +287,9 @@ class _Reader:
 
     def _check_twice(self, node: yaml.MappingNode) -> None:
         """YAML's reader lets the last of several equal keys win."""
+        if id(node) in self._checked:
+            return
+        self._checked.add(id(node))
         seen: dict[Any, yaml.Node] = {}
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
@@ -295,7 +303,9 @@ class _Reader:
 
     def _plain(self, node: yaml.Node) -> Any:
         """Plain value of a node."""
-        for each in _nodes(node):
+        for count, each in enumerate(_nodes(node)):
+            if count > MAX_VALUES:
+                raise self._fail(node, f"this is more than {MAX_VALUES:,} values, or holds itself")
             if isinstance(each, yaml.MappingNode):
                 self._check_twice(each)
             if not each.tag.startswith("tag:yaml.org,2002:") or each.tag.rpartition(":")[2] not in (
@@ -500,11 +510,13 @@ class _Reader:
 
 
 def _nodes(node: yaml.Node) -> Iterator[yaml.Node]:
-    yield node
-    if isinstance(node, yaml.CollectionNode):
-        for each in node.value:
-            for part in each if isinstance(each, tuple) else (each,):
-                yield from _nodes(part)
+    """A node and all below it. Without an end where one holds itself."""
+    waiting = deque([node])
+    while waiting:
+        yield (each := waiting.popleft())
+        if isinstance(each, yaml.CollectionNode):
+            for child in each.value:
+                waiting.extend(child if isinstance(child, tuple) else (child,))
 
 
 def _key(value: Any) -> str:

@@ -23,7 +23,7 @@ from typing import IO, Any
 from sb3_sample.kinds import check_value, integer
 from sb3_sample.study.plan import Plan, Run, read_plan
 from sb3_sample.study.runs import Outcome, StudyFolder, checkpointed
-from sb3_sample.study.status import DONE, FAILED, RUNNING, WAITING, RunStatus, Status
+from sb3_sample.study.states import DONE, FAILED, RUNNING, WAITING, RunStatus, Status
 
 #: Command of a process that makes runs, before the study's folder.
 WORKER = (sys.executable, "-c", "from sb3_sample.study.worker import serve; serve()")

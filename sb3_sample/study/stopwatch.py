@@ -28,11 +28,12 @@ class Stopwatch(BaseCallback):
     def _on_rollout_start(self) -> None:
         now = time.monotonic()
         if self._first is None:
-            if self.model._n_updates > 0:
-                self._turns += 1
+            if self.model._n_updates == 0:
+                return
             # A turn of PPO is as long as hundreds of SAC's.
-            if self._turns > (1 if hasattr(self.model, "rollout_buffer") else SKIPPED):
+            if self._turns == (0 if hasattr(self.model, "rollout_buffer") else SKIPPED):
                 self._first = (self.num_timesteps, now)
+            self._turns += 1
             return
         steps, seconds = self.num_timesteps - self._first[0], now - self._first[1]
         if seconds >= self.seconds and steps:

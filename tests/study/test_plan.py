@@ -82,6 +82,19 @@ def test_anchors_and_merges(plan_of) -> None:
     assert plan_of(text).runs[2].arguments == {"learning_starts": 500, "gamma": 0.97, "replay_ratio": 1}
 
 
+def test_what_is_merged_can_be_there_often(plan_of) -> None:
+    shared = "{<<: {net_arch: [8]}, net_arch: &net [16]}"
+    text = GOOD.replace("learning_starts: 500", f"policy_kwargs: &kwargs {shared}")
+    text = text.replace("  BRO Fast:", "  VPL-SAC:\n    algo: vpl_sac\n    policy_kwargs: *kwargs\n  BRO Fast:")
+    runs = plan_of(text.replace("grid:\n", "grid:\n  replay_buffer_kwargs: [{<<: {}}]\n")).runs
+    assert [run.arguments["policy_kwargs"] for run in runs[:4]] == [{"net_arch": [16]}] * 4
+
+
+def test_a_value_that_holds_itself_is_refused(plan_of) -> None:
+    with pytest.raises(PlanError, match="line 4: this is more than 10,000 values, or holds itself"):
+        plan_of(GOOD.replace("learning_starts: 500", "learning_starts: &itself [*itself]"))
+
+
 # What is changed in the plan above, the line that the message names, and what else it says.
 BAD = [
     ("    learning_starts: 500", "    learning_start: 500", 4, "'learning_start' .*'learning_starts'. Allowed .*gamma"),

@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import io
 import signal
 import subprocess
 import sys
@@ -11,9 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from sb3_sample import study
+from sb3_sample import cli, study
+from sb3_sample.study import command
 from sb3_sample.study.plan import Plan
-from sb3_sample.study.runs import StudyFolder
+from sb3_sample.study.runs import Outcome, StudyFolder
+from sb3_sample.study.states import RunStatus, Status
 from tests.study import nothing
 
 ROOT = Path(__file__).parents[2]
@@ -48,19 +51,23 @@ def test_each_run_is_made_once_and_not_again(tmp_path: Path) -> None:
     assert sorted(made(tmp_path)[8:]) == sorted(f"{w} Nothing/nothing-v0/{i}" for i in (0, 2) for w in ("begin", "end"))
 
 
-def test_a_run_that_fails_is_tried_again_and_named_and_the_others_go_on(tmp_path: Path) -> None:
-    failing = list(nothing.plan(3, fail=2).runs)
-    plan = Plan("mixed", (*failing, *(nothing.plan(6).runs[3:])))
+def test_a_run_that_fails_is_tried_again_and_named_and_the_others_go_on(tmp_path: Path, capsys) -> None:
+    failing = nothing.plan(1, fail=2).runs[0]
+    plan = Plan("mixed", (failing, *nothing.plan(4).runs[1:]))
     found = run(plan, tmp_path, retries=1)
-    assert found.counts == {"done": 3, "running": 0, "failed": 3, "waiting": 0}
-    assert list(found.failures) == [each.title for each in failing]
-    assert "RuntimeError: nothing comes of seed 1" in found.failures[failing[1].title]
-    assert all(each.outcome.attempts == 2 for each in found.of("failed"))
-    assert str(found).count("failed after 2 attempts") == 3
+    assert found.counts == {"done": 3, "running": 0, "failed": 1, "waiting": 0}
+    assert list(found.failures) == [failing.title]
+    assert "RuntimeError: nothing comes of seed 0" in found.failures[failing.title]
+    assert found.of("failed")[0].outcome.attempts == 2
+    assert "failed after 2 attempts: Nothing on nothing-v0, seed 0" in str(found)
     assert study.status(tmp_path).failures == found.failures
-    assert "nothing comes of seed 0" in (tmp_path / "state/Nothing/nothing-v0/0.txt").read_text()
-    # The same command tries them again, and the third attempt succeeds.
-    assert run(plan, tmp_path, retries=0).counts["done"] == 6
+    cli.main(["study", "status", str(tmp_path)])
+    said = capsys.readouterr().out
+    assert said.splitlines()[1].split() == ["Nothing", "3", "0", "1", "0"]
+    assert "RuntimeError: nothing comes of seed 0" in said
+    assert (tmp_path / "state/Nothing/nothing-v0/0.txt").read_text().count("nothing comes of seed 0") == 2
+    # The same command tries it again, and the third attempt succeeds.
+    assert run(plan, tmp_path, retries=0).counts["done"] == 4
 
 
 def test_a_process_that_dies_is_replaced(tmp_path: Path) -> None:
@@ -158,6 +165,30 @@ def test_other_settings_in_a_folder_are_refused(tmp_path: Path) -> None:
         run(nothing.plan(1), tmp_path, workers=0)
     with pytest.raises(study.StudyError, match="is no folder of sb3-sample study run"):
         study.status(tmp_path / "runs")
+
+
+def test_lines_and_the_live_table(tmp_path: Path, capsys) -> None:
+    console = pytest.importorskip("rich.console")
+    plan, folder = nothing.plan(30), StudyFolder(tmp_path)
+    folder.enter(plan)
+    done = Outcome(True, steps=1, steps_made=1, seconds=10.0, last_return=-3.25, finished=5.0)
+    states = [RunStatus(plan.runs[0], "done", done), RunStatus(plan.runs[1], "failed", Outcome(False, 1, "why"))]
+    states += [RunStatus(each, "running", Outcome(False)) for each in plan.runs[2:27]]
+    states += [RunStatus(each, "waiting", Outcome(False)) for each in plan.runs[27:]]
+    found = Status(folder, states, states[:2])
+    # 28 runs of one step, each of 10 seconds, 25 at once.
+    line = (
+        "1 done, 25 running, 1 failed, 3 waiting, last return -3.2 (Nothing on nothing-v0, seed 0), about 0:00:11 left"
+    )
+    assert found.line() == line
+    drawn = console.Console(record=True, width=150, file=io.StringIO())
+    drawn.print(command.table(found))
+    text = " ".join(drawn.export_text().split())
+    assert line in text and "and 5 more" in text and "nothing-v0" in text
+    lines = command._Lines()
+    lines(found)
+    said = "done: Nothing on nothing-v0, seed 0, last return -3.2\nfailed: Nothing on nothing-v0, seed 1\n"
+    assert capsys.readouterr().out == said
 
 
 def test_the_work_for_a_run_does_not_grow_with_the_number_of_runs(tmp_path: Path) -> None:

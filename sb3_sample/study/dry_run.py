@@ -19,7 +19,7 @@ from sb3_sample.study.worker import train
 SECONDS = 3.0
 #: Steps of random actions before that.
 WARM_UP = 500
-_PROBE = (sys.executable, "-c", "from sb3_sample.study.estimate import probe; probe()")
+_PROBE = (sys.executable, "-c", "from sb3_sample.study.dry_run import probe; probe()")
 
 
 class Cost(NamedTuple):
