@@ -1,5 +1,6 @@
 """
-The command ``sb3-sample``: the zoo's commands with the algorithms of this package in them, ``plot`` and ``variance``.
+The command ``sb3-sample``: the zoo's commands with the algorithms of this package in them, ``plot``, ``study`` and
+``variance``.
 """
 
 import argparse
@@ -217,11 +218,23 @@ def _variance(arguments: list[str]) -> None:
     variance(arguments)
 
 
+def _study(arguments: list[str]) -> None:
+    from sb3_sample.study.command import main as study
+
+    try:
+        study(arguments)
+    except ImportError as error:
+        if isinstance(error.__cause__, ModuleNotFoundError):
+            sys.exit(f"sb3-sample: {error}")
+        raise
+
+
 COMMANDS: dict[str, Command] = {
     "train": Command(_train, "train an agent, or search for hyperparameters"),
     "enjoy": Command(_enjoy, "run a trained agent"),
     "record_video": Command(_record_video, "write a video of a trained agent"),
     "plot": Command(_plot, "draw the runs of a task, mean and range over seeds, beside the published curves"),
+    "study": Command(_study, "make the runs of a plan: agents, tasks, seeds and a grid of arguments"),
     "variance": Command(_variance, "measure a policy gradient's variance: more actions or a longer trajectory?"),
     "plot_train": Command(_zoo_plot("plot_train"), "draw the return of the training episodes"),
     "all_plots": Command(_zoo_plot("all_plots"), "draw and tabulate the evaluations of several runs"),

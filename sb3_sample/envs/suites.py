@@ -162,6 +162,11 @@ MBMA = _dmc(
 #: MBMA, table 4: four harder tasks, 3M (quadruped) and 6M (humanoid) environment steps, action repeat 4.
 MBMA_HARD = _dmc("quadruped-walk", "quadruped-run", "humanoid-stand", "humanoid-walk")
 
+#: The lists by their names.
+SUITES: dict[str, tuple[str, ...]] = {
+    name: tasks for name, tasks in list(globals().items()) if isinstance(tasks, tuple) and not name.startswith("_")
+}
+
 # The published curves of Gymnasium's tasks are of v4; v5 is the version of today.
 _GYMNASIUM = ("Ant", "HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup", "Walker2d")
 #: How HumanoidBench's ids begin. The package has none of them; who has installed it finds the curves.

@@ -19,7 +19,6 @@ import re
 import secrets
 import stat
 import warnings
-import weakref
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -27,6 +26,7 @@ from typing import IO, Any, NamedTuple
 from sb3_sample.saving import temporary
 from sb3_sample.saving.container import is_sha256, sync_folder
 from sb3_sample.saving.folders import Folder
+from sb3_sample.saving.locks import Lock
 
 MODEL, STATE, MANIFEST = "model.zip", "state.zip", "manifest.json"
 SEGMENTS, LOG = "replay", "progress.jsonl"
@@ -85,19 +85,6 @@ class Segment(NamedTuple):
         return f"{SEGMENTS}/{self.name}"
 
 
-#: Folders whose locks this process has. Workers that are forked later must not keep them.
-_LOCKED: weakref.WeakSet["RunFolder"] = weakref.WeakSet()
-
-
-def _let_go() -> None:
-    for folder in list(_LOCKED):
-        folder.close()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_let_go)
-
-
 class RunFolder:
     """
     A folder that one run has for itself.
@@ -114,7 +101,7 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
         #: What was warned of.
         self._told: set[str] = set()
-        self._lock: int | None = None
+        self._lock: Lock | None = None
         with Folder.at(self.path) as root:
             self._check(root)
             self._lock = self._take_lock(root)
@@ -145,7 +132,7 @@ class RunFolder:
                     "overwritten: name another folder. Nothing was changed."
                 )
 
-    def _take_lock(self, root: Folder) -> int | None:
+    def _take_lock(self, root: Folder) -> Lock | None:
         root.separate(_LOCK)
         lock = root.descriptor(_LOCK, os.O_RDWR | os.O_CREAT)
         try:
@@ -164,15 +151,13 @@ class RunFolder:
         if not held:
             os.close(lock)
             return None
-        _LOCKED.add(self)
-        return lock
+        return Lock(lock)
 
     def close(self) -> None:
         """Let others have the folder."""
         lock, self._lock = self._lock, None
-        _LOCKED.discard(self)
         if lock is not None:
-            os.close(lock)
+            lock.release()
 
     def _warn(self, message: str) -> None:
         """Once: the same is found again at each checkpoint."""

@@ -1,15 +1,33 @@
-"""Many runs as one table, their statistics, and the figures of the papers' studies."""
+"""
+Studies: a plan of many runs, made on as many cores as are free and on as many machines as share a folder; their table,
+its statistics, and the figures of the papers' studies.
+"""
 
 from sb3_sample.envs.scores import Score
 from sb3_sample.study.aggregate import aggregate, performance_profiles, probability_of_improvement
 from sb3_sample.study.analysis import correlate, cost, heatmap, marginalize, regress
+from sb3_sample.study.dry_run import Estimate, estimate
+from sb3_sample.study.plan import Plan, PlanError, Run, read_plan
+from sb3_sample.study.runs import Outcome, StudyError
+from sb3_sample.study.schedule import Stopped, run
+from sb3_sample.study.states import RunStatus, Status, status
 from sb3_sample.study.table import load, published_curves, published_runs, read, write
 
 __all__ = [
+    "Estimate",
+    "Outcome",
+    "Plan",
+    "PlanError",
+    "Run",
+    "RunStatus",
     "Score",
+    "Status",
+    "Stopped",
+    "StudyError",
     "aggregate",
     "correlate",
     "cost",
+    "estimate",
     "heatmap",
     "load",
     "marginalize",
@@ -18,6 +36,9 @@ __all__ = [
     "published_curves",
     "published_runs",
     "read",
+    "read_plan",
     "regress",
+    "run",
+    "status",
     "write",
 ]

@@ -1,0 +1,78 @@
+"""Locks of files that this process holds: what it forks does not have them, and a process that is gone has none."""
+
+import contextlib
+import errno
+import os
+import weakref
+from pathlib import Path
+
+from sb3_sample.saving import temporary
+
+#: Locks that this process has. Workers that are forked later must not keep them.
+_HELD: weakref.WeakSet["Lock"] = weakref.WeakSet()
+
+
+def _let_go() -> None:
+    for lock in list(_HELD):
+        lock.release()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_let_go)
+
+
+class Lock:
+    """
+    Lock of a file, held until ``release`` or the end of the process.
+
+    :param descriptor: of the open file, which this process has locked
+    """
+
+    def __init__(self, descriptor: int):
+        self._descriptor: int | None = descriptor
+        _HELD.add(self)
+
+    def write(self, text: str) -> None:
+        """
+        :param text: who has the lock, for whoever looks at the file; it stays there
+        """
+        if self._descriptor is not None:
+            os.ftruncate(self._descriptor, 0)
+            os.write(self._descriptor, text.encode())
+
+    def release(self) -> None:
+        """Let others have it. More than one call does no harm."""
+        descriptor, self._descriptor = self._descriptor, None
+        _HELD.discard(self)
+        if descriptor is not None:
+            os.close(descriptor)
+
+    def __enter__(self) -> "Lock":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.release()
+
+
+def take(path: Path) -> Lock | None:
+    """
+    Lock a file, without waiting.
+
+    :param path: of the file, made if it is not there
+    :return: the lock; None while another process has it, on this machine or on another that shares the folder
+    :raises OSError: the file cannot be opened, or its file system has no locks
+    """
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o644)
+        with contextlib.ExitStack() as on_return:
+            on_return.callback(os.close, descriptor)
+            held = temporary.lock(descriptor)
+            if held is None:
+                raise OSError(errno.ENOLCK, "the system or the file system has no locks", str(path))
+            if held is False:
+                return None
+            # Whoever removed the file since it was opened would lock another one by its name.
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(descriptor), os.stat(path)):
+                    on_return.pop_all()
+                    return Lock(descriptor)

@@ -1,0 +1,171 @@
+"""What a plan costs, before it is run: hours, by the step time of this machine, and bytes."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from sb3_sample.study.plan import Plan, Run, constructor_arguments, read_plan
+from sb3_sample.study.runs import StudyFolder, checkpointed
+from sb3_sample.study.schedule import free_cores, threads_of_libraries
+from sb3_sample.study.worker import train
+
+#: Seconds for which the step time of an agent on a task is measured.
+SECONDS = 3.0
+#: Steps of random actions before that.
+WARM_UP = 500
+_PROBE = (sys.executable, "-c", "from sb3_sample.study.dry_run import probe; probe()")
+
+
+class Cost(NamedTuple):
+    """
+    :param seconds: of an environment step, with what is learned from it
+    :param bytes_of_run: what the run's folder holds besides the replay buffer
+    :param bytes_of_step: of a transition
+    """
+
+    seconds: float
+    bytes_of_run: float
+    bytes_of_step: float
+
+
+class Estimate(NamedTuple):
+    """
+    :param n_runs: runs of the plan
+    :param n_done: those of them that are done
+    :param hours: of one core for each of the run's threads, for those that are not
+    :param workers: runs at once
+    :param n_bytes: what their folders will hold
+    """
+
+    n_runs: int
+    n_done: int
+    hours: float
+    workers: int
+    n_bytes: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.n_runs} runs, {self.n_done} of them done. The others take {self.hours:.2f} hours, "
+            f"{self.hours / self.workers:.2f} with {self.workers} at once (evaluations apart), and "
+            f"{_size(self.n_bytes)} of disk"
+        )
+
+
+def _size(n_bytes: float) -> str:
+    for unit in ("bytes", "kB", "MB", "GB"):
+        if n_bytes < 1000:
+            return f"{n_bytes:.3g} {unit}"
+        n_bytes /= 1000
+    return f"{n_bytes:.3g} TB"
+
+
+def estimate(
+    plan: str | Path | Plan,
+    folder: str | Path | None = None,
+    *,
+    workers: int | None = None,
+    threads: int = 1,
+    device: str = "auto",
+    say: Callable[[str], None] = lambda _: None,
+) -> Estimate:
+    """
+    Estimate what a plan costs. The step time is measured on this machine, by the first seconds of a training of each
+    agent on the first task and of the first agent on each task; that of another pair is the product of the two ratios.
+
+    :param plan: a plan or its file
+    :param folder: the study's, of which what is done is not counted; ``runs/<name of the plan>`` if None
+    :param workers: runs at once; as many as there are free cores for, if None
+    :param threads: of each run
+    :param device: of each run
+    :param say: gets what is being measured
+    :return: the estimate
+    :raises PlanError: the plan cannot be run as it stands
+    :raises RuntimeError: a training that was to be measured has failed; the message has its output
+    """
+    plan = plan if isinstance(plan, Plan) else read_plan(plan)
+    place = StudyFolder(Path("runs") / plan.name if folder is None else folder)
+    at_once = max(free_cores() // threads, 1) if workers is None else workers
+    left = [run for run in plan.runs if not place.outcome(run).done]
+    costs: dict[tuple[str, str], Cost] = {}
+    seconds = n_bytes = 0.0
+    for run in left:
+        base = left[0]
+        for probe in (base, dataclasses.replace(run, task=base.task), dataclasses.replace(base, task=run.task)):
+            if (probe.variant, probe.task) not in costs:
+                say(f"measuring {probe.variant} on {probe.task}")
+                costs[probe.variant, probe.task] = measure(probe, threads, device)
+        first, agent, task = (
+            costs[base.variant, base.task],
+            costs[run.variant, base.task],
+            costs[base.variant, run.task],
+        )
+        seconds += run.steps * agent.seconds * task.seconds / first.seconds
+        # Networks are the agent's, observations the task's.
+        n_bytes += agent.bytes_of_run * task.bytes_of_run / first.bytes_of_run
+        n_bytes += min(run.steps, _buffer_size(run)) * (task.bytes_of_step if agent.bytes_of_step else 0.0)
+    return Estimate(
+        len(plan.runs), len(plan.runs) - len(left), seconds / 3600, min(at_once, max(len(left), 1)), n_bytes
+    )
+
+
+def _buffer_size(run: Run) -> float:
+    return float(run.arguments.get("buffer_size", 1_000_000))
+
+
+def measure(run: Run, threads: int, device: str) -> Cost:
+    """
+    Measure a run by its first seconds, in a process and a folder of its own.
+
+    :param run: the run
+    :param threads: its threads
+    :param device: its device
+    :return: what it costs
+    :raises RuntimeError: it has failed, or ended before anything was learned
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        times, place = Path(folder) / "times.json", Path(folder) / "run"
+        stopwatch = {"sb3_sample.study.stopwatch.Stopwatch": {"path": str(times), "seconds": SECONDS}}
+        arguments = {**run.arguments, "callback": stopwatch}
+        if "learning_starts" in constructor_arguments(run.algo):
+            arguments["learning_starts"] = WARM_UP
+        # As many steps as the run has, since what is compiled depends on them.
+        order = {
+            "run": dataclasses.replace(run, arguments=arguments, eval_freq=run.steps).as_json(),
+            "options": ["--num-threads", str(threads), "--device", device],
+        }
+        env = {**os.environ, **threads_of_libraries(threads)}
+        done = subprocess.run(
+            [*_PROBE, str(place)], input=json.dumps(order), capture_output=True, text=True, env=env, check=False
+        )
+        try:
+            found = json.loads(times.read_text())
+        except FileNotFoundError as error:
+            raise RuntimeError(f"{run.title} cannot be measured: {done.stdout[-2000:]}{done.stderr[-2000:]}") from error
+        replay, rest = _bytes(place)
+        return Cost(found["seconds"] / found["steps"], rest, replay / max(checkpointed(place), 1))
+
+
+def probe() -> None:
+    """Make the run that the standard input gives as JSON in the folder that the command line names."""
+    order = json.loads(sys.stdin.read())
+    train(Run.of_json(order["run"]), Path(sys.argv[1]), order["options"])
+
+
+def _bytes(folder: Path) -> tuple[float, float]:
+    """Bytes of rows of replay buffers, and of everything else when the run has ended."""
+    replay = rest = 0.0
+    for path in folder.rglob("*"):
+        if path.is_file():
+            size = path.stat().st_size
+            if path.parent.name == "replay":
+                replay += size
+            else:
+                # Two checkpoints are kept, and the best model besides the last.
+                rest += size * (2 if path.parent.name.startswith("checkpoint-") or path.suffix == ".zip" else 1)
+    return replay, rest

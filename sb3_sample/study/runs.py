@@ -1,0 +1,283 @@
+"""
+The folder of a study: a folder a run, as ``sb3-sample train --run-dir`` makes it, and beside these what a study says of
+its runs.
+
+A run is claimed by the lock of a file, which the process holds that makes the run. So no two processes have the same
+run, on one machine or on several that share the folder, and one that is dead has none.
+"""
+
+import json
+import os
+import re
+import socket
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sb3_sample.run_logs import EVALUATIONS, read_evaluations
+from sb3_sample.saving import temporary
+from sb3_sample.saving.locks import Lock, take
+from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
+from sb3_sample.study.plan import Plan, Run
+
+#: What is in a study's folder: its runs, what is said of each, the list of them and the plan as it was read.
+RUNS, STATE, LIST, PLAN = "runs", "state", "study.json", "plan.yml"
+_LOG = "progress.jsonl"
+#: Bytes of the list, of what is said of one run, and of the end of a log that is looked at.
+MAX_LIST, MAX_OUTCOME, TAIL = 2**28, 2**20, 2**14
+#: Characters of a traceback that are kept.
+MAX_TRACEBACK = 20_000
+
+
+class StudyError(ValueError):
+    """A study that cannot be made or read as asked."""
+
+
+def this_process() -> str:
+    """
+    :return: machine and process, in words
+    """
+    return f"{socket.gethostname()}, process {os.getpid()}"
+
+
+class Outcome(NamedTuple):
+    """
+    What became of a run.
+
+    :param done: whether it was made to its end
+    :param attempts: attempts that failed
+    :param traceback: of the last that failed
+    :param steps: environment steps that it has
+    :param seconds: of the last attempt
+    :param steps_made: environment steps of the last attempt, which goes on from a checkpoint
+    :param last_return: mean return of the last evaluation, if there was one
+    :param host: machine of the last attempt
+    :param threads: its threads
+    :param finished: when it ended, in seconds since 1970
+    """
+
+    done: bool
+    attempts: int = 0
+    traceback: str = ""
+    steps: int = 0
+    seconds: float = 0.0
+    steps_made: int = 0
+    last_return: float | None = None
+    host: str = ""
+    threads: int = 1
+    finished: float = 0.0
+
+
+class Progress(NamedTuple):
+    """
+    How far a run is, by its own files.
+
+    :param steps: environment steps
+    :param last_return: mean return of the last evaluation; None before the first
+    """
+
+    steps: int
+    last_return: float | None
+
+
+class StudyFolder:
+    """
+    :param path: the folder of a study
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+
+    # ---------------------------------------------------------------- the list of runs
+
+    def enter(self, plan: Plan) -> None:
+        """
+        Make the folder that of a plan. A plan that has been run there may have got more runs and more steps since.
+
+        :param plan: the plan
+        :raises StudyError: a run of its is there with other settings
+        :raises OSError: the folder cannot be made or written to, or has no locks
+        """
+        for name in (RUNS, STATE):
+            (self.path / name).mkdir(parents=True, exist_ok=True)
+        # Two machines that begin at the same time.
+        while (lock := take(self.path / STATE / ".lock")) is None:
+            time.sleep(0.01)
+        with lock:
+            if (self.path / LIST).exists():
+                _check_same(self.path, self.runs(), plan.runs)
+            runs = [run.as_json() for run in plan.runs]
+            _write(self.path / LIST, json.dumps({"name": plan.name, "runs": runs}, indent=1))
+            if plan.text:
+                _write(self.path / PLAN, plan.text)
+
+    def runs(self) -> list[Run]:
+        """
+        :return: the runs of the plan that was last run there
+        :raises StudyError: there is none, or its list is not what was written
+        """
+        path = self.path / LIST
+        try:
+            found = parse_json(read_regular(path, MAX_LIST), "it")
+        except FileNotFoundError as error:
+            raise StudyError(f"{self.path} is no folder of sb3-sample study run: it has no {LIST}") from error
+        except (OSError, BadFile) as error:
+            raise StudyError(f"{path} is not what sb3-sample study run has written: {error}") from error
+        try:
+            return [Run.of_json(run) for run in found["runs"]]
+        except (ValueError, KeyError, TypeError) as error:
+            raise StudyError(f"{path} is not what sb3-sample study run has written: {error}") from error
+
+    # ---------------------------------------------------------------- one run
+
+    def place(self, run: Run) -> Path:
+        """
+        :param run: a run
+        :return: its folder, as ``sb3-sample train --run-dir`` has it
+        """
+        return self.path / RUNS / run.name
+
+    def _beside(self, run: Run, suffix: str) -> Path:
+        return self.path / STATE / f"{run.name}{suffix}"
+
+    def output(self, run: Run) -> Path:
+        """
+        :param run: a run
+        :return: the file of what its process prints
+        """
+        return self._beside(run, ".txt")
+
+    def claim(self, run: Run) -> Lock | None:
+        """
+        :param run: a run
+        :return: its lock; None while another process has it
+        :raises OSError: the folder has no locks
+        """
+        path = self._beside(run, ".lock")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return take(path)
+
+    def holder(self, run: Run) -> str:
+        """
+        :param run: a run that a process has claimed
+        :return: the process, as it has said
+        """
+        try:
+            found = read_regular(self._beside(run, ".lock"), 1000).decode(errors="replace")
+        except (OSError, BadFile):
+            return ""
+        return "".join(letter for letter in found if letter.isprintable())
+
+    def is_claimed(self, run: Run) -> bool:
+        """
+        :param run: a run
+        :return: whether a process has it at present
+        """
+        if not self._beside(run, ".lock").exists():
+            return False
+        lock = self.claim(run)
+        if lock is None:
+            return True
+        lock.release()
+        return False
+
+    def outcome(self, run: Run) -> Outcome:
+        """
+        :param run: a run
+        :return: what became of it so far. A run whose folder was removed is as one that was never made, and so is one
+            that shall have more steps
+        :raises StudyError: the file is not what was written
+        """
+        path = self._beside(run, ".json")
+        try:
+            found = parse_json(read_regular(path, MAX_OUTCOME), "it")
+        except FileNotFoundError:
+            return Outcome(False)
+        except (OSError, BadFile) as error:
+            raise StudyError(f"{path} is not what sb3-sample study run has written: {error}") from error
+        if not isinstance(found, dict) or found.keys() != set(Outcome._fields):
+            raise StudyError(f"{path} is not what sb3-sample study run has written: remove it, and the run goes on")
+        outcome = Outcome(**found)
+        if outcome.done and (outcome.steps < run.steps or not self.place(run).is_dir()):
+            return Outcome(False)
+        return outcome
+
+    def write_outcome(self, run: Run, outcome: Outcome) -> Outcome:
+        """
+        :param run: a run that this process has claimed
+        :param outcome: what became of it
+        :return: the same, with machine and time
+        """
+        whole = outcome._replace(
+            traceback=outcome.traceback[-MAX_TRACEBACK:], host=socket.gethostname(), finished=time.time()
+        )
+        _write(self._beside(run, ".json"), json.dumps(whole._asdict(), indent=1))
+        return whole
+
+    def progress(self, run: Run) -> Progress:
+        """
+        :param run: a run
+        :return: how far it is, by its checkpoints, its log and its evaluations, of which the last counts
+        """
+        folder = self.place(run)
+        steps = max(checkpointed(folder), _logged(folder / _LOG))
+        try:
+            found = read_evaluations(folder / EVALUATIONS)
+        except (OSError, BadFile):  # none so far, or one is being written
+            return Progress(steps, None)
+        return Progress(max(steps, int(found["timesteps"][-1])), float(found["results"][-1].mean()))
+
+
+def checkpointed(folder: Path) -> int:
+    """
+    :param folder: a run's
+    :return: environment steps of its newest checkpoint; 0 without one
+    """
+    try:
+        names = os.listdir(folder)
+    except OSError:
+        return 0
+    return max((int(m[1]) for name in names if (m := re.fullmatch(r"checkpoint-(\d{12,})", name))), default=0)
+
+
+def _logged(path: Path) -> int:
+    """Environment steps by the last whole line of a run's log."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(file.seek(0, os.SEEK_END) - TAIL, 0))
+            lines = file.read().split(b"\n")
+    except OSError:
+        return 0
+    for line in reversed(lines[:-1]):
+        try:
+            steps = json.loads(line)["time/total_timesteps"]
+        except (ValueError, KeyError, TypeError):
+            continue
+        if type(steps) is int:
+            return steps
+    return 0
+
+
+def _write(path: Path, text: str) -> None:
+    with temporary.becoming(path) as file:
+        file.write(text.encode())
+
+
+def _check_same(path: Path, before: Iterable[Run], now: Iterable[Run]) -> None:
+    known = {run.name: run.as_json() for run in before}
+    for run in now:
+        if (there := known.get(run.name)) is None:
+            continue
+        here = run.as_json()
+        free = {"checkpoint_freq", "gym_packages"} | ({"steps"} if run.steps >= there["steps"] else set())
+        for name in here.keys() - free:
+            if here[name] != there[name]:
+                raise StudyError(
+                    f"{path} has {run.title}, with {_pair(name, there, here)}. Nothing was changed: run the plan as it "
+                    "was, or in another --folder"
+                )
+
+
+def _pair(name: str, there: dict[str, Any], here: dict[str, Any]) -> str:
+    return f"{name} {there[name]!r:.200}, and the plan now says {here[name]!r:.200}"

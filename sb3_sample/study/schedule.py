@@ -1,0 +1,377 @@
+"""
+Running a study: which run is made next, by which process, and what becomes of it.
+
+Processes that make runs (:mod:`sb3_sample.study.worker`) stay for runs that differ in their seed alone, so that imports
+are paid for once. The scheduler holds no locks while they work and reads nothing of theirs but their answers: what is
+done, failed and claimed stands in the folder, so that it may be killed at any moment, and others may work beside it.
+"""
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+from sb3_sample.kinds import check_value, integer
+from sb3_sample.study.plan import Plan, Run, read_plan
+from sb3_sample.study.runs import Outcome, StudyFolder, checkpointed
+from sb3_sample.study.states import DONE, FAILED, RUNNING, WAITING, RunStatus, Status
+
+#: Command of a process that makes runs, before the study's folder.
+WORKER = (sys.executable, "-c", "from sb3_sample.study.worker import serve; serve()")
+#: Seconds between two looks at what is going on, and at runs that other machines have.
+REFRESH, ELSEWHERE = 2.0, 5.0
+#: Variables that libraries take their number of threads from.
+_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+#: Number of seconds for which idle cores are counted.
+_LOOK = 0.3
+
+
+class Stopped(Exception):
+    """
+    SIGTERM or SIGHUP, raised in the midst of the scheduler's waiting.
+
+    :param number: the signal
+    """
+
+    def __init__(self, number: int):
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+def run(
+    plan: str | Path | Plan,
+    folder: str | Path | None = None,
+    *,
+    workers: int | None = None,
+    retries: int = 1,
+    threads: int = 1,
+    device: str = "auto",
+    show: Callable[[Status], None] | None = None,
+    worker: Sequence[str] = WORKER,
+) -> Status:
+    """
+    Make all runs of a plan, or go on with them. What is done is not made again, what was interrupted goes on from its
+    last checkpoint, and what has failed is tried again. Runs that other processes make in the folder are waited for.
+
+    :param plan: a plan or its file
+    :param folder: the study's; ``runs/<name of the plan>`` if None
+    :param workers: processes, each with one run at a time; as many as there are free cores for, if None
+    :param retries: how often a run is tried again that fails
+    :param threads: of each process
+    :param device: of each run, as ``sb3-sample train --device`` takes it
+    :param show: gets the status, at the beginning, every two seconds and at the end
+    :param worker: command of a process that makes runs, before the study's folder
+    :return: what became of the runs
+    :raises PlanError: the plan cannot be run as it stands; nothing was run
+    :raises StudyError: the folder has runs of other settings; nothing was changed
+    :raises KeyboardInterrupt: after Ctrl-C, when the runs under way have written their checkpoints; a ``Stopped`` after
+        SIGTERM and SIGHUP. A second one leaves at once
+    :raises OSError: the folder cannot be written to, or has no locks
+    """
+    check_value("retries", retries, integer(0))
+    check_value("threads", threads, integer(1))
+    check_value("workers", workers, integer(1).or_none())
+    if not isinstance(plan, Plan):
+        plan = read_plan(plan)
+    place = StudyFolder(Path("runs") / plan.name if folder is None else folder)
+    place.enter(plan)
+    slots = free_cores() // threads if workers is None else workers
+    scheduler = Scheduler(plan.runs, place, max(slots, 1), retries, threads, device, show or (lambda _: None), worker)
+    with _signals():
+        return scheduler.run()
+
+
+def threads_of_libraries(threads: int) -> dict[str, str]:
+    """
+    :param threads: of a process
+    :return: the variables of its environment that libraries take their number of threads from
+    """
+    return dict.fromkeys(_THREADS, str(threads))
+
+
+def free_cores() -> int:
+    """
+    :return: cores that this process may use and that nobody uses at present, at least 1
+    """
+    usable = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
+    free = float(len(usable))
+    with contextlib.suppress(OSError, ValueError):
+        before = _idle(usable)
+        time.sleep(_LOOK)
+        after = _idle(usable)
+        free = sum((after[core][0] - before[core][0]) / max(after[core][1] - before[core][1], 1) for core in after)
+    with contextlib.suppress(OSError, ValueError):
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        free = min(free, int(quota) / int(period))  # "max": a ValueError
+    return max(round(free), 1)
+
+
+def _idle(usable: set[int]) -> dict[int, tuple[int, int]]:
+    """By core, the ticks that it was idle and all of them (Linux)."""
+    found = {}
+    for line in Path("/proc/stat").read_text().splitlines():
+        name, *ticks = line.split()
+        core = name.removeprefix("cpu")
+        if name.startswith("cpu") and core.isdigit() and int(core) in usable:
+            numbers = [int(tick) for tick in ticks[:8]]
+            found[int(core)] = (numbers[3] + numbers[4], sum(numbers))
+    if not found:
+        raise ValueError("no cores")
+    return found
+
+
+@contextlib.contextmanager
+def _signals() -> Iterator[None]:
+    """Have SIGTERM and SIGHUP raise, as SIGINT does."""
+
+    def stop(number: int, frame: Any) -> None:
+        raise Stopped(number)
+
+    before: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
+            if signal.getsignal(number) is signal.SIG_DFL:
+                before[number] = signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class Worker:
+    """
+    A process that makes runs.
+
+    :param command: of the process
+    :param threads: its threads
+    :param events: gets its answers, and None when it has ended, each with the worker
+    """
+
+    def __init__(self, command: Sequence[str], threads: int, events: "queue.Queue[tuple[Worker, Any]]"):
+        # A session of its own: the terminal's Ctrl-C is the scheduler's, which tells its workers.
+        self.process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **threads_of_libraries(threads)},
+            start_new_session=True,
+        )
+        self.run: Run | None = None
+        self.kind = ""
+        self.started = 0.0
+        threading.Thread(target=self._listen, args=(self.process.stdout, events), daemon=True).start()
+
+    def _listen(self, answers: IO[str], events: "queue.Queue[tuple[Worker, Any]]") -> None:
+        with answers:
+            for line in answers:
+                events.put((self, json.loads(line)))
+        events.put((self, None))
+
+    def give(self, run: Run, options: list[str], threads: int) -> None:
+        """
+        :param run: what it is to make
+        :param options: options of ``sb3-sample train``
+        :param threads: its threads
+        """
+        self.run, self.kind, self.started = run, run.kind, time.monotonic()
+        assert self.process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # it has died: its end is on the way
+            print(
+                json.dumps({"run": run.as_json(), "options": options, "threads": threads}),
+                file=self.process.stdin,
+                flush=True,
+            )
+
+    def leave(self) -> None:
+        """Let it end: a training under way is saved first."""
+        assert self.process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self.process.stdin.close()
+
+    def why_ended(self) -> str:
+        """
+        :return: how the process has ended, in words
+        """
+        code = self.process.wait()
+        if code < 0:
+            return f"the process that made the run was ended by {signal.Signals(-code).name}"
+        return f"the process that made the run has ended with exit code {code}"
+
+
+class Scheduler:
+    """
+    :param runs: in their order
+    :param folder: the study's
+    :param slots: processes at once
+    :param retries: how often a run is tried again that fails
+    :param threads: of each process
+    :param device: of each run
+    :param show: gets the status
+    :param worker: command of a process, before the study's folder
+    """
+
+    def __init__(
+        self,
+        runs: Sequence[Run],
+        folder: StudyFolder,
+        slots: int,
+        retries: int,
+        threads: int,
+        device: str,
+        show: Callable[[Status], None],
+        worker: Sequence[str],
+    ):
+        self._runs, self._folder, self._slots, self._retries = runs, folder, slots, retries
+        self._threads, self._options = threads, ["--num-threads", str(threads), "--device", device]
+        self._show, self._command = show, [*worker, str(folder.path)]
+        self._events: queue.Queue[tuple[Worker, Any]] = queue.Queue()
+        self._workers: list[Worker] = []
+        self._pending: deque[Run] = deque()
+        #: By run, when it is looked at again that another process has.
+        self._elsewhere: dict[str, tuple[Run, float]] = {}
+        #: Failed attempts that do not count, since they were made before.
+        self._before: dict[str, int] = {}
+        self._states: dict[str, RunStatus] = {}
+        self._ended: list[RunStatus] = []
+        self._shown = time.monotonic()
+
+    def run(self) -> Status:
+        """
+        :return: what became of the runs
+        """
+        for run in self._runs:
+            outcome = self._folder.outcome(run)
+            self._before[run.name] = outcome.attempts
+            self._states[run.name] = RunStatus(run, DONE if outcome.done else WAITING, outcome)
+            if not outcome.done:
+                self._pending.append(run)
+        try:
+            self._tell()
+            while True:
+                self._look_elsewhere()
+                self._give_out()
+                if not (self._pending or self._elsewhere or any(worker.run for worker in self._workers)):
+                    break
+                self._hear()
+        finally:
+            self._end()
+        return self._tell()
+
+    # ------------------------------------------------ giving out
+
+    def _give_out(self) -> None:
+        while self._pending:
+            run = self._pending[0]
+            idle = [worker for worker in self._workers if worker.run is None]
+            fitting = [worker for worker in idle if worker.kind == run.kind]
+            if fitting:
+                worker = fitting[0]
+            else:
+                if len(self._workers) >= self._slots:
+                    if not idle:
+                        return
+                    idle[0].leave()
+                    self._workers.remove(idle[0])
+                worker = Worker(self._command, self._threads, self._events)
+                self._workers.append(worker)
+            self._pending.popleft()
+            worker.give(run, self._options, self._threads)
+            self._set(run, RUNNING)
+
+    def _look_elsewhere(self) -> None:
+        now = time.monotonic()
+        for name, (run, when) in list(self._elsewhere.items()):
+            if when > now:
+                continue
+            if self._folder.is_claimed(run):
+                self._elsewhere[name] = (run, now + ELSEWHERE)
+                continue
+            # It is done or has failed there, or that process has died.
+            del self._elsewhere[name]
+            self._judge(run, self._folder.outcome(run))
+
+    # ------------------------------------------------ hearing
+
+    def _hear(self) -> None:
+        wait = self._shown + REFRESH - time.monotonic()
+        if wait <= 0:
+            self._tell()
+            wait = REFRESH
+        try:
+            worker, answer = self._events.get(timeout=wait)
+        except queue.Empty:
+            return
+        run, worker.run = worker.run, None
+        if answer is None:
+            if worker in self._workers:
+                self._workers.remove(worker)
+            if run is not None:
+                self._judge(run, self._died(run, worker))
+        elif run is not None and answer.get("taken"):
+            self._elsewhere[run.name] = (run, time.monotonic() + ELSEWHERE)
+            self._set(run, RUNNING)
+        elif run is not None:
+            if not answer["done"] and worker in self._workers:
+                self._workers.remove(worker)  # it ends by itself
+            self._judge(run, Outcome(**answer))
+
+    def _died(self, run: Run, worker: Worker) -> Outcome:
+        """Outcome of a run whose process has ended without an answer."""
+        outcome = self._folder.outcome(run)
+        lock = self._folder.claim(run)
+        if outcome.done or lock is None:  # another process has it already
+            return outcome
+        with lock:
+            steps = checkpointed(self._folder.place(run))
+            outcome = outcome._replace(attempts=outcome.attempts + 1, traceback=worker.why_ended(), steps=steps)
+            return self._folder.write_outcome(run, outcome)
+
+    def _judge(self, run: Run, outcome: Outcome) -> None:
+        """Decide whether a run is done, is tried again or has failed."""
+        if outcome.done:
+            self._set(run, DONE, outcome)
+        elif outcome.attempts - self._before[run.name] > self._retries:
+            self._set(run, FAILED, outcome)
+        else:
+            self._pending.append(run)
+            self._set(run, WAITING, outcome)
+
+    def _set(self, run: Run, state: str, outcome: Outcome | None = None) -> None:
+        before = self._states[run.name]
+        self._states[run.name] = RunStatus(run, state, outcome or before.outcome)
+        if state in (DONE, FAILED):
+            self._ended.append(self._states[run.name])
+
+    # ------------------------------------------------ telling
+
+    def _tell(self) -> Status:
+        status = Status(self._folder, list(self._states.values()), self._ended)
+        self._ended = []
+        self._show(status)
+        self._shown = time.monotonic()
+        return status
+
+    # ------------------------------------------------ the end
+
+    def _end(self) -> None:
+        """Have the workers end, after their checkpoints; a second Ctrl-C ends them at once."""
+        for worker in self._workers:
+            worker.leave()
+        try:
+            for worker in self._workers:
+                worker.process.wait()
+        except BaseException:
+            for worker in self._workers:
+                worker.process.kill()
+            raise

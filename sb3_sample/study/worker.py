@@ -1,0 +1,141 @@
+"""
+The process that makes runs, started by the scheduler with the study's folder as its argument.
+
+It takes one run after the other, as lines of JSON on its standard input, and answers each with a line on its standard
+output. What the run prints goes to a file of its own. When the input ends, because the scheduler has nothing more or
+is gone, it stops: a training under way finishes its turn and writes a checkpoint, as after SIGTERM.
+"""
+
+import contextlib
+import gc
+import json
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+from sb3_sample.study.plan import Run
+from sb3_sample.study.runs import Outcome, StudyFolder, checkpointed, this_process
+
+#: Makes a run: the run, its folder, and options of ``sb3-sample train``.
+Train = Callable[[Run, Path, list[str]], None]
+#: What a process ends with that SIGTERM has ended in an orderly way.
+_TERMINATED = 128 + signal.SIGTERM
+
+
+def train(run: Run, folder: Path, options: list[str]) -> None:
+    """
+    Make a run as ``sb3-sample train`` does.
+
+    :param run: the run
+    :param folder: its folder
+    :param options: more options
+    :raises Exception: whatever keeps the run from being made
+    """
+    from sb3_sample import zoo
+    from sb3_sample.zoo import runs
+    from sb3_sample.zoo.patches import reading
+
+    zoo.register()
+    given, rest = runs.train_parser().parse_known_args([*run.command(folder), *options])
+    with reading():
+        start = runs.plan(given, rest)
+        assert start is not None
+        sys.argv = ["sb3-sample train", *start.arguments]
+        runs.train(start)
+
+
+def serve(make: Train = train) -> None:
+    """
+    Make runs until the standard input ends.
+
+    :param make: makes one
+    """
+    folder = StudyFolder(sys.argv[1])
+    # The terminal's Ctrl-C is the scheduler's to answer.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with os.fdopen(os.dup(sys.stdout.fileno()), "w") as replies:
+        nothing = os.open(os.devnull, os.O_RDWR)
+        os.dup2(nothing, sys.stdout.fileno())
+        os.close(nothing)
+        orders: queue.Queue[dict[str, Any] | None] = queue.Queue()
+        threading.Thread(target=_listen, args=(sys.stdin.buffer, orders), daemon=True).start()
+        n_made = 0
+        while (order := orders.get()) is not None:
+            if n_made < 2:
+                # What was imported stays, the zoo too, which the first run imports: looking through all of it after
+                # each run would take a quarter of a second.
+                gc.collect()
+                gc.freeze()
+            n_made += 1
+            reply = _answer(folder, order, make)
+            print(json.dumps(reply), file=replies, flush=True)
+            if reply.get("traceback"):
+                return  # what a failed run leaves in the process is not known
+
+
+def _listen(file: IO[bytes], orders: "queue.Queue[dict[str, Any] | None]") -> None:
+    for line in file:
+        orders.put(json.loads(line))
+    orders.put(None)
+    # A training finishes its turn and saves; whatever else is under way ends here.
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _answer(folder: StudyFolder, order: dict[str, Any], make: Train) -> dict[str, Any]:
+    run = Run.of_json(order["run"])
+    lock = folder.claim(run)
+    if lock is None:
+        return {"taken": True}
+    with lock:
+        lock.write(this_process())
+        before = folder.outcome(run)
+        if before.done:  # by another process, since the scheduler has looked
+            return before._asdict()
+        place, start = folder.place(run), time.monotonic()
+        first = checkpointed(place)
+        outcome = Outcome(False, before.attempts, threads=order["threads"])
+        with _printing_to(folder.output(run)):
+            try:
+                make(run, place, order["options"])
+            except BaseException as error:
+                if isinstance(error, SystemExit) and error.code == _TERMINATED:
+                    raise
+                text = traceback.format_exc()
+                print(text, file=sys.stderr)
+                outcome = outcome._replace(attempts=before.attempts + 1, traceback=text)
+        gc.collect()  # networks and environments are in circles
+        progress = folder.progress(run)
+        outcome = outcome._replace(
+            done=not outcome.traceback,
+            steps=progress.steps if outcome.traceback else run.steps,
+            seconds=time.monotonic() - start,
+            last_return=progress.last_return,
+        )
+        outcome = outcome._replace(steps_made=max(outcome.steps - first, 0))
+        return folder.write_outcome(run, outcome)._asdict()
+
+
+@contextlib.contextmanager
+def _printing_to(path: Path) -> Iterator[None]:
+    """Have a file take what this process and those that it starts print, after what it has."""
+    streams = (sys.stdout, sys.stderr)
+    before = [os.dup(stream.fileno()) for stream in streams]
+    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    try:
+        for stream in streams:
+            stream.flush()
+            os.dup2(file, stream.fileno())
+        yield
+    finally:
+        for stream, descriptor in zip(streams, before, strict=True):
+            stream.flush()
+            os.dup2(descriptor, stream.fileno())
+            os.close(descriptor)
+        os.close(file)

@@ -1,0 +1,55 @@
+"""What a plan costs, measured before it is run."""
+
+import dataclasses
+import os
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rl_zoo3")
+
+from sb3_sample import cli, study
+from sb3_sample.study import dry_run as module
+from sb3_sample.study.dry_run import Cost
+from sb3_sample.study.plan import Plan, Run
+
+
+def test_a_dry_run_measures_and_runs_nothing(tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(module, "SECONDS", 0.2)
+    plan = tmp_path / "tiny.yml"
+    plan.write_text(
+        "agents:\n  SAC: {algo: sac_sample, replay_ratio: 0.5, buffer_size: 1000, policy_kwargs: {net_arch: [8]}}\n"
+        "tasks: [Pendulum-v1]\nseeds: 4\nsteps: 30_000\n"
+    )
+    cli.main(["study", "run", str(plan), "--folder", str(tmp_path / "folder"), "--workers", "2", "--dry-run"])
+    said = capsys.readouterr()
+    assert said.out.startswith("4 runs, 0 of them done. The others take ")
+    assert said.err == "measuring SAC on Pendulum-v1\n"
+    assert sorted(os.listdir(tmp_path)) == ["tiny.yml"]
+
+
+def test_a_pair_that_was_not_measured_is_the_product_of_two_ratios(tmp_path: Path, monkeypatch) -> None:
+    measured = {
+        ("A", "x"): Cost(1.0, 100.0, 10.0), ("B", "x"): Cost(3.0, 400.0, 10.0), ("A", "y"): Cost(2.0, 200.0, 50.0),
+    }  # fmt: skip
+    asked = []
+
+    def measure(run: Run, threads: int, device: str) -> Cost:
+        asked.append((run.agent, run.task))
+        return measured[run.agent, run.task]
+
+    monkeypatch.setattr(module, "measure", measure)
+    base = Run("A", "sac_sample", {"buffer_size": 20}, {}, "x", 0, 3600)
+    runs = [dataclasses.replace(base, agent=a, task=t, seed=s) for s in (0, 1) for a in "AB" for t in "xy"]
+    found = study.estimate(Plan("made up", tuple(runs)), tmp_path, workers=3)
+    assert sorted(asked) == sorted(measured)
+    assert found.n_runs == 8 and found.n_done == 0 and found.workers == 3
+    assert found.hours == pytest.approx(2 * (1 + 2 + 3 + 3 * 2))
+    # Of each run all but the replay buffer, and its 20 rows.
+    assert found.n_bytes == pytest.approx(2 * (100 + 200 + 400 + 800 + 20 * (10 + 50 + 10 + 50)))
+
+
+def test_what_cannot_be_measured_is_an_error(tmp_path: Path) -> None:
+    run = Run("A", "sac_sample", {}, {}, "CartPole-v1", 0, 30_000)
+    with pytest.raises(RuntimeError, match="A on CartPole-v1, seed 0 cannot be measured(.|\n)*Discrete"):
+        study.estimate(Plan("bad", (run,)), tmp_path, workers=1)

@@ -1,0 +1,173 @@
+"""Plans: what they say, and what is refused before anything runs."""
+
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rl_zoo3")
+
+from sb3_sample import cli
+from sb3_sample.envs import suites
+from sb3_sample.study import Plan, PlanError, Run, read_plan
+from sb3_sample.study.runs import StudyFolder
+
+ROOT = Path(__file__).parents[2]
+GOOD = """\
+agents:
+  SAC:
+    algo: sac_sample
+    learning_starts: 500
+  BRO Fast:
+    algo: bro_fast
+    model_size: 0.55M
+grid:
+  replay_ratio: [1, 2]
+tasks: [Pendulum-v1, dmc/cheetah-run-v0]
+seeds: [0, 7]
+steps: 1e5
+evaluation: {every: 25_000, episodes: 3}
+"""
+
+
+@pytest.fixture
+def plan_of(tmp_path: Path) -> Callable[[str], Plan]:
+    def read(text: str) -> Plan:
+        path = tmp_path / "some.yml"
+        path.write_text(textwrap.dedent(text))
+        return read_plan(path)
+
+    return read
+
+
+def test_a_plan_is_its_runs_the_first_seed_of_everything_first(plan_of) -> None:
+    plan = plan_of(GOOD)
+    assert plan.name == "some" and plan.text == GOOD
+    assert len(plan.runs) == len({run.name for run in plan.runs}) == 2 * 2 * 2 * 2
+    assert [run.seed for run in plan.runs] == [0] * 8 + [7] * 8
+    first, fourth = plan.runs[0], plan.runs[3]
+    assert first == Run(
+        "SAC", "sac_sample", {"learning_starts": 500, "replay_ratio": 1}, {"replay_ratio": 1}, "Pendulum-v1", 0,
+        100_000, 25_000, 3,
+    )  # fmt: skip
+    assert fourth.arguments == {"model_size": "0.55M", "replay_ratio": 2}
+    assert fourth.name == "BRO-Fast,replay_ratio=2/Pendulum-v1/0"
+    assert plan.runs[7].name == "BRO-Fast,replay_ratio=2/dmc-cheetah-run-v0/0"
+    assert {run.kind for run in plan.runs[:8]} == {run.kind for run in plan.runs[8:]}
+    assert len({run.kind for run in plan.runs}) == 8
+    assert Run.of_json(first.as_json()) == first
+
+
+def test_a_run_is_a_command_of_train(plan_of) -> None:
+    text = GOOD + "checkpoint_freq: 50_000\nenv_kwargs: {max_episode_steps: 100}\n"
+    assert plan_of(text).runs[2].command(Path("x")) == [
+        "--algo", "bro_fast", "--env", "Pendulum-v1", "--seed", "0", "-n", "100000", "--eval-freq", "25000",
+        "--eval-episodes", "3", "--checkpoint-freq", "50000", "--run-dir", "x", "--verbose", "0",
+        "--env-kwargs", "max_episode_steps:100", "-params", "model_size:'0.55M'", "replay_ratio:1",
+    ]  # fmt: skip
+
+
+def test_a_suite_is_its_tasks_each_once(plan_of) -> None:
+    text = GOOD.replace("[Pendulum-v1, dmc/cheetah-run-v0]", "[bro-dmc, VPL_DMC, Pendulum-v1]")
+    tasks = list(dict.fromkeys(run.task for run in plan_of(text.replace("[0, 7]", "2")).runs))
+    assert tasks == [*dict.fromkeys(suites.BRO_DMC + suites.VPL_DMC), "Pendulum-v1"]
+    assert set(suites.SUITES["BRO"]) == set(suites.BRO) and "PACKAGE" not in suites.SUITES
+
+
+def test_anchors_and_merges(plan_of) -> None:
+    text = GOOD.replace("  SAC:\n", "  SAC: &sac\n").replace(
+        "  BRO Fast:", "  Longer SAC:\n    <<: *sac\n    gamma: 0.97\n  BRO Fast:"
+    )
+    assert plan_of(text).runs[2].arguments == {"learning_starts": 500, "gamma": 0.97, "replay_ratio": 1}
+
+
+def test_what_is_merged_can_be_there_often(plan_of) -> None:
+    shared = "{<<: {net_arch: [8]}, net_arch: &net [16]}"
+    text = GOOD.replace("learning_starts: 500", f"policy_kwargs: &kwargs {shared}")
+    text = text.replace("  BRO Fast:", "  VPL-SAC:\n    algo: vpl_sac\n    policy_kwargs: *kwargs\n  BRO Fast:")
+    runs = plan_of(text.replace("grid:\n", "grid:\n  replay_buffer_kwargs: [{<<: {}}]\n")).runs
+    assert [run.arguments["policy_kwargs"] for run in runs[:4]] == [{"net_arch": [16]}] * 4
+
+
+def test_a_value_that_holds_itself_is_refused(plan_of) -> None:
+    with pytest.raises(PlanError, match="line 4: this is more than 10,000 values, or holds itself"):
+        plan_of(GOOD.replace("learning_starts: 500", "learning_starts: &itself [*itself]"))
+
+
+# What is changed in the plan above, the line that the message names, and what else it says.
+BAD = [
+    ("    learning_starts: 500", "    learning_start: 500", 4, "'learning_start' .*'learning_starts'. Allowed .*gamma"),
+    ("    learning_starts: 500", "    seed: 500", 4, "'seed' of agent 'SAC' is no argument of sac_sample"),
+    ("    learning_starts: 500", "    learning_starts: -1", 4, "learning_starts must be an integer of at least 0,"),
+    ("0.55M", "0.56M", 5, "agent 'BRO Fast' with replay_ratio=1 of grid .*: model_size must be one of .*'0.55M'"),
+    ("    learning_starts: 500", "    learning_starts: .inf", 4, "a number must be finite"),
+    ("sac_sample", "sac_simple", 3, "algo must be one of bro, .*, not 'sac_simple'; did you mean 'sac_sample'"),
+    ("    algo: sac_sample\n", "", 2, "agent 'SAC' needs algo, one of bro, "),
+    ("BRO Fast:", "SAC:", 5, "'SAC' is there twice: once on line 2"),
+    ("BRO Fast:", "sac:", 5, "agents 'SAC' and 'sac' would have the same folder"),
+    ("bro_fast\n    model_size: 0.55M", "sac_sample\n    learning_starts: 500", 5, "is agent 'SAC' of line 2"),
+    ("BRO Fast", "BRO/Fast", 5, "the name of an agent can have letters"),
+    ("    learning_starts: 500", "    replay_ratio: 500", 9, "grid crosses .*agent 'SAC' has fixed at 500 on line 4"),
+    ("  replay_ratio: [1, 2]", "  model_size: [0.55M]", 9, "grid crosses 'model_size', which agent 'BRO Fast'"),
+    ("  replay_ratio: [1, 2]", "  weight_decay: [0.1]", 9, "'weight_decay' of grid, for agent 'SAC', is no argument"),
+    ("[1, 2]", "[1, 2, 1]", 9, "'replay_ratio' of grid has 1 twice"),
+    ("[1, 2]", "[1, two]", 9, "replay_ratio must .*, not 'two'"),
+    ("[1, 2]", "1", 9, "'replay_ratio' of grid must be a list that is not empty, not 1"),
+    ("dmc/cheetah-run-v0", "dmc/cheetah-ran-v0", 10, "close are dmc/cheetah-run-v0.*Suites are BRO"),
+    ("dmc/cheetah-run-v0", "BRO_DMK", 10, "'BRO_DMK' is neither .*close are .*BRO_DMC"),
+    ("dmc/cheetah-run-v0", "Pendulum-v1", 10, "task 'Pendulum-v1' is there twice"),
+    ("[0, 7]", "[0, 0]", 11, "seed 0 is there twice"),
+    ("[0, 7]", "[0, -7]", 11, "a seed must be a whole number from 0"),
+    ("1e5", "many", 12, "steps must be a whole number of at least 1, not 'many'"),
+    ("1e5", "0", 12, "steps must be a whole number of at least 1, not 0"),
+    ("25_000", "250_000", 13, "an evaluation every 250,000 steps is none in 100,000"),
+    ("episodes", "episode", 13, "'episode' is no entry of evaluation; did you mean 'episodes'"),
+    ("seeds:", "seed:", 11, "'seed' is no entry of a plan; did you mean 'seeds'. Allowed are agents, tasks"),
+    ("steps: 1e5\n", "", 1, "a plan needs steps"),
+    ("[0, 7]", "[0, 7", 12, "this is no YAML"),
+    ("    learning_starts: 500", "    learning_starts: 2020-01-01", 4, "a value must be a number"),
+    ("0.55M", "!!python/name:os.system", 7, "a value must be a number"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "line", "words"), BAD)
+def test_a_bad_plan_is_refused_by_file_line_and_what_is_allowed(plan_of, tmp_path, old, new, line, words) -> None:
+    assert GOOD.count(old) == 1
+    with pytest.raises(PlanError, match=words) as caught:
+        plan_of(GOOD.replace(old, new))
+    assert str(caught.value).startswith(f"{tmp_path / 'some.yml'}, line {line}: ")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "- 1", "agents: 1", "agents: {}", "tasks", "? [1]\n: 2", "agents: {SAC: {algo: [1]}}"]
+)
+def test_a_plan_of_another_shape_is_refused(plan_of, text: str) -> None:
+    with pytest.raises(PlanError):
+        plan_of(f"{text}\ntasks: [Pendulum-v1]\nseeds: 1\nsteps: 30_000\n" if text.startswith("agents") else text)
+    with pytest.raises(PlanError, match="cannot be read"):
+        read_plan("nowhere.yml")
+
+
+def test_nothing_runs_of_a_bad_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "bad.yml"
+    path.write_text(GOOD.replace("learning_starts", "learning_start"))
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["study", "run", str(path), "--folder", str(tmp_path / "folder")])
+    assert caught.value.code == 2
+    assert capsys.readouterr().err.startswith(f"sb3-sample study run: {path}, line 4: 'learning_start' of agent 'SAC'")
+    assert not (tmp_path / "folder").exists()
+
+
+def test_a_list_of_somebody_elses_leads_nowhere_else(tmp_path: Path) -> None:
+    run = Run("A", "sac_sample", {}, {"x": "../../../y"}, "../../../z", 0, 1)
+    assert (tmp_path / "runs").resolve() in StudyFolder(tmp_path).place(run).resolve().parents
+    with pytest.raises(ValueError, match="no run"):
+        Run.of_json({**run.as_json(), "agent": "../x"})
+    with pytest.raises(ValueError, match="steps of a run cannot be '1'"):
+        Run.of_json({**run.as_json(), "steps": "1"})
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("studies/small/*.yml")), ids=lambda path: path.stem)
+def test_the_plans_that_come_with_it_are_good(path: Path) -> None:
+    assert read_plan(path).runs
