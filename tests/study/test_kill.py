@@ -18,6 +18,8 @@ pytest.importorskip("rl_zoo3")
 from sb3_sample import SAC, study
 
 ROOT = Path(__file__).parents[2]
+
+pytestmark = pytest.mark.slow
 PLAN = """\
 agents:
   SAC:
