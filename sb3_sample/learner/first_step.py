@@ -103,9 +103,12 @@ def _try(learner: Any, batch: Batch) -> None:
     n_critics = critic.n_critics
     # Networks: whatever they return is read by a dense layer, which takes one output for all copies as well.
     trunk, inputs = critic.trunk, critic.inputs(batch.observations, batch.actions)
-    shape = (n_critics, n, trunk.out_features)
+    # A network without weights, such as an MLP without hidden layers, is the same for all critics.
+    has_copies = any(True for _ in trunk.parameters())
+    shape = (n_critics, n, trunk.out_features) if has_copies else (n, trunk.out_features)
+    letters = "(E, B, out_features)" if has_copies else "(B, out_features)"
     outputs = _called(trunk, "forward", inputs, letters=f"n_copies={n_critics} and x (B, in_features)")
-    _check(trunk, "forward", outputs, "outputs of critics", shape, "(E, B, out_features)")
+    _check(trunk, "forward", outputs, "outputs of critics", shape, letters)
     actor = learner.actor
     features = actor.features(batch.observations)
     outputs = _called(actor.trunk, "forward", features, letters="x (B, in_features)")

@@ -261,6 +261,11 @@ def test_a_batch_of_ones_own_is_checked(change: dict[str, Any], words: str) -> N
     assert model.learner.n_updates == 0
 
 
+def test_networks_without_hidden_layers_train() -> None:
+    """Stable-Baselines3's ``net_arch=[]``: linear critics, whose network is the identity for all of them."""
+    assert sac(policy_kwargs={"net_arch": []}).learn(20)._n_updates > 0
+
+
 def test_a_data_set_is_no_batch() -> None:
     model = sac().learn(20)
     data = Dataset.from_arrays(np.zeros((8, 3)), np.zeros((8, 2)), *np.zeros((3, 8)))
