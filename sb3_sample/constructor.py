@@ -87,11 +87,12 @@ class Constructed:
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         cls.constructor_arguments = _declared(cls)
+        signature = _signature(cls)
         first = next(base for base in cls.__mro__ if "__init__" in vars(base))
         others = [base for base in cls.__mro__ if hasattr(vars(base).get("__init__"), "of_declarations")]
         if first is not cls and (not others or first is others[0]):
-            cls.__init__ = _constructor(cls)  # type: ignore[method-assign, misc]
-        cls.__doc__ = _with_meanings(cls)
+            cls.__init__ = _constructor(cls, signature)  # type: ignore[method-assign, misc]
+        cls.__doc__ = _with_meanings(cls, signature)
 
     def _construct(self, given: dict[str, Any]) -> None:
         """
@@ -103,7 +104,7 @@ class Constructed:
 
 
 def _declared(cls: type) -> dict[str, Argument]:
-    """What a class inherits and declares. The declarations are taken away from it: an attribute is the object's."""
+    """Merge a class's declarations into what it inherits, and delete them from it: an attribute is the object's."""
     arguments: dict[str, Argument] = {}
     for base in reversed(cls.__mro__[1:]):
         arguments |= vars(base).get("constructor_arguments", {})
@@ -179,11 +180,11 @@ def _strings_below(cls: type) -> dict[str, str]:
     return found
 
 
-def _with_meanings(cls: type[Constructed]) -> str:
+def _with_meanings(cls: type[Constructed], signature: inspect.Signature) -> str:
     """The class's docstring, with its arguments before the errors that it raises."""
     description, separator, errors = inspect.cleandoc(cls.__doc__ or "").partition("\n:raises")
     wrap = functools.partial(textwrap.fill, width=100, subsequent_indent="    ", break_on_hyphens=False)
-    arguments = [cls.constructor_arguments[name] for name in list(_signature(cls).parameters)[1:]]
+    arguments = [cls.constructor_arguments[name] for name in list(signature.parameters)[1:]]
     lines = [wrap(f":param {each.name}: {each.meaning}") for each in arguments if each.meaning]
     return "\n".join([description.rstrip(), "", *lines]) + separator + errors
 
@@ -199,9 +200,7 @@ def _signature(cls: type[Constructed]) -> inspect.Signature:
     return inspect.Signature([of_object, *sorted(parameters, key=lambda each: each.kind)])
 
 
-def _constructor(cls: type[Constructed]) -> Callable[..., None]:
-    signature = _signature(cls)
-
+def _constructor(cls: type[Constructed], signature: inspect.Signature) -> Callable[..., None]:
     def __init__(self: Constructed, *args: Any, **kwargs: Any) -> None:
         try:
             bound = signature.bind(self, *args, **kwargs)

@@ -42,7 +42,7 @@ def make(
         if isinstance(error, AttributeError) and "__init__() call" in str(error):
             raise ValueError(_without_base(argument, cls)) from error
         name = next(iter(inspect.signature(cls).parameters), "")
-        # What it is made of, taken for one of its arguments.
+        # The learner, taken for one of its arguments.
         if not fixed and name != _first(fixed) and any(type(each).__name__ in str(error) for each in given):
             raise ValueError(f"{_without_first(argument, cls, fixed)}, not {name} ({error})") from error
         raise
@@ -135,7 +135,7 @@ def _function_of(value: Any) -> Any:
 
 
 def _first(fixed: dict[str, Any]) -> str:
-    """What a part is made of, and a network."""
+    """Name of the first argument that a network, or another part, is made with."""
     return "in_features" if fixed else "learner"
 
 

@@ -147,7 +147,7 @@ def _try(learner: Any, batch: Batch) -> None:
 
 
 def _called(part: Any, method: str, *arguments: Any, letters: str = "") -> Any:
-    """What a method gives; an error that it raises has a note of where, and of the shapes that it was called with."""
+    """Call a method; an error that it raises has a note of where, and of the shapes that it was called with."""
     try:
         return part(*arguments) if method == "forward" else getattr(part, method)(*arguments)
     except Exception as error:

@@ -17,6 +17,7 @@ from sb3_sample.kinds import (
     AT_LEAST_0,
     DICT,
     FINITE,
+    LEARNING_RATE,
     TRUE_OR_FALSE,
     UNIT,
     Kind,
@@ -38,9 +39,7 @@ class PPOArguments(Resumable):
     """"MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes"""
     _env: gym.Env[Any, Any] | VecEnv | str | None = argument(alias="env", kw_only=False)
     """the environment, an id, or a vectorised environment"""
-    learning_rate: float | Schedule = argument(
-        default=3e-4, kind=AT_LEAST_0.otherwise("a schedule", callable), kw_only=False
-    )
+    learning_rate: float | Schedule = argument(default=3e-4, kind=LEARNING_RATE, kw_only=False)
     """of actor and critic; a number or a function of the remaining progress (from 1 to 0)"""
     n_steps: int = argument(default=2048, kind=integer(1), kw_only=False)
     """T, steps of each environment between two updates"""

@@ -81,7 +81,7 @@ class PolicyUpdate:
                 try:
                     loss, step = self._losses(dict(zip(shuffled, batch, strict=True)), clip_range, clip_range_vf)
                 except ValueError:
-                    # What torch's distributions say of a mean that is not finite comes one minibatch late.
+                    # The error of torch's distributions at a mean that is not finite comes one minibatch late.
                     self._stop_if_diverged(metrics)
                     raise
                 metrics.append({name: value.detach() for name, value in step.items()})

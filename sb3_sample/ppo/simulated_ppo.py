@@ -5,7 +5,6 @@ The on-policy family: PPO whose policy gradient also sees simulated samples, and
 samples come from is the business of its subclasses, in ``fit_models`` and ``_simulate``.
 """
 
-import inspect
 import math
 import pathlib
 import time
@@ -43,8 +42,6 @@ NET_ARCH: dict[str, list[int]] = {"pi": [512, 512], "vf": [1024, 1024]}
 #: Share of the training over which the number of samples rises (MBMA, section 5.1).
 WARM_UP = 0.15
 NAMED_POLICIES = ("MlpPolicy", "MultiInputPolicy")
-#: Arguments that Stable-Baselines3's constructor stores.
-_STABLE_BASELINES3 = inspect.signature(PPO.__init__).parameters.keys()
 
 
 class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
@@ -73,8 +70,7 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         check_program(type(self), given)
         arguments.check_counts(type(self), given)
         is_set_up = given.pop("_init_setup_model")
-        theirs = {name: given.pop(name) for name in _STABLE_BASELINES3 & given.keys()}
-        vars(self).update(given)
+        theirs = self._store(given, PPO)
         PPO.__init__(self, **theirs, _init_setup_model=False)
         # A policy class has its own widths. A loaded model's class is known, the name it was given by is not.
         self._has_named_policy = theirs["policy"] in NAMED_POLICIES

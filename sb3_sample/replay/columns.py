@@ -159,7 +159,7 @@ _PLAIN = OF_EVERY_BUFFER[2:]
 
 
 class HasColumns:
-    """What a replay buffer gains that stores columns of its own."""
+    """Base of replay buffers that may store columns of their own."""
 
     # Beside the attributes, since it can neither be copied nor saved, and follows from them.
     __slots__ = ("_writers",)

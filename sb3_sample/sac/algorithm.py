@@ -4,7 +4,6 @@ The off-policy family as Stable-Baselines3's: acting, storing, when and how ofte
 The update is the learner's (``sb3_sample/learner/learner.py``).
 """
 
-import inspect
 import pathlib
 import warnings
 from typing import Any, ClassVar, TypeVar
@@ -58,8 +57,6 @@ Self = TypeVar("Self", bound="SAC")
 
 # Batches of at most this many gradient steps are drawn at once, to bound the memory they take.
 MAX_BATCHES_AT_ONCE = 64
-#: Arguments that Stable-Baselines3's constructor stores.
-_STABLE_BASELINES3 = inspect.signature(OffPolicyAlgorithm.__init__).parameters.keys()
 
 
 class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]  # actor
@@ -106,8 +103,7 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         for name in "train_freq", "gradient_steps":
             given[name] = 1 if given[name] is None else given[name]
         is_set_up = given.pop("_init_setup_model")
-        theirs = {name: given.pop(name) for name in _STABLE_BASELINES3 & given.keys()}
-        vars(self).update(given)
+        theirs = self._store(given, OffPolicyAlgorithm)
         OffPolicyAlgorithm.__init__(self, **theirs, sde_support=False, support_multi_env=True)
         #: Whether the gradient step is compiled; None while that is not decided. Saved: a loaded model goes on with it.
         self.compiled: bool | None = None

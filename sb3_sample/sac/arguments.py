@@ -14,6 +14,7 @@ from sb3_sample.kinds import (
     ABOVE_0,
     AT_LEAST_0,
     DICT,
+    LEARNING_RATE,
     UNIT,
     Kind,
     instance,
@@ -52,9 +53,7 @@ class SACArguments(Resumable):
     """"MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class"""
     _env: gym.Env[Any, Any] | VecEnv | str | None = argument(alias="env", kw_only=False, of_training=True)
     """the environment, an id, or a vectorised environment; its action space a bounded Box"""
-    learning_rate: float | Schedule = argument(
-        default=3e-4, kind=AT_LEAST_0.otherwise("a schedule", callable), kw_only=False
-    )
+    learning_rate: float | Schedule = argument(default=3e-4, kind=LEARNING_RATE, kw_only=False)
     """of all networks and the temperature; a number or a function of the remaining progress (from 1 to 0)"""
     buffer_size: int = argument(default=1_000_000, kind=integer(1), kw_only=False, of_training=True)
     """capacity of the replay buffer in transitions"""

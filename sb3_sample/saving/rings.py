@@ -17,7 +17,7 @@ from sb3_sample.replay.columns import columns_of
 from sb3_sample.replay.compact import CompactReplay
 from sb3_sample.saving.untrusted import BadFile
 
-#: What hindsight keeps of each row besides the columns.
+#: Attributes that hindsight keeps of each row besides the columns.
 _OF_HINDSIGHT = ("ep_start",)
 #: What changes in rows that are there already, or is no row; written anew each time.
 _SMALL = ("ep_length", "_current_ep_start")

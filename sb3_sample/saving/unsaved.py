@@ -1,4 +1,4 @@
-"""What parts and networks of the user's own keep in plain attributes, which no state has."""
+"""Plain attributes of parts and networks of the user's own, which no state has."""
 
 import functools
 import hashlib
@@ -16,7 +16,7 @@ from sb3_sample.own_classes import names_in
 from sb3_sample.saving.classes import PACKAGES, within
 from sb3_sample.saving.encoding import Encoder, NotPortable
 
-#: What torch keeps in every module.
+#: Attributes of every torch module.
 _OF_EVERY_MODULE = frozenset(vars(nn.Module()))
 
 

@@ -1,5 +1,6 @@
 """Life cycle of an algorithm, the same for both families: environments, networks, ``learn`` with checkpoints."""
 
+import inspect
 import os
 import pathlib
 from typing import Any, TypeVar
@@ -53,6 +54,18 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
     """whether to build the networks at once"""
 
     # ---------------------------------------------------------------- construction
+
+    def _store(self, given: dict[str, Any], of: type[BaseAlgorithm]) -> dict[str, Any]:
+        """
+        Store the arguments that Stable-Baselines3's class does not know.
+
+        :param given: arguments by name, of which only these are left
+        :param of: Stable-Baselines3's class
+        :return: those that its constructor takes
+        """
+        theirs = {name: given.pop(name) for name in inspect.signature(of).parameters.keys() & given.keys()}
+        vars(self).update(given)
+        return theirs
 
     def _setup_model(self) -> None:
         self._check_arguments()
