@@ -7,7 +7,22 @@ from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
 from sb3_sample.replay.dataset import Dataset
-from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
+from sb3_sample.sac import (
+    BRO,
+    BROTD3,
+    DAC,
+    GPLSAC,
+    OAC,
+    OPLSAC,
+    SAC,
+    SRSAC,
+    TOPSAC,
+    VPLSAC,
+    BROFast,
+    RegularizedSAC,
+    SimBa,
+    SimbaV2,
+)
 from sb3_sample.version import __version__
 
 __all__ = [
@@ -32,6 +47,8 @@ __all__ = [
     "DiagnosticsCallback",
     "EnvironmentDied",
     "RegularizedSAC",
+    "SimBa",
+    "SimbaV2",
     "SupervisedSubprocVecEnv",
     "TrainingDiverged",
     "__version__",

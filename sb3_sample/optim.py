@@ -75,13 +75,8 @@ class AdamW(Optimizer):
         Bring everything that :meth:`apply` reads up to date: the moments exist, and the learning rates of the groups
         stand in tensors. Compiled and captured steps, which know tensors only, then find both.
         """
-        rates = [float(group["lr"]) for group in self.param_groups]
+        self.prepare_rates()
         device = self.param_groups[0]["params"][0].device
-        if self._rates is None or self._rates.device != device or len(self._rates_held) != len(rates):
-            self._rates, self._rates_held = torch.tensor(rates, dtype=torch.float32, device=device), rates
-        elif self._rates_held != rates:
-            self._rates.copy_(torch.tensor(rates, dtype=torch.float32))
-            self._rates_held = rates
         for i, group in enumerate(self.param_groups):
             params = group["params"]
             if i < len(self._steps) and all("step" in self.state[p] for p in params):
@@ -101,6 +96,17 @@ class AdamW(Optimizer):
         if any(p is not q for p, q in zip(self.state, parameters, strict=False)):
             ordered = {p: self.state.pop(p) for p in parameters if p in self.state}
             self.state.update(ordered)
+
+    @torch.no_grad()
+    def prepare_rates(self) -> None:
+        """Bring the tensors with the learning rates up to date, which change with the steps in a schedule."""
+        rates = [float(group["lr"]) for group in self.param_groups]
+        device = self.param_groups[0]["params"][0].device
+        if self._rates is None or self._rates.device != device or len(self._rates_held) != len(rates):
+            self._rates, self._rates_held = torch.tensor(rates, dtype=torch.float32, device=device), rates
+        elif self._rates_held != rates:
+            self._rates.copy_(torch.tensor(rates, dtype=torch.float32))
+            self._rates_held = rates
 
     def read_tensors(self) -> list[torch.Tensor]:
         """

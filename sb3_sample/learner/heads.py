@@ -52,6 +52,15 @@ class ValueHead(nn.Module):
         """
         return td_target(batch, value(self.values(next_q)), entropy_bonus)
 
+    def mean_target(self, target: torch.Tensor) -> torch.Tensor:
+        """
+        Compute the value that a target stands for.
+
+        :param target: from :meth:`target`
+        :return: (B, 1)
+        """
+        return target.mean(dim=1, keepdim=True)
+
     def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """
         Compute the critics' loss.

@@ -18,16 +18,20 @@ from sb3_sample.learner.batch import Batch, CriticStep, Extra, Noise
 from sb3_sample.learner.execution import Execution
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
+from sb3_sample.learner.observation_statistics import ObservationStatistics
 from sb3_sample.learner.observations import Observations
 from sb3_sample.learner.parts import Part, logged
 from sb3_sample.learner.pessimism import Pessimism, pessimistic_value
 from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.randomness import OwnGenerators
+from sb3_sample.learner.reward_scale import RewardScale
 from sb3_sample.learner.scalars import FixedScalar, LogScalar
+from sb3_sample.learner.schedules import LearningRateSchedule
 from sb3_sample.learner.target import next_step, online_outputs, step_outputs, values
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
+from sb3_sample.networks.unit_norm import project_weights
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 
 
@@ -41,6 +45,8 @@ class Counts:
         self.num_transitions = 0
         #: Whether the gradient step is compiled; None while that is not decided.
         self.compiled: bool | None = None
+        #: Gradient steps planned, for the schedule of the learning rate; None while they are not known.
+        self.planned_updates: int | None = None
 
 
 class Learner:
@@ -55,13 +61,16 @@ class Learner:
     :param plasticity: resets of networks, optimizers and learned numbers
     :param redo: recycling of dormant neurons; None for none
     :param make_transforms: each makes a batch transform for the learner, applied in this order
+    :param make_reward_scaler: makes the rule that scales rewards for the learner, applied before them; None for none
     :param learning_rate: of actor, critics and temperature, at the start
+    :param schedule: learning rates over the planned gradient steps; None: as :meth:`set_learning_rate` says
     :param temperature_beta1: beta1 of the temperature's Adam
     :param gamma: discount factor of batches that have none of their own
     :param tau: weight of the new critics in the Polyak average of the targets
     :param target_entropy: entropy that the learned temperature aims at
     :param target_update_interval: gradient steps between two updates of the targets; None: ``policy_delay``
     :param policy_delay: gradient steps between two of the actors' and of the temperature
+    :param actor_first: whether actors and temperature learn before the critics, whose target is then of the new ones
     :param target_subset: how many critics, drawn at random, make the TD target; None: all
     :param actor_pessimism: a weight of pessimism for the actor's objective alone; None: the rule's
     :param sam_radius: radius of sharpness-aware minimisation of the critics' loss; None for none
@@ -76,8 +85,8 @@ class Learner:
 
     #: Arguments that may be set between two gradient steps, with effect from the next one on.
     SETTINGS = (
-        "gamma", "tau", "target_update_interval", "policy_delay", "target_subset", "actor_pessimism", "sam_radius",
-        "learning_starts", "verbose", "compile",
+        "gamma", "tau", "target_update_interval", "policy_delay", "actor_first", "target_subset", "actor_pessimism",
+        "sam_radius", "learning_starts", "verbose", "compile",
     )  # fmt: skip
 
     pessimism_rule: Pessimism
@@ -94,13 +103,16 @@ class Learner:
         plasticity: Resets,
         redo: ReDo | None = None,
         make_transforms: Sequence[Callable[[Any], BatchTransform]] = (),
+        make_reward_scaler: Callable[[Any], RewardScale] | None = None,
         learning_rate: float = 3e-4,
+        schedule: LearningRateSchedule | None = None,
         temperature_beta1: float = 0.9,
         gamma: float = 0.99,
         tau: float = 0.005,
         target_entropy: float | None = None,
         target_update_interval: int | None = 1,
         policy_delay: int = 1,
+        actor_first: bool = False,
         target_subset: int | None = None,
         actor_pessimism: float | None = None,
         sam_radius: float | None = None,
@@ -116,7 +128,9 @@ class Learner:
         self._make_pessimism, self._make_explorer = make_pessimism, make_explorer
         self.device, self.verbose, self.learning_rate = torch.device(device), verbose, learning_rate
         self.gamma, self.tau = gamma, tau
+        self.schedule = schedule
         self.target_update_interval, self.policy_delay = target_update_interval, policy_delay
+        self.actor_first = actor_first
         self.target_subset, self.actor_pessimism, self.sam_radius = target_subset, actor_pessimism, sam_radius
         self.learning_starts, self.compile = learning_starts, compile
         self._counts = Counts() if counts is None else counts
@@ -127,7 +141,9 @@ class Learner:
             self.temperature = make_temperature(self)
             self.pessimism_rule = self.make_pessimism()
             self.explorer = self.make_explorer()
+            self.reward_scaler = None if make_reward_scaler is None else make_reward_scaler(self).to(self.device)
             self.transforms: Any = nn.ModuleList(make(self).to(self.device) for make in make_transforms)
+        self.observation_statistics = None if self.observation_norm is None else ObservationStatistics()
         self.plasticity, self.redo = plasticity, redo
         if redo is not None:
             redo.check(self)
@@ -167,6 +183,11 @@ class Learner:
         return self.networks.critic_target
 
     @property
+    def observation_norm(self) -> Any:
+        """Running normalisation of the networks' observations; None for none."""
+        return self.networks.observation_norm
+
+    @property
     def n_updates(self) -> int:
         """Gradient steps taken over the learner's life."""
         return int(self._counts._n_updates)
@@ -180,6 +201,15 @@ class Learner:
     def n_envs(self) -> int:
         """Environments of the latest step that it was told of; 1 before."""
         return self._n_envs
+
+    @property
+    def planned_updates(self) -> int | None:
+        """Gradient steps planned, for the schedule of the learning rate; None while they are not known."""
+        return self._counts.planned_updates  # type: ignore[no-any-return]
+
+    @planned_updates.setter
+    def planned_updates(self, value: int | None) -> None:
+        self._counts.planned_updates = value
 
     @property
     def compiled(self) -> bool | None:
@@ -254,7 +284,8 @@ class Learner:
             "pessimism_rule": self.pessimism_rule,
             "plasticity": self.plasticity,
         }
-        parts |= {} if self.redo is None else {"redo": self.redo}
+        optional = ("redo", "observation_statistics", "reward_scaler")
+        parts |= {name: getattr(self, name) for name in optional if getattr(self, name) is not None}
         return parts | {f"transforms.{i}": transform for i, transform in enumerate(self.transforms)}
 
     def optimizers(self) -> dict[str, Optimizer]:
@@ -293,7 +324,33 @@ class Learner:
                 if group.get("scheduled", True):
                     group["lr"] = rate
 
+    @property
+    def scheduled_rate(self) -> float | None:
+        """Learning rate of the critics' next step by the schedule; None without one."""
+        return None if self.schedule is None else self.schedule.rate(self.n_updates, self.planned_updates)
+
+    def _set_scheduled_rates(self, schedule: LearningRateSchedule) -> None:
+        """Set the rates of the step that is counted already; each optimizer goes by the steps that it took itself."""
+        before = self.n_updates - 1
+        of_critics = schedule.rate(before, self.planned_updates)
+        of_actors = schedule.rate(before // self.policy_delay, self.planned_updates)
+        for optimizer in self.optimizers().values():
+            for group in optimizer.param_groups:
+                if group.get("scheduled", True):
+                    group["lr"] = of_critics if optimizer is self.critic.optimizer else of_actors
+            if isinstance(optimizer, AdamW):
+                optimizer.prepare_rates()
+
     # ---------------------------------------------------------------- what it is told
+
+    def on_observations(self, observations: Any) -> None:
+        """
+        Tell the parts of the observations that are acted on, before the actions of a step are chosen in training.
+
+        :param observations: arrays or tensors, (n_envs, O), or a dict of them
+        """
+        for part in self.parts().values():
+            part.on_observations(self, observations)
 
     def on_step(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """
@@ -416,7 +473,7 @@ class Learner:
             extra = extra._replace(batch=extra.batch._replace(discounts=self.gamma))
         if not self._checked_step:
             first_step.check_batch("batch", batch)
-        if self.transforms:
+        if self.transforms or self.reward_scaler is not None:
             batch, noise, extra = self._transformed(batch, noise, extra)
         subset = None if self.target_subset is None else (self.target_subset, self.critic.n_critics)
         noise = (noise or Noise()).completed(batch, extra, subset)
@@ -424,6 +481,8 @@ class Learner:
             first_step.check(self, batch, extra)
             self._checked_step = True
         self._counts._n_updates += 1
+        if self.schedule is not None:
+            self._set_scheduled_rates(self.schedule)
         moves_targets = self.n_updates % (self.target_update_interval or self.policy_delay) == 0
         moves_actor = self.n_updates % self.policy_delay == 0
         metrics = execution(self, batch, noise, extra, moves_targets, moves_actor, eager=eager)
@@ -434,6 +493,10 @@ class Learner:
 
     def _transformed(self, batch: Batch, noise: Noise | None, extra: Extra | None) -> tuple[Batch, Noise, Extra | None]:
         noise = noise or Noise()
+        if self.reward_scaler is not None:
+            batch = self.reward_scaler.transform(batch, None)
+            if extra is not None:
+                extra = extra._replace(batch=self.reward_scaler.transform(extra.batch, None))
         drawn = noise.transforms or tuple(transform.draw(batch) for transform in self.transforms)
         for transform, numbers in zip(self.transforms, drawn, strict=True):
             before, batch = batch, transform.transform(batch, numbers)
@@ -456,8 +519,24 @@ class Learner:
         :param moves_actor: whether actors and temperature learn in this step
         :return: what to log, by name, scalars
         """
-        alpha = self.temperature()
+        alpha, metrics = self.temperature(), {}
+        if self.actor_first and moves_actor:
+            metrics.update(self._learn_actors(batch, noise, alpha))
+            alpha = self.temperature()
+        step, of_critics = self._learn_critics(batch, noise, alpha, moves_targets)
+        metrics.update(of_critics)
+        if moves_actor and not self.actor_first:
+            metrics.update(self._learn_actors(batch, noise, alpha))
 
+        # Pessimism.
+        rule = self.pessimism_rule
+        metrics.update(logged(rule, "update", rule.update(self, batch, step, noise.pessimism, extra)))
+        return {name: value.detach() for name, value in metrics.items()}
+
+    def _learn_critics(
+        self, batch: Batch, noise: Noise, alpha: torch.Tensor, moves_targets: bool
+    ) -> tuple[CriticStep, dict[str, torch.Tensor]]:
+        """Take the critics' step, and that of their targets."""
         # Critics, towards the targets' value of the actor's next action.
         next_actions, entropy_bonus = next_step(self, batch, alpha, noise.critic)
         q, next_q = step_outputs(self, batch, next_actions, noise.subset)
@@ -468,43 +547,40 @@ class Learner:
             self.minimize(self.critic.optimizer, critic_loss)
         else:
             self._sharpness_aware_step(critic_loss, batch, next_actions, target)
-        self.critic.trunk.project()
+        self.critic.project()
         q = self.head.values(q)
         metrics = {"train/critic_loss": critic_loss, "train/q_mean": q.mean()}
 
         # Targets, by Polyak averaging.
         if moves_targets:
             self._follow(self.critic_target, self.critic)
+        return CriticStep(q.detach(), self.head.values(next_q), entropy_bonus, noise.subset), metrics
 
-        if moves_actor:
-            # Actor, on the new critics, and on their new encoder if it is shared.
-            observations = self.encoded(batch.observations)
-            actions, log_prob = self.actor.sample(observations, noise.actor)
-            value = self._actor_value(values(self, self.critic, observations, actions))
-            actor_loss = losses.actor_loss(log_prob, value, alpha.detach())
-            self.minimize(self.actor.optimizer, actor_loss)
-            self.actor.trunk.project()
-            metrics["train/actor_loss"] = actor_loss
-            if self.networks.actor_target is not None:
-                self._follow(self.networks.actor_target, self.actor)
+    def _learn_actors(self, batch: Batch, noise: Noise, alpha: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Take the steps of actor, explorer and temperature."""
+        # Actor, on the critics, and on their encoder if it is shared.
+        observations = self.encoded(batch.observations)
+        actions, log_prob = self.actor.sample(observations, noise.actor)
+        value = self._actor_value(values(self, self.critic, observations, actions))
+        actor_loss = losses.actor_loss(log_prob, value, alpha.detach())
+        self.minimize(self.actor.optimizer, actor_loss)
+        self.actor.project()
+        metrics = {"train/actor_loss": actor_loss}
+        if self.networks.actor_target is not None:
+            self._follow(self.networks.actor_target, self.actor)
 
-            # Explorer, on the new critics and the new actor.
-            metrics.update(logged(self.explorer, "update", self.explorer.update(self, batch, noise.exploration)))
+        # Explorer, on the critics and the new actor.
+        metrics.update(logged(self.explorer, "update", self.explorer.update(self, batch, noise.exploration)))
 
-            # Temperature.
-            if self.actor.has_entropy:
-                entropy = -log_prob.detach().mean()
-                metrics.update({"train/entropy": entropy, "train/ent_coef": alpha})
-                if self.temperature_optimizer is not None:
-                    temperature_loss = losses.temperature_loss(alpha, entropy, self.target_entropy)
-                    self.minimize(self.temperature_optimizer, temperature_loss)
-                    metrics["train/ent_coef_loss"] = temperature_loss
-
-        # Pessimism.
-        step = CriticStep(q.detach(), self.head.values(next_q), entropy_bonus, noise.subset)
-        rule = self.pessimism_rule
-        metrics.update(logged(rule, "update", rule.update(self, batch, step, noise.pessimism, extra)))
-        return {name: value.detach() for name, value in metrics.items()}
+        # Temperature.
+        if self.actor.has_entropy:
+            entropy = -log_prob.detach().mean()
+            metrics.update({"train/entropy": entropy, "train/ent_coef": alpha})
+            if self.temperature_optimizer is not None:
+                temperature_loss = losses.temperature_loss(alpha, entropy, self.target_entropy)
+                self.minimize(self.temperature_optimizer, temperature_loss)
+                metrics["train/ent_coef_loss"] = temperature_loss
+        return metrics
 
     def _actor_value(self, q: torch.Tensor) -> torch.Tensor:
         """Value of the ensemble in the actor's objective, (E, B, K) to (B, K)."""
@@ -569,7 +645,12 @@ class Learner:
         :return: everything that later steps depend on, besides the arguments
         """
         state = {name: owner.state_dict() for name, owner in self._owners_of_state().items()}
-        counts = {"n_updates": self.n_updates, "num_transitions": self.num_transitions, "heard": self._heard}
+        counts = {
+            "n_updates": self.n_updates,
+            "num_transitions": self.num_transitions,
+            "planned_updates": self.planned_updates,
+            "heard": self._heard,
+        }
         generators = {} if self._generators is None else {"generators": self._generators.state_dict()}
         return {**state, "counts": counts, **generators}
 
@@ -587,7 +668,7 @@ class Learner:
             owner.load_state_dict(state[name])
         counts = state["counts"]
         self._counts._n_updates, self._counts.num_transitions = counts["n_updates"], counts["num_transitions"]
-        self._heard = counts["heard"]
+        self.planned_updates, self._heard = counts["planned_updates"], counts["heard"]
         if self._generators is not None:
             self._generators.load_state_dict(state["generators"])
 
@@ -613,7 +694,11 @@ class Learner:
 
         :param shrink: share of the old parameters that stays
         """
-        self.restart(self.networks, self._make_networks(), shrink)
+        fresh = self._make_networks()
+        if self.observation_norm is not None:
+            # They describe the replay, which stays.
+            fresh.observation_norm.load_state_dict(self.observation_norm.state_dict())
+        self.restart(self.networks, fresh, shrink)
         self.restart(self.temperature, self._make_temperature(self), shrink)
         # The explorer's start may depend on the pessimism in force.
         self.restart(self.pessimism_rule, self.make_pessimism(), shrink)
@@ -636,6 +721,7 @@ class Learner:
                 state[name] = torch.lerp(state[name].to(parameter.device), parameter.detach(), shrink)
         module.load_state_dict(state)
         if shrink > 0:
+            project_weights(module)
             # Quantities computed from the weights, such as the directions of spectral norms, are refreshed.
             for network in module.modules():
                 if isinstance(network, Network):

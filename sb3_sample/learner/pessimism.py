@@ -45,6 +45,8 @@ def pessimistic_value(q: torch.Tensor, beta: torch.Tensor | float) -> torch.Tens
     :param beta: pessimism, at least 0
     :return: (B, K)
     """
+    if q.shape[0] == 1:
+        return q[0]
     if isinstance(beta, float):
         if beta == 0:
             return q.mean(dim=0)

@@ -7,11 +7,21 @@ from sb3_sample.networks.ensemble import EnsembleLayerNorm, EnsembleLinear
 from sb3_sample.networks.initialization import init_orthogonal, linear
 from sb3_sample.networks.mlp import MLP
 from sb3_sample.networks.network import HiddenUnits, Network
+from sb3_sample.networks.normalization import RunningMoments, RunningNorm
+from sb3_sample.networks.simba import SimbaNet
+from sb3_sample.networks.simbav2 import SimbaV2Net
 from sb3_sample.networks.spectral_net import SpectralNet
 from sb3_sample.networks.spectral_norm import SpectralEnsembleLinear, SpectralLinear
+from sb3_sample.networks.unit_norm import UnitEnsembleLinear, UnitLinear, UnitNorm, project_weights
 
 #: Trunks by the name that a policy's ``critic_network`` and ``actor_network`` take.
-NETWORKS: dict[str, type[Network]] = {"mlp": MLP, "bronet": BroNet, "spectral": SpectralNet}
+NETWORKS: dict[str, type[Network]] = {
+    "mlp": MLP,
+    "bronet": BroNet,
+    "simba": SimbaNet,
+    "simbav2": SimbaV2Net,
+    "spectral": SpectralNet,
+}
 
 __all__ = [
     "MLP",
@@ -22,11 +32,19 @@ __all__ = [
     "EnsembleLinear",
     "HiddenUnits",
     "Network",
+    "RunningMoments",
+    "RunningNorm",
+    "SimbaNet",
+    "SimbaV2Net",
     "SpectralEnsembleLinear",
     "SpectralLinear",
     "SpectralNet",
+    "UnitEnsembleLinear",
+    "UnitLinear",
+    "UnitNorm",
     "init_orthogonal",
     "linear",
     "neuron_scores",
+    "project_weights",
     "recycle",
 ]

@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from sb3_sample.networks.ensemble import Dense, Norm
+from sb3_sample.networks.initialization import DEFAULT_GAIN, linear
 from sb3_sample.networks.spectral_norm import SpectralNorm
 
 
@@ -47,6 +48,9 @@ class Network(nn.Module):
     #: evaluation mode, so that running statistics are those of the stacked rows alone.
     stacks_rows: ClassVar[str | None] = None
 
+    #: Gain of the output layer's kernel, unless its owner asks for another.
+    head_gain: ClassVar[float] = DEFAULT_GAIN
+
     @abstractmethod
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """
@@ -62,8 +66,22 @@ class Network(nn.Module):
         """
         return []
 
+    def make_head(self, n_outputs: int, n_copies: int | None = None, gain: float | None = None) -> nn.Module:
+        """
+        Make an output layer that reads the network's output.
+
+        :param n_outputs: number of outputs
+        :param n_copies: E for E independent layers, None for one
+        :param gain: of an orthogonal kernel, as its owner asks for; None: the network's ``head_gain``
+        :return: the layer, (B, out_features) to (B, n_outputs), or with an axis E in front
+        """
+        return linear(self.out_features, n_outputs, n_copies, gain=self.head_gain if gain is None else gain)
+
     def project(self) -> None:
-        """Called after every step of the optimizer: bring weights back to where they belong, in place."""
+        """
+        Called after every step of the optimizer: bring weights back to where they belong, in place. Dense layers of
+        unit norm in the head are projected by its owner.
+        """
 
     def refresh(self) -> None:
         """Called after weights were overwritten, as at a shrink and perturb: compute anew what follows from them."""

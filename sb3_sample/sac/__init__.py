@@ -5,6 +5,7 @@ from sb3_sample.sac.bro import BRO, BROTD3, BROFast
 from sb3_sample.sac.dac import DAC
 from sb3_sample.sac.regularized_sac import RegularizedSAC
 from sb3_sample.sac.rivals import GPLSAC, OAC, OPLSAC, SRSAC, TOPSAC
+from sb3_sample.sac.simba import SimBa, SimbaV2
 from sb3_sample.sac.vpl_sac import VPLSAC
 
 __all__ = [
@@ -20,4 +21,6 @@ __all__ = [
     "VPLSAC",
     "BROFast",
     "RegularizedSAC",
+    "SimBa",
+    "SimbaV2",
 ]

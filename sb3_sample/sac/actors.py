@@ -17,7 +17,7 @@ from torch import nn
 from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, check_value
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
-from sb3_sample.networks import Network, linear
+from sb3_sample.networks import Network, RunningNorm, project_weights
 from sb3_sample.networks.modes import evaluated
 from sb3_sample.sac.trunks import keep_at_rest, make_trunk
 
@@ -44,6 +44,8 @@ class Actor(BasePolicy):
     has_entropy: ClassVar[bool] = True
     #: View in evaluation mode, for the actions of TD targets, if the trunk ``stacks_rows``.
     at_rest: Any = None
+    #: The policy's running normalisation of observations, None for none.
+    observation_norm: RunningNorm | None = None
     _encoder: Any
 
     def __init__(
@@ -70,8 +72,8 @@ class Actor(BasePolicy):
         self.features_dim = features_extractor.features_dim
         self.action_dim = get_action_dim(action_space)
         self.trunk = make_trunk("actor_network", network, self.features_dim, network_kwargs)
-        self.mean = linear(self.trunk.out_features, self.action_dim, None)
-        self.log_std = linear(self.trunk.out_features, self.action_dim, None, gain=1.0)
+        self.mean = self.trunk.make_head(self.action_dim)
+        self.log_std = self.trunk.make_head(self.action_dim, gain=1.0)
         #: Stable-Baselines3's distribution of the actions, for its own use: nothing here reads it.
         self.action_dist = SquashedDiagGaussianDistribution(self.action_dim)
         keep_at_rest(self)
@@ -103,11 +105,21 @@ class Actor(BasePolicy):
         """
         if isinstance(obs, Encoded):
             return obs.features
+        seen: PyTorchObs = obs if self.observation_norm is None else self.observation_norm(obs)
         if self.shares_encoder:
             with torch.no_grad():
-                return self.extract_features(obs, self._encoder)
+                return self.extract_features(seen, self._encoder)
         assert isinstance(self.features_extractor, BaseFeaturesExtractor)
-        return self.extract_features(obs, self.features_extractor)
+        return self.extract_features(seen, self.features_extractor)
+
+    def project(self) -> None:
+        """Called after every step of the optimizer: bring weights back to where they belong, in place."""
+        self.trunk.project()
+        for head in self._heads():
+            project_weights(head)
+
+    def _heads(self) -> tuple[nn.Module, ...]:
+        return self.mean, self.log_std
 
     def statistics(self) -> list[torch.Tensor]:
         """
@@ -260,6 +272,9 @@ class DeterministicActor(Actor):
         :raises AttributeError: always; as with Stable-Baselines3's TD3, there is no distribution
         """
         raise AttributeError("a deterministic actor (backbone='td3') has no distribution of its actions")
+
+    def _heads(self) -> tuple[nn.Module, ...]:
+        return (self.mean,)
 
     def gaussian(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         mean = self.mean(self.trunk(features))

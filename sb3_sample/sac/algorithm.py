@@ -112,6 +112,8 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         self._keeps_gradients = False
         #: Transitions stored over the model's life; unlike ``num_timesteps`` never zeroed by ``learn``.
         self.num_transitions = 0
+        #: Gradient steps planned, for ``learning_rate_schedule``; None while they are not known.
+        self.planned_updates: int | None = self.schedule_steps
         # Gradient steps owed but not yet taken, the fraction that a replay ratio leaves over.
         self._updates_owed = 0.0
         self._metrics: dict[str, torch.Tensor] = {}
@@ -155,14 +157,21 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
             # only its own variant needs to have ended.
             self.optimize_memory_usage = False
 
+    def _n_critics(self) -> int:
+        """Number of critics that the arguments ask for."""
+        return self.policy_kwargs.get("n_critics", 2)  # type: ignore[no-any-return]
+
     def _full_policy_kwargs(self) -> dict[str, Any]:
-        return {**self.policy_kwargs, "n_outputs": self._make_head().n_outputs, "backbone": self.backbone}
+        kwargs = {**self.policy_kwargs, "n_outputs": self._make_head().n_outputs, "backbone": self.backbone}
+        return {**kwargs, "normalize_observations": True} if self.normalize_observations else kwargs
 
     @classmethod
     def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
         implied: dict[str, Any] = {}
         if "compile" in kwargs:
             implied["compiled"] = None
+        if "schedule_steps" in kwargs:
+            implied["planned_updates"] = kwargs["schedule_steps"]
         if "train_freq" in kwargs or "gradient_steps" in kwargs:
             implied["replay_ratio"] = None
         # One way to count resets replaces the file's other one.
@@ -183,6 +192,7 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         assert isinstance(self.action_space, spaces.Box)
+        self.learner.on_observations(self._last_obs)
         if self.num_transitions < learning_starts:
             unscaled = np.array([self.action_space.sample() for _ in range(n_envs)])
             scaled = self.policy.scale_action(unscaled)
@@ -293,19 +303,21 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         self.learner.on_environment_reset()
 
     def _before_turns(self) -> None:
-        """Decide, with ``compile="auto"`` once and for all, whether the coming environment steps pay it back."""
+        """
+        Plan the gradient steps of the first ``learn``, and decide, with ``compile="auto"`` once and for all, whether
+        the coming environment steps pay for compiling.
+        """
+        n_steps = self._total_timesteps - self.num_timesteps
+        if self.learning_rate_schedule is not None and self.planned_updates is None:
+            self.planned_updates = round(self._updates_in(n_steps)) or None
+            if self.planned_updates is None and n_steps > 0:
+                raise ValueError(
+                    f"schedule_steps must be given, as learning_rate_schedule={self.learning_rate_schedule!r} needs to "
+                    "know how many gradient steps are planned, and the arguments do not say it"
+                )
         if self.compiled is not None:
             return
-        n_steps = self._total_timesteps - self.num_timesteps
-        n_steps -= max(self.learning_starts - self.num_transitions, 0)
-        if self.replay_ratio is not None:
-            n_updates = self.replay_ratio * n_steps
-        else:
-            assert isinstance(self.train_freq, TrainFreq)
-            n_calls = n_steps / (self.n_envs * self.train_freq.frequency)
-            if self.train_freq.unit is TrainFrequencyUnit.EPISODE:
-                n_calls = 0  # How long episodes are is not known.
-            n_updates = n_steps if self.gradient_steps < 0 else self.gradient_steps * n_calls
+        n_updates = self._updates_in(n_steps - max(self.learning_starts - self.num_transitions, 0))
         # What keeps the step from being compiled is worth a warning only where it was asked for, but for an old torch,
         # which is easily renewed.
         foreign = foreign_parts(self.learner) if n_updates >= PAYS_FROM else []
@@ -318,6 +330,17 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         if reason is not None and reason == old_torch():
             warn_not_compiled(self.learner, reason)
         self.learner.forget_execution()
+
+    def _updates_in(self, n_steps: int) -> float:
+        """Gradient steps in as many environment steps after the warm-up; 0 where that is not known."""
+        if self.replay_ratio is not None:
+            return self.replay_ratio * n_steps
+        assert isinstance(self.train_freq, TrainFreq)
+        if self.gradient_steps < 0:
+            return n_steps
+        if self.train_freq.unit is TrainFrequencyUnit.EPISODE:
+            return 0  # How long episodes are is not known.
+        return self.gradient_steps * n_steps / (self.n_envs * self.train_freq.frequency)
 
     def _after_turns(self) -> None:
         """Say if nothing was learned for want of steps."""
@@ -372,7 +395,8 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         batch_size = self.batch_size if batch_size is None else batch_size
         self._take_settings()
         self._set_training_mode(True)
-        self.learner.set_learning_rate(self.lr_schedule(self._current_progress_remaining))
+        if self.learner.schedule is None:
+            self.learner.set_learning_rate(self.lr_schedule(self._current_progress_remaining))
         self.learner.before_updates()
         taken = 0
         while taken < gradient_steps:

@@ -15,6 +15,7 @@ from sb3_sample.kinds import (
     AT_LEAST_0,
     DICT,
     LEARNING_RATE,
+    TRUE_OR_FALSE,
     UNIT,
     Kind,
     instance,
@@ -23,9 +24,12 @@ from sb3_sample.kinds import (
     one_of,
     subclass,
 )
+from sb3_sample.learner.categorical import VALUE_HEADS
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.pessimism import Pessimism
+from sb3_sample.learner.reward_scale import REWARD_SCALES, RewardScale
+from sb3_sample.learner.schedules import SCHEDULES
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.sac.policies import SACPolicy
 from sb3_sample.training.resumable import Resumable
@@ -108,10 +112,11 @@ class SACArguments(Resumable):
     1"""
     n_quantiles: int | None = argument(default=None, kind=integer(1).or_none("scalar critics"))
     """quantiles a critic; None for scalar critics"""
-    value_head: type[ValueHead] | None = argument(
-        default=None, kind=subclass(ValueHead).or_none("scalars or quantiles")
+    value_head: str | type[ValueHead] | None = argument(
+        default=None, kind=one_of(VALUE_HEADS, ValueHead).or_none("scalars or quantiles")
     )
-    """a class of one's own, derived from ``ValueHead``, in the place of those two; with ``n_quantiles=None``"""
+    """"categorical", "hl_gauss", or a class derived from ``ValueHead``, in the place of those two; with
+    ``n_quantiles=None``"""
     value_head_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
     """its arguments"""
     pessimism: float | str | type[Pessimism] = argument(default=1.0)
@@ -136,6 +141,24 @@ class SACArguments(Resumable):
     """"sac", or "td3": a deterministic actor, without entropy"""
     policy_delay: int = argument(default=1, kind=integer(1))
     """gradient steps between two of the actors' and of the temperature"""
+    actor_first: bool = argument(default=False, kind=TRUE_OR_FALSE)
+    """whether actors and temperature learn before the critics in a gradient step, whose target is then of the new
+    actor and temperature (SimbaV2, FlashSAC)"""
+    learning_rate_schedule: str | None = argument(
+        default=None,
+        kind=Kind(f"be one of {list(SCHEDULES)}", lambda value: value in SCHEDULES).or_none("no such schedule"),
+    )
+    """"linear" or "cosine": decay from ``learning_rate``, a number, to ``final_learning_rate`` over the planned
+    gradient steps, each optimizer by the steps that it has taken; the final rate from there on"""
+    final_learning_rate: float = argument(default=0.0, kind=AT_LEAST_0)
+    """rate at the end of the schedule"""
+    schedule_steps: int | None = argument(default=None, kind=integer(1).or_none("those of the first learn"))
+    """planned gradient steps; None: environment steps of the first ``learn``, random ones included, times the replay
+    ratio, which later calls do not change"""
+    warm_up_steps: int = argument(default=0, kind=integer(0))
+    """planned gradient steps that come before the decay, in which the rate rises linearly to ``learning_rate``"""
+    warm_up_learning_rate: float = argument(default=0.0, kind=AT_LEAST_0)
+    """rate from which it rises"""
     resets: Sequence[int] | int = argument(default=())
     """environment steps at which all parameters start anew, counted in transitions over the model's life; or one
     integer for every so many"""
@@ -160,6 +183,16 @@ class SACArguments(Resumable):
     )
     """classes derived from ``BatchTransform``, or pairs of one and its arguments, which every batch goes through before
     it is learned from"""
+    reward_scale: str | type[RewardScale] | None = argument(
+        default=None, kind=one_of(REWARD_SCALES, RewardScale).or_none("rewards as they are")
+    )
+    """rule by which rewards are divided by a running measure of the return: "simbav2", "xqc", "flashsac", "brc", or a
+    class derived from ``RewardScale``"""
+    reward_scale_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
+    """its arguments"""
+    normalize_observations: bool = argument(default=False, kind=TRUE_OR_FALSE)
+    """whether the networks read observations less their running mean, by their running standard deviation. The
+    statistics are the policy's, and move while training only"""
     use_sde: bool = argument(default=False, of_training=True)
     """not supported, refused if True"""
     sde_sample_freq: int = argument(default=-1, kind=integer(-1), of_training=True)

@@ -29,7 +29,7 @@ def check(agent: Any) -> None:
     :raises ValueError: if an argument is out of range or contradicts another
     """
     check_every(agent)
-    n_critics = check_value("n_critics", agent.policy_kwargs.get("n_critics", 2), integer(1))
+    n_critics = check_value("n_critics", agent._n_critics(), integer(1))
     check_target_entropy(agent)
     check_use_sde(agent.use_sde)
     if n_critics == 1 and (isinstance(agent.pessimism, (str, type)) or agent.exploration == "oac"):
@@ -53,7 +53,10 @@ def check(agent: Any) -> None:
             f"n_quantiles={agent.n_quantiles} and value_head={agent.value_head!r} are two value heads: pass "
             "n_quantiles=None"
         )
-    for name in ("n_quantiles", "n_outputs", "backbone"):
+    if agent.reward_scale is None:
+        check_unused(agent, ["reward_scale_kwargs"], "reward_scale=None")
+    _check_schedule(agent)
+    for name in ("n_quantiles", "n_outputs", "backbone", "normalize_observations"):
         if name in agent.policy_kwargs:
             raise ValueError(f"{name} is an argument of the algorithm, not of policy_kwargs")
     if agent.backbone == "td3":
@@ -65,6 +68,26 @@ def check(agent: Any) -> None:
     _check_memory_map(agent)
     _check_device_buffer(agent)
     _check_train_freq(agent)
+
+
+def _check_schedule(agent: Any) -> None:
+    """Whether a schedule over planned gradient steps goes with the rate."""
+    if agent.learning_rate_schedule is None:
+        names = ["final_learning_rate", "schedule_steps", "warm_up_steps", "warm_up_learning_rate"]
+        check_unused(agent, names, "learning_rate_schedule=None")
+        return
+    if callable(agent.learning_rate):
+        raise ValueError(
+            f"learning_rate={agent.learning_rate!r} is a schedule, and so is "
+            f"learning_rate_schedule={agent.learning_rate_schedule!r}: pass a number, or learning_rate_schedule=None"
+        )
+    if agent.schedule_steps is not None and agent.schedule_steps <= agent.warm_up_steps:
+        raise ValueError(
+            f"schedule_steps={agent.schedule_steps} must exceed warm_up_steps={agent.warm_up_steps}, which are part of "
+            "them"
+        )
+    if agent.warm_up_steps == 0:
+        check_unused(agent, ["warm_up_learning_rate"], "warm_up_steps=0")
 
 
 def has_resets(resets: Any) -> bool:
@@ -134,11 +157,11 @@ def _check_pessimism(agent: Any) -> None:
             f"pessimism={agent.pessimism!r} weighs the spread of the targets, and target_subset=1 leaves none"
         )
     if agent.target_subset is not None:
-        n_critics = agent.policy_kwargs.get("n_critics", 2)
+        n_critics = agent._n_critics()
         if not integer(1, n_critics).fits(agent.target_subset):
             raise ValueError(
                 f"target_subset must lie between 1 and the number of critics, {n_critics} "
-                f"(policy_kwargs['n_critics']), or be None for all, not {agent.target_subset!r}"
+                f"(n_critics), or be None for all, not {agent.target_subset!r}"
             )
 
 

@@ -35,7 +35,10 @@ class MetricsLog:
         self._record_counts()
 
     def _record_counts(self: Any) -> None:
-        self.logger.record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
+        rate = self.learner.scheduled_rate
+        if rate is None:
+            rate = self.lr_schedule(self._current_progress_remaining)
+        self.logger.record("train/learning_rate", rate)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if self.learner.seconds_compiling > 0:
             self.logger.record("time/seconds_compiling", self.learner.seconds_compiling)

@@ -13,13 +13,17 @@ from torch import nn
 
 from sb3_sample import own_classes
 from sb3_sample.kinds import check_value, chosen, integer
+from sb3_sample.learner.categorical import VALUE_HEADS
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
 from sb3_sample.learner.heads import QuantileHead, ValueHead
 from sb3_sample.learner.learner import Counts, Learner
+from sb3_sample.learner.observation_statistics import ObservationStatistics
 from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
 from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.randomness import OwnGenerators
+from sb3_sample.learner.reward_scale import REWARD_SCALES, RewardScale
 from sb3_sample.learner.scalars import FixedScalar, LogScalar
+from sb3_sample.learner.schedules import LearningRateSchedule
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.optim import AdamW
 from sb3_sample.sac import checks
@@ -61,8 +65,10 @@ def _maker(cls: Any) -> Callable[..., Learner]:
 
         ``resets`` and the episodes of "top" count environment steps and do nothing unless ``on_step`` is called;
         ``reset_gradient_steps`` counts what the learner does itself. A learning rate that is a function stays at its
-        first value until ``set_learning_rate``. ``compile="auto"`` compiles nothing, since how many steps will follow
-        is not known.
+        first value until ``set_learning_rate``, and a ``learning_rate_schedule`` does not decay unless
+        ``schedule_steps`` is given, or ``planned_updates`` set. ``compile="auto"`` compiles nothing, since how many
+        steps will follow is not known. Statistics of rewards and observations are those of ``on_step`` and
+        ``on_observations``.
 
         :param observation_space: observation space
         :param action_space: action space, a bounded Box; batches have actions in [-1, 1]
@@ -95,6 +101,7 @@ def _maker(cls: Any) -> Callable[..., Learner]:
         model._setup_lr_schedule()
         counts = Counts()
         counts.compiled = None if model.compile == "auto" else bool(model.compile)
+        counts.planned_updates = model.schedule_steps
         return model._make_learner(counts=counts, generators=generators)  # type: ignore[no-any-return]
 
     learner.__qualname__ = f"{cls.__name__}.learner"
@@ -160,6 +167,10 @@ class HasLearner:
     """value head of the critics"""
     transforms = OfLearner[nn.ModuleList]()
     """batch transforms, in their order"""
+    reward_scaler = OfLearner[RewardScale | None]()
+    """rule by which rewards are scaled; None for none"""
+    observation_statistics = OfLearner[ObservationStatistics | None]()
+    """feeder of the observations' statistics; None without"""
     gradients_are_stale = OfLearner[bool]()
     """whether ``.grad`` holds the gradients of another gradient step than the last"""
     #: The class of the learner.
@@ -182,7 +193,9 @@ class HasLearner:
             plasticity=Resets(self.resets, self.reset_shrink, self.reset_gradient_steps),
             redo=None if self.redo_period is None else ReDo(self.redo_period, self.redo_threshold),
             make_transforms=[functools.partial(_make_transform, *each) for each in enumerate(self.batch_transforms)],
+            make_reward_scaler=None if self.reward_scale is None else self.make_reward_scaler,
             learning_rate=self.lr_schedule(1),
+            schedule=self._make_schedule(),
             temperature_beta1=self.temperature_beta1,
             target_entropy=self._target_entropy,
             device=self.device,
@@ -209,8 +222,10 @@ class HasLearner:
         return {**kwargs, "batch_transforms": completed}
 
     def _make_head(self: Any) -> ValueHead:
-        if (cls := self.value_head) is not None:
-            head = own_classes.make("value_head", cls, cls, ValueHead, kwargs=self.value_head_kwargs or {})
+        if self.value_head is not None:
+            cls = chosen("value_head", self.value_head, VALUE_HEADS, ValueHead)
+            kwargs = self._full_value_head_kwargs()
+            head = own_classes.make("value_head", self.value_head, cls, ValueHead, kwargs=kwargs)
             check_value(f"{cls.__name__}.n_outputs", head.n_outputs, integer(1))
             return head  # type: ignore[no-any-return]
         return ValueHead() if self.n_quantiles is None else QuantileHead(self.n_quantiles)
@@ -241,6 +256,18 @@ class HasLearner:
         :return: the explorer's arguments: the user's and the algorithm's
         """
         return dict(self.exploration_kwargs or {})
+
+    def _full_value_head_kwargs(self: Any) -> dict[str, Any]:
+        """
+        :return: the value head's arguments: the user's and the algorithm's
+        """
+        return dict(self.value_head_kwargs or {})
+
+    def _full_reward_scale_kwargs(self: Any) -> dict[str, Any]:
+        """
+        :return: the arguments of the rule that scales rewards: the user's and the algorithm's
+        """
+        return dict(self.reward_scale_kwargs or {})
 
     def _full_pessimism_kwargs(self: Any) -> dict[str, Any]:
         """
@@ -282,6 +309,26 @@ class HasLearner:
         make = chosen("pessimism", self.pessimism, PESSIMISMS, Pessimism)
         kwargs = self._full_pessimism_kwargs()
         return own_classes.make("pessimism", self.pessimism, make, Pessimism, learner, kwargs=kwargs)  # type: ignore[no-any-return]
+
+    def make_reward_scaler(self: Any, learner: Learner) -> RewardScale:
+        """
+        :param learner: whose it is
+        :return: a rule that scales rewards, without statistics yet
+        """
+        make = chosen("reward_scale", self.reward_scale, REWARD_SCALES, RewardScale)
+        kwargs = self._full_reward_scale_kwargs()
+        return own_classes.make("reward_scale", self.reward_scale, make, RewardScale, learner, kwargs=kwargs)  # type: ignore[no-any-return]
+
+    def _make_schedule(self: Any) -> LearningRateSchedule | None:
+        if self.learning_rate_schedule is None:
+            return None
+        return LearningRateSchedule(
+            self.learning_rate_schedule,
+            self.lr_schedule(1),
+            self.final_learning_rate,
+            self.warm_up_steps,
+            self.warm_up_learning_rate,
+        )
 
     def _optimizers(self: Any) -> dict[str, torch.optim.Optimizer]:
         """Every optimizer by its path from the algorithm."""

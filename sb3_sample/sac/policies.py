@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
     CombinedExtractor,
@@ -21,7 +22,7 @@ from torch import nn
 from sb3_sample.arguments import check_net_arch
 from sb3_sample.kinds import DICT, TRUE_OR_FALSE, check_value, integer
 from sb3_sample.learner.batch import Encoded
-from sb3_sample.networks import Network
+from sb3_sample.networks import Network, RunningNorm
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.optim import AdamW
 from sb3_sample.sac.actors import BACKBONES, Actor, DeterministicActor
@@ -61,6 +62,8 @@ class SACPolicy(BasePolicy):
         the critics' step (SAC-AE, Yarats et al. 2021; DrQ, Kostrikov et al. 2021; DrQ-v2 reads those from before
         the step). The actors read it in evaluation mode. The target critics have a Polyak average of it, which a
         target actor reads too
+    :param normalize_observations: whether all networks read observations through one running normalisation,
+        ``observation_norm``, whose statistics are in the policy
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
@@ -91,6 +94,7 @@ class SACPolicy(BasePolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
         critic_optimizer_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = False,
+        normalize_observations: bool = False,
     ):
         check_value("share_features_extractor", share_features_extractor, TRUE_OR_FALSE)
         super().__init__(
@@ -105,6 +109,7 @@ class SACPolicy(BasePolicy):
         )
         check_value("n_critics", n_critics, integer(1))
         check_value("n_outputs", n_outputs, integer(1))
+        check_value("normalize_observations", normalize_observations, TRUE_OR_FALSE)
         check_net_arch(net_arch, ("pi", "qf"), both=True)
         pi_arch: list[int] | None = None
         qf_arch: list[int] | None = None
@@ -113,8 +118,12 @@ class SACPolicy(BasePolicy):
         actor_args = network_args("actor", actor_network, actor_network_kwargs, pi_arch, activation_fn)
         critic_args = network_args("critic", critic_network, critic_network_kwargs, qf_arch, activation_fn)
 
+        self.observation_norm: RunningNorm | None = None
+        if normalize_observations:
+            self.observation_norm = RunningNorm(_normalized_shape(observation_space))
+
         def critics() -> CriticEnsemble:
-            return CriticEnsemble(
+            made = CriticEnsemble(
                 observation_space,
                 action_space,
                 *critic_args,
@@ -123,6 +132,8 @@ class SACPolicy(BasePolicy):
                 n_outputs=n_outputs,
                 normalize_images=normalize_images,
             )
+            self._share_norm(made)
+            return made
 
         if not isinstance(backbone, str) or backbone not in BACKBONES:
             raise ValueError(f"backbone must be one of {sorted(BACKBONES)}, not {backbone!r}")
@@ -142,6 +153,7 @@ class SACPolicy(BasePolicy):
         self.actor_target: Actor | None = None
         if isinstance(self.actor, DeterministicActor):
             self.actor_target = copy.deepcopy(self.actor).requires_grad_(False)
+            self._share_norm(self.actor_target)
             self.actor_target.set_training_mode(False)
         if not share_features_extractor:
             self.critic = critics()
@@ -176,7 +188,14 @@ class SACPolicy(BasePolicy):
             optimizer_kwargs=self.optimizer_kwargs,
             critic_optimizer_kwargs=critic_optimizer_kwargs,
             share_features_extractor=share_features_extractor,
+            normalize_observations=normalize_observations,
         )
+
+    def _share_norm(self, network: Any) -> None:
+        """Have a network read observations through the policy's own normalisation, which is in the policy's state."""
+        if self.observation_norm is not None:
+            # Past nn.Module's own setattr, which would register it.
+            vars(network)["observation_norm"] = self.observation_norm
 
     def make_actor(self) -> Actor:
         """
@@ -185,7 +204,7 @@ class SACPolicy(BasePolicy):
         args, kwargs = self._actor_args
         shared = self.share_features_extractor
         extractor: Any = self.critic.features_extractor if shared else self.make_features_extractor()
-        return self._actor_class(
+        actor = self._actor_class(
             self.observation_space,
             self.action_space,
             *args,
@@ -194,6 +213,8 @@ class SACPolicy(BasePolicy):
             shares_encoder=shared,
             **kwargs,
         )
+        self._share_norm(actor)
+        return actor
 
     def make_optimizer(self, parameters: Any, learning_rate: float, **kwargs: Any) -> torch.optim.Optimizer:
         """
@@ -285,6 +306,15 @@ class SACPolicy(BasePolicy):
         """
         self._mode_switch(mode)
         self.training = mode
+
+
+def _normalized_shape(space: spaces.Space) -> tuple[int, ...]:
+    """Shape of observations whose running normalisation makes sense."""
+    if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and not is_image_space(space):
+        return space.shape
+    raise ValueError(
+        f"normalize_observations=True needs observations of a Box of floats, not of {space}: use VecNormalize"
+    )
 
 
 MlpPolicy = SACPolicy
