@@ -8,6 +8,7 @@ from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.sac import (
+    BRC,
     BRO,
     BROTD3,
     DAC,
@@ -26,6 +27,7 @@ from sb3_sample.sac import (
 from sb3_sample.version import __version__
 
 __all__ = [
+    "BRC",
     "BRO",
     "BROTD3",
     "DAC",

@@ -33,8 +33,20 @@ class RewardScale(BatchTransform):
         raise NotImplementedError
 
     def transform(self, batch: Batch, noise: torch.Tensor | None) -> Batch:
-        rewards, divisor = batch.rewards, self.divisor(batch.columns.get("task"))
+        rewards, divisor = batch.rewards, self.divisor(task_of(batch))
         return batch._replace(rewards=(rewards.to(divisor.dtype) / divisor).to(rewards.dtype))
+
+
+def task_of(batch: Batch) -> torch.Tensor | None:
+    """
+    Look up the tasks of transitions: the column "task", or that of dict observations.
+
+    :param batch: transitions
+    :return: numbers of tasks, (B, 1); None if they tell none
+    """
+    dicts = batch.observations if isinstance(batch.observations, dict) else {}
+    task = batch.columns.get("task", dicts.get("task"))
+    return None if task is None else task.long().reshape(-1, 1)
 
 
 class ReturnScale(RewardScale):
@@ -183,8 +195,8 @@ class TaskScale(RewardScale):
     the temperature alpha being read before the gradient steps that follow an environment step. It is infinite, and the
     rewards are 0, until the task has finished an episode.
 
-    The task of an environment's step is its info's "task", that of a transition the batch's column "task"; without
-    either it is 0.
+    The task of an environment's step is that of the dict observation that was acted on, key "task", or its info's
+    "task"; that of a transition the same key, or the batch's column "task". Without either it is 0.
 
     :param learner: the learner
     :param n_tasks: number of tasks
@@ -202,24 +214,29 @@ class TaskScale(RewardScale):
         self.register_buffer("smallest", torch.full((n_tasks,), torch.inf))
         self.register_buffer("largest", torch.full((n_tasks,), -torch.inf))
         self.register_buffer("divisors", torch.full((n_tasks,), torch.inf, dtype=torch.float64))
-        # Rewards of each environment's episode so far.
+        # Rewards of each environment's episode so far, and the tasks that their observations told.
         self._episodes: list[list[float]] = []
+        self._tasks: list[int] = []
+
+    def on_observations(self, learner: Learning, observations: Any) -> None:
+        told = observations.get("task") if isinstance(observations, dict) else None
+        self._tasks = [] if told is None else [int(task) for task in np.asarray(told).reshape(-1)]
 
     def on_step(self, learner: Learning, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         if len(self._episodes) != len(dones):
             self._episodes = [[] for _ in dones]
-        for episode, reward, done, info in zip(self._episodes, rewards, dones, infos, strict=True):
+        for i, (episode, reward, done, info) in enumerate(zip(self._episodes, rewards, dones, infos, strict=True)):
             episode.append(float(reward))
             if done:
-                truncated = bool(info.get("TimeLimit.truncated", False))
-                self._take(episode, truncated, int(info.get("task", 0)), learner.gamma)
+                task = self._tasks[i] if self._tasks else int(info.get("task", 0))
+                self._take(episode, bool(info.get("TimeLimit.truncated", False)), task, learner.gamma)
                 episode.clear()
 
     def _take(self, rewards: list[float], truncated: bool, task: int, gamma: float) -> None:
         """Take in a finished episode."""
         n_tasks = len(self.largest)
         if not 0 <= task < n_tasks:
-            raise ValueError(f"'task' of an environment's info must lie in [0, {n_tasks - 1}], by n_tasks, not {task}")
+            raise ValueError(f"the task of an environment must lie in [0, {n_tasks - 1}], by n_tasks, not be {task}")
         following = sum(rewards) / len(rewards) / (1 - gamma) if truncated else 0.0
         returns = []
         for reward in reversed(rewards):
@@ -239,7 +256,7 @@ class TaskScale(RewardScale):
         self.divisors.copy_((size - entropy) / self.max_return)
 
     def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
-        return self.divisors[0] if task is None else self.divisors[task.long().reshape(-1, 1)]
+        return self.divisors[0] if task is None else self.divisors[task]
 
     def get_extra_state(self) -> dict[str, Any]:
         return {"episodes": [list(episode) for episode in self._episodes]}

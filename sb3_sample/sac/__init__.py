@@ -1,6 +1,7 @@
 """The off-policy family."""
 
 from sb3_sample.sac.algorithm import SAC
+from sb3_sample.sac.brc import BRC
 from sb3_sample.sac.bro import BRO, BROTD3, BROFast
 from sb3_sample.sac.dac import DAC
 from sb3_sample.sac.regularized_sac import RegularizedSAC
@@ -9,6 +10,7 @@ from sb3_sample.sac.simba import SimBa, SimbaV2
 from sb3_sample.sac.vpl_sac import VPLSAC
 
 __all__ = [
+    "BRC",
     "BRO",
     "BROTD3",
     "DAC",

@@ -100,7 +100,7 @@ def test_brc_by_task() -> None:
     found = scale.transform(Batch(o, o, o, o, rewards, 0.9, {"task": tasks}), None).rewards
     expected = [3 / ((5 + 5) / 10), 0.0, 3 / ((1 + 5) / 10), 3 / ((1 + 5) / 10)]
     assert found.flatten().tolist() == pytest.approx(expected, rel=1e-6)
-    with pytest.raises(ValueError, match=r"'task' of an environment's info must lie in \[0, 2\], by n_tasks, not 3"):
+    with pytest.raises(ValueError, match=r"the task of an environment must lie in \[0, 2\], by n_tasks, not be 3"):
         scale.on_step(of, np.array([1.0, 5.0]), ends, [{"task": 3}, {"task": 0}])
 
 

@@ -21,8 +21,8 @@ import torch
 from gymnasium import spaces
 from torch import nn
 
-from sb3_sample import BRO, DAC, SimbaV2
-from sb3_sample.learner.batch import Batch, Noise
+from sb3_sample import BRC, BRO, DAC, SimbaV2
+from sb3_sample.learner.batch import Batch, Encoded, Noise
 from sb3_sample.learner.target import values
 from sb3_sample.networks import MLP, BroNet, SimbaV2Net
 from sb3_sample.networks.ensemble import EnsembleLayerNorm, EnsembleLinear
@@ -44,10 +44,14 @@ def parameter_tolerance(n_updates: int) -> float:
 
 
 class Shapes(gym.Env):
-    """An environment that has only shapes."""
+    """An environment that has only shapes; of one task, or one that tells which of several it is."""
 
-    def __init__(self, obs_dim: int, act_dim: int):
-        self.observation_space = spaces.Box(-np.inf, np.inf, (obs_dim,), np.float32)
+    def __init__(self, obs_dim: int, act_dim: int, n_tasks: int | None = None):
+        self.observation_space: spaces.Space = spaces.Box(-np.inf, np.inf, (obs_dim,), np.float32)
+        if n_tasks is not None:
+            self.observation_space = spaces.Dict(
+                {"observation": self.observation_space, "task": spaces.Discrete(n_tasks)}
+            )
         self.action_space = spaces.Box(-1, 1, (act_dim,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
@@ -659,9 +663,214 @@ def simbav2_sequence(data: dict[str, np.ndarray], name: str, meta: dict[str, Any
             Updates.check_numbers(f"{name}/query_reward[{t}]", scaled, get("state/query_reward_out")[queries[t]], 1e-7)
 
 
+class BRCUpdates(Updates):
+    """BRC's, for one task and for several, whose numbers are in the observations; rewards go through the normaliser."""
+
+    info_tolerance = 1e-5
+    scalar_tolerances = (2e-7, 5e-7)
+    aux = ("actor", "critic", "embedding", "embedding_after", "grad")
+
+    @property
+    def is_multi_task(self) -> bool:
+        return bool(self.dims["embedding"])
+
+    def build(self, compile: bool) -> Any:
+        dims, hp, optimizers = self.dims, self.hyperparameters, self.meta["optimizers"]
+        sizes = {who: {"width": dims[f"{who}_hidden"], "n_blocks": dims[f"{who}_depth"]} for who in ("actor", "critic")}
+        BRC_of = type("BRC", (BRC,), {"temperature_beta1": optimizers["temp"]["b1"]})
+        return BRC_of(
+            "MultiInputPolicy" if self.is_multi_task else "MlpPolicy",
+            Shapes(dims["obs_dim"], dims["act_dim"], dims["tasks"] if self.is_multi_task else None),
+            gamma=hp["discount"],
+            tau=hp["tau"],
+            target_entropy=hp["target_entropy"],
+            learning_rate=optimizers["critic"]["lr"],
+            weight_decay=optimizers["critic"]["weight_decay"],
+            value_head_kwargs={"n_atoms": dims["atoms"], "v_min": -hp["v_max"], "v_max": hp["v_max"]},
+            embedding_size=dims["embedding"] or 32,
+            critic_width=None,
+            policy_kwargs={
+                "critic_network_kwargs": sizes["critic"],
+                "actor_network_kwargs": sizes["actor"],
+                "n_critics": dims["critics"],
+            },
+            buffer_size=1,
+            device="cpu",
+            compile=compile,
+        )
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        model = self.model
+        layers = self._bronet("actor/BroNet_0", model.actor.trunk)
+        layers.update({"actor/Dense_0": model.actor.mean, "actor/Dense_1": model.actor.log_std})
+        tables = {}
+        for module, critic in (("critic", model.critic), ("target_critic", model.critic_target)):
+            path = f"{module}/q_value_ensemble/q_value_ensemble/critic"
+            layers.update({**self._bronet(path, critic.trunk), f"{path}/Dense_1": critic.head})
+            if self.is_multi_task:
+                tables[f"{module}/task_embedding/embeddings/embedding"] = critic.features_extractor.table
+        named = {**tables, "temp/log_temp": model.temperature.log_value}
+        for name, layer in layers.items():
+            is_norm = "LayerNorm" in name
+            named[f"{name}/{'scale' if is_norm else 'kernel'}"] = vector(layer.weight) if is_norm else kernel(layer)
+            named[f"{name}/bias"] = vector(layer.bias)
+        return named
+
+    @staticmethod
+    def _bronet(path: str, trunk: BroNet) -> dict[str, Any]:
+        layers = {f"{path}/Dense_0": trunk.dense, f"{path}/LayerNorm_0": trunk.norm}
+        for k, block in enumerate(trunk.blocks):
+            here = f"{path}/BronetBlock_{k}"
+            layers.update({f"{here}/Dense_0": block.dense1, f"{here}/LayerNorm_0": block.norm1})
+            layers.update({f"{here}/Dense_1": block.dense2, f"{here}/LayerNorm_1": block.norm2})
+        return layers
+
+    def arranged(self, name: str, value: np.ndarray) -> np.ndarray:
+        # The critics' inputs: observation, action, embedding there; observation, embedding, action here.
+        if not self.is_multi_task or not name.endswith("q_value_ensemble/critic/Dense_0/kernel"):
+            return value
+        n, a = self.dims["obs_dim"], self.dims["act_dim"]
+        return np.concatenate((value[:, :n], value[:, n + a :], value[:, n : n + a]), axis=1)
+
+    def load(self) -> None:
+        super().load()
+        self._n_fed = 0
+
+    def prepare(self, i: int) -> None:
+        while self._n_fed < self.data[f"statistics/{i}/steps_fed"]:
+            feed(
+                self.model,
+                None,
+                *(self.data[f"stream/{k}"][self._n_fed] for k in ("reward", "terminated", "truncated")),
+            )
+            self._n_fed += 1
+        if i % self.dims.get("updates_per_step", 1) == 0:
+            self.model.learner.before_updates()
+        for key, value in brc_state(self.model).items():
+            self.check_numbers(f"statistics/{i}/{key}", value, self.data[f"statistics/{i}/{key}"], 1e-6)
+
+    def transitions(self, i: int) -> tuple[Batch, Noise]:
+        def seen(key: str) -> Any:
+            observations = self.tensor(f"batch/{i}/{key}")
+            if not self.is_multi_task:
+                return observations
+            return {"observation": observations, "task": self.tensor(f"batch/{i}/task_ids")[:, None]}
+
+        rewards, masks = self.tensor(f"raw/{i}/rewards")[:, None], self.tensor(f"batch/{i}/masks")[:, None]
+        actions = self.tensor(f"batch/{i}/actions")
+        batch = Batch(seen("observations"), actions, seen("next_observations"), 1 - masks, rewards, self.model.gamma)
+        scaled = self.model.reward_scaler.transform(batch, None).rewards[:, 0].numpy()
+        theirs = self.data[f"batch/{i}/rewards"]
+        assert np.abs(scaled - theirs).max() <= 1e-6 * np.abs(theirs).max() and (scaled[theirs == 0] == 0).all()
+        return batch, Noise(critic=self.tensor(f"noise/{i}/critic"), actor=self.tensor(f"noise/{i}/actor"))
+
+    def before(self, i: int, batch: Batch, noise: Noise) -> dict[str, Any]:
+        model = self.model
+        self._actor = copy.deepcopy(model.actor)
+        sampled = policy_numbers(model.actor, batch.next_observations, noise.critic)  # type: ignore[arg-type]
+        scaled = model.reward_scaler.transform(batch, None)
+        with torch.no_grad():
+            logits = model.critic.q_values(batch.observations, batch.actions)
+            next_logits = model.critic_target.q_values(batch.next_observations, sampled["action"])
+            bonus = -model.temperature() * sampled["log_prob"][:, None]
+            target = model.head.target(scaled, next_logits, model.pessimism_rule.value, bonus)
+        q = model.head.mean_target(target)
+        found = {
+            "info/r": scaled.rewards.mean(),
+            "info/q_mean": q.mean(),
+            "info/q_min": q.min(),
+            "info/q_max": q.max(),
+            "info/critic_pnorm": norm(list(model.critic.parameters())),
+            "info/actor_pnorm": norm(list(model.actor.parameters())),
+            "aux/critic/logits": logits,
+            "aux/critic/next_logits": next_logits,
+            "aux/critic/target_probs": target,
+            **self._embedding("aux/embedding", batch),
+        }
+        return found | {f"aux/critic/{name}": value for name, value in sampled.items()}
+
+    def after(self, i: int, batch: Batch, noise: Noise, metrics: dict[str, float]) -> dict[str, Any]:
+        model = self.model
+        found = {f"info/{theirs}": metrics[SHARED_NAMES[theirs]] for theirs in self.reported}
+        if self.execution != "compiled":
+            for who, module in (("critic", model.critic), ("actor", model.actor)):
+                found[f"info/{who}_gnorm"] = norm([p.grad for p in module.parameters()])
+        # The actor's loss was that of the old actor on the new critics and their embeddings.
+        with torch.no_grad():
+            features = model.actor.features(batch.observations)
+            sampled = policy_numbers(self._actor, Encoded(features), noise.actor)  # type: ignore[arg-type]
+            logits = model.critic.q_values(batch.observations, sampled["action"])
+        found.update({"aux/actor/logits": logits, **self._embedding("aux/embedding_after", batch)})
+        return found | {f"aux/actor/{name}": value for name, value in sampled.items()}
+
+    reported: ClassVar[tuple[str, ...]] = ("critic_loss", "actor_loss", "entropy", "temperature", "temp_loss")
+
+    def _embedding(self, name: str, batch: Batch) -> dict[str, torch.Tensor]:
+        if not self.is_multi_task:
+            return {}
+        with torch.no_grad():
+            return {name: self.model.actor.features(batch.observations)[:, self.dims["obs_dim"] :]}
+
+    def check_more(self, prefix: str, n_updates: int) -> None:
+        def is_of(name: str) -> bool:
+            return name.startswith(("actor/", "critic/"))
+
+        groups: dict[str, tuple[Callable[[str], bool], float]] = {
+            "all": (is_of, DECAY_TOLERANCE),
+            "scales and biases": (lambda name: is_of(name) and not name.endswith("kernel"), DECAY_TOLERANCE),
+        }
+        if self.is_multi_task:
+            groups["embeddings"] = (lambda name: name.startswith("critic/task_embedding"), 5e-5)
+        for group, (among, limit) in groups.items():
+            excess = self.excess_decay(prefix, n_updates, among)
+            assert abs(excess) <= limit, f"{prefix}: weight decay of {group} is off by {-excess:.2e}"
+
+
+def brc_state(model: Any) -> dict[str, Any]:
+    """The state of BRC's normaliser by the names of the files."""
+    scaler = model.reward_scaler
+    return {"returns_min": scaler.smallest, "returns_max": scaler.largest, "reward_divisor": scaler.divisors}
+
+
+def brc_sequence(data: dict[str, np.ndarray], name: str, meta: dict[str, Any]) -> None:
+    """BRC's normaliser over one sequence of steps, and what it makes of rewards."""
+    n_tasks = meta["tasks"]
+    model = BRC(
+        "MultiInputPolicy" if n_tasks > 1 else "MlpPolicy",
+        Shapes(1, meta["act_dim"], n_tasks if n_tasks > 1 else None),
+        gamma=meta["discount"],
+        target_entropy=meta["target_entropy"],
+        value_head_kwargs={"v_min": -meta["v_max"], "v_max": meta["v_max"]},
+        critic_width=4,
+        buffer_size=1,
+        device="cpu",
+    )
+    get = lambda key: data[f"{name}/{key}"]  # noqa: E731
+    rewards, tasks = torch.as_tensor(get("query_reward"))[:, None], torch.as_tensor(get("query_task"))[:, None]
+    for t in range(len(get("reward")) + 1):
+        if t > 0:
+            feed(model, None, *(get(k)[t - 1] for k in ("reward", "terminated", "truncated")))
+        with torch.no_grad():
+            model.temperature.log_value.fill_(float(np.log(np.float64(get("temperature")[t]))))
+        model.learner.before_updates()
+        batch = Batch(rewards, rewards, rewards, rewards, rewards, columns={"task": tasks})
+        scaled = model.reward_scaler.transform(batch, None).rewards[:, 0]
+        for key, value in {**brc_state(model), "query_reward_out": scaled}.items():
+            ours, theirs = np.asarray(value), get(f"state/{key}")[t]
+            np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=0, err_msg=f"{name}/state/{key}[{t}]")
+
+
 #: By the beginning of a file's name, of which the longest counts: the updates of a method, and its sequences.
-METHODS: dict[str, type[Updates]] = {"bro_": BROUpdates, "dac_": DACUpdates, "simbav2_": SimbaV2Updates}
-SEQUENCES: dict[str, Callable[[dict[str, np.ndarray], str, dict[str, Any]], None]] = {"simbav2_": simbav2_sequence}
+METHODS: dict[str, type[Updates]] = {
+    "brc_": BRCUpdates,
+    "bro_": BROUpdates,
+    "dac_": DACUpdates,
+    "simbav2_": SimbaV2Updates,
+}
+SEQUENCES: dict[str, Callable[[dict[str, np.ndarray], str, dict[str, Any]], None]] = {
+    "brc_": brc_sequence,
+    "simbav2_": simbav2_sequence,
+}
 
 
 def method_of(path: Path, table: dict[str, Any]) -> Any:
