@@ -19,8 +19,7 @@ from sb3_sample.sac.algorithm import SAC
 
 class TaskEmbedding(BaseFeaturesExtractor):
     """
-    Observation and the embedding of its task, a learned vector divided by its length; of one task the observation
-    alone.
+    Observation and the embedding of its task, a learned vector divided by its length.
 
     :param observation_space: a Dict of "observation", a Box, and "task", a Discrete
     :param size: of an embedding
@@ -29,34 +28,28 @@ class TaskEmbedding(BaseFeaturesExtractor):
     def __init__(self, observation_space: spaces.Dict, size: int = 32):
         task = observation_space["task"]
         assert isinstance(task, spaces.Discrete)
-        n_tasks = int(task.n)
-        size = size if n_tasks > 1 else 0
         super().__init__(observation_space, get_flattened_obs_dim(observation_space["observation"]) + size)
-        #: A row for each task, whose length is learned as well and without effect on the embedding; None for one task.
-        self.table = nn.Parameter(torch.randn(n_tasks, size) / size**0.5) if size else None
+        #: A row for each task, whose length is learned as well and without effect on the embedding.
+        self.table = nn.Parameter(torch.randn(int(task.n), size) / size**0.5)
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
         """
         :param observations: "observation", (B, ...), and "task", one-hot, (B, n_tasks)
         :return: (B, O + size)
         """
-        if self.table is None:
-            return observations["observation"].flatten(1)
         rows = observations["task"].flatten(1) @ self.table
         lengths = torch.linalg.vector_norm(rows, dim=1, keepdim=True)
         return torch.cat((observations["observation"].flatten(1), rows / lengths), dim=1)
 
 
-def number_of_tasks(space: spaces.Space) -> int | None:
+def is_multi_task(space: spaces.Space) -> bool:
     """
     :param space: of observations
-    :return: how many tasks they tell of, as a Dict of "observation", a Box, and "task", a Discrete; None if they are no
-        such Dict
+    :return: whether they tell the task: a Dict of "observation", a Box, and "task", a Discrete
     """
     if not isinstance(space, spaces.Dict) or space.spaces.keys() != {"observation", "task"}:
-        return None
-    observation, task = space["observation"], space["task"]
-    return int(task.n) if isinstance(observation, spaces.Box) and isinstance(task, spaces.Discrete) else None
+        return False
+    return isinstance(space["observation"], spaces.Box) and isinstance(space["task"], spaces.Discrete)
 
 
 class BRC(SAC):
@@ -70,7 +63,7 @@ class BRC(SAC):
     With observations that are a Dict of "observation" and "task" (a Discrete), critics and actor read a learned
     embedding of the task beside the observation, and rewards are scaled by task. The embeddings are the critics', which
     learn them; the actor reads them without gradient. Target entropy and temperature are one for all tasks. The
-    published batch is then 1,024. With one task nothing is added.
+    published batch is then 1,024.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -112,8 +105,9 @@ class BRC(SAC):
 
     def _full_reward_scale_kwargs(self) -> dict[str, Any]:
         kwargs: dict[str, Any] = super()._full_reward_scale_kwargs()
-        n_tasks = number_of_tasks(self.observation_space)
-        return kwargs if self.reward_scale != "brc" or n_tasks is None else {"n_tasks": n_tasks, **kwargs}
+        if self.reward_scale != "brc" or not is_multi_task(self.observation_space):
+            return kwargs
+        return {"n_tasks": int(self.observation_space["task"].n), **kwargs}  # type: ignore[index]
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         kwargs: dict[str, Any] = {
@@ -129,10 +123,9 @@ class BRC(SAC):
             }
         if self.critic_width is not None:
             kwargs["critic_network_kwargs"] = {"width": self.critic_width, "n_blocks": 2}
-        n_tasks = number_of_tasks(self.observation_space)
-        if n_tasks is not None and "features_extractor_class" not in kwargs:
+        if is_multi_task(self.observation_space) and "features_extractor_class" not in kwargs:
             kwargs["features_extractor_class"] = TaskEmbedding
             kwargs["features_extractor_kwargs"] = {"size": self.embedding_size}
-            kwargs["share_features_extractor"] = n_tasks > 1
+            kwargs["share_features_extractor"] = True
         kwargs["optimizer_kwargs"] = {**(kwargs.get("optimizer_kwargs") or {}), "weight_decay": self.weight_decay}
         return kwargs

@@ -126,16 +126,7 @@ def test_acts_by_task_saves_and_resumes(tmp_path: Path) -> None:
     assert not differing(state(whole), state(run(tmp_path / "b")))
 
 
-def test_one_task_is_one_task() -> None:
-    """Told its number or not, bit by bit."""
-    plain = MAKERS["BRC"](vec(truncate=True)).learn(60)
-    told = brc(DummyVecEnv([lambda: Monitor(Task(0, n_tasks=1))])).learn(60)
-    assert plain._n_updates == told._n_updates > 0
-    ours, theirs = state(told), state(plain)
-    assert not differing(ours, theirs)
-
-
-def test_without_tasks_there_is_no_embedding() -> None:
+def test_one_task_has_no_embedding() -> None:
     model = MAKERS["BRC"]()
     assert not isinstance(model.critic.features_extractor, TaskEmbedding)
     assert len(model.reward_scaler.largest) == 1
