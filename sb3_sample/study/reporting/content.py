@@ -1,0 +1,460 @@
+"""Content of a report: what was run, who is better and how sure that is, what it cost, and how it was made."""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sb3_sample.plots import METRICS, Curve
+from sb3_sample.study.aggregate import Groups, Scores, score_for
+from sb3_sample.study.reporting.curves import Curves, dressed, task_curves
+from sb3_sample.study.reporting.facts import Facts, compute
+from sb3_sample.study.reporting.pieces import (
+    Agent,
+    Cell,
+    Count,
+    Dots,
+    Figure,
+    Interval,
+    Line,
+    Lines,
+    Report,
+    Section,
+    Table,
+    Text,
+    counted,
+    interval_text,
+    number,
+)
+from sb3_sample.study.reporting.reading import Gathered
+from sb3_sample.study.states import DONE, FAILED, STATES, Status
+from sb3_sample.study.table import RUN
+from sb3_sample.version import __version__
+
+#: Agents that the summary names.
+NAMED = 3
+#: What checkpoints were made with, in the order of the table.
+_MADE_WITH = (
+    "sb3_sample", "commit", "torch", "stable_baselines3", "gymnasium", "mujoco", "numpy", "python", "processor",
+    "device", "torch threads",
+)  # fmt: skip
+_STATISTICS = {"iqm": "IQM", "mean": "mean", "median": "median", "optimality_gap": "optimality gap"}
+_STEPS = "simulator steps"
+
+
+def build(
+    gathered: Gathered,
+    *,
+    title: str,
+    curves: Sequence[str] | None,
+    steps: Sequence[int] | None,
+    groups: Groups | None,
+    scores: Scores | None,
+    all_tasks: bool,
+    reps: int,
+    confidence: float,
+    seed: int,
+) -> Report:
+    """
+    :param gathered: runs
+    :param title: of the report
+    :param curves: published algorithms beside the runs
+    :param steps: see :func:`~sb3_sample.study.reporting.facts.compute`, as what follows
+    :param groups: likewise
+    :param scores: likewise
+    :param all_tasks: likewise
+    :param reps: likewise
+    :param confidence: likewise
+    :param seed: likewise
+    :return: the report
+    :raises ValueError: an argument is out of range
+    """
+    facts = compute(
+        gathered,
+        steps=steps,
+        groups=groups,
+        scores=scores,
+        all_tasks=all_tasks,
+        reps=reps,
+        confidence=confidence,
+        seed=seed,
+    )
+    drawn = [task_curves(gathered, task, scores, curves) for task in gathered.tasks]
+    agents = dressed(gathered, drawn)
+    how = f"{confidence:.0%} intervals, {reps:,} samples of rliable's stratified bootstrap (seed {seed})"
+    sections = [
+        _runs(gathered),
+        _averages(gathered, facts, agents, how),
+        _training(facts, drawn, agents, scores),
+        _tasks(drawn, agents),
+        _profiles(facts, agents),
+        _improvement(facts, agents),
+        _costs(gathered),
+        _settings(gathered, facts, how),
+    ]
+    return Report(title, _summary(gathered, facts), [each for each in sections if each.parts], __version__)
+
+
+# ---------------------------------------------------------------- the first ten seconds
+
+
+def _summary(gathered: Gathered, facts: Facts) -> list[tuple[str, str]]:
+    return [
+        ("Compared", _compared(gathered)),
+        ("Result", _result(facts)),
+        ("Missing", _missing(gathered, facts)),
+    ]
+
+
+def _compared(gathered: Gathered) -> str:
+    own = [agent for agent in gathered.agents if agent not in gathered.published]
+    if not own:
+        planned = list(dict.fromkeys(each.run.variant for state in gathered.states for each in state.runs))
+        return f"Nothing yet. Planned: {_listed(planned)}." if planned else "Nothing yet."
+    rows = gathered.table[gathered.table["agent"].isin(own)]
+    seeds = rows[RUN].drop_duplicates().groupby(["agent", "task"]).size()
+    of = f"{seeds.min()}" if seeds.min() == seeds.max() else f"{seeds.min()} to {seeds.max()}"
+    words = f"{_listed(own)} on {counted(rows['task'].nunique(), 'task')}, {of} {'seed' if of == '1' else 'seeds'} each"
+    ends = rows.groupby(RUN, dropna=False)["step"].max()
+    words += f", up to {ends.max():,} {_STEPS}"
+    if gathered.published:
+        words += f"; beside {_listed(gathered.published)}"
+    return f"{words}."
+
+
+def _listed(names: Sequence[str]) -> str:
+    shown = names if len(names) <= NAMED + 1 else names[:NAMED]
+    more = len(names) - len(shown)
+    return ", ".join(shown) + (f" and {more} more" if more else "")
+
+
+def _result(facts: Facts) -> str:
+    if facts.averages is None:
+        return f"No averages: {facts.reason[0].lower()}{facts.reason[1:]}"
+    rows = facts.at(facts.step)
+    found = [(row.agent, Interval(row.iqm, row.low, row.high)) for row in rows.itertuples()]
+    named = ", ".join(f"{agent} {interval_text(value)}" for agent, value in found[:NAMED])
+    words = f"At {facts.step:,} steps over {counted(len(facts.tasks), 'task')}, interquartile mean of the scores: {named}"
+    words += f" and {len(found) - NAMED} more. " if len(found) > NAMED else ". "
+    if all(math.isnan(value.low) for _, value in found):
+        return f"{words}One run a task gives no interval: nothing is certain here."
+    if facts.improvement is None:
+        return words.strip()
+    best = facts.improvement.iloc[0]
+    chance = Interval(best["probability"], best["low"], best["high"])
+    verdict = f"A run of {best['x']} beats one of {best['y']} on the same task with probability {interval_text(chance)}"
+    if math.isnan(chance.low):
+        return f"{words}{verdict}, without an interval."
+    if chance.low > 0.5:
+        return f"{words}{verdict}: it is better."
+    if chance.high < 0.5:
+        return f"{words}{verdict}: by this it is worse, whatever the averages say."
+    return f"{words}{verdict}: the two cannot be told apart."
+
+
+def _missing(gathered: Gathered, facts: Facts) -> str:
+    words = []
+    if gathered.states:
+        counts = Counter(each.state for state in gathered.states for each in state.runs)
+        total = sum(counts.values())
+        rest = ", ".join(f"{counts[state]} {state}" for state in STATES if state != DONE and counts[state])
+        words.append(f"{counts[DONE]} of {counted(total, 'planned run')} are done" + (f"; {rest}" if rest else ""))
+    if facts.short is not None and len(facts.short):
+        words.append(f"{counted(len(facts.short), 'run')} end{'s' if len(facts.short) == 1 else ''} before {facts.step:,} steps")
+    holes = _holes(gathered)
+    if holes:
+        words.append(f"{counted(len(holes), 'pair')} of agent and task without a run")
+    if facts.lacking:
+        words.append(f"{counted(len(facts.lacking), 'task')} without a score")
+    for agent, reason in facts.left_out.items():
+        words.append(f"{agent} is in no average: it {reason}" if not reason.startswith("no ") else f"{agent}: {reason}")
+    return f"{'; '.join(words)}." if words else "Nothing."
+
+
+def _holes(gathered: Gathered) -> list[tuple[str, str]]:
+    own = gathered.table[~gathered.table["agent"].isin(gathered.published)]
+    there = set(zip(own["agent"], own["task"], strict=True))
+    return [(a, t) for a in own["agent"].unique() for t in own["task"].unique() if (a, t) not in there]
+
+
+# ---------------------------------------------------------------- sections
+
+
+def _runs(gathered: Gathered) -> Section:
+    parts: list[Any] = []
+    for state in gathered.states:
+        parts += _of_study(state)
+    table = gathered.table
+    rows: list[list[Cell]] = []
+    ends = table.groupby(RUN, sort=False, dropna=False)["step"].max().reset_index()
+    for (agent, task), found in ends.groupby(["agent", "task"], sort=False):
+        seeds = ", ".join(str(seed) for seed in found["seed"])
+        rows.append([agent, task, len(found), seeds, int(found["step"].min()), int(found["step"].max())])
+    for agent, task in _holes(gathered):
+        rows.append([agent, task, 0, "", None, None])
+    head = ["agent", "task", "runs", "seeds", "shortest run", "longest run"]
+    if rows:
+        parts.append(Table(f"Runs with evaluations, and at which of the {_STEPS} they end", head, rows, folded=True))
+    return Section("runs", "Runs", [*parts, *gathered.notes])
+
+
+def _of_study(state: Status) -> list[Table | Text]:
+    by_agent: dict[str, Counter[str]] = {}
+    by_task: dict[tuple[str, str], Counter[str]] = {}
+    for each in state.runs:
+        by_agent.setdefault(each.run.variant, Counter())[each.state] += 1
+        by_task.setdefault((each.run.variant, each.run.task), Counter())[each.state] += 1
+
+    def cells(counts: Counter[str]) -> list[Cell]:
+        return [Count(counts[name], name) for name in STATES] + [sum(counts.values())]
+
+    head = [*STATES, "planned"]
+    parts: list[Table | Text] = [
+        Table("Runs of the study", ["agent", *head], [[agent, *cells(counts)] for agent, counts in by_agent.items()]),
+        Table(
+            "Runs of the study by task",
+            ["agent", "task", *head],
+            [[*key, *cells(counts)] for key, counts in by_task.items()],
+            folded=True,
+        ),
+    ]
+    for each in state.of(FAILED):
+        times = counted(each.outcome.attempts, "attempt")
+        parts.append(Text(f"Failed after {times}: {each.run.title}", each.outcome.traceback))
+    return parts
+
+
+def _averages(gathered: Gathered, facts: Facts, agents: dict[str, Agent], how: str) -> Section:
+    parts: list[Any] = []
+    if facts.averages is None:
+        parts.append(f"There are no averages. {facts.reason}")
+    else:
+        parts.append(_normalised(facts))
+        rows = facts.at(facts.step)
+        if rows["low"].isna().all():
+            parts.append("There are no intervals: no task has a second run.")
+        panels = []
+        for key, name in _STATISTICS.items():
+            prefix = "" if key == "iqm" else f"{key}_"
+            dots = [
+                (row["agent"], agents[row["agent"]], Interval(row[key], row[f"{prefix}low"], row[f"{prefix}high"]))
+                for _, row in rows.iterrows()
+            ]
+            panels.append(Dots(name, dots))
+        caption = f"Scores at {facts.step:,} steps, {facts.group}: {how}. Higher is better, but for the optimality gap."
+        parts += [Figure("averages", caption, panels, []), _averages_table(facts)]
+    if facts.lacking:
+        given = list(facts.lacking)
+        parts.append(
+            Table("Tasks without a score, in no average", ["task", "why"], [[task, facts.lacking[task]] for task in given])
+        )
+    return Section("averages", "Averages over tasks", [*parts, *facts.notes])
+
+
+def _normalised(facts: Facts) -> str:
+    n = len(facts.tasks)
+    which = "all of them" if n == facts.n_scored else f"of {facts.n_scored}: those that every agent has reached"
+    return (
+        f"Scores: DeepMind Control's returns over 1,000; success rates as they are; MuJoCo's returns over a reference's; "
+        f"others as they were given. Nothing is clipped. Averages are over {counted(n, 'task')} ({which}"
+        f"{f' {facts.step:,} steps on' if n < facts.n_scored else ''})."
+    )
+
+
+def _averages_table(facts: Facts) -> Table:
+    rows: list[list[Cell]] = []
+    for group in facts.groups:
+        for step in facts.steps:
+            for row in facts.at(step, group).to_dict("records"):
+                cells: list[Cell] = [row["agent"], group, step]
+                for key in _STATISTICS:
+                    prefix = "" if key == "iqm" else f"{key}_"
+                    cells.append(Interval(row[key], row[f"{prefix}low"], row[f"{prefix}high"]))
+                rows.append([*cells, int(row["tasks"]), int(row["runs"])])
+    head = ["agent", "group", "step", *_STATISTICS.values(), "tasks", "runs"]
+    return Table("Averages by group of tasks", head, rows)
+
+
+def _training(facts: Facts, drawn: Sequence[Curves], agents: dict[str, Agent], scores: Scores | None) -> Section:
+    if facts.averages is None:
+        return Section("training", "Training", [])
+    panels: list[Lines] = []
+    for group in facts.groups:
+        rows = facts.averages[facts.averages["group"] == group]
+        lines = [
+            Line(agents[agent], *(found[name].to_numpy(float) for name in ("step", "iqm", "low", "high")))
+            for agent, found in rows.groupby("agent", sort=False)
+        ]
+        title = f"{group}: {counted(len(facts.groups[group]), 'task')}"
+        panels.append(Lines(title, _STEPS, "IQM of the scores", lines, facts.step))
+    shown = list(dict.fromkeys(agents[name] for name in facts.averages["agent"]))
+    parts: list[Any] = [Figure("training", "Interquartile mean along the training, with intervals", panels, shown)]
+    means, others = _mean_panels(facts, drawn, agents, scores)
+    if others:
+        caption = (
+            "Mean of the tasks' means, beside published curves, of which there are statistics over seeds only: dashed, "
+            "without intervals, where they have all tasks of the group"
+        )
+        parts.append(Figure("means", caption, means, [*shown, *others]))
+    return Section("training", "Training", parts)
+
+
+def _mean_panels(
+    facts: Facts, drawn: Sequence[Curves], agents: dict[str, Agent], scores: Scores | None
+) -> tuple[list[Lines], list[Agent]]:
+    """Means over tasks of our agents and of published curves; and the published agents that have one."""
+    assert facts.averages is not None
+    by_label: dict[str, dict[str, Curve]] = {}
+    for each in drawn:
+        for curve in each.others:
+            by_label.setdefault(curve.label, {})[each.task] = curve
+    panels, others = [], {}
+    for group, tasks in facts.groups.items():
+        rows = facts.averages[facts.averages["group"] == group]
+        lines = [
+            Line(agents[agent], found["step"].to_numpy(float), found["mean"].to_numpy(float))
+            for agent, found in rows.groupby("agent", sort=False)
+        ]
+        for label, by_task in by_label.items():
+            if not set(tasks) <= by_task.keys():
+                continue
+            curves = [by_task[task].data for task in tasks]
+            steps = np.unique(np.concatenate([data["env_step"] for data in curves]))
+            first, last = (f(data["env_step"].iloc[i] for data in curves) for f, i in ((max, 0), (min, -1)))
+            steps = steps[(steps >= first) & (steps <= min(last, facts.step))]
+            values = []
+            for task, data in zip(tasks, curves, strict=True):
+                score = score_for(task, scores)
+                assert score is not None
+                values.append(score.of(np.interp(steps, data["env_step"], data["mean"])))
+            if len(steps):
+                others[label] = agents[label]
+                lines.append(Line(agents[label], steps.astype(float), np.mean(values, axis=0)))
+        title = f"{group}: {counted(len(tasks), 'task')}"
+        panels.append(Lines(title, _STEPS, "mean of the scores", lines, facts.step))
+    return panels, list(others.values())
+
+
+def _tasks(drawn: Sequence[Curves], agents: dict[str, Agent]) -> Section:
+    panels: list[Lines] = []
+    shown: dict[Agent, None] = {}
+    for each in sorted(drawn, key=lambda curves: curves.task):
+        own = [curve for name, curve in each.own.items() if not agents[name].published] or list(each.own.values())
+        if not own:
+            continue
+        lines = []
+        for curve in [*each.own.values(), *each.others]:
+            agent = agents[curve.label]
+            data = curve.data[curve.data["n_seeds"] > 0]
+            shown[agent] = None
+            has_band = (data["n_seeds"] > 1).any()
+            columns = [data[name].to_numpy(float) for name in ("env_step", "mean", "min", "max")]
+            lines.append(Line(agent, *columns) if has_band else Line(agent, *columns[:2]))
+        for name, runs in each.under_way.items():
+            lines += [Line(agents[name], run.steps, run.values, thin=True) for run in runs]
+        ends = [curve.data["env_step"].iloc[-1] for curve in own]
+        ends += [run.steps[-1] for name, runs in each.under_way.items() if not agents[name].published for run in runs]
+        y_range = (-0.03, 1.03) if each.metric == "success_rate" else None
+        panels.append(Lines(each.task, _STEPS, METRICS[each.metric], lines, float(max(ends)), y_range))
+    if not panels:
+        return Section("tasks", "Single tasks", [])
+    caption = "Mean and range over seeds; thin: runs that have not got as far; dashed: measured and published by others"
+    order = sorted(shown, key=list(agents.values()).index)
+    return Section("tasks", "Single tasks", [Figure("tasks", caption, panels, order)])
+
+
+def _profiles(facts: Facts, agents: dict[str, Agent]) -> Section:
+    if facts.profiles is None:
+        return Section("profiles", "Performance profiles", [])
+    lines = [
+        Line(agents[agent], *(rows[name].to_numpy(float) for name in ("threshold", "share", "low", "high")))
+        for agent, rows in facts.profiles.groupby("agent", sort=False)
+    ]
+    end = float(facts.profiles["threshold"].max())
+    panel = Lines(f"{facts.group}, {facts.step:,} steps", "score", "share of runs above it", lines, end, (-0.03, 1.03))
+    caption = "Share of the runs whose score is above a threshold, tasks weighing the same, with intervals"
+    return Section("profiles", "Performance profiles", [Figure("profiles", caption, [panel], [x.agent for x in lines])])
+
+
+def _improvement(facts: Facts, agents: dict[str, Agent]) -> Section:
+    section = Section("improvement", "Probability of improvement", [])
+    if facts.averages is None:
+        return section
+    if facts.improvement is None:
+        n = facts.averages["agent"].nunique()
+        why = "there is one agent" if n == 1 else "no two agents have a task in common"
+        section.parts.append(f"Left out: {why} to compare." if n == 1 else f"Left out: {why}.")
+        return section
+    rows = facts.improvement.to_dict("records")
+    values = [Interval(row["probability"], row["low"], row["high"]) for row in rows]
+    dots = [(f"{row['x']} > {row['y']}", agents[row["x"]], value) for row, value in zip(rows, values, strict=True)]
+    which = "" if facts.all_pairs else ", the best agent with each other one"
+    caption = (
+        f"How likely a run of the first scores more than one of the second on the same task, ties a half, at "
+        f"{facts.step:,} steps, {facts.group}{which}"
+    )
+    section.parts.append(Figure("improvement", caption, [Dots("probability of improvement", dots, middle=0.5)], []))
+    cells: list[list[Cell]] = [
+        [row["x"], row["y"], value, row["tasks"]] for row, value in zip(rows, values, strict=True)
+    ]
+    section.parts.append(Table("Probability of improvement", ["agent", "over", "probability", "tasks"], cells))
+    return section
+
+
+def _costs(gathered: Gathered) -> Section:
+    timed = gathered.table[gathered.table["metric"] == "hours"].sort_values("step", kind="stable")
+    ends = timed.groupby(RUN, sort=False, dropna=False)[["step", "value"]].last().reset_index()
+    ends = ends[ends["value"] > 0]
+    section = Section("costs", "Costs", [])
+    if not len(ends):
+        return section
+    for names, folded in ((["agent"], False), (["agent", "task"], True)):
+        rows: list[list[Cell]] = []
+        for key, found in ends.groupby(names, sort=False):
+            speed = found["step"].sum() / found["value"].sum() / 3_600
+            rows.append([*key, len(found), float(found["value"].mean()), float(found["value"].sum()), float(speed)])
+        head = [*names, "runs", "hours a run", "hours in all", f"{_STEPS} a second"]
+        caption = "Time in training and evaluating" + (" by task" if folded else "")
+        section.parts.append(Table(caption, head, rows, folded))
+    outcomes = [each.outcome for state in gathered.states for each in state.runs if each.outcome.host]
+    if outcomes:
+        found = Counter((each.host, each.threads) for each in outcomes)
+        words = [f"{host}: {counted(n, 'run')} with {counted(t, 'thread')} each" for (host, t), n in sorted(found.items())]
+        section.parts.append(f"Machines: {'; '.join(words)}.")
+    section.parts.append("Times compare only where all ran on one machine, with as many threads and neighbours.")
+    return section
+
+
+def _settings(gathered: Gathered, facts: Facts, how: str) -> Section:
+    parts: list[Any] = []
+    found: dict[str, dict[str, list[str]]] = {}
+    for row in gathered.table[["agent", "arguments"]].drop_duplicates().itertuples():
+        for name, value in json.loads(row.arguments).items():
+            values = found.setdefault(name, {}).setdefault(row.agent, [])
+            text = value if isinstance(value, str) else json.dumps(value)
+            values += [] if text in values else [text]
+    if found:
+        agents = [agent for agent in gathered.agents if any(agent in by_agent for by_agent in found.values())]
+        rows: list[list[Cell]] = [
+            [name, *(" / ".join(by_agent.get(agent, ["default"])) for agent in agents)]
+            for name, by_agent in sorted(found.items())
+        ]
+        parts.append(Table("Arguments", ["argument", *agents], rows, folded=True))
+    if gathered.made_with:
+        rows = []
+        for name in _MADE_WITH:
+            values = Counter(made[name] for made in gathered.made_with if name in made)
+            for value, n in values.most_common():
+                rows.append([name, value, n])
+        parts.append(Table("Versions and machines that the runs' checkpoints name", ["of", "value", "runs"], rows))
+    for source, text in gathered.plans.items():
+        parts.append(Text(f"Plan of {source}", text))
+    parts.append(
+        f"Made by sb3_sample {__version__} (sb3-sample study report) of {', '.join(gathered.names)}; {how}. Steps are "
+        "of the simulator, whatever the action repeat."
+    )
+    return Section("settings", "Settings and versions", parts)
