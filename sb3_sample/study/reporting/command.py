@@ -144,8 +144,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=steps_of,
         metavar="STEP",
-        help="simulator steps at which averages are told, as 100k or 1M; the last is that of the profiles (default: the "
-        "last that a run of each agent has reached)",
+        help="simulator steps at which averages are told, as 100k or 1M; the last is that of the profiles (default: "
+        "the last that a run of each agent has reached)",
     )
     parser.add_argument(
         "--all-tasks",

@@ -1,7 +1,6 @@
 """Content of a report: what was run, who is better and how sure that is, what it cost, and how it was made."""
 
 import json
-import math
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -14,6 +13,8 @@ from sb3_sample.study.aggregate import Groups, Scores, score_for
 from sb3_sample.study.reporting.curves import Curves, dressed, task_curves
 from sb3_sample.study.reporting.facts import Facts, compute
 from sb3_sample.study.reporting.pieces import (
+    DASH,
+    STEPS,
     Agent,
     Cell,
     Count,
@@ -27,23 +28,24 @@ from sb3_sample.study.reporting.pieces import (
     Table,
     Text,
     counted,
-    interval_text,
-    number,
+    cut,
 )
 from sb3_sample.study.reporting.reading import Gathered
-from sb3_sample.study.states import DONE, FAILED, STATES, Status
+from sb3_sample.study.reporting.summary import holes, summary
+from sb3_sample.study.states import FAILED, STATES, Status
 from sb3_sample.study.table import RUN
 from sb3_sample.version import __version__
 
-#: Agents that the summary names.
-NAMED = 3
+#: Rows of a table of runs that is not folded.
+UNFOLDED = 12
+#: Letters of an agent's name in a pair.
+PAIR = 18
 #: What checkpoints were made with, in the order of the table.
 _MADE_WITH = (
     "sb3_sample", "commit", "torch", "stable_baselines3", "gymnasium", "mujoco", "numpy", "python", "processor",
     "device", "torch threads",
 )  # fmt: skip
 _STATISTICS = {"iqm": "IQM", "mean": "mean", "median": "median", "optimality_gap": "optimality gap"}
-_STEPS = "simulator steps"
 
 
 def build(
@@ -96,89 +98,7 @@ def build(
         _costs(gathered),
         _settings(gathered, facts, how),
     ]
-    return Report(title, _summary(gathered, facts), [each for each in sections if each.parts], __version__)
-
-
-# ---------------------------------------------------------------- the first ten seconds
-
-
-def _summary(gathered: Gathered, facts: Facts) -> list[tuple[str, str]]:
-    return [
-        ("Compared", _compared(gathered)),
-        ("Result", _result(facts)),
-        ("Missing", _missing(gathered, facts)),
-    ]
-
-
-def _compared(gathered: Gathered) -> str:
-    own = [agent for agent in gathered.agents if agent not in gathered.published]
-    if not own:
-        planned = list(dict.fromkeys(each.run.variant for state in gathered.states for each in state.runs))
-        return f"Nothing yet. Planned: {_listed(planned)}." if planned else "Nothing yet."
-    rows = gathered.table[gathered.table["agent"].isin(own)]
-    seeds = rows[RUN].drop_duplicates().groupby(["agent", "task"]).size()
-    of = f"{seeds.min()}" if seeds.min() == seeds.max() else f"{seeds.min()} to {seeds.max()}"
-    words = f"{_listed(own)} on {counted(rows['task'].nunique(), 'task')}, {of} {'seed' if of == '1' else 'seeds'} each"
-    ends = rows.groupby(RUN, dropna=False)["step"].max()
-    words += f", up to {ends.max():,} {_STEPS}"
-    if gathered.published:
-        words += f"; beside {_listed(gathered.published)}"
-    return f"{words}."
-
-
-def _listed(names: Sequence[str]) -> str:
-    shown = names if len(names) <= NAMED + 1 else names[:NAMED]
-    more = len(names) - len(shown)
-    return ", ".join(shown) + (f" and {more} more" if more else "")
-
-
-def _result(facts: Facts) -> str:
-    if facts.averages is None:
-        return f"No averages: {facts.reason[0].lower()}{facts.reason[1:]}"
-    rows = facts.at(facts.step)
-    found = [(row.agent, Interval(row.iqm, row.low, row.high)) for row in rows.itertuples()]
-    named = ", ".join(f"{agent} {interval_text(value)}" for agent, value in found[:NAMED])
-    words = f"At {facts.step:,} steps over {counted(len(facts.tasks), 'task')}, interquartile mean of the scores: {named}"
-    words += f" and {len(found) - NAMED} more. " if len(found) > NAMED else ". "
-    if all(math.isnan(value.low) for _, value in found):
-        return f"{words}One run a task gives no interval: nothing is certain here."
-    if facts.improvement is None:
-        return words.strip()
-    best = facts.improvement.iloc[0]
-    chance = Interval(best["probability"], best["low"], best["high"])
-    verdict = f"A run of {best['x']} beats one of {best['y']} on the same task with probability {interval_text(chance)}"
-    if math.isnan(chance.low):
-        return f"{words}{verdict}, without an interval."
-    if chance.low > 0.5:
-        return f"{words}{verdict}: it is better."
-    if chance.high < 0.5:
-        return f"{words}{verdict}: by this it is worse, whatever the averages say."
-    return f"{words}{verdict}: the two cannot be told apart."
-
-
-def _missing(gathered: Gathered, facts: Facts) -> str:
-    words = []
-    if gathered.states:
-        counts = Counter(each.state for state in gathered.states for each in state.runs)
-        total = sum(counts.values())
-        rest = ", ".join(f"{counts[state]} {state}" for state in STATES if state != DONE and counts[state])
-        words.append(f"{counts[DONE]} of {counted(total, 'planned run')} are done" + (f"; {rest}" if rest else ""))
-    if facts.short is not None and len(facts.short):
-        words.append(f"{counted(len(facts.short), 'run')} end{'s' if len(facts.short) == 1 else ''} before {facts.step:,} steps")
-    holes = _holes(gathered)
-    if holes:
-        words.append(f"{counted(len(holes), 'pair')} of agent and task without a run")
-    if facts.lacking:
-        words.append(f"{counted(len(facts.lacking), 'task')} without a score")
-    for agent, reason in facts.left_out.items():
-        words.append(f"{agent} is in no average: it {reason}" if not reason.startswith("no ") else f"{agent}: {reason}")
-    return f"{'; '.join(words)}." if words else "Nothing."
-
-
-def _holes(gathered: Gathered) -> list[tuple[str, str]]:
-    own = gathered.table[~gathered.table["agent"].isin(gathered.published)]
-    there = set(zip(own["agent"], own["task"], strict=True))
-    return [(a, t) for a in own["agent"].unique() for t in own["task"].unique() if (a, t) not in there]
+    return Report(title, summary(gathered, facts), [each for each in sections if each.parts], __version__)
 
 
 # ---------------------------------------------------------------- sections
@@ -192,14 +112,28 @@ def _runs(gathered: Gathered) -> Section:
     rows: list[list[Cell]] = []
     ends = table.groupby(RUN, sort=False, dropna=False)["step"].max().reset_index()
     for (agent, task), found in ends.groupby(["agent", "task"], sort=False):
-        seeds = ", ".join(str(seed) for seed in found["seed"])
-        rows.append([agent, task, len(found), seeds, int(found["step"].min()), int(found["step"].max())])
-    for agent, task in _holes(gathered):
+        rows.append(
+            [agent, task, len(found), _ranges(found["seed"]), int(found["step"].min()), int(found["step"].max())]
+        )
+    for agent, task in holes(gathered):
         rows.append([agent, task, 0, "", None, None])
     head = ["agent", "task", "runs", "seeds", "shortest run", "longest run"]
     if rows:
-        parts.append(Table(f"Runs with evaluations, and at which of the {_STEPS} they end", head, rows, folded=True))
+        caption = f"Runs that were evaluated, and after how many {STEPS} they end"
+        parts.append(Table(caption, head, rows, folded=bool(gathered.states) or len(rows) > UNFOLDED))
     return Section("runs", "Runs", [*parts, *gathered.notes])
+
+
+def _ranges(seeds: pd.Series) -> str:
+    """Seeds in words, such as 0 to 4 and 7."""
+    parts: list[list[int]] = []
+    for seed in sorted(int(seed) for seed in seeds.dropna()):
+        if parts and seed == parts[-1][-1] + 1:
+            parts[-1].append(seed)
+        else:
+            parts.append([seed])
+    words = [str(part[0]) if len(part) == 1 else f"{part[0]}{DASH}{part[-1]}" for part in parts]
+    return ", ".join(words)
 
 
 def _of_study(state: Status) -> list[Table | Text]:
@@ -248,20 +182,18 @@ def _averages(gathered: Gathered, facts: Facts, agents: dict[str, Agent], how: s
         caption = f"Scores at {facts.step:,} steps, {facts.group}: {how}. Higher is better, but for the optimality gap."
         parts += [Figure("averages", caption, panels, []), _averages_table(facts)]
     if facts.lacking:
-        given = list(facts.lacking)
-        parts.append(
-            Table("Tasks without a score, in no average", ["task", "why"], [[task, facts.lacking[task]] for task in given])
-        )
+        why: list[list[Cell]] = [[task, reason] for task, reason in facts.lacking.items()]
+        parts.append(Table("Tasks without a score, in no average", ["task", "why"], why))
     return Section("averages", "Averages over tasks", [*parts, *facts.notes])
 
 
 def _normalised(facts: Facts) -> str:
-    n = len(facts.tasks)
-    which = "all of them" if n == facts.n_scored else f"of {facts.n_scored}: those that every agent has reached"
+    n, of = len(facts.tasks), facts.n_scored
+    which = "all of them" if n == of else f"of {of}: those that every agent has reached {facts.step:,} steps on"
     return (
-        f"Scores: DeepMind Control's returns over 1,000; success rates as they are; MuJoCo's returns over a reference's; "
-        f"others as they were given. Nothing is clipped. Averages are over {counted(n, 'task')} ({which}"
-        f"{f' {facts.step:,} steps on' if n < facts.n_scored else ''})."
+        "Scores: DeepMind Control's returns over 1,000; success rates as they are; MuJoCo's returns over a "
+        "reference's; others as they were given. Nothing is clipped. Averages are over "
+        f"{counted(n, 'task')} ({which})."
     )
 
 
@@ -290,7 +222,7 @@ def _training(facts: Facts, drawn: Sequence[Curves], agents: dict[str, Agent], s
             for agent, found in rows.groupby("agent", sort=False)
         ]
         title = f"{group}: {counted(len(facts.groups[group]), 'task')}"
-        panels.append(Lines(title, _STEPS, "IQM of the scores", lines, facts.step))
+        panels.append(Lines(title, STEPS, "IQM of the scores", lines, facts.step))
     shown = list(dict.fromkeys(agents[name] for name in facts.averages["agent"]))
     parts: list[Any] = [Figure("training", "Interquartile mean along the training, with intervals", panels, shown)]
     means, others = _mean_panels(facts, drawn, agents, scores)
@@ -335,7 +267,7 @@ def _mean_panels(
                 others[label] = agents[label]
                 lines.append(Line(agents[label], steps.astype(float), np.mean(values, axis=0)))
         title = f"{group}: {counted(len(tasks), 'task')}"
-        panels.append(Lines(title, _STEPS, "mean of the scores", lines, facts.step))
+        panels.append(Lines(title, STEPS, "mean of the scores", lines, facts.step))
     return panels, list(others.values())
 
 
@@ -355,11 +287,11 @@ def _tasks(drawn: Sequence[Curves], agents: dict[str, Agent]) -> Section:
             columns = [data[name].to_numpy(float) for name in ("env_step", "mean", "min", "max")]
             lines.append(Line(agent, *columns) if has_band else Line(agent, *columns[:2]))
         for name, runs in each.under_way.items():
-            lines += [Line(agents[name], run.steps, run.values, thin=True) for run in runs]
+            lines += [Line(agents[name], list(run.steps), list(run.values), thin=True) for run in runs]
         ends = [curve.data["env_step"].iloc[-1] for curve in own]
         ends += [run.steps[-1] for name, runs in each.under_way.items() if not agents[name].published for run in runs]
         y_range = (-0.03, 1.03) if each.metric == "success_rate" else None
-        panels.append(Lines(each.task, _STEPS, METRICS[each.metric], lines, float(max(ends)), y_range))
+        panels.append(Lines(each.task, STEPS, METRICS[each.metric], lines, float(max(ends)), y_range))
     if not panels:
         return Section("tasks", "Single tasks", [])
     caption = "Mean and range over seeds; thin: runs that have not got as far; dashed: measured and published by others"
@@ -391,7 +323,8 @@ def _improvement(facts: Facts, agents: dict[str, Agent]) -> Section:
         return section
     rows = facts.improvement.to_dict("records")
     values = [Interval(row["probability"], row["low"], row["high"]) for row in rows]
-    dots = [(f"{row['x']} > {row['y']}", agents[row["x"]], value) for row, value in zip(rows, values, strict=True)]
+    names = [f"{cut(row['x'], PAIR)} > {cut(row['y'], PAIR)}" for row in rows]
+    dots = [(name, agents[row["x"]], value) for name, row, value in zip(names, rows, values, strict=True)]
     which = "" if facts.all_pairs else ", the best agent with each other one"
     caption = (
         f"How likely a run of the first scores more than one of the second on the same task, ties a half, at "
@@ -417,13 +350,15 @@ def _costs(gathered: Gathered) -> Section:
         for key, found in ends.groupby(names, sort=False):
             speed = found["step"].sum() / found["value"].sum() / 3_600
             rows.append([*key, len(found), float(found["value"].mean()), float(found["value"].sum()), float(speed)])
-        head = [*names, "runs", "hours a run", "hours in all", f"{_STEPS} a second"]
+        head = [*names, "runs", "hours a run", "hours in all", f"{STEPS} a second"]
         caption = "Time in training and evaluating" + (" by task" if folded else "")
         section.parts.append(Table(caption, head, rows, folded))
     outcomes = [each.outcome for state in gathered.states for each in state.runs if each.outcome.host]
     if outcomes:
         found = Counter((each.host, each.threads) for each in outcomes)
-        words = [f"{host}: {counted(n, 'run')} with {counted(t, 'thread')} each" for (host, t), n in sorted(found.items())]
+        words = [
+            f"{host}: {counted(n, 'run')} with {counted(t, 'thread')} each" for (host, t), n in sorted(found.items())
+        ]
         section.parts.append(f"Machines: {'; '.join(words)}.")
     section.parts.append("Times compare only where all ran on one machine, with as many threads and neighbours.")
     return section
@@ -447,8 +382,8 @@ def _settings(gathered: Gathered, facts: Facts, how: str) -> Section:
     if gathered.made_with:
         rows = []
         for name in _MADE_WITH:
-            values = Counter(made[name] for made in gathered.made_with if name in made)
-            for value, n in values.most_common():
+            counts = Counter(made[name] for made in gathered.made_with if name in made)
+            for value, n in counts.most_common():
                 rows.append([name, value, n])
         parts.append(Table("Versions and machines that the runs' checkpoints name", ["of", "value", "runs"], rows))
     for source, text in gathered.plans.items():

@@ -3,14 +3,14 @@
 import itertools
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import pandas as pd
 
 from sb3_sample.plots import Curve, Run, summarize
 from sb3_sample.study.aggregate import Scores, score_for
-from sb3_sample.study.reporting.pieces import N_COLORS, Agent, counted
+from sb3_sample.study.reporting.pieces import N_COLORS, Agent, counted, range_text
 from sb3_sample.study.reporting.published import chosen_curves, differences
 from sb3_sample.study.reporting.reading import Gathered
 from sb3_sample.study.table import RUN
@@ -34,9 +34,7 @@ class Curves(NamedTuple):
     others: list[Curve]
 
 
-def task_curves(
-    gathered: Gathered, task: str, scores: Scores | None, names: Sequence[str] | None
-) -> Curves:
+def task_curves(gathered: Gathered, task: str, scores: Scores | None, names: Sequence[str] | None) -> Curves:
     """
     :param gathered: runs
     :param task: id of the environment
@@ -80,19 +78,20 @@ def dressed(gathered: Gathered, curves: Sequence[Curves]) -> dict[str, Agent]:
         for curve in each.others:
             of_others.setdefault(curve.label, []).append((each, curve))
     agents: dict[str, Agent] = {}
-    colors: dict[str, int] = {}
+    of_ours: dict[str, int] = {}
     free = itertools.count()
     for name in [*gathered.agents, *of_others]:
         published = name in of_others or name in gathered.published
         base = name.partition(",")[0].partition(" (")[0].lower().replace(" ", "_")
-        color = colors[base] if published and base in colors else next(free)
-        colors.setdefault(base, color)
+        color = of_ours.pop(base) if published and base in of_ours else next(free)
+        if not published:
+            of_ours.setdefault(base, color)
         label = name
         if name in of_others:
             label = f"{name}, published: {_difference_words(of_others[name], repeats)}"
         elif published:
             seeds = gathered.table[gathered.table["agent"] == name].groupby("task")["seed"].nunique()
-            label = f"{name}: {_seeds_words(seeds)}"
+            label = f"{name}: {range_text(seeds, 'seed')}"
         agents[name] = Agent(name, color % N_COLORS, color // N_COLORS, published, label)
     return agents
 
@@ -100,7 +99,7 @@ def dressed(gathered: Gathered, curves: Sequence[Curves]) -> dict[str, Agent]:
 def _difference_words(found: Sequence[tuple[Curves, Curve]], repeats: Mapping[str, set[int]]) -> str:
     """Seeds of a published curve on all its tasks, and what of its measurement was otherwise."""
     seeds = {int(n) for _, curve in found for n in curve.data["n_seeds"]}
-    words = [_seeds_words(seeds)]
+    words = [range_text(seeds, "seed")]
     notes = Counter(
         note
         for each, curve in found
@@ -111,11 +110,6 @@ def _difference_words(found: Sequence[tuple[Curves, Curve]], repeats: Mapping[st
         if not (everywhere and len(seeds) == 1 and note.endswith("seeds only")):
             words.append(note if everywhere else f"{note} on {n} of {counted(len(found), 'task')}")
     return "; ".join(words)
-
-
-def _seeds_words(numbers: Iterable[int]) -> str:
-    low, high = min(numbers), max(numbers)
-    return counted(low, "seed") if low == high else f"{low}–{high} seeds"
 
 
 def _repeats(table: pd.DataFrame) -> dict[str, set[int]]:

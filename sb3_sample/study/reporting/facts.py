@@ -20,6 +20,7 @@ from sb3_sample.study.aggregate import (
     scored,
     unscored,
 )
+from sb3_sample.study.reporting.pieces import counted
 from sb3_sample.study.reporting.reading import Gathered
 from sb3_sample.study.table import RUN
 
@@ -43,7 +44,6 @@ class Facts:
     :param profiles: at the last step, of the first group; None without averages
     :param improvement: likewise, of pairs, the one with the better average first; None with one agent
     :param all_pairs: whether all pairs are compared, not only those with the best
-    :param short: agent, task, seed and last step of the runs that do not reach the last step
     :param left_out: agents without averages, with the reason
     :param notes: warnings
     """
@@ -58,7 +58,6 @@ class Facts:
     profiles: pd.DataFrame | None = None
     improvement: pd.DataFrame | None = None
     all_pairs: bool = True
-    short: pd.DataFrame | None = None
     left_out: dict[str, str] = dataclasses.field(default_factory=dict)
     notes: list[str] = dataclasses.field(default_factory=list)
 
@@ -116,7 +115,6 @@ def compute(
     ends = scored(rows, scores).groupby(RUN, sort=False, dropna=False)["step"].agg(["min", "max"]).reset_index()
     own = ends[~ends["agent"].isin(gathered.published)]
     facts.steps = sorted(steps) if steps else [int(own.groupby("agent")["max"].max().min())]
-    facts.short = own[own["max"] < facts.step]
     reaching = ends[ends["max"] >= facts.step]
     if not len(reaching):
         raise ValueError(f"steps must be within those of the runs, up to {own['max'].max():,}, not {facts.step:,}")
@@ -132,7 +130,7 @@ def compute(
         warnings.simplefilter("always", UserWarning)
         facts.averages = aggregate(rows, at, facts.groups, **shared)
         first = {facts.group: facts.groups[facts.group]}
-        best = [agent for agent in facts.at(facts.step)["agent"]]
+        best = list(facts.at(facts.step)["agent"])
         facts.profiles = performance_profiles(rows, facts.step, groups=first, **shared)
         facts.all_pairs = len(best) <= ALL_PAIRS
         pairs = itertools.combinations(best, 2) if facts.all_pairs else ((best[0], other) for other in best[1:])
@@ -152,7 +150,7 @@ def _comparable(
     ours = [agent for agent in gathered.agents if agent in tasks and agent not in gathered.published]
     for agent in own["agent"].unique():
         if agent not in tasks:
-            facts.left_out[agent] = f"no run has reached {facts.step:,} steps"
+            facts.left_out[agent] = f"no run of it has reached {facts.step:,} steps"
     if all_tasks or not ours:
         return reaching
     common = set.intersection(*(tasks[agent] for agent in ours))
@@ -161,7 +159,7 @@ def _comparable(
         return reaching
     for agent in tasks:
         if not common <= tasks[agent]:
-            facts.left_out[agent] = f"has {len(tasks[agent] & common)} of the {len(common)} tasks"
+            facts.left_out[agent] = f"it has {len(tasks[agent] & common)} of the {counted(len(common), 'task')}"
     return reaching[reaching["task"].isin(common) & ~reaching["agent"].isin(list(facts.left_out))]
 
 

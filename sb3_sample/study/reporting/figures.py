@@ -2,12 +2,14 @@
 
 import contextlib
 import io
+import math
 import re
+import textwrap
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from sb3_sample.plots import needing_matplotlib
-from sb3_sample.study.reporting.pieces import N_COLORS, Agent, Dots, Figure, Lines
+from sb3_sample.study.reporting.pieces import N_COLORS, Agent, Dots, Figure, Lines, cut
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,9 +26,10 @@ _INK, _GRID, _BAND = "#010203", "#030201", "#020301"
 #: Styles of lines of agents that share a colour, by how often all colours were taken before; those of others.
 _STYLES, _DASHED = ("-", "-.", ":"), (0, (4, 2))
 _MARKERS = ("o", "s", "D")
-#: Inches of a panel, letters of a name in a figure, and panels side by side in a file.
-WIDTH, HEIGHT, LETTERS, COLUMNS = 4.4, 3.1, 34, 3
-_DPI = 100
+#: Inches of a panel of lines, of one of dots, and panels side by side in a file.
+WIDTH, HEIGHT, DOTS_WIDTH, COLUMNS = 4.4, 3.1, 6.2, 3
+#: Letters of a legend in an inch, and dots of a file.
+_LETTERS, _DPI = 13, 100
 
 
 @contextlib.contextmanager
@@ -51,8 +54,7 @@ def shortened(name: str) -> str:
     :return: the same for a figure: in one line, not too long. A space that does not break keeps a leading underscore,
         which matplotlib takes for "not in the legend"
     """
-    text = "".join(letter if letter.isprintable() else " " for letter in name)
-    text = text if len(text) <= LETTERS else f"{text[: LETTERS - 1]}…"
+    text = cut(name)
     return f"\u00a0{text}" if text.startswith("_") else text
 
 
@@ -64,13 +66,15 @@ def svg(panel: Lines | Dots, prefix: str) -> str:
     :raises ImportError: matplotlib is not installed
     """
     with _style(_INK, _GRID):
-        drawing = _drawing(WIDTH, _height(panel))
+        drawing = _drawing(*_size(panel))
         _draw(drawing.add_subplot(), panel, _BAND)
         file = io.StringIO()
         drawing.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
     text = file.getvalue()
     text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->|<style.*?</style>|<title>.*?</title>", "", text, flags=re.DOTALL)
+    text = re.sub(
+        r"<metadata>.*?</metadata>|<!--.*?-->|<style.*?</style>|<title>.*?</title>", "", text, flags=re.DOTALL
+    )
     names = {_INK: "var(--ink)", _GRID: "var(--grid)", _BAND: "var(--band)"}
     names |= {color: f"var(--c{i})" for i, color in enumerate(LIGHT)}
     colors = re.compile("|".join(names))
@@ -95,14 +99,15 @@ def png(figure: Figure) -> bytes:
     :raises ImportError: matplotlib is not installed
     """
     n = len(figure.panels)
-    columns = min(n, COLUMNS if n != 4 else 2)
+    width, height = _size(figure.panels[0])
+    columns = min(n, COLUMNS if width == WIDTH else 2)
     rows = -(-n // columns)
-    labels = [agent.label or agent.name for agent in figure.agents]
-    wide = max(map(len, labels), default=0) > LETTERS
-    legend_rows = len(labels) if wide else -(-len(labels) // columns)
-    height = rows * _height(figure.panels[0]) + 0.25 * legend_rows
+    inches = max(width * columns, 2 * WIDTH)
+    labels = [_legend_text(agent, int(inches * _LETTERS)) for agent in figure.agents]
+    side_by_side = max(int(inches * _LETTERS) // (max(map(len, labels), default=0) + 8), 1)
+    lines = sum(label.count("\n") + 1 for label in labels[::side_by_side])
     with _style(INK, GRID):
-        drawing = _drawing(WIDTH * columns, height)
+        drawing = _drawing(inches, rows * height + 0.21 * lines)
         drawing.patch.set_facecolor("white")
         drawing.subplots(rows, columns, squeeze=False)
         for place, panel in zip(drawing.axes, figure.panels, strict=False):
@@ -110,7 +115,7 @@ def png(figure: Figure) -> bytes:
         for place in drawing.axes[n:]:
             place.set_axis_off()
         if labels:
-            _legend(drawing, figure.agents, labels, 1 if wide else columns)
+            _legend(drawing, figure.agents, labels, side_by_side)
         file = io.BytesIO()
         drawing.savefig(file, format="png", dpi=_DPI, metadata={"Software": None})
     return file.getvalue()
@@ -130,8 +135,8 @@ def _drawing(width: float, height: float) -> "Drawing":
     return Drawing(figsize=(width, height), layout="constrained")
 
 
-def _height(panel: Lines | Dots) -> float:
-    return HEIGHT if isinstance(panel, Lines) else 0.75 + 0.3 * len(panel.rows)
+def _size(panel: Lines | Dots) -> tuple[float, float]:
+    return (WIDTH, HEIGHT) if isinstance(panel, Lines) else (DOTS_WIDTH, 0.75 + 0.3 * len(panel.rows))
 
 
 def _look(agent: Agent) -> dict[str, Any]:
@@ -171,11 +176,12 @@ def _draw_lines(axes: "Axes", panel: Lines, band: str) -> None:
 def _draw_dots(axes: "Axes", panel: Dots) -> None:
     for i, (_, agent, (value, low, high)) in enumerate(panel.rows):
         color = LIGHT[agent.color % N_COLORS]
-        if low == low:  # is a number
-            axes.plot([low, high], [i, i], color=color, linewidth=5, alpha=0.45, solid_capstyle="butt")
-        face = "none" if agent.published else color
-        marker = _MARKERS[min(agent.turn, 2)]
-        axes.plot([value], [i], marker=marker, color=color, markerfacecolor=face, markersize=7, linestyle="")
+        alone = math.isnan(low)
+        if not alone:
+            alpha = 0.25 if agent.published else 0.5
+            axes.plot([low, high], [i, i], color=color, linewidth=9, alpha=alpha, solid_capstyle="butt")
+        marker = _MARKERS[min(agent.turn, 2)] if alone else "|"
+        axes.plot([value], [i], marker=marker, color=color, markersize=7 if alone else 13, markeredgewidth=2.2)
     if panel.middle is not None:
         axes.axvline(panel.middle, color=axes.xaxis.label.get_color(), linewidth=0.8)
         axes.set_xlim(-0.03, 1.03)
@@ -189,6 +195,10 @@ def _legend(drawing: "Drawing", agents: Sequence[Agent], labels: Sequence[str], 
     from matplotlib.lines import Line2D
 
     handles = [Line2D([], [], linewidth=1.5 if agent.published else 2, **_look(agent)) for agent in agents]
-    names = ["".join(c if c.isprintable() else " " for c in label)[:160] for label in labels]
-    names = [f"\u00a0{name}" if name.startswith("_") else name for name in names]
-    drawing.legend(handles, names, loc="outside lower left", ncols=columns, fontsize=9.5)
+    drawing.legend(handles, labels, loc="outside lower left", ncols=columns, fontsize=9.5)
+
+
+def _legend_text(agent: Agent, letters: int) -> str:
+    text = "".join(letter if letter.isprintable() else " " for letter in agent.label or agent.name)
+    text = "\n".join(textwrap.wrap(text, letters - 8)[:3]) or " "
+    return f"\u00a0{text}" if text.startswith("_") else text

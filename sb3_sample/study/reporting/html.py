@@ -8,6 +8,7 @@ from typing import Any
 from sb3_sample.extras import install
 from sb3_sample.study.reporting import figures
 from sb3_sample.study.reporting.pieces import (
+    DASH,
     Agent,
     Cell,
     Count,
@@ -80,7 +81,7 @@ def shown(cell: Cell) -> str:
     :return: its text
     """
     if cell is None:
-        return "–"
+        return DASH
     if isinstance(cell, Interval):
         return interval_text(cell)
     if isinstance(cell, Count):

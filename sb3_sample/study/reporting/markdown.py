@@ -56,7 +56,7 @@ def markdown(report: Report, pictures: str) -> str:
     :return: the text; the same for the same content
     """
     lines = [f"## {escaped(report.title)}", ""]
-    lines += [f"- **{heading}**: {escaped(words)}" for heading, words in report.summary]
+    lines += [f"- **{heading}.** {escaped(' '.join(words))}" for heading, words in report.summary]
     for section in report.sections:
         lines += ["", f"### {section.title}", *_section(section, pictures)]
     return "\n".join(lines) + "\n"
@@ -79,7 +79,7 @@ def _section(section: Section, pictures: str) -> list[str]:
         if isinstance(part, str):
             lines.append(escaped(part))
         elif isinstance(part, Figure):
-            caption = escaped(part.caption)
+            caption = escaped(part.caption).rstrip(".")
             lines += [f"![{caption}]({pictures.replace(' ', '%20')}/{part.name}.png)", "", f"*{caption}.*"]
         elif isinstance(part, Table):
             rows = _table(part)
@@ -104,7 +104,7 @@ def _lines(text: str) -> list[str]:
 
 
 def _table(table: Table) -> list[str]:
-    right = ["" if not table.rows or isinstance(cell, str) else ":" for cell in (table.rows or [table.head])[0]]
+    right = ["" if isinstance(cell, str) else ":" for cell in table.rows[0]]
     cells = [[escaped(shown(cell)) for cell in row] for row in table.rows]
     heads = [escaped(name) for name in table.head]
     return [f"| {' | '.join(line)} |" for line in (heads, [f"---{colon}" for colon in right], *cells)]

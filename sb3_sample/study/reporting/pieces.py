@@ -7,11 +7,17 @@ they are, and whoever writes them into a file escapes them.
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+#: Between two ends, and where there is nothing.
+DASH = "\N{EN DASH}"
+#: The unit of all steps.
+STEPS = "simulator steps"
 #: Colours that figures have.
 N_COLORS = 8
+#: Letters of a name in a sentence or a figure.
+LETTERS = 36
 
 
 class Interval(NamedTuple):
@@ -169,27 +175,19 @@ class Report:
     """
 
     title: str
-    summary: list[tuple[str, str]]
+    summary: list[tuple[str, list[str]]]
     sections: list[Section]
     version: str
-
-
-def steps_text(step: int) -> str:
-    """
-    :param step: a number of steps
-    :return: the same for people
-    """
-    return f"{step:,}"
 
 
 def number(value: float, digits: int = 3) -> str:
     """
     :param value: any number
     :param digits: after the point, for those of the order of 1
-    :return: the same for people; "–" for NaN
+    :return: the same for people; a dash for NaN
     """
     if math.isnan(value):
-        return "–"
+        return DASH
     if abs(value) >= 1_000:
         return f"{value:,.0f}"
     return f"{value:.{digits}f}" if abs(value) < 100 else f"{value:.1f}"
@@ -202,7 +200,7 @@ def interval_text(found: Interval) -> str:
     """
     if math.isnan(found.low):
         return number(found.value)
-    return f"{number(found.value)} ({number(found.low)}–{number(found.high)})"
+    return f"{number(found.value)} ({number(found.low)}{DASH}{number(found.high)})"
 
 
 def counted(n: int, noun: str) -> str:
@@ -212,3 +210,23 @@ def counted(n: int, noun: str) -> str:
     :return: both in words
     """
     return f"{n:,} {noun}{'' if n == 1 else 's'}"
+
+
+def range_text(numbers: Iterable[int], noun: str) -> str:
+    """
+    :param numbers: at least one
+    :param noun: of what, in the singular
+    :return: the smallest and the largest in words
+    """
+    found = sorted(numbers)
+    return counted(found[0], noun) if found[0] == found[-1] else f"{found[0]:,}{DASH}{found[-1]:,} {noun}s"
+
+
+def cut(name: str, letters: int = LETTERS) -> str:
+    """
+    :param name: from a file
+    :param letters: that are kept
+    :return: the same in one line, cut where it is longer than a sentence can bear
+    """
+    text = " ".join("".join(letter if letter.isprintable() else " " for letter in name).split())
+    return text if len(text) <= letters else f"{text[: letters - 1]}…"

@@ -117,4 +117,3 @@ def chosen_curves(names: Sequence[str] | None, covered: Sequence[str], task: str
         Curve(algorithm, data.loc[data["algorithm"] == algorithm, COLUMNS].sort_values("env_step"), published=True)
         for algorithm in chosen
     ]
-

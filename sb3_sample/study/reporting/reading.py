@@ -4,6 +4,7 @@ import dataclasses
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import pandas as pd
 
@@ -17,7 +18,7 @@ from sb3_sample.study.runs import LIST, PLAN, checkpointed
 from sb3_sample.study.states import Status, status
 
 #: Where runs are, or a table of them.
-Source = str | Path | pd.DataFrame
+Source: TypeAlias = str | Path | pd.DataFrame
 #: Bytes of a plan and of a checkpoint's manifest.
 _MAX_PLAN, _MAX_MANIFEST = 2**20, 8 * 2**20
 _MEASURED = ("return", "success_rate")
@@ -99,7 +100,8 @@ def gather(sources: Source | Iterable[Source], published: Sequence[str | Path] =
         if published and not len(theirs):
             found.notes.append("The published runs have none of the tasks here, and are left out.")
     found.names += [str(name) for name in published]
-    found.table = pd.concat([own, theirs], ignore_index=True) if len(theirs) else own
+    kept = [part for part in (own, theirs) if len(part)]
+    found.table = pd.concat(kept, ignore_index=True) if kept else own
     return found
 
 
@@ -159,7 +161,10 @@ def _published(name: str | Path, found: Gathered) -> pd.DataFrame:
 
 def _measured(parts: list[pd.DataFrame], found: Gathered) -> pd.DataFrame:
     """The runs of tables, named apart; their rows of statistics over seeds become curves."""
-    table = pd.concat(parts, ignore_index=True) if parts else found.table
+    parts = [part for part in parts if len(part)]
+    if not parts:
+        return found.table
+    table = pd.concat(parts, ignore_index=True)
     heads = table["metric"].str.partition("/")
     statistics = table["seed"].isna() & heads[0].isin(_MEASURED) & heads[2].isin(tables.STATISTICS)
     for (agent, task, metric), rows in table[statistics].groupby(["agent", "task", heads[0]], sort=False):
