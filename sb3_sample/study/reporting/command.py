@@ -71,7 +71,7 @@ def report(
     gathered = gather(folders, published)
     found = build(
         gathered,
-        title=title or ", ".join(Path(name).stem if "/" in name else name for name in gathered.names),
+        title=title or ", ".join(gathered.titles),
         curves=curves,
         steps=steps,
         groups=groups,

@@ -39,7 +39,7 @@ from sb3_sample.version import __version__
 #: Rows of a table of runs that is not folded.
 UNFOLDED = 12
 #: Letters of an agent's name in a pair.
-PAIR = 18
+PAIR = 12
 #: What checkpoints were made with, in the order of the table.
 _MADE_WITH = (
     "sb3_sample", "commit", "torch", "stable_baselines3", "gymnasium", "mujoco", "numpy", "python", "processor",
@@ -212,18 +212,18 @@ def _averages_table(facts: Facts) -> Table:
 
 
 def _training(facts: Facts, drawn: Sequence[Curves], agents: dict[str, Agent], scores: Scores | None) -> Section:
-    if facts.averages is None:
+    if facts.curves is None:
         return Section("training", "Training", [])
     panels: list[Lines] = []
     for group in facts.groups:
-        rows = facts.averages[facts.averages["group"] == group]
+        rows = facts.curves[facts.curves["group"] == group]
         lines = [
             Line(agents[agent], *(found[name].to_numpy(float) for name in ("step", "iqm", "low", "high")))
             for agent, found in rows.groupby("agent", sort=False)
         ]
         title = f"{group}: {counted(len(facts.groups[group]), 'task')}"
         panels.append(Lines(title, STEPS, "IQM of the scores", lines, facts.step))
-    shown = list(dict.fromkeys(agents[name] for name in facts.averages["agent"]))
+    shown = list(dict.fromkeys(agents[name] for name in facts.curves["agent"]))
     parts: list[Any] = [Figure("training", "Interquartile mean along the training, with intervals", panels, shown)]
     means, others = _mean_panels(facts, drawn, agents, scores)
     if others:
@@ -239,14 +239,14 @@ def _mean_panels(
     facts: Facts, drawn: Sequence[Curves], agents: dict[str, Agent], scores: Scores | None
 ) -> tuple[list[Lines], list[Agent]]:
     """Means over tasks of our agents and of published curves; and the published agents that have one."""
-    assert facts.averages is not None
+    assert facts.curves is not None
     by_label: dict[str, dict[str, Curve]] = {}
     for each in drawn:
         for curve in each.others:
             by_label.setdefault(curve.label, {})[each.task] = curve
     panels, others = [], {}
     for group, tasks in facts.groups.items():
-        rows = facts.averages[facts.averages["group"] == group]
+        rows = facts.curves[facts.curves["group"] == group]
         lines = [
             Line(agents[agent], found["step"].to_numpy(float), found["mean"].to_numpy(float))
             for agent, found in rows.groupby("agent", sort=False)

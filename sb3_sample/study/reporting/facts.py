@@ -40,7 +40,8 @@ class Facts:
     :param n_scored: how many have a score
     :param steps: at which the averages are told
     :param groups: of tasks, by name; the first is the one of profiles and improvement
-    :param averages: of :func:`~sb3_sample.study.aggregate`, at ``steps`` and along the training
+    :param averages: of :func:`~sb3_sample.study.aggregate`, at ``steps``
+    :param curves: the same along the training
     :param profiles: at the last step, of the first group; None without averages
     :param improvement: likewise, of pairs, the one with the better average first; None with one agent
     :param all_pairs: whether all pairs are compared, not only those with the best
@@ -55,6 +56,7 @@ class Facts:
     steps: list[int] = dataclasses.field(default_factory=list)
     groups: dict[str, list[str]] = dataclasses.field(default_factory=dict)
     averages: pd.DataFrame | None = None
+    curves: pd.DataFrame | None = None
     profiles: pd.DataFrame | None = None
     improvement: pd.DataFrame | None = None
     all_pairs: bool = True
@@ -115,7 +117,7 @@ def compute(
     ends = scored(rows, scores).groupby(RUN, sort=False, dropna=False)["step"].agg(["min", "max"]).reset_index()
     own = ends[~ends["agent"].isin(gathered.published)]
     facts.steps = sorted(steps) if steps else [int(own.groupby("agent")["max"].max().min())]
-    reaching = ends[ends["max"] >= facts.step]
+    reaching = ends[(ends["min"] <= facts.step) & (ends["max"] >= facts.step)]
     if not len(reaching):
         raise ValueError(f"steps must be within those of the runs, up to {own['max'].max():,}, not {facts.step:,}")
     reaching = _comparable(reaching, own, gathered, facts, all_tasks)
@@ -124,11 +126,13 @@ def compute(
     agents = [agent for agent in gathered.agents if agent in set(reaching["agent"])]
     rows = rows.sort_values("agent", key=lambda names: names.map(agents.index), kind="stable")
     facts.groups = _groups(groups, facts.tasks)
-    at = sorted({*facts.steps, *_grid(rows, int(reaching["min"].max()), facts.step)})
+    grid = _grid(rows, int(reaching["min"].max()), facts.step)
     shared: dict[str, Any] = {"scores": scores, "reps": reps, "confidence": confidence, "seed": seed}
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", UserWarning)
-        facts.averages = aggregate(rows, at, facts.groups, **shared)
+        # Apart, so that the numbers are those of "study aggregate": samples depend on how many steps there are.
+        facts.averages = aggregate(rows, facts.steps, facts.groups, **shared)
+        facts.curves = aggregate(rows, grid, facts.groups, **shared)
         first = {facts.group: facts.groups[facts.group]}
         best = list(facts.at(facts.step)["agent"])
         facts.profiles = performance_profiles(rows, facts.step, groups=first, **shared)
@@ -150,7 +154,7 @@ def _comparable(
     ours = [agent for agent in gathered.agents if agent in tasks and agent not in gathered.published]
     for agent in own["agent"].unique():
         if agent not in tasks:
-            facts.left_out[agent] = f"no run of it has reached {facts.step:,} steps"
+            facts.left_out[agent] = f"no run of it was evaluated around {facts.step:,} steps"
     if all_tasks or not ours:
         return reaching
     common = set.intersection(*(tasks[agent] for agent in ours))

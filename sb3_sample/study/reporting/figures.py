@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from sb3_sample.plots import needing_matplotlib
-from sb3_sample.study.reporting.pieces import N_COLORS, Agent, Dots, Figure, Lines, cut
+from sb3_sample.study.reporting.pieces import LETTERS, N_COLORS, Agent, Dots, Figure, Lines, cut
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,9 +27,9 @@ _INK, _GRID, _BAND = "#010203", "#030201", "#020301"
 _STYLES, _DASHED = ("-", "-.", ":"), (0, (4, 2))
 _MARKERS = ("o", "s", "D")
 #: Inches of a panel of lines, of one of dots, and panels side by side in a file.
-WIDTH, HEIGHT, DOTS_WIDTH, COLUMNS = 4.4, 3.1, 6.2, 3
-#: Letters of a legend in an inch, and dots of a file.
-_LETTERS, _DPI = 13, 100
+WIDTH, HEIGHT, DOTS_WIDTH, COLUMNS = 4.4, 3.1, 5.4, 3
+#: Letters of a name beside dots, of a legend in an inch, and dots of a file in an inch.
+BESIDE, _LETTERS, _DPI = 26, 13, 100
 
 
 @contextlib.contextmanager
@@ -48,13 +48,14 @@ def _style(ink: str, grid: str) -> Iterator[None]:
         yield
 
 
-def shortened(name: str) -> str:
+def shortened(name: str, letters: int = LETTERS) -> str:
     """
     :param name: of an agent or task, from a file
+    :param letters: that are kept
     :return: the same for a figure: in one line, not too long. A space that does not break keeps a leading underscore,
         which matplotlib takes for "not in the legend"
     """
-    text = cut(name)
+    text = cut(name, letters)
     return f"\u00a0{text}" if text.startswith("_") else text
 
 
@@ -185,7 +186,7 @@ def _draw_dots(axes: "Axes", panel: Dots) -> None:
     if panel.middle is not None:
         axes.axvline(panel.middle, color=axes.xaxis.label.get_color(), linewidth=0.8)
         axes.set_xlim(-0.03, 1.03)
-    axes.set_yticks(range(len(panel.rows)), [shortened(label) for label, _, _ in panel.rows])
+    axes.set_yticks(range(len(panel.rows)), [shortened(label, BESIDE) for label, _, _ in panel.rows])
     axes.set_ylim(len(panel.rows) - 0.5, -0.5)
     axes.grid(visible=False, axis="y")
     axes.locator_params(axis="x", nbins=5)

@@ -14,6 +14,7 @@ from sb3_sample.run_logs import EVALUATIONS
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.study import table as tables
 from sb3_sample.study.aggregate import named_apart
+from sb3_sample.study.reporting.pieces import counted
 from sb3_sample.study.runs import LIST, PLAN, checkpointed
 from sb3_sample.study.states import Status, status
 
@@ -30,6 +31,7 @@ class Gathered:
     Everything that a report is made of.
 
     :param names: of the sources, as they were given
+    :param titles: the same without their folders, or their labels
     :param table: runs, agents with different arguments named apart
     :param published: the agents of it that others have measured
     :param asked: names by which every seed of a published agent was asked for
@@ -41,6 +43,7 @@ class Gathered:
     """
 
     names: list[str]
+    titles: list[str]
     table: pd.DataFrame
     published: list[str]
     asked: list[str]
@@ -76,12 +79,13 @@ def gather(sources: Source | Iterable[Source], published: Sequence[str | Path] =
     given: list[Source] = [sources] if isinstance(sources, (str, Path, pd.DataFrame)) else list(sources)
     if not given and not published:
         raise ValueError("sources must be at least one folder or table, or --published runs")
-    found = Gathered([], pd.DataFrame(columns=tables.COLUMNS), [], [], {}, [], {}, [], [])
+    found = Gathered([], [], pd.DataFrame(columns=tables.COLUMNS), [], [], {}, [], {}, [], [])
     parts: list[pd.DataFrame] = []
     paths: list[str | Path] = []
     for source in given:
         if isinstance(source, pd.DataFrame):
             found.names.append("a table")
+            found.titles.append("a table")
             parts.append(source)
             continue
         found.names.append(str(source))
@@ -100,6 +104,7 @@ def gather(sources: Source | Iterable[Source], published: Sequence[str | Path] =
         if published and not len(theirs):
             found.notes.append("The published runs have none of the tasks here, and are left out.")
     found.names += [str(name) for name in published]
+    found.titles += [] if given else [Path(name).stem for name in published]
     kept = [part for part in (own, theirs) if len(part)]
     found.table = pd.concat(kept, ignore_index=True) if kept else own
     return found
@@ -112,6 +117,7 @@ def _marked(agent: str) -> str:
 def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
     """The runs of a source, those of a study that have been evaluated; its state and what its runs were made with."""
     label, path = tables.labelled(source)
+    found.titles.append(label or path.resolve().stem)
     if path.is_file():
         return [source]
     is_study = (path / LIST).is_file()
@@ -130,7 +136,7 @@ def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
         evaluated = [folder for folder in folders if (folder / EVALUATIONS).exists()]
         if len(evaluated) < len(folders):
             found.notes.append(
-                f"{len(folders) - len(evaluated)} runs of {source} have no evaluation yet, and are in no figure."
+                f"{counted(len(folders) - len(evaluated), 'run')} of {source} without an evaluation yet: in no figure."
             )
         folders = evaluated
     found.made_with += [made for folder in folders if (made := made_with(folder))]
