@@ -8,8 +8,10 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from sb3_sample.plots import needing_matplotlib
-from sb3_sample.study.reporting.pieces import LETTERS, N_COLORS, Agent, Dots, Figure, Lines, cut
+from sb3_sample.study.reporting.pieces import LETTERS, N_COLORS, Agent, Dots, Figure, Line, Lines, cut
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -156,7 +158,8 @@ def _draw(axes: "Axes", panel: Lines | Dots, band: str) -> None:
 def _draw_lines(axes: "Axes", panel: Lines, band: str) -> None:
     from matplotlib.ticker import EngFormatter
 
-    for agent, x, y, low, high, thin in panel.lines:
+    for line in panel.lines:
+        agent, x, y, low, high, thin = _until(line, panel.x_end)
         look = _look(agent)
         if low is not None and high is not None:
             color = band if agent.published else look["color"]
@@ -172,6 +175,19 @@ def _draw_lines(axes: "Axes", panel: Lines, band: str) -> None:
     if panel.x_end >= 1_000:
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.locator_params(axis="x", nbins=6)
+
+
+def _until(line: Line, end: float) -> Line:
+    """A line up to an x, so that what is not shown has no part in the choice of the axes."""
+    x = np.asarray(line.x, float)
+    shown = x <= end
+    if shown.all():
+        return line
+    if not shown.any():
+        return Line(line.agent, [], [])
+    steps = np.append(x[shown], end)
+    y, low, high = (None if ys is None else list(np.interp(steps, x, ys)) for ys in (line.y, line.low, line.high))
+    return line._replace(x=list(steps), y=y or [], low=low, high=high)
 
 
 def _draw_dots(axes: "Axes", panel: Dots) -> None:
