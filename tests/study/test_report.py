@@ -1,5 +1,6 @@
 """The report: what it says of made-up runs, of a study's folder and of the published seeds, and that it is safe."""
 
+import contextlib
 import html
 import json
 import re
@@ -7,6 +8,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import matplotlib
 import numpy as np
@@ -69,16 +71,23 @@ def tables_of(page: str) -> dict[str, list[list[str]]]:
     return found
 
 
-def written(path: Path, *args: Any, **kwargs: Any) -> str:
-    study.report(*args, path=path, **{"reps": 20, "curves": [], **kwargs})
+def written(path: Path, *args: Any, drawn: bool = False, **kwargs: Any) -> str:
+    """The page of a report. Drawing takes most of the time, so that panels are only named unless it is of them."""
+    named = contextlib.nullcontext() if drawn else mock.patch.object(figures, "svg", _name)
+    with named:
+        study.report(*args, path=path, **{"reps": 20, "curves": [], **kwargs})
     return path.read_text()
+
+
+def _name(panel: pieces.Lines | pieces.Dots, prefix: str) -> str:
+    return f"<svg>{html.escape(panel.title)}</svg>"
 
 
 # ---------------------------------------------------------------- content
 
 
 def test_a_reader_sees_first_what_was_compared_who_wins_and_what_is_missing(tmp_path: Path) -> None:
-    page = written(tmp_path / "r.html", two_agents(), title="Two agents")
+    page = written(tmp_path / "r.html", two_agents(), title="Two agents", drawn=True)
     summary = text_of(page.partition("<section")[0])
     assert "good, bad." in summary and "2 tasks, 3 seeds each, up to 200 simulator steps." in summary
     assert "good is better than bad." in summary
@@ -104,7 +113,6 @@ def test_a_reader_sees_first_what_was_compared_who_wins_and_what_is_missing(tmp_
 def test_the_table_9_of_bro_is_on_the_page_of_the_published_seeds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(figures, "svg", lambda *_: "")  # forty panels
     monkeypatch.setattr(facts_module, "POINTS", 2)
     study.write(study.published_runs(["BRO", "BRO Fast"]), tmp_path / "seeds.csv")
     steps = [100_000, 200_000, 500_000, 1_000_000]
@@ -185,14 +193,14 @@ def test_tasks_without_a_score_have_curves_and_are_named(tmp_path: Path) -> None
     (task, why) = tables_of(page)["Tasks without a score, in no average"][1]
     assert task == OWN and f"--score {OWN}=1000" in why
     assert "1 task has no score." in text_of(page) and "over 2 tasks: good 0.650" in text_of(page)
-    assert f">{OWN}</text>" in page  # title of its panel
+    assert f"<svg>{OWN}</svg>" in page  # title of its panel
     # With a score it is one of three.
     page = written(tmp_path / "r.html", table, scores={OWN: study.Score("return", 0, -10)})
     assert "over 3 tasks" in text_of(page) and "no score" not in text_of(page)
     # None has one.
     page = written(tmp_path / "r.html", table[table["task"] == OWN])
     assert "No averages. No task of these runs has a score." in text_of(page)
-    assert f">{OWN}</text>" in page and "Performance profiles" not in page
+    assert f"<svg>{OWN}</svg>" in page and "Performance profiles" not in page
     # A success rate that was not recorded.
     rows = [(*row[:2], PUSH, *row[3:]) for row in runs("good", CHEETAH, [1, 2])]
     text = text_of(written(tmp_path / "r.html", made_up(rows)))
@@ -266,7 +274,7 @@ def test_a_study_says_what_is_done_and_what_has_failed(folder: StudyFolder, tmp_
     assert tables_of(page)["Runs of the study by task"][1] == ["A", CHEETAH, "2", "0", "0", "1", "3"]
     assert "Failed after 2 attempts: " in text and f"ValueError: {EVIL}" in text
     assert "Plan of " in text and "agents: {}" in text
-    made = tables_of(page)["Versions and machines that the runs' checkpoints name"]
+    made = tables_of(page)["Versions and machines of the runs that say so"]
     assert ["torch", "9.9", "1"] in made and ["commit", "abc", "1"] in made
     assert re.search(r"Machines: .*: 2 runs with 2 threads each", text)
     # The step that a run of each agent has reached.
@@ -302,11 +310,34 @@ def test_a_real_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     page = (tmp_path / "s" / "report.html").read_text()
     text = text_of(page)
     assert "SAC." in text and "2 of 2 planned runs are done." in text
-    made = {row[0]: row[1:] for row in tables_of(page)["Versions and machines that the runs' checkpoints name"]}
+    made = {row[0]: row[1:] for row in tables_of(page)["Versions and machines of the runs that say so"]}
     assert made["torch"][1] == "2" and made["torch threads"] == ["1", "2"]
     assert made["processor"] == [" ".join(processor().split()), "2"] and made.get("commit", ["", "2"])[1] == "2"
     assert ["learning_starts", "20"] in tables_of(page)["Arguments"]
     assert len(tables_of(page)["Time in training and evaluating"]) == 2
+
+
+def test_a_table_with_its_plan_and_the_records_beside_it(tmp_path: Path) -> None:
+    """As ``make evidence`` leaves them in docs/evidence."""
+    rows = runs("SAC", "Pendulum-v1", [-900, -800], replay_ratio=1) + runs("SAC", "Pendulum-v1", [-700], replay_ratio=2)
+    study.write(made_up(rows), tmp_path / "t.csv")
+    records = [{"run": {}, "commit": "0123abc", "python": "3.11.7", "processor": "A chip", "threads": 1}] * 3
+    (tmp_path / "t.json").write_text(json.dumps(records))
+    (tmp_path / "plan.yml").write_text(
+        "agents: {SAC: {algo: sac_sample}}\ngrid: {replay_ratio: [1, 2]}\ntasks: [Pendulum-v1]\nseeds: 3\nsteps: 200\n"
+        "evaluation: {every: 100}\n"
+    )
+    page = written(tmp_path / "r.html", tmp_path / "t.csv", plan=tmp_path / "plan.yml")
+    assert "3 of 6 planned runs are here." in text_of(page)
+    assert tables_of(page)["Planned runs that are not here"][1:] == [
+        ["SAC,replay_ratio=1", "Pendulum-v1", "2"],
+        ["SAC,replay_ratio=2", "Pendulum-v1", f"1{pieces.DASH}2"],
+    ]
+    made = tables_of(page)["Versions and machines of the runs that say so"]
+    assert ["commit", "0123abc", "3"] in made and ["threads", "1", "3"] in made
+    for other in ("[1, 2]", "{}", "no JSON"):  # a file of something else
+        (tmp_path / "t.json").write_text(other)
+        assert "Versions and machines" not in written(tmp_path / "r.html", tmp_path / "t.csv")
 
 
 def test_the_commit_is_that_of_the_checkout() -> None:
@@ -321,7 +352,7 @@ def test_names_and_tracebacks_are_only_text(folder: StudyFolder, tmp_path: Path)
     table = two_agents()
     table["agent"] = table["agent"].replace({"good": EVIL, "bad": "_$\\bad$ | [x](javascript:y) \n#0072b2 url(#a)"})
     table["task"] = table["task"].replace({WALKER: f"dmc/{EVIL}-v0"})
-    page = written(tmp_path / "r.html", [folder.path, table], title=EVIL, markdown=tmp_path / "r.md")
+    page = written(tmp_path / "r.html", [folder.path, table], title=EVIL, markdown=tmp_path / "r.md", drawn=True)
     script = (ROOT / "sb3_sample/study/reporting/page.js").read_text()
     assert page.count("<script") == 1 and f"<script>{script}</script>" in page
     assert EVIL not in page and EVIL in text_of(page)

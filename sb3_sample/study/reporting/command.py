@@ -23,6 +23,7 @@ def report(
     markdown: str | Path | None = None,
     pictures: str | Path | None = None,
     title: str | None = None,
+    plan: str | Path | None = None,
     published: Sequence[str | Path] = (),
     curves: Sequence[str] | None = None,
     steps: Sequence[int] | None = None,
@@ -44,6 +45,7 @@ def report(
         of this title, and only what is between them is replaced. None for none
     :param pictures: folder of its pictures; ``<page>_files`` beside it if None
     :param title: of the report; the sources' names if None
+    :param plan: file of a plan, to say which of its runs are missing; the folder of a study has its own
     :param published: runs of others besides, each a name as of :func:`~sb3_sample.study.published_runs` or a file of a
         table. They have intervals; without ``folders`` they are the runs that are compared
     :param curves: published algorithms whose curves, of which there are statistics over seeds only, are drawn beside
@@ -68,7 +70,7 @@ def report(
             raise ValueError(f"{name} must end in {ending}, not {str(each)!r}")
     if pictures is not None and markdown is None:
         raise ValueError("pictures are those of markdown, which is not given")
-    gathered = gather(folders, published)
+    gathered = gather(folders, published, plan)
     found = build(
         gathered,
         title=title or ", ".join(gathered.titles),
@@ -124,6 +126,9 @@ def _add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--title", help="of the report (default: the names of the folders)")
     parser.add_argument(
+        "--plan", type=Path, metavar="FILE", help="plan of runs that are no study's folder, to say which are missing"
+    )
+    parser.add_argument(
         "-p",
         "--published",
         nargs="+",
@@ -167,6 +172,7 @@ def _run(options: argparse.Namespace) -> None:
             markdown=options.markdown,
             pictures=options.pictures,
             title=options.title,
+            plan=options.plan,
             published=options.published,
             curves=[] if options.curves == ["none"] else options.curves,
             steps=options.steps,

@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,7 @@ from sb3_sample.study.reporting.pieces import (
     cut,
 )
 from sb3_sample.study.reporting.reading import Gathered
-from sb3_sample.study.reporting.summary import holes, summary
+from sb3_sample.study.reporting.summary import holes, missing, summary
 from sb3_sample.study.states import FAILED, STATES, Status
 from sb3_sample.study.table import RUN
 from sb3_sample.version import __version__
@@ -43,7 +43,7 @@ PAIR = 12
 #: What checkpoints were made with, in the order of the table.
 _MADE_WITH = (
     "sb3_sample", "commit", "torch", "stable_baselines3", "gymnasium", "mujoco", "numpy", "python", "processor",
-    "device", "torch threads",
+    "device", "threads", "torch threads",
 )  # fmt: skip
 _STATISTICS = {"iqm": "IQM", "mean": "mean", "median": "median", "optimality_gap": "optimality gap"}
 
@@ -109,6 +109,9 @@ def _runs(gathered: Gathered) -> Section:
     for state in gathered.states:
         parts += _of_study(state)
     table = gathered.table
+    if absent := missing(gathered):
+        lost: list[list[Cell]] = [[agent, task, _ranges(seeds)] for (agent, task), seeds in absent.items()]
+        parts.append(Table("Planned runs that are not here", ["agent", "task", "seeds"], lost, len(lost) > UNFOLDED))
     rows: list[list[Cell]] = []
     ends = table.groupby(RUN, sort=False, dropna=False)["step"].max().reset_index()
     for (agent, task), found in ends.groupby(["agent", "task"], sort=False):
@@ -124,10 +127,10 @@ def _runs(gathered: Gathered) -> Section:
     return Section("runs", "Runs", [*parts, *gathered.notes])
 
 
-def _ranges(seeds: pd.Series) -> str:
+def _ranges(seeds: Iterable[Any]) -> str:
     """Seeds in words, such as 0 to 4 and 7."""
     parts: list[list[int]] = []
-    for seed in sorted(int(seed) for seed in seeds.dropna()):
+    for seed in sorted(int(seed) for seed in seeds if seed is not pd.NA):
         if parts and seed == parts[-1][-1] + 1:
             parts[-1].append(seed)
         else:
@@ -385,7 +388,7 @@ def _settings(gathered: Gathered, facts: Facts, how: str) -> Section:
             counts = Counter(made[name] for made in gathered.made_with if name in made)
             for value, n in counts.most_common():
                 rows.append([name, value, n])
-        parts.append(Table("Versions and machines that the runs' checkpoints name", ["of", "value", "runs"], rows))
+        parts.append(Table("Versions and machines of the runs that say so", ["of", "value", "runs"], rows))
     for source, text in gathered.plans.items():
         parts.append(Text(f"Plan of {source}", text))
     parts.append(

@@ -14,14 +14,15 @@ from sb3_sample.run_logs import EVALUATIONS
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.study import table as tables
 from sb3_sample.study.aggregate import named_apart
+from sb3_sample.study.plan import Run, read_plan
 from sb3_sample.study.reporting.pieces import counted
 from sb3_sample.study.runs import LIST, PLAN, checkpointed
 from sb3_sample.study.states import Status, status
 
 #: Where runs are, or a table of them.
 Source: TypeAlias = str | Path | pd.DataFrame
-#: Bytes of a plan and of a checkpoint's manifest.
-_MAX_PLAN, _MAX_MANIFEST = 2**20, 8 * 2**20
+#: Bytes of a plan, of a checkpoint's manifest, and of the records beside a table.
+_MAX_PLAN, _MAX_MANIFEST, _MAX_RECORDS = 2**20, 8 * 2**20, 64 * 2**20
 _MEASURED = ("return", "success_rate")
 
 
@@ -37,7 +38,8 @@ class Gathered:
     :param asked: names by which every seed of a published agent was asked for
     :param curves: of others, of which there are statistics over seeds only, by task and metric
     :param states: of the studies among the sources
-    :param plans: their plans' texts, by folder
+    :param plans: plans' texts, by folder or file
+    :param planned: runs of the plan that was given
     :param made_with: of each run that says so, by what it was made: versions, device, processor, commit
     :param notes: what was left out, and why
     """
@@ -50,6 +52,7 @@ class Gathered:
     curves: dict[tuple[str, str], list[Curve]]
     states: list[Status]
     plans: dict[str, str]
+    planned: list[Run]
     made_with: list[dict[str, str]]
     notes: list[str]
 
@@ -65,13 +68,16 @@ class Gathered:
         return list(self.table["task"].unique())
 
 
-def gather(sources: Source | Iterable[Source], published: Sequence[str | Path] = ()) -> Gathered:
+def gather(
+    sources: Source | Iterable[Source], published: Sequence[str | Path] = (), plan: str | Path | None = None
+) -> Gathered:
     """
     Read all that a report needs, each file once.
 
     :param sources: as of :func:`~sb3_sample.study.read`, or tables
     :param published: runs that others have made: names as of :func:`~sb3_sample.study.published_runs`, or files of
         tables. Their tasks are those of the sources; without sources they are the runs that are compared
+    :param plan: file of a plan whose runs are to be found among them
     :return: runs and states
     :raises ValueError: there are neither, a file is damaged, or a name is unknown
     :raises OSError: a file cannot be read
@@ -79,7 +85,7 @@ def gather(sources: Source | Iterable[Source], published: Sequence[str | Path] =
     given: list[Source] = [sources] if isinstance(sources, (str, Path, pd.DataFrame)) else list(sources)
     if not given and not published:
         raise ValueError("sources must be at least one folder or table, or --published runs")
-    found = Gathered([], [], pd.DataFrame(columns=tables.COLUMNS), [], [], {}, [], {}, [], [])
+    found = Gathered([], [], pd.DataFrame(columns=tables.COLUMNS), [], [], {}, [], {}, [], [], [])
     parts: list[pd.DataFrame] = []
     paths: list[str | Path] = []
     for source in given:
@@ -90,6 +96,9 @@ def gather(sources: Source | Iterable[Source], published: Sequence[str | Path] =
             continue
         found.names.append(str(source))
         paths += _paths(source, found)
+    if plan is not None:
+        found.planned = list(read_plan(plan).runs)
+        found.plans[str(plan)] = read_regular(Path(plan), _MAX_PLAN).decode(errors="replace")
     if paths:
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always", UserWarning)
@@ -119,6 +128,7 @@ def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
     label, path = tables.labelled(source)
     found.titles.append(label or path.resolve().stem)
     if path.is_file():
+        found.made_with += _recorded(path.with_suffix(".json"))
         return [source]
     is_study = (path / LIST).is_file()
     folders = []
@@ -155,6 +165,22 @@ def made_with(folder: Path) -> dict[str, str]:
         return {}
     found = manifest.get("circumstances") if isinstance(manifest, dict) else None
     return {str(name): str(value) for name, value in found.items()} if isinstance(found, dict) else {}
+
+
+def _recorded(path: Path) -> list[dict[str, str]]:
+    """What the runs of a table were made with, by the file beside it that ``studies/evidence.py`` writes."""
+    if not path.is_file():
+        return []
+    try:
+        records = parse_json(read_regular(path, _MAX_RECORDS), str(path))
+    except BadFile:  # of something else
+        return []
+    kept = [record for record in records if isinstance(record, dict)] if isinstance(records, list) else []
+    return [
+        {name: str(value) for name, value in record.items() if name != "run"}
+        for record in kept
+        if isinstance(record.get("run"), dict) and isinstance(record.get("commit"), str)
+    ]
 
 
 def _published(name: str | Path, found: Gathered) -> pd.DataFrame:

@@ -1,5 +1,6 @@
 """The beginning of a report: what was compared, who is better and how sure that is, and what is missing."""
 
+import json
 import math
 from collections.abc import Sequence
 
@@ -87,6 +88,9 @@ def _missing(gathered: Gathered, facts: Facts) -> list[str]:
             f"{state.counts[DONE]} of {counted(len(state.runs), 'planned run')}{where} are done"
             + (f"; {rest}." if rest else ".")
         )
+    if gathered.planned:
+        n = sum(map(len, missing(gathered).values()))
+        found.append(f"{len(gathered.planned) - n} of {counted(len(gathered.planned), 'planned run')} are here.")
     if facts.steps:
         own = gathered.table[~gathered.table["agent"].isin(gathered.published)]
         short = int((own.groupby(RUN, dropna=False)["step"].max() < facts.step).sum())
@@ -108,3 +112,26 @@ def holes(gathered: Gathered) -> list[tuple[str, str]]:
     own = gathered.table[~gathered.table["agent"].isin(gathered.published)]
     there = set(zip(own["agent"], own["task"], strict=True))
     return [(a, t) for a in own["agent"].unique() for t in own["task"].unique() if (a, t) not in there]
+
+
+def missing(gathered: Gathered) -> dict[tuple[str, str], list[int]]:
+    """
+    :param gathered: runs
+    :return: seeds of the given plan's runs that are not among them, by agent (with the grid's arguments) and task
+    """
+    own = gathered.table[~gathered.table["agent"].isin(gathered.published)]
+    there = own[RUN].drop_duplicates()
+    # Agents of a table that differ in their arguments have these behind their names.
+    names = [name.partition(" (")[0] for name in there["agent"]]
+    arguments = [json.loads(text) for text in there["arguments"]]
+    known = list(zip(there["agent"], names, arguments, there["task"], there["seed"], strict=True))
+    found: dict[tuple[str, str], list[int]] = {}
+    for run in gathered.planned:
+        if not any(
+            run.agent in (agent, name)
+            and (task, seed) == (run.task, run.seed)
+            and all(given.get(key) == value for key, value in run.grid.items())
+            for agent, name, given, task, seed in known
+        ):
+            found.setdefault((run.variant, run.task), []).append(run.seed)
+    return found
