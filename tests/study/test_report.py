@@ -24,7 +24,7 @@ from sb3_sample.study.reporting import figures, pieces, published
 from sb3_sample.study.reporting.content import build
 from sb3_sample.study.reporting.reading import gather
 from sb3_sample.study.runs import Outcome, StudyFolder
-from tests.study.made_up import made_up, write_evaluations, write_run
+from tests.study.made_up import made_up, write_evaluations, write_monitor, write_run
 from tests.study.test_aggregate import TABLE_9
 
 pytest.importorskip("rliable.library")
@@ -228,6 +228,15 @@ def test_runs_under_way_are_in_their_tasks_and_in_no_average(tmp_path: Path) -> 
     assert "late is in no average: no run of it was evaluated around 200 steps." in text
 
 
+def test_training_episodes_of_runs_that_end_at_other_steps(tmp_path: Path) -> None:
+    for seed, lengths in enumerate([(100, 110, 90), (95, 100, 100), (105, 100, 105)]):
+        write_monitor(tmp_path / "mine" / str(seed), CHEETAH, lengths, (1.0, 2.0, 30.0))
+    page = written(tmp_path / "r.html", tmp_path / "mine")
+    assert "at 295 steps over 1 task: mine 0.0" in text_of(page) and "Nothing." in text_of(page)
+    assert tables_of(page)["Averages by group of tasks"][1][-1] == "3"
+    assert "their rows are training episodes, which explore" in text_of(page)
+
+
 # ---------------------------------------------------------------- a study's folder
 
 
@@ -369,27 +378,38 @@ def test_names_and_tracebacks_are_only_text(folder: StudyFolder, tmp_path: Path)
 
 
 def test_published_runs_and_curves_beside_ours(tmp_path: Path) -> None:
-    rows = runs("BRO", CHEETAH, [200, 300], steps=(25_000, 50_000)) + runs(
-        "BRO", PUSH, [0.1, 0.2], steps=(25_000, 50_000)
-    )
+    rows = runs("BRO", CHEETAH, [200, 300], LATER) + runs("BRO", PUSH, [0.1, 0.2], LATER)
     page = written(tmp_path / "r.html", made_up(rows), published=["BRO Fast"], curves=["BRO", "TD-MPC2"])
     legend = [html.unescape(re.sub("<.*?>", "", item)) for item in re.findall(r"<li>(.*?)</li>", page)]
-    assert "BRO Fast, published: 10 seeds" in legend
+    assert "BRO Fast, published: 10 seeds; of the v2 task on 1 of 2 tasks" in legend
     assert "BRO (RR=10), published: 10 seeds; of the v2 task on 1 of 2 tasks" in legend
     assert (
         "TD-MPC2, published: 3 seeds; action repeat 2; success at the last step on 1 of 2 tasks; "
         "of the v2 task on 1 of 2 tasks"
     ) in legend
     # Ours and the published one of its name have one colour, and that is dashed.
-    ours, theirs = (
-        next(x for x in re.findall(r"<li>.*?</li>", page) if name in x) for name in (">BRO<", "BRO (RR=10)")
-    )
-    assert "var(--c0)" in ours and "dasharray: none" in ours and "var(--c0)" in theirs and "dasharray: 6 3" in theirs
+    look = looks(page)
+    assert look["BRO"] == ("0", "none")
+    assert look["BRO (RR=10), published: 10 seeds; of the v2 task on 1 of 2 tasks"] == ("0", "6 3")
     # Every seed is there: in the averages, but not among what is missing or compared.
     assert [row[0] for row in tables_of(page)["Averages by group of tasks"][1:3]] != ["BRO", "BRO"]
     assert "Beside them: BRO Fast, published." in text_of(page) and "1 agent" not in text_of(page)
     # Means over tasks of what has statistics only, by hand.
     assert "beside published curves, of which there are statistics over seeds only" in text_of(page)
+
+
+def test_a_published_curve_that_is_called_as_ours_is_another(tmp_path: Path) -> None:
+    rows = runs("SAC", CHEETAH, [200, 300], LATER) + runs("DAC", CHEETAH, [200, 300], LATER)
+    look = looks(written(tmp_path / "r.html", made_up(rows), curves=["SAC"]))
+    assert look["SAC"] == ("0", "none") and look["DAC"] == ("1", "none")
+    assert look["SAC, published: 3 seeds; action repeat not stated"] == ("0", "6 3") and len(look) == 3
+
+
+def looks(page: str) -> dict[str, tuple[str, str]]:
+    """Colour and dashes of what legends name."""
+    items = re.findall(r"<li>(.*?)</li>", page)
+    styles = [re.search(r"var\(--c(\d)\).*dasharray: ([^\"]*)", item) for item in items]
+    return {text_of(item).strip(): (style[1], style[2]) for item, style in zip(items, styles, strict=True) if style}
 
 
 def test_the_mean_of_published_curves_over_tasks() -> None:

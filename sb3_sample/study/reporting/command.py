@@ -50,7 +50,8 @@ def report(
         table. They have intervals; without ``folders`` they are the runs that are compared
     :param curves: published algorithms whose curves, of which there are statistics over seeds only, are drawn beside
         the runs, named as in ``sb3-sample plot``; none if empty; None for BRO, BRO Fast and SAC where there are some
-    :param steps: simulator steps at which averages are told; None for the last that a run of each agent has reached
+    :param steps: simulator steps at which averages are told; None for the last that half of each agent's runs have
+        reached
     :param groups: of tasks, see :func:`~sb3_sample.study.aggregate`
     :param scores: of tasks without a common one, likewise
     :param all_tasks: average each agent over all its tasks, not over those that every agent has reached the step on
@@ -150,7 +151,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
         type=steps_of,
         metavar="STEP",
         help="simulator steps at which averages are told, as 100k or 1M; the last is that of the profiles (default: "
-        "the last that a run of each agent has reached)",
+        "the last that half of each agent's runs have reached)",
     )
     parser.add_argument(
         "--all-tasks",

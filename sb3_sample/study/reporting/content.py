@@ -10,7 +10,7 @@ import pandas as pd
 
 from sb3_sample.plots import METRICS, Curve
 from sb3_sample.study.aggregate import Groups, Scores, score_for
-from sb3_sample.study.reporting.curves import Curves, dressed, task_curves
+from sb3_sample.study.reporting.curves import Curves, Looks, dressed, task_curves
 from sb3_sample.study.reporting.facts import Facts, compute
 from sb3_sample.study.reporting.pieces import (
     DASH,
@@ -86,17 +86,17 @@ def build(
         seed=seed,
     )
     drawn = [task_curves(gathered, task, scores, curves) for task in gathered.tasks]
-    agents = dressed(gathered, drawn)
+    looks = dressed(gathered, drawn)
     how = f"{confidence:.0%} intervals, {reps:,} samples of rliable's stratified bootstrap (seed {seed})"
     sections = [
         _runs(gathered),
-        _averages(gathered, facts, agents, how),
-        _training(facts, drawn, agents, scores),
-        _tasks(drawn, agents),
-        _profiles(facts, agents),
-        _improvement(facts, agents),
+        _averages(facts, looks.runs, how),
+        _training(facts, drawn, looks, scores),
+        _tasks(drawn, looks),
+        _profiles(facts, looks.runs),
+        _improvement(facts, looks.runs),
         _costs(gathered),
-        _settings(gathered, facts, how),
+        _settings(gathered, how),
     ]
     return Report(title, summary(gathered, facts), [each for each in sections if each.parts], __version__)
 
@@ -110,7 +110,7 @@ def _runs(gathered: Gathered) -> Section:
         parts += _of_study(state)
     table = gathered.table
     if absent := missing(gathered):
-        lost: list[list[Cell]] = [[agent, task, _ranges(seeds)] for (agent, task), seeds in absent.items()]
+        lost: list[list[Cell]] = [[agent, task, _ranges(seeds)] for (agent, task), seeds in sorted(absent.items())]
         parts.append(Table("Planned runs that are not here", ["agent", "task", "seeds"], lost, len(lost) > UNFOLDED))
     rows: list[list[Cell]] = []
     ends = table.groupby(RUN, sort=False, dropna=False)["step"].max().reset_index()
@@ -165,7 +165,7 @@ def _of_study(state: Status) -> list[Table | Text]:
     return parts
 
 
-def _averages(gathered: Gathered, facts: Facts, agents: dict[str, Agent], how: str) -> Section:
+def _averages(facts: Facts, agents: dict[str, Agent], how: str) -> Section:
     parts: list[Any] = []
     if facts.averages is None:
         parts.append(f"There are no averages. {facts.reason}")
@@ -214,21 +214,21 @@ def _averages_table(facts: Facts) -> Table:
     return Table("Averages by group of tasks", head, rows)
 
 
-def _training(facts: Facts, drawn: Sequence[Curves], agents: dict[str, Agent], scores: Scores | None) -> Section:
+def _training(facts: Facts, drawn: Sequence[Curves], looks: Looks, scores: Scores | None) -> Section:
     if facts.curves is None:
         return Section("training", "Training", [])
     panels: list[Lines] = []
     for group in facts.groups:
         rows = facts.curves[facts.curves["group"] == group]
         lines = [
-            Line(agents[agent], *(found[name].to_numpy(float) for name in ("step", "iqm", "low", "high")))
+            Line(looks.runs[agent], *(found[name].to_numpy(float) for name in ("step", "iqm", "low", "high")))
             for agent, found in rows.groupby("agent", sort=False)
         ]
         title = f"{group}: {counted(len(facts.groups[group]), 'task')}"
         panels.append(Lines(title, STEPS, "IQM of the scores", lines, facts.step))
-    shown = list(dict.fromkeys(agents[name] for name in facts.curves["agent"]))
+    shown = list(dict.fromkeys(looks.runs[name] for name in facts.curves["agent"]))
     parts: list[Any] = [Figure("training", "Interquartile mean along the training, with intervals", panels, shown)]
-    means, others = _mean_panels(facts, drawn, agents, scores)
+    means, others = _mean_panels(facts, drawn, looks, scores)
     if others:
         caption = (
             "Mean of the tasks' means, beside published curves, of which there are statistics over seeds only: dashed, "
@@ -239,7 +239,7 @@ def _training(facts: Facts, drawn: Sequence[Curves], agents: dict[str, Agent], s
 
 
 def _mean_panels(
-    facts: Facts, drawn: Sequence[Curves], agents: dict[str, Agent], scores: Scores | None
+    facts: Facts, drawn: Sequence[Curves], looks: Looks, scores: Scores | None
 ) -> tuple[list[Lines], list[Agent]]:
     """Means over tasks of our agents and of published curves; and the published agents that have one."""
     assert facts.curves is not None
@@ -251,7 +251,7 @@ def _mean_panels(
     for group, tasks in facts.groups.items():
         rows = facts.curves[facts.curves["group"] == group]
         lines = [
-            Line(agents[agent], found["step"].to_numpy(float), found["mean"].to_numpy(float))
+            Line(looks.runs[agent], found["step"].to_numpy(float), found["mean"].to_numpy(float))
             for agent, found in rows.groupby("agent", sort=False)
         ]
         for label, by_task in by_label.items():
@@ -267,38 +267,39 @@ def _mean_panels(
                 assert score is not None
                 values.append(score.of(np.interp(steps, data["env_step"], data["mean"])))
             if len(steps):
-                others[label] = agents[label]
-                lines.append(Line(agents[label], steps.astype(float), np.mean(values, axis=0)))
+                others[label] = looks.curves[label]
+                lines.append(Line(looks.curves[label], steps.astype(float), np.mean(values, axis=0)))
         title = f"{group}: {counted(len(tasks), 'task')}"
         panels.append(Lines(title, STEPS, "mean of the scores", lines, facts.step))
     return panels, list(others.values())
 
 
-def _tasks(drawn: Sequence[Curves], agents: dict[str, Agent]) -> Section:
+def _tasks(drawn: Sequence[Curves], looks: Looks) -> Section:
     panels: list[Lines] = []
     shown: dict[Agent, None] = {}
     for each in sorted(drawn, key=lambda curves: curves.task):
-        own = [curve for name, curve in each.own.items() if not agents[name].published] or list(each.own.values())
-        if not own:
+        ours = [name for name in each.own if not looks.runs[name].published] or list(each.own)
+        if not ours:
             continue
         lines = []
-        for curve in [*each.own.values(), *each.others]:
-            agent = agents[curve.label]
+        curves = [(looks.runs[name], curve) for name, curve in each.own.items()]
+        curves += [(looks.curves[curve.label], curve) for curve in each.others]
+        for agent, curve in curves:
             data = curve.data[curve.data["n_seeds"] > 0]
             shown[agent] = None
             has_band = (data["n_seeds"] > 1).any()
             columns = [data[name].to_numpy(float) for name in ("env_step", "mean", "min", "max")]
             lines.append(Line(agent, *columns) if has_band else Line(agent, *columns[:2]))
         for name, runs in each.under_way.items():
-            lines += [Line(agents[name], list(run.steps), list(run.values), thin=True) for run in runs]
-        ends = [curve.data["env_step"].iloc[-1] for curve in own]
-        ends += [run.steps[-1] for name, runs in each.under_way.items() if not agents[name].published for run in runs]
+            lines += [Line(looks.runs[name], list(run.steps), list(run.values), thin=True) for run in runs]
+        ends = [each.own[name].data["env_step"].iloc[-1] for name in ours]
+        ends += [run.steps[-1] for name in ours for run in each.under_way[name]]
         y_range = (-0.03, 1.03) if each.metric == "success_rate" else None
         panels.append(Lines(each.task, STEPS, METRICS[each.metric], lines, float(max(ends)), y_range))
     if not panels:
         return Section("tasks", "Single tasks", [])
     caption = "Mean and range over seeds; thin: runs that have not got as far; dashed: measured and published by others"
-    order = sorted(shown, key=list(agents.values()).index)
+    order = sorted(shown, key=[*looks.runs.values(), *looks.curves.values()].index)
     return Section("tasks", "Single tasks", [Figure("tasks", caption, panels, order)])
 
 
@@ -367,7 +368,7 @@ def _costs(gathered: Gathered) -> Section:
     return section
 
 
-def _settings(gathered: Gathered, facts: Facts, how: str) -> Section:
+def _settings(gathered: Gathered, how: str) -> Section:
     parts: list[Any] = []
     found: dict[str, dict[str, list[str]]] = {}
     for row in gathered.table[["agent", "arguments"]].drop_duplicates().itertuples():

@@ -10,6 +10,7 @@ import pandas as pd
 
 from sb3_sample.plots import Curve, Run, summarize
 from sb3_sample.study.aggregate import Scores, score_for
+from sb3_sample.study.reporting.facts import spacing
 from sb3_sample.study.reporting.pieces import N_COLORS, Agent, counted, range_text
 from sb3_sample.study.reporting.published import chosen_curves, differences
 from sb3_sample.study.reporting.reading import Gathered
@@ -58,18 +59,32 @@ def task_curves(gathered: Gathered, task: str, scores: Scores | None, names: Seq
         if not runs:
             continue
         last = max(run.steps[-1] for run in runs)
-        own[agent] = Curve(agent, summarize([run for run in runs if run.steps[-1] == last]))
-        under_way[agent] = [run for run in runs if run.steps[-1] < last]
+        # Episodes of a training do not all end at the same step.
+        there = [run.steps[-1] + spacing(run.steps) > last or run.steps[-1] == last for run in runs]
+        own[agent] = Curve(agent, summarize(list(itertools.compress(runs, there))))
+        under_way[agent] = [run for run, far in zip(runs, there, strict=True) if not far]
     others = [*gathered.curves.get((task, metric), []), *chosen_curves(names, gathered.asked, task, metric)]
     return Curves(task, metric, own, under_way, others)
 
 
-def dressed(gathered: Gathered, curves: Sequence[Curves]) -> dict[str, Agent]:
+class Looks(NamedTuple):
+    """
+    The look that agents have in all figures. A published one has the colour of ours of the same name, else one of its
+    own.
+
+    :param runs: of the table's agents, by name
+    :param curves: of published curves, by algorithm, which may be called as an agent is
+    """
+
+    runs: dict[str, Agent]
+    curves: dict[str, Agent]
+
+
+def dressed(gathered: Gathered, curves: Sequence[Curves]) -> Looks:
     """
     :param gathered: runs
     :param curves: of all tasks
-    :return: agents by name, each with the look that it has in all figures. A published one has the colour of ours of
-        the same name, else one of its own
+    :return: looks
     """
     own = gathered.table[~gathered.table["agent"].isin(gathered.published)]
     repeats = _repeats(own)
@@ -77,29 +92,37 @@ def dressed(gathered: Gathered, curves: Sequence[Curves]) -> dict[str, Agent]:
     for each in curves:
         for curve in each.others:
             of_others.setdefault(curve.label, []).append((each, curve))
-    agents: dict[str, Agent] = {}
+    looks = Looks({}, {})
     of_ours: dict[str, int] = {}
     free = itertools.count()
-    for name in [*gathered.agents, *of_others]:
-        published = name in of_others or name in gathered.published
+
+    def dress(name: str, published: bool, label: str) -> Agent:
         base = name.partition(",")[0].partition(" (")[0].lower().replace(" ", "_")
         color = of_ours.pop(base) if published and base in of_ours else next(free)
         if not published:
             of_ours.setdefault(base, color)
-        label = name
-        if name in of_others:
-            label = f"{name}, published: {_difference_words(of_others[name], repeats)}"
-        elif published:
-            seeds = gathered.table[gathered.table["agent"] == name].groupby("task")["seed"].nunique()
-            label = f"{name}: {range_text(seeds, 'seed')}"
-        agents[name] = Agent(name, color % N_COLORS, color // N_COLORS, published, label)
-    return agents
+        return Agent(name, color % N_COLORS, color // N_COLORS, published, label)
+
+    for name in gathered.agents:
+        if name not in gathered.published:
+            looks.runs[name] = dress(name, False, name)
+            continue
+        base = name.removesuffix(", published")
+        found = [(each, Curve(base, each.own[name].data, True)) for each in curves if name in each.own]
+        words = _difference_words(found, repeats) if base in gathered.asked else _seeds_words(found)
+        looks.runs[name] = dress(name, True, f"{name}: {words}")
+    for name, found in of_others.items():
+        looks.curves[name] = dress(name, True, f"{name}, published: {_difference_words(found, repeats)}")
+    return looks
+
+
+def _seeds_words(found: Sequence[tuple[Curves, Curve]]) -> str:
+    return range_text({int(n) for _, curve in found for n in curve.data["n_seeds"]}, "seed")
 
 
 def _difference_words(found: Sequence[tuple[Curves, Curve]], repeats: Mapping[str, set[int]]) -> str:
     """Seeds of a published curve on all its tasks, and what of its measurement was otherwise."""
-    seeds = {int(n) for _, curve in found for n in curve.data["n_seeds"]}
-    words = [range_text(seeds, "seed")]
+    words = [_seeds_words(found)]
     notes = Counter(
         note
         for each, curve in found
@@ -107,7 +130,7 @@ def _difference_words(found: Sequence[tuple[Curves, Curve]], repeats: Mapping[st
     )
     for note, n in notes.items():
         everywhere = n == len(found)
-        if not (everywhere and len(seeds) == 1 and note.endswith("seeds only")):
+        if note.removesuffix(" only") not in words:
             words.append(note if everywhere else f"{note} on {n} of {counted(len(found), 'task')}")
     return "; ".join(words)
 

@@ -97,7 +97,7 @@ def compute(
 ) -> Facts:
     """
     :param gathered: runs
-    :param steps: at which the averages are told; None for the last step that a run of each agent has reached
+    :param steps: at which the averages are told; None for the last that half of each agent's runs have reached
     :param groups: see :func:`~sb3_sample.study.aggregate`, as ``scores``, ``reps``, ``confidence`` and ``seed``
     :param scores: likewise
     :param all_tasks: average each agent over all its tasks, not over those that all agents have
@@ -114,9 +114,10 @@ def compute(
         facts.reason = "No task of these runs has a score." if facts.lacking else "No run has been evaluated yet."
         return facts
     facts.n_scored = rows["task"].nunique()
-    ends = scored(rows, scores).groupby(RUN, sort=False, dropna=False)["step"].agg(["min", "max"]).reset_index()
+    runs = scored(rows, scores).groupby(RUN, sort=False, dropna=False)["step"]
+    ends = runs.agg(["min", "max", spacing]).reset_index()
     own = ends[~ends["agent"].isin(gathered.published)]
-    facts.steps = sorted(steps) if steps else [int(own.groupby("agent")["max"].max().min())]
+    facts.steps = sorted(steps) if steps else [_reached(own)]
     reaching = ends[(ends["min"] <= facts.step) & (ends["max"] >= facts.step)]
     if not len(reaching):
         raise ValueError(f"steps must be within those of the runs, up to {own['max'].max():,}, not {facts.step:,}")
@@ -144,6 +145,24 @@ def compute(
             facts.improvement = probability_of_improvement(rows, facts.step, first, pairs=chosen, **shared)
     facts.notes += dict.fromkeys(str(warning.message) for warning in told)
     return facts
+
+
+def spacing(steps: Any) -> int:
+    """
+    :param steps: of a run's evaluations, increasing
+    :return: steps between its last two; 0 if there is one
+    """
+    last = np.asarray(steps)[-2:]
+    return int(last[-1] - last[0])
+
+
+def _reached(ends: pd.DataFrame) -> int:
+    """The last step that half of the runs of each agent have reached, or will by their next evaluation."""
+    halves = ends.groupby("agent")["max"].apply(lambda last: sorted(last)[len(last) // 2])
+    step = int(halves.min())
+    # Episodes of a training do not all end at the same step.
+    near = ends[(ends["max"] < step) & (ends["max"] + ends["spacing"] > step)]
+    return int(min([step, *near["max"]]))
 
 
 def _comparable(

@@ -126,7 +126,7 @@ def _marked(agent: str) -> str:
 def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
     """The runs of a source, those of a study that have been evaluated; its state and what its runs were made with."""
     label, path = tables.labelled(source)
-    found.titles.append(label or path.resolve().stem)
+    found.titles.append(label or (path.stem if path.is_file() else path.resolve().name))
     if path.is_file():
         found.made_with += _recorded(path.with_suffix(".json"))
         return [source]
