@@ -75,7 +75,7 @@ class Chromium:
                 return result
             self.events.append(found)
 
-    def _read(self, seconds: float = 60) -> dict[str, Any]:
+    def _read(self, seconds: float = 300) -> dict[str, Any]:
         end = time.monotonic() + seconds
         while b"\0" not in self._rest:
             ready, _, _ = select.select([self._in], [], [], max(end - time.monotonic(), 0))
