@@ -7,7 +7,29 @@ from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
 from sb3_sample.replay.dataset import Dataset
-from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
+from sb3_sample.replay.weighted import (
+    FadedDictReplayBuffer,
+    FadedReplayBuffer,
+    PrioritizedDictReplayBuffer,
+    PrioritizedReplayBuffer,
+    WindowDictReplayBuffer,
+    WindowReplayBuffer,
+)
+from sb3_sample.sac import (
+    BRO,
+    BROTD3,
+    DAC,
+    GPLSAC,
+    OAC,
+    OPLSAC,
+    SAC,
+    SRSAC,
+    TOPSAC,
+    VPLSAC,
+    BROFast,
+    DebiasedRQ,
+    RegularizedSAC,
+)
 from sb3_sample.version import __version__
 
 __all__ = [
@@ -28,12 +50,19 @@ __all__ = [
     "CompactDictReplayBuffer",
     "CompactReplayBuffer",
     "Dataset",
+    "DebiasedRQ",
     "DeviceReplayBuffer",
     "DiagnosticsCallback",
     "EnvironmentDied",
+    "FadedDictReplayBuffer",
+    "FadedReplayBuffer",
+    "PrioritizedDictReplayBuffer",
+    "PrioritizedReplayBuffer",
     "RegularizedSAC",
     "SupervisedSubprocVecEnv",
     "TrainingDiverged",
+    "WindowDictReplayBuffer",
+    "WindowReplayBuffer",
     "__version__",
     "make_env",
 ]
