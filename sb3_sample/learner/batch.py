@@ -5,7 +5,6 @@ from typing import Any, NamedTuple, Protocol
 
 import torch
 
-
 #: Column of batches from a replay buffer with priorities: the slots that the transitions were drawn from, (B, 1).
 SLOTS = "slots"
 

@@ -137,13 +137,22 @@ class DebiasedRQLearner(Learner):
         :return: what to log of the last step, by name, scalars on the learner's device
         """
         self.copy_targets()
+        metrics: dict[str, torch.Tensor] = {}
+        for batch in windows:
+            metrics = self.update_encoder(batch)
+        return metrics
+
+    def update_encoder(self, batch: Windows) -> dict[str, torch.Tensor]:
+        """
+        Take one step of the encoder.
+
+        :param batch: windows
+        :return: what to log, by name, scalars on the learner's device
+        """
         if self._encoder_execution is None:
             self.prepared_execution()
         assert self._encoder_execution is not None
-        metrics: dict[str, torch.Tensor] = {}
-        for batch in windows:
-            metrics = self._encoder_execution(self, batch)
-        return metrics
+        return self._encoder_execution(self, batch)
 
     @torch.no_grad()
     def copy_targets(self) -> None:

@@ -30,7 +30,6 @@ from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 
-
 #: Among a gradient step's results, the TD errors that are no metric.
 _TD_ERRORS = "td_errors"
 
@@ -543,9 +542,7 @@ class Learner:
         return {name: value.detach() for name, value in metrics.items()}
 
     @torch.no_grad()
-    def _errors(
-        self, batch: Batch, q: torch.Tensor, next_q: torch.Tensor, entropy_bonus: torch.Tensor
-    ) -> torch.Tensor:
+    def _errors(self, batch: Batch, q: torch.Tensor, next_q: torch.Tensor, entropy_bonus: torch.Tensor) -> torch.Tensor:
         """The largest absolute TD error of any critic, of the means over quantiles, (B,)."""
         value = self.pessimism_rule.value(self.head.values(next_q))
         target = td_target(batch, value, entropy_bonus).mean(dim=1)

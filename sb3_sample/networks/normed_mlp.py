@@ -1,5 +1,6 @@
 """Multi-layer perceptron of MR.Q and DR.Q, whose layer norms have nothing to learn."""
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -54,9 +55,7 @@ class NormedMLP(Network):
         if any(width < 1 for width in hidden_sizes):
             raise ValueError(f"the widths in hidden_sizes must be at least 1, not {list(hidden_sizes)}")
         widths = [in_features, *hidden_sizes]
-        self.layers = nn.ModuleList(
-            xavier_linear(*pair, n_copies) for pair in zip(widths[:-1], widths[1:], strict=True)
-        )
+        self.layers = nn.ModuleList(xavier_linear(*pair, n_copies) for pair in itertools.pairwise(widths))
         self.activations = nn.ModuleList(activation_fn() for _ in hidden_sizes)
         self.out_features = widths[-1]
 

@@ -26,9 +26,7 @@ class DrawWeights:
     _NUMBERS = ("n_taken", "size", "n_stored", "max_priority")
     _ARRAYS = ("ordinal", "priority", "ready")
 
-    def __init__(
-        self, n_slots: int, fade: float, fade_floor: float, priority_exponent: float, smallest_error: float
-    ):
+    def __init__(self, n_slots: int, fade: float, fade_floor: float, priority_exponent: float, smallest_error: float):
         self.n_slots, self.fade, self.fade_floor = n_slots, fade, fade_floor
         self.priority_exponent, self.smallest_error = priority_exponent, smallest_error
         #: Number of the transition in each slot, counted over all that were stored; -1 where there is none.

@@ -79,7 +79,7 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
-    policy_base = SACPolicy
+    policy_base: ClassVar[type[SACPolicy]] = SACPolicy
     _kept: ClassVar[dict[str, Kept]] = {
         # Saved by its parts.
         "_learner": Kept.NOWHERE,

@@ -21,7 +21,9 @@ from sb3_sample.replay.sources import WindowSource
 from sb3_sample.replay.weighted import WindowDictReplayBuffer, WindowReplay, WindowReplayBuffer
 from sb3_sample.sac import checks
 from sb3_sample.sac.algorithm import SAC
-from sb3_sample.sac.embeddings import DebiasedRQCnnPolicy, DebiasedRQMultiInputPolicy, DebiasedRQPolicy
+from sb3_sample.sac.embeddings import DebiasedRQCnnPolicy, DebiasedRQMultiInputPolicy, DebiasedRQPolicy, Encoder
+from sb3_sample.sac.model_learner import OfLearner
+from sb3_sample.sac.policies import SACPolicy
 
 _RANGE = Kind(
     "be two finite numbers, the smaller first",
@@ -69,8 +71,12 @@ class DebiasedRQ(SAC):
         "CnnPolicy": DebiasedRQCnnPolicy,
         "MultiInputPolicy": DebiasedRQMultiInputPolicy,
     }
-    policy_base = DebiasedRQPolicy
+    policy_base: ClassVar[type[SACPolicy]] = DebiasedRQPolicy
     learner_class: ClassVar[type[Learner]] = DebiasedRQLearner
+    encoder = OfLearner[Encoder]()
+    """encoder of states and actions, with the model of dynamics and rewards"""
+    encoder_target = OfLearner[Encoder]()
+    """target encoder"""
 
     learning_rate: float | Schedule = argument(default=3e-4, kw_only=False)
     """of encoder, critics and actor; a number or a function of the remaining progress (from 1 to 0)"""

@@ -239,12 +239,13 @@ class DebiasedRQPolicy(SACPolicy):
             observation_space, action_space, self.encoder, qf_arch, n_critics, n_outputs, normalize_images
         )
         # Copied together, so that the copies read the encoder's copy.
-        copies = copy.deepcopy({"encoder": self.encoder, "actor": self.actor, "critic": self.critic})
-        self.encoder_target, self.actor_target, self.critic_target = copies.values()
-        for target in (self.encoder_target, self.actor_target, self.critic_target):
+        online: Any = (self.encoder, self.actor, self.critic)
+        targets = copy.deepcopy(online)
+        self.encoder_target, self.actor_target, self.critic_target = targets
+        for target in targets:
             target.requires_grad_(False)
             target.train(False)
-        for module in (self.encoder, self.actor, self.critic):
+        for module in online:
             module.optimizer = self.make_optimizer(module.parameters(), lr_schedule(1))
         self._mode_switch = ModeSwitch(self.encoder, self.actor, self.critic)
         self._constructor_args = dict(

@@ -27,7 +27,8 @@ from tests.sac.test_execution import captured
 
 OWN_FOLDER = Path(__file__).parents[1] / "golden"
 FOLDER = Path(os.environ.get("SB3_SAMPLE_GOLDEN") or OWN_FOLDER)
-FILES = sorted(FOLDER.glob("*.npz"))
+#: Those of BRO and DAC; others have tests of their own.
+FILES = sorted(path for path in FOLDER.glob("*.npz") if path.stem.startswith(("bro_", "dac_")))
 
 INFO_TOLERANCE = 3e-5
 SCALAR_TOLERANCE = 2e-7
@@ -269,9 +270,9 @@ def check_parameters(
 
 
 def test_files_are_there() -> None:
-    assert FILES, f"no file of updates in {FOLDER}"
     kinds = {path.stem.split("_")[0] for path in OWN_FOLDER.glob("*.npz")}
-    assert kinds == {"bro", "dac"}
+    assert kinds >= {"bro", "dac"}
+    assert any(FOLDER.glob("*.npz")), f"no file of updates in {FOLDER}"
 
 
 #: Compiled here in the short tests too; the other files in the long ones.
