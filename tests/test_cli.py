@@ -229,7 +229,7 @@ def test_without_rliable_scores_are_as_they_were(rliable) -> None:
 SHORT = ["--env", "Pendulum-v1", "--eval-freq", "-1", "--device", "cpu"]
 QUICK = ("dac", "vpl_sac")
 NAMES = [
-    "bro", "bro_fast", "bro_td3", "dac", "gpl_sac", "oac", "opl_sac", "regularized_sac", "sac_sample", "sr_sac",
+    "bro", "bro_fast", "bro_td3", "dac", "dr_q", "gpl_sac", "oac", "opl_sac", "regularized_sac", "sac_sample", "sr_sac",
     "top_sac", "vpl_sac",
 ]  # fmt: skip
 

@@ -10,7 +10,21 @@ from typing import Any, NamedTuple
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
-from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
+from sb3_sample.sac import (
+    BRO,
+    BROTD3,
+    DAC,
+    GPLSAC,
+    OAC,
+    OPLSAC,
+    SAC,
+    SRSAC,
+    TOPSAC,
+    VPLSAC,
+    BROFast,
+    DebiasedRQ,
+    RegularizedSAC,
+)
 from sb3_sample.saving.untrusted import BadFile
 from sb3_sample.zoo import search
 from sb3_sample.zoo.trials import check_params
@@ -40,6 +54,7 @@ ALGORITHMS: dict[str, ZooAlgorithm] = {
     "bro_fast": ZooAlgorithm(BROFast, search.BRO_FAST_SPACE),
     "bro_td3": ZooAlgorithm(BROTD3, search.BRO_TD3_SPACE),
     "dac": ZooAlgorithm(DAC, search.DAC_SPACE),
+    "dr_q": ZooAlgorithm(DebiasedRQ, search.DR_Q_SPACE),
     "gpl_sac": ZooAlgorithm(GPLSAC, search.GPL_SPACE),
     "mbma_ppo": ZooAlgorithm(MBMAPPO, search.MBMA_SPACE),
     "mbpo_ppo": ZooAlgorithm(MBPOPPO, search.MBPO_SPACE),
