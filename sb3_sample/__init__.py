@@ -7,6 +7,14 @@ from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
 from sb3_sample.replay.dataset import Dataset
+from sb3_sample.replay.weighted import (
+    FadedDictReplayBuffer,
+    FadedReplayBuffer,
+    PrioritizedDictReplayBuffer,
+    PrioritizedReplayBuffer,
+    WindowDictReplayBuffer,
+    WindowReplayBuffer,
+)
 from sb3_sample.sac import (
     BRC,
     BRO,
@@ -20,6 +28,7 @@ from sb3_sample.sac import (
     TOPSAC,
     VPLSAC,
     BROFast,
+    DebiasedRQ,
     RegularizedSAC,
     SimBa,
     SimbaV2,
@@ -45,14 +54,21 @@ __all__ = [
     "CompactDictReplayBuffer",
     "CompactReplayBuffer",
     "Dataset",
+    "DebiasedRQ",
     "DeviceReplayBuffer",
     "DiagnosticsCallback",
     "EnvironmentDied",
+    "FadedDictReplayBuffer",
+    "FadedReplayBuffer",
+    "PrioritizedDictReplayBuffer",
+    "PrioritizedReplayBuffer",
     "RegularizedSAC",
     "SimBa",
     "SimbaV2",
     "SupervisedSubprocVecEnv",
     "TrainingDiverged",
+    "WindowDictReplayBuffer",
+    "WindowReplayBuffer",
     "__version__",
     "make_env",
 ]

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import ClassVar
 
 import torch
+import torch.nn.functional as F
 from torch import nn
 
 from sb3_sample.learner import losses
@@ -85,3 +86,13 @@ class QuantileHead(ValueHead):
 
     def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         return losses.quantile_huber(q, target)
+
+
+class HuberHead(ValueHead):
+    """
+    Head of scalar critics, trained by the Huber loss with threshold 1, its mean over batch and critics (DR.Q; LAP,
+    Fujimoto et al. 2020).
+    """
+
+    def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        return F.smooth_l1_loss(q, target.expand_as(q))

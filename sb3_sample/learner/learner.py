@@ -4,8 +4,8 @@ Learner of the off-policy family: networks, targets, learned numbers, optimizers
 ``Learner.gradient_step`` is the whole gradient step, in the order of BRO's pseudo-code (BRO, algorithm 2).
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from torch import nn
 from torch.optim import Optimizer
 
 from sb3_sample.learner import first_step, losses
-from sb3_sample.learner.batch import Batch, CriticStep, Extra, Noise
+from sb3_sample.learner.batch import SLOTS, Batch, CriticStep, Extra, Noise
 from sb3_sample.learner.execution import Execution
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
@@ -27,12 +27,26 @@ from sb3_sample.learner.randomness import OwnGenerators
 from sb3_sample.learner.reward_scale import RewardScale
 from sb3_sample.learner.scalars import FixedScalar, LogScalar
 from sb3_sample.learner.schedules import LearningRateSchedule
-from sb3_sample.learner.target import next_step, online_outputs, step_outputs, values
+from sb3_sample.learner.target import next_step, online_outputs, step_outputs, td_target, values
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
 from sb3_sample.networks.unit_norm import project_weights
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
+
+#: Among a gradient step's results, the TD errors that are no metric.
+_TD_ERRORS = "td_errors"
+
+
+def check_is_batch(batch: Any) -> None:
+    """
+    Check that something is a batch.
+
+    :param batch: anything
+    :raises ValueError: if it is none
+    """
+    if not isinstance(batch, Batch):
+        raise ValueError(f"batch must be a Batch, not {batch!r:.100}: data.sample(n) of a Dataset gives one")
 
 
 class Counts:
@@ -157,6 +171,8 @@ class Learner:
         self.gradients_are_stale = False
         # Whether the shapes of a gradient step, and those of the explorer's actions, were checked.
         self._checked_step = self._checked_actions = False
+        # TD errors of the last gradient step's batch.
+        self._td_errors: torch.Tensor | None = None
         # Whether a step was reported since the last gradient step.
         self._heard = False
         self._n_envs = 1
@@ -210,6 +226,14 @@ class Learner:
     @planned_updates.setter
     def planned_updates(self, value: int | None) -> None:
         self._counts.planned_updates = value
+
+    @property
+    def td_errors(self) -> torch.Tensor | None:
+        """
+        TD errors of the last gradient step, for the priorities of its transitions: absolute, the largest of any
+        critic's, from before the step, (B,). None if the batch came without the column ``slots``.
+        """
+        return self._td_errors
 
     @property
     def compiled(self) -> bool | None:
@@ -411,15 +435,20 @@ class Learner:
         :return: what to log, by name, scalars on the learner's device
         :raises ValueError: if the batch is none
         """
-        if not isinstance(batch, Batch):
-            raise ValueError(f"batch must be a Batch, not {batch!r:.100}: data.sample(n) of a Dataset gives one")
+        check_is_batch(batch)
+        with self._updating():
+            return self.step(batch, noise, extra)
+
+    @contextmanager
+    def _updating(self) -> Iterator[None]:
+        """What :meth:`update` does around a gradient step."""
         with self._random():
             if self._heard:
                 self.before_updates()
             self.plasticity.before_gradient_steps(self, 1)
             self.set_training_mode(True)
             try:
-                return self.step(batch, noise, extra)
+                yield
             finally:
                 self.set_training_mode(False)
 
@@ -483,13 +512,17 @@ class Learner:
         self._counts._n_updates += 1
         if self.schedule is not None:
             self._set_scheduled_rates(self.schedule)
-        moves_targets = self.n_updates % (self.target_update_interval or self.policy_delay) == 0
-        moves_actor = self.n_updates % self.policy_delay == 0
-        metrics = execution(self, batch, noise, extra, moves_targets, moves_actor, eager=eager)
+        metrics = execution(self, batch, noise, extra, *self._what_moves(), eager=eager)
+        self._td_errors = metrics.pop(_TD_ERRORS, None)
         self.gradients_are_stale = not (eager or execution.leaves_gradients)
         for part in self.parts().values():
             metrics.update(logged(part, "after_update", part.after_update(self, batch)))
         return metrics
+
+    def _what_moves(self) -> tuple[bool, bool]:
+        """Whether the targets, and whether actors and temperature move in the gradient step that was just counted."""
+        moves_targets = self.n_updates % (self.target_update_interval or self.policy_delay) == 0
+        return moves_targets, self.n_updates % self.policy_delay == 0
 
     def _transformed(self, batch: Batch, noise: Noise | None, extra: Extra | None) -> tuple[Batch, Noise, Extra | None]:
         noise = noise or Noise()
@@ -550,6 +583,8 @@ class Learner:
         self.critic.project()
         q = self.head.values(q)
         metrics = {"train/critic_loss": critic_loss, "train/q_mean": q.mean()}
+        if SLOTS in batch.columns:
+            metrics[_TD_ERRORS] = self._errors(batch, q, next_q, entropy_bonus)
 
         # Targets, by Polyak averaging.
         if moves_targets:
@@ -581,6 +616,13 @@ class Learner:
                 self.minimize(self.temperature_optimizer, temperature_loss)
                 metrics["train/ent_coef_loss"] = temperature_loss
         return metrics
+
+    @torch.no_grad()
+    def _errors(self, batch: Batch, q: torch.Tensor, next_q: torch.Tensor, entropy_bonus: torch.Tensor) -> torch.Tensor:
+        """The largest absolute TD error of any critic, of the means over quantiles, (B,)."""
+        value = self.pessimism_rule.value(self.head.values(next_q))
+        target = td_target(batch, value, entropy_bonus).mean(dim=1)
+        return (q.mean(dim=2) - target).abs().amax(dim=0)
 
     def _actor_value(self, q: torch.Tensor) -> torch.Tensor:
         """Value of the ensemble in the actor's objective, (E, B, K) to (B, K)."""

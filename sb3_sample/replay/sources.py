@@ -1,11 +1,12 @@
 """Sources of batches: the way from a model's replay buffer to its learner."""
 
+from collections.abc import Iterator
 from typing import Any
 
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_sample.learner.batch import Batch, Extra
+from sb3_sample.learner.batch import Batch, Extra, Windows
 from sb3_sample.replay.buffers import BatchMemory, ValidationSplit, latest, samples_as_its_class
 
 
@@ -68,6 +69,42 @@ class ReplaySource:
             return None
         samples, ends = latest(model.replay_buffer, n_steps, model.get_vec_normalize_env())
         return Extra(Batch.of(samples, model.gamma), ends)
+
+
+class WindowSource(ReplaySource):
+    """
+    Source of n-step transitions and of windows, from a model whose buffer holds windows; its ``n_steps`` and
+    ``encoder_horizon`` are those in force when something is drawn.
+
+    :param model: the algorithm
+    """
+
+    def batches(self, n_batches: int, batch_size: int) -> list[Batch]:
+        """
+        Draw the batches of several gradient steps.
+
+        :param n_batches: number of gradient steps
+        :param batch_size: transitions a step
+        :return: the batches, each drawn by the weights of now
+        """
+        model = self._model
+        drawn = (self._window(batch_size, model.n_steps) for _ in range(n_batches))
+        return [windows.n_step(model.gamma) for windows in drawn]
+
+    def windows(self, n_batches: int, batch_size: int) -> Iterator[Windows]:
+        """
+        Draw the batches of several steps of the encoder, each when it is needed.
+
+        :param n_batches: number of steps
+        :param batch_size: windows a step
+        :return: the batches
+        """
+        return (self._window(batch_size, self._model.encoder_horizon) for _ in range(n_batches))
+
+    def _window(self, batch_size: int, length: int) -> Windows:
+        model = self._model
+        found: Windows = model.replay_buffer.windows(batch_size, length, model.get_vec_normalize_env())
+        return found
 
 
 def draw_batches(

@@ -4,6 +4,7 @@ from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.brc import BRC
 from sb3_sample.sac.bro import BRO, BROTD3, BROFast
 from sb3_sample.sac.dac import DAC
+from sb3_sample.sac.debiased_rq import DebiasedRQ
 from sb3_sample.sac.regularized_sac import RegularizedSAC
 from sb3_sample.sac.rivals import GPLSAC, OAC, OPLSAC, SRSAC, TOPSAC
 from sb3_sample.sac.simba import SimBa, SimbaV2
@@ -22,6 +23,7 @@ __all__ = [
     "TOPSAC",
     "VPLSAC",
     "BROFast",
+    "DebiasedRQ",
     "RegularizedSAC",
     "SimBa",
     "SimbaV2",

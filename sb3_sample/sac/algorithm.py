@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_sample.arguments import check_program, default_of
 from sb3_sample.console import say
 from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, not_finite
-from sb3_sample.learner.batch import Batch, Noise
+from sb3_sample.learner.batch import SLOTS, Batch, Noise
 from sb3_sample.learner.execution import (
     PAYS_FROM,
     foreign_parts,
@@ -39,6 +39,7 @@ from sb3_sample.replay.buffers import (
 from sb3_sample.replay.columns import has_own_columns
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
 from sb3_sample.replay.sources import ReplaySource
+from sb3_sample.replay.weighted import PrioritizedReplay
 from sb3_sample.sac import checks
 from sb3_sample.sac.arguments import SACArguments
 from sb3_sample.sac.metrics_log import MetricsLog
@@ -78,7 +79,7 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
-    policy_base = SACPolicy
+    policy_base: ClassVar[type[SACPolicy]] = SACPolicy
     _kept: ClassVar[dict[str, Kept]] = {
         # Saved by its parts.
         "_learner": Kept.NOWHERE,
@@ -193,7 +194,7 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
     ) -> tuple[np.ndarray, np.ndarray]:
         assert isinstance(self.action_space, spaces.Box)
         self.learner.on_observations(self._last_obs)
-        if self.num_transitions < learning_starts:
+        if self._n_of_warm_up < learning_starts:
             unscaled = np.array([self.action_space.sample() for _ in range(n_envs)])
             scaled = self.policy.scale_action(unscaled)
         else:
@@ -360,11 +361,22 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
     def _is_warming_up(self) -> bool:
         """Whether there are too few transitions for a gradient step."""
         assert self.replay_buffer is not None
-        if self.num_transitions <= self.learning_starts:
+        if self._n_of_warm_up <= self.learning_starts:
             return True
         # A model that was loaded without its buffer fills it first, acting with what it has learned.
         capacity = self.replay_buffer.buffer_size * self.n_envs
-        return self.replay_buffer.size() * self.n_envs < min(self.learning_starts, capacity)
+        return self._n_in_buffer < min(self.learning_starts, capacity)
+
+    @property
+    def _n_of_warm_up(self) -> int:
+        """What ``learning_starts`` counts: transitions over the model's life."""
+        return self.num_transitions
+
+    @property
+    def _n_in_buffer(self) -> int:
+        """The same in the replay buffer."""
+        assert self.replay_buffer is not None
+        return self.replay_buffer.size() * self.n_envs
 
     def _updates_due(self, n_collected: int) -> int:
         """
@@ -374,6 +386,8 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         if self._is_warming_up():
             return 0
         if isinstance(self.replay_buffer, ValidationSplit) and self.replay_buffer.n_training == 0:
+            return 0
+        if isinstance(self.replay_buffer, PrioritizedReplay) and self.replay_buffer.n_drawable == 0:
             return 0
         if self.replay_ratio is None:
             return self.gradient_steps if self.gradient_steps >= 0 else n_collected
@@ -400,11 +414,12 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
             self.learner.set_learning_rate(self.lr_schedule(self._current_progress_remaining))
         self.learner.before_updates()
         taken = 0
+        # Each step renews the priorities of which the next one's batch is drawn.
+        at_once = 1 if isinstance(self.replay_buffer, PrioritizedReplay) else MAX_BATCHES_AT_ONCE
         while taken < gradient_steps:
-            n_batches = self.plasticity.before_gradient_steps(
-                self.learner, min(MAX_BATCHES_AT_ONCE, gradient_steps - taken)
-            )
+            n_batches = self.plasticity.before_gradient_steps(self.learner, min(at_once, gradient_steps - taken))
             self.learner.prepared_execution()
+            self._before_batches(batch_size)
             for i, batch in enumerate(self._source.batches(n_batches, batch_size), taken + 1):
                 self._keeps_gradients = self.keep_next_gradients and i == gradient_steps
                 metrics = self._update(batch)
@@ -416,6 +431,13 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
             self._watch.check()
         self._record_metrics()
 
+    def _before_batches(self, batch_size: int) -> None:
+        """
+        Called before batches of gradient steps are drawn.
+
+        :param batch_size: transitions a step
+        """
+
     def _set_training_mode(self, mode: bool) -> None:
         """Dropout and power iterations: on during gradient steps, off whoever acts."""
         self.learner.set_training_mode(mode)
@@ -425,4 +447,8 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         eager, self._keeps_gradients = self._keeps_gradients, False
         if eager:
             self.keep_next_gradients = False
-        return self.learner.step(batch, noise, self.pessimism_rule.draw(self._source), eager)
+        metrics = self.learner.step(batch, noise, self.pessimism_rule.draw(self._source), eager)
+        errors = self.learner.td_errors
+        if errors is not None and isinstance(self.replay_buffer, PrioritizedReplay):
+            self.replay_buffer.renew(batch.columns[SLOTS], errors)
+        return metrics

@@ -21,6 +21,7 @@ from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism
 from sb3_sample.replay.buffers import DeviceReplayBuffer, ValidationSplit
 from sb3_sample.replay.columns import has_own_columns
 from sb3_sample.replay.compact import CompactReplay
+from sb3_sample.replay.weighted import FadedReplay, PrioritizedReplay, WindowReplay
 
 
 def check(agent: Any) -> None:
@@ -214,6 +215,11 @@ def _check_replay(agent: Any) -> None:
             )
     if agent.validation_proportion > 0:
         cls = agent.replay_buffer_class
+        if cls is not None and issubclass(cls, (FadedReplay, PrioritizedReplay)):
+            raise ValueError(
+                f"validation_proportion={agent.validation_proportion} holds transitions out of uniform draws, which "
+                f"replay_buffer_class={cls.__name__} does not make: leave one of them out"
+            )
         if cls is not None and cls not in (ReplayBuffer, DictReplayBuffer) and not issubclass(cls, CompactReplay):
             raise ValueError(
                 f"validation_proportion={agent.validation_proportion} holds single transitions out, which is known of "
@@ -255,7 +261,7 @@ def _check_device_buffer(agent: Any) -> None:
 
 def _check_n_steps(agent: Any) -> None:
     cls = agent.replay_buffer_class
-    if agent.n_steps > 1 and cls is not None and not issubclass(cls, NStepReplayBuffer):
+    if agent.n_steps > 1 and cls is not None and not issubclass(cls, (NStepReplayBuffer, WindowReplay)):
         raise ValueError(
             f"n_steps={agent.n_steps} needs a buffer that makes n-step returns, NStepReplayBuffer, not "
             f"replay_buffer_class={cls.__name__}: leave replay_buffer_class out"

@@ -130,6 +130,18 @@ BRC_SPACE: Space = {
     "weight_decay": _float(1e-5, 1e-2, log=True),
     "replay_ratio": _int(1, 8, log=True),
 }
+#: Without ``tau``: the targets are copies.
+DR_Q_SPACE: Space = {
+    **{name: suggest for name, suggest in OFF_POLICY_SPACE.items() if name != "tau"},
+    "pessimism": _float(0.0, 1.0),
+    "n_steps": _int(1, 5),
+    "encoder_horizon": _int(1, 8),
+    "target_update_interval": _int(50, 1_000, log=True),
+    "exploration_noise": _float(0.05, 0.5, log=True),
+    "target_noise": _float(0.05, 0.5, log=True),
+    "infonce_weight": _float(0.01, 1.0, log=True),
+    "weight_decay": _float(1e-4, 1e-1, log=True),
+}
 #: PPO with simulated samples. The share of the training in which there are some is not searched: a trial is shorter
 #: than the training that its parameters are for. A trial has to be longer than an iteration, of n_steps times the
 #: environments, since nothing is simulated in the first one.

@@ -27,6 +27,7 @@ from sb3_sample.sac import (
     TOPSAC,
     VPLSAC,
     BROFast,
+    DebiasedRQ,
     RegularizedSAC,
     SimBa,
     SimbaV2,
@@ -55,6 +56,15 @@ TINY_SAC: dict[str, Any] = dict(
     policy_kwargs={"net_arch": [8, 8]},
     device="cpu",
 )
+
+
+TINY_DR_Q: dict[str, Any] = dict(
+    policy_kwargs={
+        "net_arch": [8, 8], "encoder_width": 8, "state_embedding": 6, "action_embedding": 4, "pair_embedding": 6,
+        "n_reward_atoms": 5,
+    },
+    target_update_interval=5,
+)  # fmt: skip
 
 
 #: Arguments of every algorithm that are of another kind than it takes: name, value, and what the error says.
@@ -218,9 +228,10 @@ MAKERS: dict[str, Callable[..., Any]] = {
         plasticity_regularization=("crelu", "redo", "resets", "sam"),
         redo_period=5,
     ),
+    "DebiasedRQ": _maker(sac, DebiasedRQ, **TINY_DR_Q),
 }
 #: One of each kind of part, for the slower tests.
-REPRESENTATIVE = ["SAC", "BRO", "BROTD3", "DAC", "VPLSAC", "OPLSAC", "TOPSAC", "RegularizedSAC"]
+REPRESENTATIVE = ["SAC", "BRO", "BROTD3", "DAC", "VPLSAC", "OPLSAC", "TOPSAC", "RegularizedSAC", "DebiasedRQ"]
 
 
 def state(model: SAC) -> dict[str, torch.Tensor]:

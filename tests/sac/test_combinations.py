@@ -12,7 +12,22 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_sample import BRC, BRO, DAC, GPLSAC, OAC, OPLSAC, SAC, TOPSAC, VPLSAC, RegularizedSAC, SimBa, SimbaV2
+from sb3_sample import (
+    BRC,
+    BRO,
+    DAC,
+    GPLSAC,
+    OAC,
+    OPLSAC,
+    SAC,
+    TOPSAC,
+    VPLSAC,
+    FadedReplayBuffer,
+    PrioritizedReplayBuffer,
+    RegularizedSAC,
+    SimBa,
+    SimbaV2,
+)
 from sb3_sample.parts import ValueHead
 from tests.sac.common import TINY_BRO, TINY_RESIDUAL, TINY_SAC, vec
 
@@ -36,6 +51,14 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
             {"validation_proportion": 0.1, "replay_buffer_class": type("Mine", (ReplayBuffer,), {})},
             ("validation_proportion=0.1", "Mine"),
         ),
+    ],
+    "`validation_proportion` with `FadedReplayBuffer`, `PrioritizedReplayBuffer`": [
+        (
+            SAC,
+            {"validation_proportion": 0.1, "replay_buffer_class": cls},
+            ("validation_proportion=0.1", cls.__name__),
+        )
+        for cls in (FadedReplayBuffer, PrioritizedReplayBuffer)
     ],
     '`replay_buffer_kwargs={"memory_map": …}` with `n_steps` above 1 or a buffer that does not know it': [
         (SAC, {"replay_buffer_kwargs": {"memory_map": "x"}, "n_steps": 3}, ("memory_map", "n_steps=3")),
