@@ -45,6 +45,10 @@ _FIXED: dict[str, tuple[Any, str]] = {
     "exploration": ("actor", "it explores with its actor and noise"),
     "validation_proportion": (0.0, "its windows of several steps would carry held-out transitions into training"),
     "batch_transforms": ((), "they would change single transitions, and not the windows of the encoder"),
+    "reward_scale": (None, "it would change the rewards of single transitions, and not those of the encoder's windows"),
+    "normalize_observations": (False, "its encoder learns from observations as they are"),
+    "learning_rate_schedule": (None, "its encoder takes gradient steps of its own, which no schedule counts"),
+    "actor_first": (False, "its actor learns on the new critics"),
     "redo_period": (None, "new weights in place of dormant ones are drawn as those of the other agents"),
 }
 

@@ -22,6 +22,7 @@ from torch import nn
 from sb3_sample.arguments import check_net_arch
 from sb3_sample.kinds import DICT, check_value, integer
 from sb3_sample.learner.batch import Encoded
+from sb3_sample.networks import RunningNorm
 from sb3_sample.networks.modes import ModeSwitch, evaluated
 from sb3_sample.networks.normed_mlp import NormedMLP, xavier_linear
 from sb3_sample.optim import AdamW
@@ -176,6 +177,7 @@ class DebiasedRQPolicy(SACPolicy):
 
     encoder: Encoder
     encoder_target: Encoder
+    observation_norm: RunningNorm | None = None
 
     def __init__(
         self,

@@ -245,6 +245,10 @@ def test_the_learner_asks_for_windows_where_they_are_due() -> None:
         ({"exploration": "oac"}, "DebiasedRQ has exploration='actor', not 'oac'"),
         ({"validation_proportion": 0.1}, "DebiasedRQ has validation_proportion=0.0, not 0.1"),
         ({"batch_transforms": [int]}, "DebiasedRQ has batch_transforms"),
+        ({"reward_scale": "xqc"}, "DebiasedRQ has reward_scale"),
+        ({"normalize_observations": True}, "DebiasedRQ has normalize_observations"),
+        ({"learning_rate_schedule": "linear"}, "DebiasedRQ has learning_rate_schedule"),
+        ({"actor_first": True}, "DebiasedRQ has actor_first"),
         ({"redo_period": 10}, "DebiasedRQ has redo_period=None, not 10"),
         ({"pessimism": "gpl"}, "DebiasedRQ has a fixed pessimism, a number, not 'gpl'"),
         (
