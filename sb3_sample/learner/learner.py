@@ -136,7 +136,7 @@ class Learner:
         self.actor_first = actor_first
         self.target_subset, self.actor_pessimism, self.sam_radius = target_subset, actor_pessimism, sam_radius
         self.learning_starts, self.compile = learning_starts, compile
-        self.n_tasks = n_tasks
+        self.n_tasks, self._n_envs = n_tasks, 1
         self._counts = Counts() if counts is None else counts
         self._generators, self.head = generators, head.to(self.device)
         with self._random():
@@ -164,7 +164,6 @@ class Learner:
         self._checked_step = self._checked_actions = False
         # Whether a step was reported since the last gradient step.
         self._heard = False
-        self._n_envs = 1
         self.set_training_mode(False)
 
     def _random(self) -> AbstractContextManager[None]:

@@ -161,13 +161,24 @@ class MultiTaskEvalCallback(EvalCallback):
         )
         self.task_log_path = None if log_path is None else os.fspath(log_path)
         self.at_start = at_start
-        #: The latest evaluation, by the task's id.
-        self.last_results: dict[str, TaskEvaluation] = {}
         #: Steps a task at the evaluations, and the values of all episodes, (T, tasks, episodes).
         self.evaluations_timesteps: list[int] = []
         self.evaluations_results: list[list[list[float]]] = []  # type: ignore[assignment]
         self.evaluations_length: list[list[list[int]]] = []  # type: ignore[assignment]
         self.evaluations_successes: list[list[list[bool]]] = []  # type: ignore[assignment]
+
+    @property
+    def last_results(self) -> dict[str, TaskEvaluation]:
+        """The latest evaluation, by the task's id; empty before the first."""
+        if not self.evaluations_timesteps:
+            return {}
+        returns, lengths, successes = (
+            values[-1] for values in (self.evaluations_results, self.evaluations_length, self.evaluations_successes)
+        )
+        return {
+            task_id: TaskEvaluation(returns[k], lengths[k], successes[k])  # type: ignore[arg-type]
+            for k, task_id in enumerate(self.task_ids)
+        }
 
     def _init_callback(self) -> None:
         for name in ("observation_space", "action_space"):
@@ -190,7 +201,6 @@ class MultiTaskEvalCallback(EvalCallback):
         found = evaluate_tasks(
             self.model, self.eval_env, self.n_eval_episodes, self.deterministic, self.render, self.warn
         )
-        self.last_results = found
         steps = self.num_timesteps // len(found)
         self.last_mean_reward = float(np.mean([task.mean_return for task in found.values()]))
         self._log(found, steps)
