@@ -17,7 +17,7 @@ from torch import nn
 
 from sb3_sample.networks import NETWORKS, SimbaNet, SimbaV2Net, UnitNorm, linear
 from sb3_sample.networks.ensemble import EnsembleLinear
-from sb3_sample.sac import SAC, SimbaV2
+from sb3_sample.sac import SAC, SimBa, SimbaV2
 from tests.sac.common import MAKERS, TINY_RESIDUAL, sac, vec
 
 SBX = np.load(Path(__file__).with_name("simba_sbx.npz"))
@@ -182,6 +182,21 @@ def test_sizes_are_checked(network: str, kwargs: dict[str, Any]) -> None:
     (name,) = kwargs
     with pytest.raises(ValueError, match=f"needs width >= 1.*{name}={kwargs[name]}"):
         NETWORKS[network](3, **kwargs)
+
+
+def test_defaults_of_simba() -> None:
+    """The published sizes and numbers, read from the model."""
+    model = SimBa("MlpPolicy", vec(), buffer_size=10, device="cpu")
+    for trunk, width, n_blocks in ((model.critic.trunk, 512, 2), (model.actor.trunk, 128, 1)):
+        assert isinstance(trunk, SimbaNet) and (trunk.out_features, len(trunk.blocks)) == (width, n_blocks)
+        assert trunk.blocks[0].dense1.out_features == 4 * width
+    assert model.critic.n_critics == 1 and model.policy.observation_norm is not None
+    assert model.critic(torch.zeros(4, 3), torch.zeros(4, 2)).shape == (1, 4, 1)
+    assert (model.temperature().item(), model._target_entropy) == (pytest.approx(0.01), -1.0)
+    assert (model.replay_ratio, model.learning_starts, model.batch_size, model.gamma) == (2, 5_000, 256, 0.99)
+    decays = {name: o.param_groups[0]["weight_decay"] for name, o in model.learner.optimizers().items()}
+    assert decays == {"actor.optimizer": 0.01, "critic.optimizer": 0.01, "temperature_optimizer": 0}
+    assert all(o.param_groups[0]["lr"] == 1e-4 for o in model.learner.optimizers().values())
 
 
 def test_defaults_of_simbav2() -> None:

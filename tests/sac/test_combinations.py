@@ -9,6 +9,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample import BRC, BRO, DAC, GPLSAC, OAC, OPLSAC, SAC, TOPSAC, VPLSAC, RegularizedSAC, SimBa, SimbaV2
@@ -113,6 +114,9 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
     ],
     "`reward_scale_kwargs` without `reward_scale`": [
         (SAC, {"reward_scale_kwargs": {"max_return": 1}}, ("reward_scale_kwargs", "reward_scale=None")),
+    ],
+    "`reward_scale` with `VecNormalize(norm_reward=True)`": [
+        (SAC, {"reward_scale": "xqc", "env": VecNormalize(vec())}, ("reward_scale='xqc'", "norm_reward=False")),
     ],
     "`learning_rate_schedule` with a function as `learning_rate`; its settings without it": [
         (

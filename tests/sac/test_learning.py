@@ -117,9 +117,8 @@ def successor(name: str) -> SAC:
     return SimBa("MlpPolicy", "Pendulum-v1", **both, **kwargs)
 
 
-@pytest.mark.parametrize(
-    "name", ["SimbaV2", pytest.param("SimBa", marks=pytest.mark.slow), pytest.param("BRC", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["BRC", "SimBa", "SimbaV2"])
 def test_the_successors_of_bro_learn_pendulum(name: str) -> None:
     assert score(successor(name).learn(4_000)) > GOOD
 
