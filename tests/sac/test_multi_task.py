@@ -1,5 +1,6 @@
 """Agents of several tasks: what networks read, pace, temperatures by task, files, logs, evaluation by task."""
 
+import importlib.util
 import json
 import math
 from pathlib import Path
@@ -24,6 +25,7 @@ from sb3_sample.sac import BRC, BRO
 from sb3_sample.sac.multi_task import TaskEmbedding, TaskOneHot
 from tests.sac.common import COMPILES, MAKERS, bro, differing, sac, state, vec
 
+ROOT = Path(__file__).parents[2]
 PENDULUM, CAR = "Pendulum-v1", "MountainCarContinuous-v0"
 #: Of episodes of eight steps.
 SHORT = {"max_episode_steps": 8}
@@ -418,3 +420,40 @@ def test_callbacks_of_one_task_and_of_another_are_refused() -> None:
         sac(tasks(), policy="MultiInputPolicy").learn(2, callback=MultiTaskEvalCallback(tasks(PENDULUM)))
     with pytest.raises(ValueError, match="DiagnosticsCallback measures models of one task, and this one has 2"):
         sac(tasks(), policy="MultiInputPolicy").learn(2, callback=DiagnosticsCallback(vec()))
+
+
+# ---------------------------------------------------------------- the page and the program
+
+
+def test_the_pages_program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The code of docs/multi_task.md, with small numbers in the place of its own."""
+    pytest.importorskip("metaworld")
+    page = (ROOT / "docs" / "multi_task.md").read_text()
+    code = page.partition("```python\n")[2].partition("```")[0]
+    for theirs, ours in (
+        ("critic_width=512, batch_size=1024", "critic_width=8, batch_size=8, learning_starts=10, device='cpu'"),
+        ("100_000", "60"),
+        ("eval_freq=5_000", "eval_freq=4, n_eval_episodes=1, verbose=0"),
+        ('"MT10", seed', '"MT10", env_kwargs={"max_episode_steps": 2}, seed'),
+    ):
+        assert theirs in code
+        code = code.replace(theirs, ours)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(code, names)
+    assert names["model"]._n_updates > 0 and names["action"].shape == (4,)
+    assert study.read("runs/mt10")["task"].nunique() == 10
+
+
+def test_the_example(tmp_path: Path) -> None:
+    spec = importlib.util.spec_from_file_location("multi_task", ROOT / "examples" / "multi_task.py")
+    assert spec is not None and spec.loader is not None
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    given = f"--steps 20 --eval-every 10 --episodes 1 --critic-width 8 --batch-size 8 --folder {tmp_path} --tasks"
+    example.main([*given.split(), PENDULUM, CAR, "--random-steps", "5", "--max-episode-steps", "5"])
+    table = study.read(tmp_path / "seed_0" / "tasks", ["return"])
+    assert sorted(set(table["task"])) == [CAR, PENDULUM] and sorted(set(table["step"])) == [0, 10, 20]
+    model = BRC.load(tmp_path / "seed_0" / "final_model")
+    # Two for each step of both tasks after the random ones.
+    assert model._n_updates == 2 * 15 and model.learning_starts == 10
