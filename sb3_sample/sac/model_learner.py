@@ -259,7 +259,8 @@ class HasLearner:
         if self.target_entropy == "auto":
             self._target_entropy = -get_action_dim(self.action_space) / 2
         elif isinstance(self.target_entropy, Sequence):
-            self._target_entropy = [float(each) for each in self.target_entropy]
+            targets = [float(each) for each in self.target_entropy]
+            self._target_entropy = targets if self.n_tasks > 1 else targets[0]
         else:
             self._target_entropy = float(self.target_entropy)
         if BACKBONES[self.backbone].has_entropy:

@@ -51,7 +51,8 @@ def told(task: Any, n: int | None = None) -> dict[str, Any]:
 @pytest.mark.parametrize("name", ["BRC", "BRO", "SAC"])
 def test_one_task_is_single_task_bit_by_bit(name: str, policy: str) -> None:
     """Nothing is appended and nothing widened, whatever is asked of several tasks."""
-    asked = {"task_temperatures": True} | ({} if name == "BRC" else {"multitask": True})
+    asked: dict[str, Any] = {"task_temperatures": True, "target_entropy": [-0.5]}
+    asked |= {} if name == "BRC" else {"multitask": True}
     multi = make(name, tasks(PENDULUM), policy, **asked).learn(40)
     single = make(name, make_vec_env(PENDULUM, seed=0, env_kwargs=SHORT), "MlpPolicy").learn(40)
     assert multi._n_updates == single._n_updates == 30
