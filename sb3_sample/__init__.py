@@ -1,7 +1,7 @@
 """Sample-efficient reinforcement learning for users of Stable-Baselines3."""
 
 from sb3_sample.diagnostics import DiagnosticsCallback
-from sb3_sample.envs import EnvironmentDied, SupervisedSubprocVecEnv, make_env
+from sb3_sample.envs import EnvironmentDied, SupervisedSubprocVecEnv, make_env, multi_task_env
 from sb3_sample.faults import TrainingDiverged
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.replay.buffers import DeviceReplayBuffer
@@ -33,6 +33,7 @@ from sb3_sample.sac import (
     SimBa,
     SimbaV2,
 )
+from sb3_sample.training.task_evaluation import MultiTaskEvalCallback, evaluate_tasks
 from sb3_sample.version import __version__
 
 __all__ = [
@@ -62,6 +63,7 @@ __all__ = [
     "FadedReplayBuffer",
     "PrioritizedDictReplayBuffer",
     "PrioritizedReplayBuffer",
+    "MultiTaskEvalCallback",
     "RegularizedSAC",
     "SimBa",
     "SimbaV2",
@@ -70,5 +72,7 @@ __all__ = [
     "WindowDictReplayBuffer",
     "WindowReplayBuffer",
     "__version__",
+    "evaluate_tasks",
     "make_env",
+    "multi_task_env",
 ]

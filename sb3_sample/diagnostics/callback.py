@@ -144,6 +144,8 @@ class DiagnosticsCallback(BaseCallback):
         model = self.model
         if not isinstance(model, SAC):
             raise TypeError(f"DiagnosticsCallback needs a model of sb3_sample.sac.SAC, not a {type(model).__name__}")
+        if model.n_tasks > 1:
+            raise ValueError(f"DiagnosticsCallback measures models of one task, and this one has {model.n_tasks}")
         if not model.gamma < 1:
             raise ValueError(f"gamma must be below 1 for the Monte-Carlo reference, not {model.gamma}")
         env = self._checked_env()

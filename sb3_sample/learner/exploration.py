@@ -14,7 +14,7 @@ from sb3_sample.learner.parts import Learning, Part
 from sb3_sample.learner.pessimism import epistemic_std
 from sb3_sample.learner.scalars import BoundedLogScalar, LogScalar
 from sb3_sample.learner.target import values
-from sb3_sample.networks import NETWORKS, linear
+from sb3_sample.networks import NETWORKS, linear, widened
 from sb3_sample.optim import AdamW
 
 
@@ -222,6 +222,7 @@ class OptimisticShift(OptimisticExploration):
     :param adjustment_learning_rate: of optimism and weight, by Adam with beta1 = 0.5
     :param network: trunk of the shift network, one of ``NETWORKS``
     :param network_kwargs: its arguments; None: one block, 256 wide, for "bronet", the network's own otherwise
+    :param width_factor: by which its hidden layers are wider than that
     :raises ValueError: if an argument is out of range
     """
 
@@ -236,15 +237,18 @@ class OptimisticShift(OptimisticExploration):
         adjustment_learning_rate: float = 3e-5,
         network: str = "bronet",
         network_kwargs: dict[str, Any] | None = None,
+        width_factor: int = 1,
     ):
         super().__init__(learner, kl_target, std_multiplier, uncertainty, adjustment_learning_rate)
+        check_value("width_factor", width_factor, integer(1))
         if network not in NETWORKS:
             raise ValueError(f"network must be one of {sorted(NETWORKS)}, not {network!r}")
         actor = learner.actor
         action_dim = actor.action_dim
         if network_kwargs is None:
             network_kwargs = {"width": 256, "n_blocks": 1} if network == "bronet" else {}
-        self.trunk = NETWORKS[network](actor.features_dim + action_dim, **network_kwargs)
+        made = NETWORKS[network]
+        self.trunk = made(actor.features_dim + action_dim, **widened(made, network_kwargs, width_factor))
         # Without bias and nearly zero, so that the optimistic actor starts as the pessimistic one.
         self.shift = linear(self.trunk.out_features, action_dim, None, bias=False, gain=0.01)
         self.optimism = BoundedLogScalar("initial_optimism", initial_optimism)
@@ -295,8 +299,8 @@ class OptimisticActor(OptimisticExploration):
     :param initial_kl_weight: weight of the divergence at the start, above 0
     :param adjustment_learning_rate: of optimism and weight, by Adam with beta1 = 0.5
     :param kl_direction: "optimistic_to_pessimistic" or "pessimistic_to_optimistic"
-    :param reinitialize_every: environment steps, counted in transitions over the model's life, after which it starts
-        anew; None for never
+    :param reinitialize_every: environment steps, counted in transitions over the model's life, of each task where there
+        are several, after which it starts anew; None for never
     :raises ValueError: if an argument is out of range
     """
 
@@ -337,10 +341,10 @@ class OptimisticActor(OptimisticExploration):
         self._make_optimizers(
             learner, self.actor.parameters(), self.optimism_distance.parameters(), self.kl_weight.parameters()
         )
-        self._reached = learner.num_transitions
+        self._reached = learner.environment_steps
 
     def before_updates(self, learner: Learning) -> None:
-        every, before, now = self.reinitialize_every, self._reached, learner.num_transitions
+        every, before, now = self.reinitialize_every, self._reached, learner.environment_steps
         self._reached = now
         if every is not None and now // every > before // every:
             learner.restart(self, learner.make_explorer())

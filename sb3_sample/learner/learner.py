@@ -24,8 +24,8 @@ from sb3_sample.learner.parts import Part, logged
 from sb3_sample.learner.pessimism import Pessimism, pessimistic_value
 from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.randomness import OwnGenerators
-from sb3_sample.learner.reward_scale import RewardScale
-from sb3_sample.learner.scalars import FixedScalar, LogScalar
+from sb3_sample.learner.reward_scale import RewardScale, task_of
+from sb3_sample.learner.scalars import FixedScalar, LogScalar, TaskLogScalar
 from sb3_sample.learner.schedules import LearningRateSchedule
 from sb3_sample.learner.target import next_step, online_outputs, step_outputs, td_target, values
 from sb3_sample.learner.transforms import BatchTransform
@@ -81,7 +81,9 @@ class Learner:
     :param temperature_beta1: beta1 of the temperature's Adam
     :param gamma: discount factor of batches that have none of their own
     :param tau: weight of the new critics in the Polyak average of the targets
-    :param target_entropy: entropy that the learned temperature aims at
+    :param target_entropy: entropy that the learned temperature aims at; one for each task where each has a temperature
+        of its own, or the same for all; None: -|A|/2
+    :param n_tasks: tasks that the observations tell apart
     :param target_update_interval: gradient steps between two updates of the targets; None: ``policy_delay``
     :param policy_delay: gradient steps between two of the actors' and of the temperature
     :param actor_first: whether actors and temperature learn before the critics, whose target is then of the new ones
@@ -123,7 +125,7 @@ class Learner:
         temperature_beta1: float = 0.9,
         gamma: float = 0.99,
         tau: float = 0.005,
-        target_entropy: float | None = None,
+        target_entropy: float | Sequence[float] | None = None,
         target_update_interval: int | None = 1,
         policy_delay: int = 1,
         actor_first: bool = False,
@@ -131,6 +133,7 @@ class Learner:
         actor_pessimism: float | None = None,
         sam_radius: float | None = None,
         learning_starts: int = 0,
+        n_tasks: int = 1,
         compile: bool | str = False,
         device: torch.device | str = "cpu",
         verbose: int = 0,
@@ -147,11 +150,13 @@ class Learner:
         self.actor_first = actor_first
         self.target_subset, self.actor_pessimism, self.sam_radius = target_subset, actor_pessimism, sam_radius
         self.learning_starts, self.compile = learning_starts, compile
+        self.n_tasks, self._n_envs = n_tasks, 1
         self._counts = Counts() if counts is None else counts
         self._generators, self.head = generators, head.to(self.device)
         with self._random():
             self.networks = make_networks().to(self.device) if networks is None else networks
-            self.target_entropy = -self.actor.action_dim / 2 if target_entropy is None else target_entropy
+            self.target_entropy: float | torch.Tensor = 0.0
+            self.set_target_entropy(-self.actor.action_dim / 2 if target_entropy is None else target_entropy)
             self.temperature = make_temperature(self)
             self.pessimism_rule = self.make_pessimism()
             self.explorer = self.make_explorer()
@@ -175,7 +180,6 @@ class Learner:
         self._td_errors: torch.Tensor | None = None
         # Whether a step was reported since the last gradient step.
         self._heard = False
-        self._n_envs = 1
         self.set_training_mode(False)
 
     def _random(self) -> AbstractContextManager[None]:
@@ -212,6 +216,11 @@ class Learner:
     def num_transitions(self) -> int:
         """Transitions reported by :meth:`on_step` over the learner's life."""
         return int(self._counts.num_transitions)
+
+    @property
+    def environment_steps(self) -> int:
+        """The same of each task, where several take a step together."""
+        return self.num_transitions // min(self.n_tasks, self.n_envs)
 
     @property
     def n_envs(self) -> int:
@@ -336,6 +345,32 @@ class Learner:
         """
         self.networks.set_training_mode(mode)
         self._parts_mode(mode)
+
+    def set_target_entropy(self, value: float | Sequence[float]) -> None:
+        """
+        Set the entropy that the learned temperature aims at.
+
+        :param value: a number, or one for each task
+        """
+        if isinstance(value, Sequence):
+            targets = torch.tensor(value, dtype=torch.float32, device=self.device)
+            if isinstance(self.target_entropy, torch.Tensor):
+                # In place, where a captured gradient step reads it.
+                self.target_entropy.copy_(targets)
+            else:
+                self.target_entropy = targets
+        else:
+            self.target_entropy = value
+
+    def temperature_of(self, batch: Batch) -> torch.Tensor:
+        """
+        Look up the temperature of transitions.
+
+        :param batch: transitions
+        :return: a scalar with gradient, or (B, 1) where each task has its own
+        """
+        values: torch.Tensor = self.temperature()
+        return values[task_of(batch)] if isinstance(self.temperature, TaskLogScalar) else values
 
     def set_learning_rate(self, rate: float) -> None:
         """
@@ -552,10 +587,10 @@ class Learner:
         :param moves_actor: whether actors and temperature learn in this step
         :return: what to log, by name, scalars
         """
-        alpha, metrics = self.temperature(), {}
+        alpha, metrics = self.temperature_of(batch), {}
         if self.actor_first and moves_actor:
             metrics.update(self._learn_actors(batch, noise, alpha))
-            alpha = self.temperature()
+            alpha = self.temperature_of(batch)
         step, of_critics = self._learn_critics(batch, noise, alpha, moves_targets)
         metrics.update(of_critics)
         if moves_actor and not self.actor_first:
@@ -610,9 +645,15 @@ class Learner:
         # Temperature.
         if self.actor.has_entropy:
             entropy = -log_prob.detach().mean()
-            metrics.update({"train/entropy": entropy, "train/ent_coef": alpha})
+            by_task = isinstance(self.temperature, TaskLogScalar)
+            metrics.update({"train/entropy": entropy, "train/ent_coef": alpha.mean() if by_task else alpha})
             if self.temperature_optimizer is not None:
-                temperature_loss = losses.temperature_loss(alpha, entropy, self.target_entropy)
+                if by_task:
+                    targets = self.target_entropy
+                    targets = targets[task_of(batch)] if isinstance(targets, torch.Tensor) else targets
+                    temperature_loss = losses.temperature_loss(alpha, -log_prob, targets).mean()
+                else:
+                    temperature_loss = losses.temperature_loss(alpha, entropy, self.target_entropy)
                 self.minimize(self.temperature_optimizer, temperature_loss)
                 metrics["train/ent_coef_loss"] = temperature_loss
         return metrics

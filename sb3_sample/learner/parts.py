@@ -33,11 +33,13 @@ class Learning(Protocol):
     """
     Interface of the learner to its parts.
 
-    ``actor``, ``critic`` and ``critic_target`` are the networks, ``temperature()`` the entropy's weight, a scalar,
+    ``actor``, ``critic`` and ``critic_target`` are the networks, ``temperature()`` the entropy's weight, a scalar, or
+    (n_tasks,) where each task has its own, ``temperature_of(batch)`` that of transitions,
     ``head`` gives the meaning of the critics' outputs, ``gamma`` is the discount factor, ``target_entropy`` what the
     temperature aims at, ``observation_norm`` the networks' running normalisation, None for none. ``n_updates`` counts
     gradient steps; ``num_transitions`` counts the environments' transitions over the learner's life, of which the first
-    ``learning_starts`` have random actions.
+    ``learning_starts`` have random actions; ``environment_steps`` the same of each task, where several take a step
+    together.
     """
 
     @property
@@ -62,7 +64,7 @@ class Learning(Protocol):
     def gamma(self) -> float: ...
 
     @property
-    def target_entropy(self) -> float: ...
+    def target_entropy(self) -> float | torch.Tensor: ...
 
     @property
     def observation_norm(self) -> Any: ...
@@ -80,7 +82,18 @@ class Learning(Protocol):
     def num_transitions(self) -> int: ...
 
     @property
+    def environment_steps(self) -> int: ...
+
+    @property
     def n_envs(self) -> int: ...
+
+    def temperature_of(self, batch: Batch) -> torch.Tensor:
+        """
+        Look up the temperature of transitions.
+
+        :param batch: transitions
+        :return: a scalar, or (B, 1) where each task has its own
+        """
 
     def next_actions(self, observations: Any, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """

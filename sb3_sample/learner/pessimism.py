@@ -276,7 +276,7 @@ class LearnedPessimism(Pessimism):
     ) -> CriticStep:
         """Compute what the critics' step computes, on other transitions."""
         with torch.no_grad():
-            next_q, entropy_bonus = bootstrap(learner, batch, learner.temperature(), noise, subset)
+            next_q, entropy_bonus = bootstrap(learner, batch, learner.temperature_of(batch), noise, subset)
             q = values(learner, learner.critic, batch.observations, batch.actions)
             return CriticStep(q, learner.head.values(next_q), entropy_bonus, subset)
 

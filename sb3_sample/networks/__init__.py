@@ -6,7 +6,7 @@ from sb3_sample.networks.dormant import neuron_scores, recycle
 from sb3_sample.networks.ensemble import EnsembleLayerNorm, EnsembleLinear
 from sb3_sample.networks.initialization import init_orthogonal, linear
 from sb3_sample.networks.mlp import MLP
-from sb3_sample.networks.network import HiddenUnits, Network
+from sb3_sample.networks.network import HiddenUnits, Network, widened
 from sb3_sample.networks.normalization import RunningMoments, RunningNorm
 from sb3_sample.networks.simba import SimbaNet
 from sb3_sample.networks.simbav2 import SimbaV2Net
@@ -47,4 +47,5 @@ __all__ = [
     "neuron_scores",
     "project_weights",
     "recycle",
+    "widened",
 ]

@@ -1,7 +1,9 @@
 """Base class of networks, and hidden neurons as a network lists them."""
 
+import inspect
 from abc import abstractmethod
-from typing import ClassVar, NamedTuple
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import nn
@@ -96,3 +98,27 @@ class Network(nn.Module):
         """
         layers = [layer for layer in self.modules() if not isinstance(layer, SpectralNorm)]
         return [buffer for layer in layers for buffer in layer.buffers(recurse=False)]
+
+
+def widened(network: type[Network], kwargs: Mapping[str, Any], factor: int) -> dict[str, Any]:
+    """
+    Arguments of a network that is wider.
+
+    :param network: its class, whose width is its argument "width" or "hidden_sizes"
+    :param kwargs: its arguments
+    :param factor: by which every hidden layer is wider
+    :return: the same arguments with other widths
+    :raises ValueError: if it has neither of the two
+    """
+    if factor == 1:
+        return dict(kwargs)
+    defaults = {name: each.default for name, each in inspect.signature(network).parameters.items()}
+    names = [name for name in ("width", "hidden_sizes") if name in {**defaults, **kwargs}]
+    if not names:
+        raise ValueError(
+            f"a network whose width is to be multiplied must have an argument width or hidden_sizes, and "
+            f"{network.__name__} has neither"
+        )
+    (name,) = names
+    size = kwargs.get(name, defaults.get(name))
+    return {**kwargs, name: [factor * width for width in size] if name == "hidden_sizes" else factor * size}

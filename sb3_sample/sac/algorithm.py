@@ -44,6 +44,7 @@ from sb3_sample.sac import checks
 from sb3_sample.sac.arguments import SACArguments
 from sb3_sample.sac.metrics_log import MetricsLog
 from sb3_sample.sac.model_learner import check_action_space
+from sb3_sample.sac.multi_task import is_multi_task, told_task
 from sb3_sample.sac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.sb3_names import SB3Names
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
@@ -95,6 +96,9 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
     def _construct(self, given: dict[str, Any]) -> None:
         check_program(type(self), given)
         checks.check_use_sde(given["use_sde"])
+        if given["policy"] == "MlpPolicy" and is_multi_task(getattr(given["env"], "observation_space", None)):
+            # A vector and the number of a task are no more than that policy is for.
+            given["policy"] = "MultiInputPolicy"
         if given["train_freq"] is not None or given["gradient_steps"] is not None:
             # Stable-Baselines3's two arguments are in force.
             given["replay_ratio"] = None
@@ -164,6 +168,8 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         kwargs = {**self.policy_kwargs, "n_outputs": self._make_head().n_outputs, "backbone": self.backbone}
+        if self._width_factor > 1:
+            kwargs["width_factor"] = self._width_factor
         return {**kwargs, "normalize_observations": True} if self.normalize_observations else kwargs
 
     @classmethod
@@ -188,6 +194,28 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         return Resumable._wrap_env(env, verbose, monitor_wrapper)
 
     # ---------------------------------------------------------------- acting
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        Choose actions, as in Stable-Baselines3.
+
+        :param observation: as the environment gives it, one or a batch. Of several tasks ``{"observation": ...,
+            "task": k}``, k being the number of the task, also for a batch
+        :param state: as in Stable-Baselines3, without meaning here
+        :param episode_start: likewise
+        :param deterministic: the mean action instead of a sample
+        :return: actions, and ``state``
+        :raises ValueError: if the observation is not one of the observation space, or there is no such task
+        """
+        if is_multi_task(self.observation_space) and isinstance(observation, dict):
+            observation = told_task(self.observation_space, observation)  # type: ignore[arg-type]
+        return super().predict(observation, state, episode_start, deterministic)
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -333,10 +361,15 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
             warn_not_compiled(self.learner, reason)
         self.learner.forget_execution()
 
+    @property
+    def _tasks_together(self) -> int:
+        """Tasks that take a step together; 1 where a single environment has one after the other."""
+        return min(self.n_tasks, self.n_envs)
+
     def _updates_in(self, n_steps: int) -> float:
         """Gradient steps in as many environment steps after the warm-up; 0 where that is not known."""
         if self.replay_ratio is not None:
-            return self.replay_ratio * n_steps
+            return self.replay_ratio * n_steps / self._tasks_together
         assert isinstance(self.train_freq, TrainFreq)
         if self.gradient_steps < 0:
             return n_steps
@@ -391,7 +424,7 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
             return 0
         if self.replay_ratio is None:
             return self.gradient_steps if self.gradient_steps >= 0 else n_collected
-        self._updates_owed += self.replay_ratio * n_collected
+        self._updates_owed += self.replay_ratio * n_collected / self._tasks_together
         # The tolerance keeps 10 times 0.1 from falling short of 1 by rounding.
         n_updates = int(self._updates_owed + 1e-6)
         self._updates_owed -= n_updates

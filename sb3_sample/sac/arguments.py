@@ -104,12 +104,13 @@ class SACArguments(Resumable):
     """temperature: "auto" learns it from 1, "auto_0.1" from that start, a number fixes it"""
     target_update_interval: int | None = argument(default=1, kind=integer(1).or_none("policy_delay"), kw_only=False)
     """gradient steps between two updates of the targets; None: ``policy_delay``"""
-    target_entropy: str | float = argument(default="auto", kw_only=False)
-    """entropy that the learned temperature aims at; "auto" is -|A|/2. As in Stable-Baselines3, a number once the model
-    is made; set anew, it counts from the next ``train`` on"""
+    target_entropy: str | float | Sequence[float] = argument(default="auto", kw_only=False)
+    """entropy that the learned temperature aims at; "auto" is -|A|/2, of all dimensions of the action, also of those
+    that a task has no use for. As in Stable-Baselines3, a number once the model is made; set anew, it counts from the
+    next ``train`` on. With ``task_temperatures`` also a list, one for each task"""
     replay_ratio: float | None = argument(default=2, kind=AT_LEAST_0.or_none(), of_training=True)
     """gradient steps per environment transition after the warm-up, whatever the number of environments; may be below
-    1"""
+    1. Where several tasks take a step together, per transition of each task"""
     n_quantiles: int | None = argument(default=None, kind=integer(1).or_none("scalar critics"))
     """quantiles a critic; None for scalar critics"""
     value_head: str | type[ValueHead] | None = argument(
@@ -160,8 +161,8 @@ class SACArguments(Resumable):
     warm_up_learning_rate: float = argument(default=0.0, kind=AT_LEAST_0)
     """rate from which it rises"""
     resets: Sequence[int] | int = argument(default=())
-    """environment steps at which all parameters start anew, counted in transitions over the model's life; or one
-    integer for every so many"""
+    """environment steps at which all parameters start anew, counted in transitions over the model's life, of each task
+    where several take a step together; or one integer for every so many"""
     reset_gradient_steps: int | None = argument(default=None, kind=integer(1).or_none("no such resets"))
     """resets after every so many gradient steps of the model's life instead (SR-SAC's original: 2,560,000), in the
     place of a class's own ``resets``; None for none. Not together with ``resets``"""
@@ -193,6 +194,12 @@ class SACArguments(Resumable):
     normalize_observations: bool = argument(default=False, kind=TRUE_OR_FALSE)
     """whether the networks read observations less their running mean, by their running standard deviation. The
     statistics are the policy's, and move while training only"""
+    multitask: bool = argument(default=False, kind=TRUE_OR_FALSE)
+    """whether the networks read the task as a one-hot vector and are all twice as wide (BRO, figure 19), where the
+    observations tell one of several (``multi_task_env``). False: as wide as ever, with the one-hot vector; for ``BRC``
+    with an embedding of the task in its place"""
+    task_temperatures: bool = argument(default=False, kind=TRUE_OR_FALSE)
+    """whether each of several tasks has a temperature of its own, which is learned"""
     use_sde: bool = argument(default=False, of_training=True)
     """not supported, refused if True"""
     sde_sample_freq: int = argument(default=-1, kind=integer(-1), of_training=True)

@@ -2,12 +2,6 @@
 
 from typing import Any, ClassVar
 
-import torch
-from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from torch import nn
-
 from sb3_sample.constructor import argument
 from sb3_sample.kinds import AT_LEAST_0, integer
 from sb3_sample.learner.categorical import VALUE_HEADS
@@ -15,41 +9,7 @@ from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.learner.reward_scale import RewardScale
 from sb3_sample.sac.algorithm import SAC
-
-
-class TaskEmbedding(BaseFeaturesExtractor):
-    """
-    Observation and the embedding of its task, a learned vector divided by its length.
-
-    :param observation_space: a Dict of "observation", a Box, and "task", a Discrete
-    :param size: of an embedding
-    """
-
-    def __init__(self, observation_space: spaces.Dict, size: int = 32):
-        task = observation_space["task"]
-        assert isinstance(task, spaces.Discrete)
-        super().__init__(observation_space, get_flattened_obs_dim(observation_space["observation"]) + size)
-        #: A row for each task, whose length is learned as well and without effect on the embedding.
-        self.table = nn.Parameter(torch.randn(int(task.n), size) / size**0.5)
-
-    def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
-        """
-        :param observations: "observation", (B, ...), and "task", one-hot, (B, n_tasks)
-        :return: (B, O + size)
-        """
-        rows = observations["task"].flatten(1) @ self.table
-        lengths = torch.linalg.vector_norm(rows, dim=1, keepdim=True)
-        return torch.cat((observations["observation"].flatten(1), rows / lengths), dim=1)
-
-
-def is_multi_task(space: spaces.Space) -> bool:
-    """
-    :param space: of observations
-    :return: whether they tell the task: a Dict of "observation", a Box, and "task", a Discrete
-    """
-    if not isinstance(space, spaces.Dict) or space.spaces.keys() != {"observation", "task"}:
-        return False
-    return isinstance(space["observation"], spaces.Box) and isinstance(space["task"], spaces.Discrete)
+from sb3_sample.sac.multi_task import TaskEmbedding
 
 
 class BRC(SAC):
@@ -60,10 +20,11 @@ class BRC(SAC):
     target and actor; rewards divided by a measure of the returns of finished episodes; weight decay; no resets and no
     optimism.
 
-    With observations that are a Dict of "observation" and "task" (a Discrete), critics and actor read a learned
-    embedding of the task beside the observation, and rewards are scaled by task. The embeddings are the critics', which
-    learn them; the actor reads them without gradient. Target entropy and temperature are one for all tasks. The
-    published batch is then 1,024.
+    With observations that tell one of several tasks (``multi_task_env``), critics and actor read a learned embedding of
+    the task beside the observation, and rewards are scaled by task. The embeddings are the critics', which learn them;
+    the actor reads them without gradient. Target entropy and temperature are one for all tasks, unless
+    ``task_temperatures``. The published batch is then 1,024. With ``multitask=True`` the task is a one-hot vector, as
+    in BRO, instead of an embedding.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -103,12 +64,6 @@ class BRC(SAC):
         kwargs: dict[str, Any] = super()._full_value_head_kwargs()
         return {"v_min": -10.0, "v_max": 10.0, **kwargs} if self.value_head in VALUE_HEADS else kwargs
 
-    def _full_reward_scale_kwargs(self) -> dict[str, Any]:
-        kwargs: dict[str, Any] = super()._full_reward_scale_kwargs()
-        if self.reward_scale != "brc" or not is_multi_task(self.observation_space):
-            return kwargs
-        return {"n_tasks": int(self.observation_space["task"].n), **kwargs}  # type: ignore[index]
-
     def _full_policy_kwargs(self) -> dict[str, Any]:
         kwargs: dict[str, Any] = {
             "critic_network": "bronet",
@@ -123,7 +78,7 @@ class BRC(SAC):
             }
         if self.critic_width is not None:
             kwargs["critic_network_kwargs"] = {"width": self.critic_width, "n_blocks": 2}
-        if is_multi_task(self.observation_space) and "features_extractor_class" not in kwargs:
+        if self.n_tasks > 1 and not self.multitask and "features_extractor_class" not in kwargs:
             kwargs["features_extractor_class"] = TaskEmbedding
             kwargs["features_extractor_kwargs"] = {"size": self.embedding_size}
             kwargs["share_features_extractor"] = True

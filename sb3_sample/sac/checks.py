@@ -22,6 +22,7 @@ from sb3_sample.replay.buffers import DeviceReplayBuffer, ValidationSplit
 from sb3_sample.replay.columns import has_own_columns
 from sb3_sample.replay.compact import CompactReplay
 from sb3_sample.replay.weighted import FadedReplay, PrioritizedReplay, WindowReplay
+from sb3_sample.sac.multi_task import is_multi_task
 
 
 def check(agent: Any) -> None:
@@ -58,7 +59,8 @@ def check(agent: Any) -> None:
         check_unused(agent, ["reward_scale_kwargs"], "reward_scale=None")
     check_one_reward_scale(agent)
     _check_schedule(agent)
-    for name in ("n_quantiles", "n_outputs", "backbone", "normalize_observations"):
+    _check_tasks(agent)
+    for name in ("n_quantiles", "n_outputs", "backbone", "normalize_observations", "width_factor"):
         if name in agent.policy_kwargs:
             raise ValueError(f"{name} is an argument of the algorithm, not of policy_kwargs")
     if agent.backbone == "td3":
@@ -107,6 +109,28 @@ def _check_schedule(agent: Any) -> None:
         check_unused(agent, ["warm_up_learning_rate"], "warm_up_steps=0")
 
 
+def _check_tasks(agent: Any) -> None:
+    """Whether what is said of tasks goes with the observations, and with the temperature."""
+    for name in ("multitask", "task_temperatures"):
+        if getattr(agent, name) and not is_multi_task(agent.observation_space):
+            raise ValueError(
+                f"{name}=True needs observations that tell the task, as those of multi_task_env do, not "
+                f"{agent.observation_space}: leave it out"
+            )
+    if not agent.task_temperatures:
+        return
+    if agent.backbone == "td3":
+        raise ValueError(
+            "task_temperatures=True asks for an entropy, which a deterministic actor (backbone='td3') has not: leave "
+            "it out"
+        )
+    if not (isinstance(agent.ent_coef, str) and agent.ent_coef.startswith("auto")):
+        raise ValueError(
+            f"task_temperatures=True learns a temperature for each task, and ent_coef={agent.ent_coef!r} fixes one for "
+            "all: pass ent_coef='auto' or 'auto_<start>'"
+        )
+
+
 def has_resets(resets: Any) -> bool:
     """
     :param resets: the argument of that name, checked or not
@@ -123,6 +147,17 @@ def check_target_entropy(agent: Any) -> None:
     if agent.backbone == "td3":
         _check_no_entropy(agent, "target_entropy")
     value = agent.target_entropy
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        n_tasks = agent.n_tasks
+        if not agent.task_temperatures or len(value) != n_tasks:
+            raise ValueError(
+                f"target_entropy must be a number, or 'auto', or with task_temperatures=True one for each of the "
+                f"{n_tasks} tasks, not {value!r} with task_temperatures={agent.task_temperatures}"
+            )
+        for each in value:
+            if not math.isfinite(as_number("target_entropy of a task", each, "a finite one")):
+                raise ValueError(f"target_entropy of a task must be finite, not {each}")
+        return
     if value != "auto" and not math.isfinite(as_number("target_entropy", value, "'auto'")):
         raise ValueError(f"target_entropy must be finite, or 'auto', not {value}")
 

@@ -22,7 +22,7 @@ from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
 from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.randomness import OwnGenerators
 from sb3_sample.learner.reward_scale import REWARD_SCALES, RewardScale
-from sb3_sample.learner.scalars import FixedScalar, LogScalar
+from sb3_sample.learner.scalars import FixedScalar, LogScalar, TaskLogScalar
 from sb3_sample.learner.schedules import LearningRateSchedule
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.optim import AdamW
@@ -30,6 +30,7 @@ from sb3_sample.sac import checks
 from sb3_sample.sac.actors import BACKBONES, Actor
 from sb3_sample.sac.arguments import transform_choice
 from sb3_sample.sac.critics import CriticEnsemble
+from sb3_sample.sac.multi_task import number_of_tasks
 from sb3_sample.sac.policies import SACPolicy
 
 T = TypeVar("T")
@@ -198,6 +199,7 @@ class HasLearner:
             schedule=self._make_schedule(),
             temperature_beta1=self.temperature_beta1,
             target_entropy=self._target_entropy,
+            n_tasks=self.n_tasks,
             device=self.device,
             **{name: getattr(self, name) for name in Learner.SETTINGS},
             **kwargs,
@@ -221,6 +223,16 @@ class HasLearner:
         ]
         return {**kwargs, "batch_transforms": completed}
 
+    @property
+    def n_tasks(self: Any) -> int:
+        """Tasks that the observations tell apart; 1 if they tell none."""
+        return number_of_tasks(self.observation_space)
+
+    @property
+    def _width_factor(self: Any) -> int:
+        """By which networks are wider than described: 2 with ``multitask`` and several tasks."""
+        return 2 if self.multitask and self.n_tasks > 1 else 1
+
     def _make_head(self: Any) -> ValueHead:
         if self.value_head is not None:
             cls = chosen("value_head", self.value_head, VALUE_HEADS, ValueHead)
@@ -237,15 +249,18 @@ class HasLearner:
     def _take_settings(self: Any) -> None:
         """Have the learner take up what was set since the last gradient step."""
         self._take_target_entropy()
-        self.learner.target_entropy = self._target_entropy
+        self.learner.set_target_entropy(self._target_entropy)
         for name in Learner.SETTINGS:
             setattr(self.learner, name, getattr(self, name))
 
     def _take_target_entropy(self: Any) -> None:
-        """Take up what ``target_entropy`` says, which is a number afterwards."""
+        """Take up what ``target_entropy`` says, which is a number afterwards, or a list of them, one a task."""
         checks.check_target_entropy(self)
         if self.target_entropy == "auto":
             self._target_entropy = -get_action_dim(self.action_space) / 2
+        elif isinstance(self.target_entropy, Sequence):
+            targets = [float(each) for each in self.target_entropy]
+            self._target_entropy = targets if self.n_tasks > 1 else targets[0]
         else:
             self._target_entropy = float(self.target_entropy)
         if BACKBONES[self.backbone].has_entropy:
@@ -255,7 +270,10 @@ class HasLearner:
         """
         :return: the explorer's arguments: the user's and the algorithm's
         """
-        return dict(self.exploration_kwargs or {})
+        kwargs = dict(self.exploration_kwargs or {})
+        if self._width_factor > 1 and self.exploration == "optimistic_shift":
+            return {"width_factor": self._width_factor, **kwargs}
+        return kwargs
 
     def _full_value_head_kwargs(self: Any) -> dict[str, Any]:
         """
@@ -267,7 +285,8 @@ class HasLearner:
         """
         :return: the arguments of the rule that scales rewards: the user's and the algorithm's
         """
-        return dict(self.reward_scale_kwargs or {})
+        kwargs = dict(self.reward_scale_kwargs or {})
+        return {"n_tasks": self.n_tasks, **kwargs} if self.reward_scale == "brc" else kwargs
 
     def _full_pessimism_kwargs(self: Any) -> dict[str, Any]:
         """
@@ -284,7 +303,8 @@ class HasLearner:
             value = checks.as_number("ent_coef", start, allowed, shown=self.ent_coef)
             if not 0 < value < np.inf:
                 raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
-            return LogScalar(value).to(self.device)
+            by_task = self.task_temperatures and self.n_tasks > 1
+            return (TaskLogScalar(value, self.n_tasks) if by_task else LogScalar(value)).to(self.device)
         value = checks.as_number("ent_coef", self.ent_coef, allowed)
         if not 0 <= value < np.inf:
             raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")

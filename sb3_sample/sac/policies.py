@@ -27,6 +27,7 @@ from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.optim import AdamW
 from sb3_sample.sac.actors import BACKBONES, Actor, DeterministicActor
 from sb3_sample.sac.critics import CriticEnsemble
+from sb3_sample.sac.multi_task import TaskOneHot, reads_one_hot
 from sb3_sample.sac.trunks import network_args
 
 
@@ -64,6 +65,7 @@ class SACPolicy(BasePolicy):
         target actor reads too
     :param normalize_observations: whether all networks read observations through one running normalisation,
         ``observation_norm``, whose statistics are in the policy
+    :param width_factor: by which the hidden layers of all trunks are wider than their arguments say
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
@@ -95,6 +97,7 @@ class SACPolicy(BasePolicy):
         critic_optimizer_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = False,
         normalize_observations: bool = False,
+        width_factor: int = 1,
     ):
         check_value("share_features_extractor", share_features_extractor, TRUE_OR_FALSE)
         super().__init__(
@@ -115,8 +118,10 @@ class SACPolicy(BasePolicy):
         qf_arch: list[int] | None = None
         if net_arch is not None:
             pi_arch, qf_arch = get_actor_critic_arch(net_arch if isinstance(net_arch, dict) else list(net_arch))
-        actor_args = network_args("actor", actor_network, actor_network_kwargs, pi_arch, activation_fn)
-        critic_args = network_args("critic", critic_network, critic_network_kwargs, qf_arch, activation_fn)
+        check_value("width_factor", width_factor, integer(1))
+        further = (activation_fn, width_factor)
+        actor_args = network_args("actor", actor_network, actor_network_kwargs, pi_arch, *further)
+        critic_args = network_args("critic", critic_network, critic_network_kwargs, qf_arch, *further)
 
         self.observation_norm: RunningNorm | None = None
         if normalize_observations:
@@ -189,6 +194,7 @@ class SACPolicy(BasePolicy):
             critic_optimizer_kwargs=critic_optimizer_kwargs,
             share_features_extractor=share_features_extractor,
             normalize_observations=normalize_observations,
+            width_factor=width_factor,
         )
 
     def _share_norm(self, network: Any) -> None:
@@ -329,8 +335,13 @@ class CnnPolicy(SACPolicy):
 
 
 class MultiInputPolicy(SACPolicy):
-    """The same with an extractor for dict observations."""
+    """
+    The same with an extractor for dict observations; ``TaskOneHot`` if they tell the task beside a vector.
 
-    def __init__(self, *args: Any, **kwargs: Any):
-        kwargs.setdefault("features_extractor_class", CombinedExtractor)
-        super().__init__(*args, **kwargs)
+    :param observation_space: observation space
+    """
+
+    def __init__(self, observation_space: spaces.Space, *args: Any, **kwargs: Any):
+        extractor = TaskOneHot if reads_one_hot(observation_space) else CombinedExtractor
+        kwargs.setdefault("features_extractor_class", extractor)
+        super().__init__(observation_space, *args, **kwargs)

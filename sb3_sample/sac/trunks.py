@@ -8,7 +8,7 @@ from torch import nn
 
 from sb3_sample import own_classes
 from sb3_sample.kinds import DICT, check_value, chosen, integer
-from sb3_sample.networks import NETWORKS, Network
+from sb3_sample.networks import NETWORKS, Network, widened
 from sb3_sample.networks.modes import evaluated
 
 
@@ -18,6 +18,7 @@ def network_args(
     kwargs: dict[str, Any] | None,
     net_arch: list[int] | None,
     activation_fn: type[nn.Module] | None,
+    width_factor: int = 1,
 ) -> tuple[type[Network], dict[str, Any]]:
     """Class and arguments of a trunk, from its name and from Stable-Baselines3's shorthand."""
     check_value(f"{who}_network_kwargs", kwargs, DICT)
@@ -35,7 +36,7 @@ def network_args(
             raise ValueError(f"{name} and {who}_network_kwargs[{key!r}] say the same thing: give one of them")
         kwargs[key] = value
     own_classes.check_arguments(f"{who}_network", network, cls, 1, kwargs=kwargs, n_copies=None)
-    return cls, kwargs
+    return cls, widened(cls, kwargs, width_factor)
 
 
 def make_trunk(argument: str, cls: type[Network], in_features: int, kwargs: dict[str, Any], **copies: int) -> Network:

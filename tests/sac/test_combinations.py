@@ -169,6 +169,13 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
         (BRC, {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}}, ("weight_decay", "optimizer_kwargs")),
         (BRC, {"policy_kwargs": {"critic_network": "mlp"}}, ("critic_network", "critic_width=None")),
     ],
+    "`multitask`, `task_temperatures` with observations that do not tell the task": [
+        (BRO, {"multitask": True}, ("multitask=True", "multi_task_env")),
+        (SAC, {"task_temperatures": True}, ("task_temperatures=True", "multi_task_env")),
+    ],
+    '`task_temperatures` with a fixed `ent_coef`, or `backbone="td3"`; a list as `target_entropy` without it': [
+        (SAC, {"target_entropy": [-1.0]}, ("target_entropy", "task_temperatures=False")),
+    ],
 }
 
 
