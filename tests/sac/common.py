@@ -25,7 +25,10 @@ from sb3_sample.sac import (
     SRSAC,
     TOPSAC,
     VPLSAC,
+    XQC,
     BROFast,
+    CrossQ,
+    FlashSAC,
     RegularizedSAC,
 )
 
@@ -51,6 +54,8 @@ TINY_SAC: dict[str, Any] = dict(
     policy_kwargs={"net_arch": [8, 8]},
     device="cpu",
 )
+#: FlashSAC's networks, made small.
+TINY_FLASH: dict[str, Any] = {f"{who}_network_kwargs": {"width": 8, "n_blocks": 1} for who in ("critic", "actor")}
 
 
 #: Arguments of every algorithm that are of another kind than it takes: name, value, and what the error says.
@@ -203,6 +208,10 @@ MAKERS: dict[str, Callable[..., Any]] = {
         plasticity_regularization=("crelu", "redo", "resets", "sam"),
         redo_period=5,
     ),
+    "CrossQ": _maker(sac, CrossQ),
+    "CrossQ+WN": _maker(sac, CrossQ, weight_norm=True),
+    "XQC": _maker(sac, XQC),
+    "FlashSAC": _maker(sac, FlashSAC, policy_kwargs=TINY_FLASH),
 }
 #: One of each kind of part, for the slower tests.
 REPRESENTATIVE = ["SAC", "BRO", "BROTD3", "DAC", "VPLSAC", "OPLSAC", "TOPSAC", "RegularizedSAC"]
