@@ -1,6 +1,7 @@
 # make demo      set up and train BRO on a DeepMind Control task (2 minutes on 2 free cores)
 # make test      set up, lint, types, tests (what CI runs)
 # make test-all  the same with the long tests
+# make evidence  go on with the runs of studies/evidence (WORKERS=2: two at once)
 # make clean     remove the virtual environment
 #
 # make PYTHON=python3.13 ...  sets up with another Python than python3, one of those below
@@ -40,7 +41,7 @@ endif
 endif
 endif
 
-.PHONY: demo demo-imports test test-all lint lock clean
+.PHONY: demo demo-imports test test-all lint evidence lock clean
 
 
 $(BIN)/python:
@@ -82,6 +83,10 @@ demo-imports: setup.cfg $(LOCK)
 
 test-all: lint demo-imports
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -n 2
+
+WORKERS ?= 1
+evidence:
+	$(PYTHON) studies/evidence.py --workers $(WORKERS)
 
 # Resolves the lock files anew, for maintainers: needs uv (pip install uv), installs nothing. A version stays where it
 # still fits; empty a file to have its Python's newest ones. Nothing is built but this package's own metadata (first, for

@@ -28,6 +28,7 @@ import platform
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 import warnings
 from collections.abc import Callable
@@ -194,11 +195,17 @@ def compare(args: argparse.Namespace) -> None:
     servers: dict[str, subprocess.Popen[str]] = {}
     told: dict[str, Any] = {}
     for name, tree in trees.items():
-        servers[name] = subprocess.Popen(
-            [sys.executable, __file__, *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            env={**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": str(args.threads)},
-        )  # fmt: skip
-        told[name] = answer(servers[name])
+        # The second would find what the first has compiled, were the caches not apart.
+        with tempfile.TemporaryDirectory() as cache:
+            variables = {"OMP_NUM_THREADS": str(args.threads), "TORCHINDUCTOR_CACHE_DIR": cache}
+            servers[name] = subprocess.Popen(
+                [sys.executable, __file__, *options],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+                env={**os.environ, **variables, "PYTHONPATH": str(tree)},
+            )
+            told[name] = answer(servers[name])
 
     def seconds(name: str, label: str, n: int) -> float:
         stdin = servers[name].stdin

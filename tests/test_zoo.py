@@ -57,9 +57,13 @@ BUILT = [
 ]
 #: Those of the MBMA paper.
 ON_POLICY = sorted(name for name, entry in zoo.ALGORITHMS.items() if issubclass(entry.algorithm, SimulatedPPO))
+#: What came after BRO, each with settings of its own.
+SUCCESSORS = ("brc", "simba", "simbav2")
 #: Algorithms with the settings that DAC, VPL and the regularization study (2403.00514) share.
 FAMILY = sorted(
-    name for name, entry in zoo.ALGORITHMS.items() if not issubclass(entry.algorithm, BRO) and name not in ON_POLICY
+    name
+    for name, entry in zoo.ALGORITHMS.items()
+    if not issubclass(entry.algorithm, BRO) and name not in (*ON_POLICY, *SUCCESSORS)
 )
 
 
@@ -78,7 +82,8 @@ def arguments_of(name: str) -> dict[str, Any]:
 
 def small_buffer(name: str) -> dict[str, Any]:
     """What keeps a model's memory small."""
-    return {} if name in ON_POLICY else {"buffer_size": 1000}
+    width = {"critic_width": 16} if name == "brc" else {}
+    return {} if name in ON_POLICY else {"buffer_size": 1000, **width}
 
 
 def manager(name: str, env_id: str, folder: Path, **kwargs: Any) -> ExperimentManager:

@@ -19,7 +19,7 @@ from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
 from sb3_sample.networks import Network, RunningNorm, project_weights
 from sb3_sample.networks.modes import evaluated
-from sb3_sample.sac.trunks import keep_at_rest, make_trunk
+from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
 
 # The log standard deviation is squashed into this interval by a tanh.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
@@ -68,7 +68,7 @@ class Actor(BasePolicy):
         clip_log_std: bool = False,
     ):
         super().__init__(
-            observation_space,
+            with_plain_sizes(observation_space),
             action_space,
             features_extractor=features_extractor,
             normalize_images=normalize_images,

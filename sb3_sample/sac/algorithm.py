@@ -308,6 +308,7 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         Plan the gradient steps of the first ``learn``, and decide, with ``compile="auto"`` once and for all, whether
         the coming environment steps pay for compiling.
         """
+        checks.check_one_reward_scale(self)
         n_steps = self._total_timesteps - self.num_timesteps
         if self.learning_rate_schedule is not None and self.planned_updates is None:
             self.planned_updates = round(self._updates_in(n_steps)) or None

@@ -55,6 +55,7 @@ def check(agent: Any) -> None:
         )
     if agent.reward_scale is None:
         check_unused(agent, ["reward_scale_kwargs"], "reward_scale=None")
+    check_one_reward_scale(agent)
     _check_schedule(agent)
     for name in ("n_quantiles", "n_outputs", "backbone", "normalize_observations"):
         if name in agent.policy_kwargs:
@@ -68,6 +69,21 @@ def check(agent: Any) -> None:
     _check_memory_map(agent)
     _check_device_buffer(agent)
     _check_train_freq(agent)
+
+
+def check_one_reward_scale(agent: Any) -> None:
+    """
+    Check that rewards are scaled once.
+
+    :param agent: an algorithm
+    :raises ValueError: if its environment scales them too
+    """
+    normalize = agent.get_vec_normalize_env()
+    if agent.reward_scale is not None and normalize is not None and normalize.norm_reward:
+        raise ValueError(
+            f"reward_scale={agent.reward_scale!r} scales rewards, and so does the VecNormalize of env: pass it "
+            "norm_reward=False, or the model reward_scale=None"
+        )
 
 
 def _check_schedule(agent: Any) -> None:

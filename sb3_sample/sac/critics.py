@@ -17,7 +17,7 @@ from torch import nn
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.q_values import QValues
 from sb3_sample.networks import Network, RunningNorm, project_weights
-from sb3_sample.sac.trunks import keep_at_rest, make_trunk
+from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
 
 
 class CriticEnsemble(BaseModel):
@@ -52,7 +52,10 @@ class CriticEnsemble(BaseModel):
         normalize_images: bool = True,
     ):
         super().__init__(
-            observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
+            with_plain_sizes(observation_space),
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
         )
         self._network_args = {"network": network, "network_kwargs": network_kwargs, "n_outputs": n_outputs}
         self.n_critics = n_critics

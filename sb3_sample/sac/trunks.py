@@ -1,7 +1,9 @@
 """Trunks of actors and critics: their arguments, how they are made, and their modes."""
 
+import copy
 from typing import Any
 
+from gymnasium import spaces
 from torch import nn
 
 from sb3_sample import own_classes
@@ -43,6 +45,16 @@ def make_trunk(argument: str, cls: type[Network], in_features: int, kwargs: dict
     trunk: Network = own_classes.make(argument, cls, cls, Network, in_features, kwargs=kwargs, **copies)
     check_value(f"{cls.__name__}.out_features", getattr(trunk, "out_features", None), integer(1))
     return trunk
+
+
+def with_plain_sizes(space: spaces.Space) -> spaces.Space:
+    """A space whose Discrete parts have Python's numbers for sizes, since a compiler does not take NumPy's."""
+    space = copy.copy(space)
+    if isinstance(space, spaces.Dict):
+        space.spaces = {key: with_plain_sizes(part) for key, part in space.spaces.items()}
+    elif isinstance(space, spaces.Discrete):
+        space.n = int(space.n)  # type: ignore[assignment]
+    return space
 
 
 def keep_at_rest(owner: Any) -> None:

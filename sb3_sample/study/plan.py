@@ -134,15 +134,20 @@ class Run:
         """
         kinds = {"arguments": dict, "grid": dict, "env_kwargs": dict, "gym_packages": list}
         kinds |= dict.fromkeys(("agent", "algo", "task"), str)
-        names = [field.name for field in dataclasses.fields(cls)]
-        if not isinstance(found, dict) or found.keys() != set(names):
+        names = {field.name for field in dataclasses.fields(cls)}
+        needed = {field.name for field in dataclasses.fields(cls) if not _has_default(field)}
+        if not isinstance(found, dict) or not needed <= found.keys() <= names:
             raise ValueError(f"no run: {found!r:.200}")
-        for name in names:
+        for name in found:
             if type(found[name]) is not kinds.get(name, int):
                 raise ValueError(f"{name} of a run cannot be {found[name]!r:.100}")
         if not _AGENT.fullmatch(found["agent"]) or found["seed"] < 0 or found["steps"] < 1:
             raise ValueError(f"no run: {found!r:.200}")
-        return cls(**{**found, "gym_packages": tuple(found["gym_packages"])})
+        return cls(**{**found, "gym_packages": tuple(found.get("gym_packages", ()))})
+
+
+def _has_default(field: dataclasses.Field[Any]) -> bool:
+    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
 
 class Plan(NamedTuple):

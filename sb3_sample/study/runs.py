@@ -91,11 +91,12 @@ class StudyFolder:
 
     # ---------------------------------------------------------------- the list of runs
 
-    def enter(self, plan: Plan) -> None:
+    def enter(self, plan: Plan, keep: bool = False) -> None:
         """
         Make the folder that of a plan. A plan that has been run there may have got more runs and more steps since.
 
         :param plan: the plan
+        :param keep: whether runs stay in the list that are there and not in the plan
         :raises StudyError: a run of its is there with other settings
         :raises OSError: the folder cannot be made or written to, or has no locks
         """
@@ -105,10 +106,14 @@ class StudyFolder:
         while (lock := take(self.path / STATE / ".lock")) is None:
             time.sleep(0.01)
         with lock:
+            runs = {run.name: run for run in plan.runs}
             if (self.path / LIST).exists():
-                _check_same(self.path, self.runs(), plan.runs)
-            runs = [run.as_json() for run in plan.runs]
-            _write(self.path / LIST, json.dumps({"name": plan.name, "runs": runs}, indent=1))
+                known = self.runs()
+                _check_same(self.path, known, plan.runs)
+                if keep:
+                    runs = {run.name: run for run in known} | runs
+            listed = [run.as_json() for run in runs.values()]
+            _write(self.path / LIST, json.dumps({"name": plan.name, "runs": listed}, indent=1))
             if plan.text:
                 _write(self.path / PLAN, plan.text)
 
@@ -196,7 +201,7 @@ class StudyFolder:
             return Outcome(False)
         except (OSError, BadFile) as error:
             raise StudyError(f"{path} is not what sb3-sample study run has written: {error}") from error
-        if not isinstance(found, dict) or found.keys() != set(Outcome._fields):
+        if not isinstance(found, dict) or not {"done"} <= found.keys() <= set(Outcome._fields):
             raise StudyError(f"{path} is not what sb3-sample study run has written: remove it, and the run goes on")
         outcome = Outcome(**found)
         if outcome.done and (outcome.steps < run.steps or not self.place(run).is_dir()):

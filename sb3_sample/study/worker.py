@@ -65,7 +65,9 @@ def serve(make: Train = train) -> None:
         os.dup2(nothing, sys.stdout.fileno())
         os.close(nothing)
         orders: queue.Queue[dict[str, Any] | None] = queue.Queue()
-        threading.Thread(target=_listen, args=(sys.stdin.buffer, orders), daemon=True).start()
+        # Not sys.stdin, which could not be closed while a thread reads it.
+        orders_file = os.fdopen(os.dup(sys.stdin.fileno()), "rb")
+        threading.Thread(target=_listen, args=(orders_file, orders), daemon=True).start()
         n_made = 0
         while (order := orders.get()) is not None:
             if n_made < 2:
@@ -74,9 +76,10 @@ def serve(make: Train = train) -> None:
                 gc.collect()
                 gc.freeze()
             n_made += 1
-            reply = _answer(folder, order, make)
+            outcome = attempt(folder, Run.of_json(order["run"]), order["options"], order["threads"], make)
+            reply = {"taken": True} if outcome is None else outcome._asdict()
             print(json.dumps(reply), file=replies, flush=True)
-            if reply.get("traceback"):
+            if outcome is not None and outcome.traceback:
                 return  # what a failed run leaves in the process is not known
 
 
@@ -88,22 +91,33 @@ def _listen(file: IO[bytes], orders: "queue.Queue[dict[str, Any] | None]") -> No
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _answer(folder: StudyFolder, order: dict[str, Any], make: Train) -> dict[str, Any]:
-    run = Run.of_json(order["run"])
+def attempt(folder: StudyFolder, run: Run, options: list[str], threads: int, make: Train = train) -> Outcome | None:
+    """
+    Make a run in this process, or go on with it, and write down what became of it.
+
+    :param folder: the study's
+    :param run: one of its runs
+    :param options: options of ``sb3-sample train``
+    :param threads: of this process, for the record
+    :param make: makes a run
+    :return: what became of it; None if another process has it
+    :raises SystemExit: after SIGTERM, when the run has written its checkpoint
+    :raises OSError: if the folder cannot be written to, or has no locks
+    """
     lock = folder.claim(run)
     if lock is None:
-        return {"taken": True}
+        return None
     with lock:
         lock.write(this_process())
         before = folder.outcome(run)
-        if before.done:  # by another process, since the scheduler has looked
-            return before._asdict()
+        if before.done:  # by another process, since this one has looked
+            return before
         place, start = folder.place(run), time.monotonic()
         first = checkpointed(place)
-        outcome = Outcome(False, before.attempts, threads=order["threads"])
+        outcome = Outcome(False, before.attempts, threads=threads)
         with _printing_to(folder.output(run)):
             try:
-                make(run, place, order["options"])
+                make(run, place, options)
             except BaseException as error:
                 if isinstance(error, SystemExit) and error.code == _TERMINATED:
                     raise
@@ -119,7 +133,7 @@ def _answer(folder: StudyFolder, order: dict[str, Any], make: Train) -> dict[str
             last_return=progress.last_return,
         )
         outcome = outcome._replace(steps_made=max(outcome.steps - first, 0))
-        return folder.write_outcome(run, outcome)._asdict()
+        return folder.write_outcome(run, outcome)
 
 
 @contextlib.contextmanager

@@ -16,6 +16,7 @@ from stable_baselines3.td3.policies import TD3Policy
 from sb3_sample import BRO
 from sb3_sample.learner.execution import old_torch
 from sb3_sample.sac import (
+    BRC,
     BROTD3,
     DAC,
     GPLSAC,
@@ -30,6 +31,8 @@ from sb3_sample.sac import (
     CrossQ,
     FlashSAC,
     RegularizedSAC,
+    SimBa,
+    SimbaV2,
 )
 
 #: Of tests whose gradient step is compiled.
@@ -46,6 +49,7 @@ TINY_BRO: dict[str, Any] = dict(
     exploration_kwargs={"network_kwargs": {"width": 8, "n_blocks": 1}},
     device="cpu",
 )
+TINY_RESIDUAL: dict[str, Any] = {f"{who}_network_kwargs": {"width": 8, "n_blocks": 1} for who in ("actor", "critic")}
 TINY_SAC: dict[str, Any] = dict(
     batch_size=8,
     learning_starts=10,
@@ -200,6 +204,17 @@ MAKERS: dict[str, Callable[..., Any]] = {
     "TOPSAC": _maker(sac, TOPSAC),
     "GPLSAC": _maker(sac, GPLSAC, pessimism_learning_rate=1e-2),
     "OPLSAC": _maker(sac, OPLSAC, pessimism_learning_rate=1e-2, segment_length=4),
+    "SimBa": _maker(sac, SimBa, policy_kwargs=TINY_RESIDUAL),
+    "SimbaV2": _maker(
+        sac, SimbaV2, n_critics=2, value_head_kwargs={"n_atoms": 11}, policy_kwargs=TINY_RESIDUAL, learning_rate=1e-3
+    ),
+    "BRC": _maker(
+        sac,
+        BRC,
+        critic_width=8,
+        value_head_kwargs={"n_atoms": 11},
+        policy_kwargs={"actor_network_kwargs": {"width": 8, "n_blocks": 1}},
+    ),
     "RegularizedSAC": _maker(
         sac,
         RegularizedSAC,

@@ -6,13 +6,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_sample import BRO, DAC, GPLSAC, OAC, OPLSAC, SAC, TOPSAC, VPLSAC, RegularizedSAC
+from sb3_sample import BRC, BRO, DAC, GPLSAC, OAC, OPLSAC, SAC, TOPSAC, VPLSAC, RegularizedSAC, SimBa, SimbaV2
 from sb3_sample.parts import ValueHead
-from tests.sac.common import TINY_BRO, TINY_SAC, vec
+from tests.sac.common import TINY_BRO, TINY_RESIDUAL, TINY_SAC, vec
 
 DOCS = Path(__file__).parents[2] / "docs" / "parts.md"
 NOISE = NormalActionNoise(np.zeros(2), np.ones(2))
@@ -109,6 +111,40 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
     "`value_head` with `n_quantiles`, `value_head_kwargs` without `value_head`": [
         (SAC, {"value_head": ValueHead, "n_quantiles": 5}, ("value_head", "n_quantiles=None")),
         (SAC, {"value_head_kwargs": {"a": 1}}, ("value_head_kwargs", "value_head=None")),
+    ],
+    "`reward_scale_kwargs` without `reward_scale`": [
+        (SAC, {"reward_scale_kwargs": {"max_return": 1}}, ("reward_scale_kwargs", "reward_scale=None")),
+    ],
+    "`reward_scale` with `VecNormalize(norm_reward=True)`": [
+        (SAC, {"reward_scale": "xqc", "env": VecNormalize(vec())}, ("reward_scale='xqc'", "norm_reward=False")),
+    ],
+    "`learning_rate_schedule` with a function as `learning_rate`; its settings without it": [
+        (
+            SAC,
+            {"learning_rate_schedule": "linear", "learning_rate": lambda progress: progress},
+            ("learning_rate_schedule='linear'", "learning_rate="),
+        ),
+        (SAC, {"final_learning_rate": 1e-5}, ("final_learning_rate=1e-05", "learning_rate_schedule=None")),
+        (
+            SimbaV2,
+            {"policy_kwargs": TINY_RESIDUAL, "learning_rate_schedule": None, "warm_up_steps": 5},
+            ("warm_up_steps=5",),
+        ),
+    ],
+    "`normalize_observations` with observations other than a Box of floats": [
+        (
+            SAC,
+            {"normalize_observations": True, "env": vec(obs_space=spaces.Discrete(8))},
+            ("normalize_observations=True", "Discrete(8)"),
+        ),
+    ],
+    "`n_critics` of `SimBa`, `SimbaV2`, `weight_decay` of `SimBa`, `BRC` also in `policy_kwargs`; `critic_network…` in "
+    "`BRC` without `critic_width=None`": [
+        (SimBa, {"policy_kwargs": {"n_critics": 2}}, ("n_critics", "policy_kwargs")),
+        (SimbaV2, {"policy_kwargs": {"n_critics": 2}}, ("n_critics", "policy_kwargs")),
+        (SimBa, {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}}, ("weight_decay", "optimizer_kwargs")),
+        (BRC, {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}}, ("weight_decay", "optimizer_kwargs")),
+        (BRC, {"policy_kwargs": {"critic_network": "mlp"}}, ("critic_network", "critic_width=None")),
     ],
 }
 

@@ -931,7 +931,7 @@ def check_parameters(
 
 
 def test_files_are_there() -> None:
-    assert FILES, f"no file of updates in {FOLDER}"
+    assert ALL_FILES, f"no file of a method's in {FOLDER}"
     here = {path.stem for path in OWN_FOLDER.glob("*.npz")}
     assert {name for name in METHODS if any(stem.startswith(name) for stem in here)} == METHODS.keys()
     assert all(method_of(path, METHODS | SEQUENCES) for path in OWN_FOLDER.glob("*.npz"))

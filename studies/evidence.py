@@ -1,0 +1,458 @@
+"""
+Makes the project's own evidence: the runs of the plans in studies/evidence, in the order of its file QUEUE.
+
+    make evidence [WORKERS=2]
+
+A run that is begun is made from the last commit, in a git worktree and an environment of its own, never from the files
+of the checkout; one that was interrupted goes on under the commit that it began with. All this lies in
+``~/.cache/sb3_sample/evidence``, which may be removed: what has not ended then begins anew. What has ended is written
+to ``docs/evidence`` of the checkout: evaluations as a table (``<plan>.csv``, as ``sb3-sample study table`` has it), and
+settings, commit and machine of each run (``<plan>.json``).
+
+Runs have a low priority and one thread each. Ctrl-C and SIGTERM have them save and end; after
+``kill -9`` they do so by themselves. To pause one, ``kill -STOP`` its number, which is said when a run begins.
+"""
+
+import argparse
+import contextlib
+import fcntl
+import hashlib
+import json
+import os
+import platform
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+PLANS = Path(__file__).with_name("evidence")
+#: In the folder of the evidence: worktrees by commit, environments by lock file, studies by plan and commit.
+TREES, ENVIRONMENTS, STUDIES = "trees", "environments", "studies"
+#: In a worktree that is whole.
+COMPLETE = ".complete"
+#: How often a run is tried that fails.
+ATTEMPTS = 2
+#: Settings of a run that change no result.
+FREE = {"checkpoint_freq", "gym_packages"}
+
+
+# ---------------------------------------------------------------- with the standard library: what runs where
+
+
+class Order(NamedTuple):
+    """
+    :param plan: name of the plan
+    :param commit: of which the run is made
+    :param folder: of the study
+    :param name: of the run in it
+    :param title: the run in words
+    """
+
+    plan: str
+    commit: str
+    folder: str
+    name: str
+    title: str
+
+
+class Evidence:
+    """
+    :param root: folder of worktrees, environments and studies
+    :param results: folder of the results
+    :param python: interpreter of all runs, which has what they need; None: an environment of their own
+    """
+
+    def __init__(self, root: Path, results: Path, python: str | None):
+        self.root, self.results, self._python = root.resolve(), results, python
+        self.root.mkdir(parents=True, exist_ok=True)
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        with (self.root / ".lock").open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
+    def tree(self, commit: str) -> Path:
+        """
+        :param commit: a commit
+        :return: a worktree of it
+        :raises CalledProcessError: git does not have it
+        """
+        path = self.root / TREES / commit
+        complete = path / COMPLETE
+        with self._alone():
+            if not complete.exists():
+                git("worktree", "prune")
+                shutil.rmtree(path, ignore_errors=True)
+                git("worktree", "add", "--quiet", "--force", "--detach", str(path), commit)
+                complete.touch()
+        return path
+
+    def python(self, tree: Path) -> str:
+        """
+        :param tree: a worktree
+        :return: an interpreter with all that it needs
+        """
+        if self._python is not None:
+            return self._python
+        version = f"{sys.version_info.major}.{sys.version_info.minor}"
+        lock = (tree / "constraints" / f"{version}.txt").read_bytes()
+        place = self.root / ENVIRONMENTS / f"{version}-{hashlib.sha256(lock).hexdigest()[:12]}"
+        with self._alone():
+            if not (place / ".all").exists():
+                shutil.rmtree(place, ignore_errors=True)
+                command = ["make", "--silent", "-C", str(tree), f"VENV={place}", f"PYTHON={sys.executable}"]
+                subprocess.run([*command, str(place / ".all")], check=True)
+        return str(place / "bin" / "python")
+
+    def process(self, commit: str, *command: str, **options: Any) -> "subprocess.Popen[str]":
+        """
+        :param commit: a commit
+        :param command: arguments of the interpreter, in its worktree
+        :param options: of ``Popen``
+        :return: a process
+        """
+        tree = self.tree(commit)
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+        # The checkout's own variables are not the worktree's.
+        inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "MAKE"))}
+        environment = {**inherited, **threads, "PYTHONPATH": str(tree)}
+        return subprocess.Popen((self.python(tree), *command), cwd=tree, env=environment, text=True, **options)
+
+    def next(self, left_out: list[str]) -> Order | None:
+        """
+        Write down what has ended, and choose what is next, by the last commit's plans and package.
+
+        :param left_out: runs that are not to be chosen, ``<plan>/<name>``
+        :return: the next run; None if all are done or in progress
+        :raises RuntimeError: the commit's own program fails
+        """
+        last = git("rev-parse", "HEAD").strip()
+        words = ("next", str(self.root), str(self.results), *left_out)
+        process = self.process(last, script(self.tree(last)), *words, stdout=subprocess.PIPE)
+        answer, _ = process.communicate()
+        if process.returncode:
+            raise RuntimeError(f"studies/evidence.py next, of commit {last}: exit code {process.returncode}")
+        found = json.loads(answer)
+        return None if found is None else Order(**found)
+
+    def make(self, workers: int, most: int | None) -> list[str]:
+        """
+        Make all runs that are not done.
+
+        :param workers: runs at once
+        :param most: how many runs; None: all
+        :return: titles of the runs that have failed
+        """
+        running: dict[subprocess.Popen[str], Order] = {}
+        failures: dict[str, int] = {}
+        began = 0
+        try:
+            while True:
+                left_out = [f"{order.plan}/{order.name}" for order in running.values()]
+                left_out += [name for name, times in failures.items() if times >= ATTEMPTS]
+                order = self.next(left_out)
+                if order is not None and (most is None or began < most):
+                    process = self._start(order)
+                    running[process] = order
+                    began += 1
+                    print(f"began {order.title}: commit {order.commit[:12]}, process {process.pid}", flush=True)
+                    if len(running) < workers:
+                        continue
+                if not running:
+                    break
+                process = ended(list(running))
+                order = running.pop(process)
+                if process.returncode == 0:
+                    print(f"done: {order.title}", flush=True)
+                else:
+                    name = f"{order.plan}/{order.name}"
+                    failures[name] = failures.get(name, 0) + 1
+        finally:
+            leave(list(running))
+        return [name for name, times in failures.items() if times >= ATTEMPTS]
+
+    def _start(self, order: Order) -> "subprocess.Popen[str]":
+        # The pipe's end tells it that this process is gone; the terminal's Ctrl-C is this process's to answer.
+        return self.process(
+            order.commit,
+            script(self.tree(order.commit)),
+            "run",
+            order.folder,
+            order.name,
+            stdin=subprocess.PIPE,
+            start_new_session=True,
+        )
+
+
+def script(tree: Path) -> str:
+    """
+    :param tree: a worktree
+    :return: this file there
+    """
+    return str(tree / "studies" / "evidence.py")
+
+
+def ended(processes: "list[subprocess.Popen[str]]") -> "subprocess.Popen[str]":
+    """
+    :param processes: at least one
+    :return: the first that has ended, when one has
+    """
+    while True:
+        for process in processes:
+            if process.poll() is not None:
+                return process
+        time.sleep(0.5)
+
+
+def leave(processes: "list[subprocess.Popen[str]]") -> None:
+    """
+    Have processes save and end; at once if this is interrupted again.
+
+    :param processes: that make runs
+    """
+    try:
+        for process in processes:
+            assert process.stdin is not None
+            process.stdin.close()
+        for process in processes:
+            process.wait()
+    except BaseException:
+        for process in processes:
+            process.kill()
+        raise
+
+
+def git(*words: str) -> str:
+    """
+    :param words: of a command of git, in the checkout
+    :return: what it prints
+    :raises CalledProcessError: it fails
+    """
+    return subprocess.run(["git", *words], cwd=CHECKOUT, check=True, stdout=subprocess.PIPE, text=True).stdout
+
+
+# ---------------------------------------------------------------- with the package of a worktree: what is done and next
+
+
+class Found(NamedTuple):
+    """
+    A run of a plan, where there is something of it.
+
+    :param commit: that it was begun with
+    :param folder: of the study
+    :param done: whether it has ended
+    """
+
+    commit: str
+    folder: Any
+    done: bool
+
+
+def same(here: dict[str, Any], there: dict[str, Any]) -> bool:
+    """
+    :param here: a run, as JSON
+    :param there: another one
+    :return: whether they have the same result
+    """
+    return all(here.get(name) == there.get(name) for name in (here.keys() | there.keys()) - FREE)
+
+
+def is_at_hand(root: Path, commit: str) -> bool:
+    """
+    :param root: folder of the evidence
+    :param commit: a commit
+    :return: whether there is a worktree of it, or git can make one
+    """
+    if (root / TREES / commit / COMPLETE).exists():
+        return True
+    command = ["git", "cat-file", "-e", f"{commit}^{{commit}}"]
+    return subprocess.run(command, cwd=CHECKOUT, stderr=subprocess.DEVNULL).returncode == 0
+
+
+def found(root: Path, plan: str, run: Any) -> Found | None:
+    """
+    :param root: folder of the evidence
+    :param plan: name of a plan
+    :param run: one of its runs
+    :return: the one that has ended, else the one that is farthest; None if there is nothing of it
+    """
+    from sb3_sample.study.runs import StudyFolder
+
+    places = []
+    for path in sorted((root / STUDIES / plan).glob("*")):
+        folder = StudyFolder(path)
+        listed = {each.name: each.as_json() for each in folder.runs()}
+        if run.name in listed and same(listed[run.name], run.as_json()) and folder.place(run).is_dir():
+            outcome, steps = folder.outcome(run), folder.progress(run).steps
+            if outcome.done or is_at_hand(root, path.name):
+                places.append((outcome.done, steps, Found(path.name, folder, outcome.done)))
+    return max(places, key=lambda place: place[:2])[2] if places else None
+
+
+def recorded(results: Path, plan: str) -> list[dict[str, Any]]:
+    """
+    :param results: folder of the results
+    :param plan: name of a plan
+    :return: what is written of its runs that have ended
+    """
+    path = results / f"{plan}.json"
+    return json.loads(path.read_text()) if path.exists() else []
+
+
+def queue() -> list[tuple[str, int]]:
+    """
+    :return: names of plans, and how many of their seeds are to be made, in the order in which they are
+    :raises ValueError: a line is something else
+    """
+    lines = [line.split() for line in (PLANS / "QUEUE").read_text().splitlines() if not line.startswith("#")]
+    return [(name, int(seeds)) for name, seeds in lines]
+
+
+def plan_of(name: str) -> Any:
+    """
+    :param name: of a plan in studies/evidence
+    :return: the plan
+    """
+    from sb3_sample import study
+
+    return study.read_plan(PLANS / f"{name}.yml")
+
+
+def choose(root: Path, results: Path, left_out: list[str]) -> Order | None:
+    """
+    :param root: folder of the evidence
+    :param results: folder of the results
+    :param left_out: runs that are not to be chosen, ``<plan>/<name>``
+    :return: the next run, in the study of the commit that makes it; None if all are done or in progress
+    """
+    from sb3_sample.study.plan import Plan
+    from sb3_sample.study.runs import StudyFolder
+
+    plans = {name: plan_of(name) for name, _ in queue()}
+    for name, n_seeds in queue():
+        seeds = sorted({run.seed for run in plans[name].runs})[:n_seeds]
+        ended = [record["run"] for record in recorded(results, name)]
+        for run in plans[name].runs:
+            if run.seed not in seeds or f"{name}/{run.name}" in left_out:
+                continue
+            if any(same(run.as_json(), there) for there in ended):
+                continue
+            here = found(root, name, run)
+            if here is None:
+                last = Path(__file__).resolve().parents[1].name
+                here = Found(last, StudyFolder(root / STUDIES / name / last), False)
+                here.folder.enter(Plan(name, (run,)), keep=True)
+            if not here.done and not here.folder.is_claimed(run):
+                return Order(name, here.commit, str(here.folder.path), run.name, run.title)
+    return None
+
+
+def collect(root: Path, results: Path) -> None:
+    """
+    Write down the runs that have ended and are not written down yet.
+
+    :param root: folder of the evidence
+    :param results: folder of the results
+    """
+    import pandas as pd
+
+    from sb3_sample import study
+
+    for name in dict.fromkeys(name for name, _ in queue()):
+        records = recorded(results, name)
+        path = results / f"{name}.csv"
+        tables = [study.load(path)] if path.exists() else []
+        before = len(records)
+        for run in plan_of(name).runs:
+            here = found(root, name, run)
+            if here is None or not here.done or any(same(run.as_json(), record["run"]) for record in records):
+                continue
+            outcome = here.folder.outcome(run)
+            records.append(
+                {
+                    "run": run.as_json(),
+                    "commit": here.commit,
+                    "python": platform.python_version(),
+                    "processor": processor(),
+                    "threads": outcome.threads,
+                }
+            )
+            tables.append(study.read(f"{run.agent}={here.folder.place(run)}"))
+        if len(records) > before:
+            results.mkdir(parents=True, exist_ok=True)
+            study.write(pd.concat(tables, ignore_index=True), path)
+            (results / f"{name}.json").write_text(json.dumps(records, indent=1) + "\n")
+
+
+def processor() -> str:
+    """
+    :return: model of this machine's processor
+    """
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def run(folder: str, name: str) -> None:
+    """
+    Make a run, or go on with it, until this process is told to end or its standard input does.
+
+    :param folder: of the study
+    :param name: of the run in it
+    """
+    from sb3_sample.study.runs import StudyFolder
+    from sb3_sample.study.worker import attempt
+
+    def listen() -> None:
+        while os.read(0, 1):  # not sys.stdin, which could not be closed while a thread reads it
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    os.nice(10)
+    threading.Thread(target=listen, daemon=True).start()
+    place = StudyFolder(folder)
+    (chosen,) = (each for each in place.runs() if each.name == name)
+    outcome = attempt(place, chosen, ["--num-threads", "1", "--device", "cpu"], threads=1)
+    if outcome is not None and outcome.traceback:
+        print(f"failed: {chosen.title}\n{outcome.traceback}", file=sys.stderr)
+        raise SystemExit(1)
+
+
+def main() -> None:
+    """Answer the question of another process, or make the evidence."""
+    if sys.argv[1:2] == ["run"]:
+        return run(*sys.argv[2:])
+    if sys.argv[1:2] == ["next"]:
+        root, results = map(Path, sys.argv[2:4])
+        collect(root, results)
+        order = choose(root, results, sys.argv[4:])
+        return print(json.dumps(None if order is None else order._asdict()))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help="runs at once (default: 1)")
+    parser.add_argument("--most", type=int, metavar="N", help="how many runs to make or to go on with (default: all)")
+    parser.add_argument("--root", type=Path, default=Path("~/.cache/sb3_sample/evidence").expanduser())
+    parser.add_argument("--results", type=Path, default=CHECKOUT / "docs" / "evidence")
+    parser.add_argument(
+        "--python", help="interpreter that has all that is needed, instead of an environment of its own"
+    )
+    options = parser.parse_args()
+    if options.workers < 1 or (options.most is not None and options.most < 1):
+        parser.error(f"--workers and --most must be at least 1, not {options.workers} and {options.most}")
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda number, _: sys.exit(128 + number))
+    evidence = Evidence(options.root, options.results.resolve(), options.python)
+    if failed := evidence.make(options.workers, options.most):
+        sys.exit("failed: " + ", ".join(failed))
+
+
+if __name__ == "__main__":
+    main()
