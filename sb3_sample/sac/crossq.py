@@ -96,6 +96,7 @@ class CrossQ(SAC):
         bounds = {"log_std_min": -10.0 if self.weight_norm else -20.0, "clip_log_std": True}
         kwargs = with_networks(kwargs, "crossq", sizes, more, bounds)
         optimizer = {**(kwargs.get("optimizer_kwargs") or {}), "weight_decay": self.weight_decay}
-        if not self.weight_norm and kwargs.get("optimizer_class", AdamW) in (AdamW, torch.optim.Adam, torch.optim.AdamW):
+        is_adam = kwargs.get("optimizer_class", AdamW) in (AdamW, torch.optim.Adam, torch.optim.AdamW)
+        if is_adam and not self.weight_norm:
             optimizer.setdefault("betas", (0.5, 0.999))
         return {**kwargs, "optimizer_kwargs": optimizer}

@@ -22,7 +22,8 @@ _SIZES: dict[str, dict[str, Any]] = {
 
 class FlashSAC(SAC):
     """
-    FlashSAC (Holiday Robot 2026, https://arxiv.org/abs/2604.04539), with the settings of its runs on a CPU's simulators.
+    FlashSAC (Holiday Robot 2026, https://arxiv.org/abs/2604.04539), with the settings of its runs on simulators of a
+    CPU.
 
     Residual networks with batch norm whose weights, scales and shifts keep their norms ("flash"), critics as
     classifiers over 101 atoms in [-5, 5], rewards divided by a running measure of the return, noise that is held for

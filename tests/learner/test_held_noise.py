@@ -83,7 +83,7 @@ def test_resumed_bit_by_bit(n_envs: int, tmp_path: Path) -> None:
     """A run that stops while a noise is held goes on with it."""
 
     def make() -> Any:
-        return MAKERS["FlashSAC"](vec(n_envs), exploration_kwargs={"exponent": 0.0})
+        return MAKERS["FlashSAC"](vec(n_envs), exploration_kwargs={"exponent": 0.0}, schedule_steps=80)
 
     model = make().learn(90, checkpoint=tmp_path / "a", checkpoint_freq=1000)
     stopped = make().learn(42, checkpoint=tmp_path / "b", checkpoint_freq=3)

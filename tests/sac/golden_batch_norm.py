@@ -1,5 +1,5 @@
 """
-Recorded updates of XQC, CrossQ+WN and FlashSAC, for the tests of ``test_golden.py``: what is compared with which limits.
+Recorded updates of XQC, CrossQ+WN and FlashSAC, for the tests of ``test_golden.py``: what is compared, and how closely.
 
 The classes here are mixed into ``Updates`` there. Weights are in the files as ``torch.nn.Linear`` has them, everything
 of the critics with a leading axis of the critics.
@@ -256,9 +256,9 @@ class BatchNormUpdates:
 
     def check_parameters(self, prefix: str, n_updates: int) -> None:
         """
-        In XQC's training passes a shift of the input is taken out by the next norm: its gradient is rounding, which Adam
-        turns into steps of up to the learning rate while its moments are nothing else. In evaluation mode it counts. It
-        is therefore taken over from the file after every update, so that all else can be compared closely.
+        In XQC's training passes the next norm takes a shift of the input out again: its gradient is rounding, which
+        Adam turns into steps of up to the learning rate while its moments are nothing else. In evaluation mode it
+        counts. It is therefore taken over from the file after every update, so that all else can be compared closely.
         """
         limits, rate = self.limits, self.model.learning_rate
         n_alone = n_updates - self._n_synchronised
