@@ -11,6 +11,7 @@ import torch
 from gymnasium import spaces
 from sb3_contrib import CrossQ as ContribCrossQ
 from sb3_contrib.common.torch_layers import BatchRenorm1d
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
@@ -245,6 +246,7 @@ def test_crossq_is_sb3_contribs(renorm_warm_up: int, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(theirs.replay_buffer, "sample", lambda *_, **__: samples)
     drawn = iter((noise.critic, noise.actor))
     monkeypatch.setattr(torch.distributions.normal, "_standard_normal", lambda *_, **__: next(drawn))
+    theirs.set_logger(configure(None, []))
     # The third update is the actor's, in both.
     theirs._n_updates = ours._n_updates = 2
     theirs.train(1, n)
