@@ -43,8 +43,8 @@ class BatchNorm(nn.Module):
         self.unbiased = unbiased
         self.running_unbiased = unbiased if running_unbiased is None else running_unbiased
         shape = (n_features,) if n_copies is None else (n_copies, 1, n_features)
-        self.weight = nn.Parameter(torch.ones(shape))
-        self.bias = nn.Parameter(torch.zeros(shape))
+        self.weight: torch.Tensor = nn.Parameter(torch.ones(shape))
+        self.bias: torch.Tensor = nn.Parameter(torch.zeros(shape))
         self.register_buffer("running_mean", torch.zeros(shape))
         self.register_buffer("running_var", torch.ones(shape))
 

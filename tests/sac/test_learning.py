@@ -130,7 +130,14 @@ def successor(name: str) -> SAC:
 
 
 @pytest.mark.parametrize(
-    "name", ["SimbaV2", pytest.param("SimBa", marks=pytest.mark.slow), pytest.param("BRC", marks=pytest.mark.slow)]
+    "name",
+    [
+        "SimbaV2",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("SimBa", "BRC", "CrossQ", "CrossQ+WN", "XQC", "FlashSAC")
+        ),
+    ],
 )
 def test_the_successors_of_bro_learn_pendulum(name: str) -> None:
     assert score(successor(name).learn(4_000)) > GOOD
