@@ -130,5 +130,7 @@ class BatchRenorm(BatchNorm):
             distance = torch.where(is_warm, distance, 0.0)
             self.n_passes.add_(1)
         self._follow(mean, var, x.shape[-2])
-        # The floor keeps the root's gradient finite where a feature is the same in all rows.
-        return mean - distance * var.clamp_min(1e-12).sqrt() / ratio, var / ratio.square()
+        # Where a feature is the same in all rows, as of a silent neuron, the root would have an infinite gradient.
+        is_flat = var == 0
+        std = torch.where(is_flat, 0.0, torch.where(is_flat, 1.0, var).sqrt())
+        return mean - distance * std / ratio, var / ratio.square()

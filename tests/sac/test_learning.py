@@ -129,16 +129,8 @@ def successor(name: str) -> SAC:
     return SimBa("MlpPolicy", "Pendulum-v1", **both, **kwargs)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "SimbaV2",
-        *(
-            pytest.param(name, marks=pytest.mark.slow)
-            for name in ("SimBa", "BRC", "CrossQ", "CrossQ+WN", "XQC", "FlashSAC")
-        ),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["BRC", "CrossQ", "CrossQ+WN", "FlashSAC", "SimBa", "SimbaV2", "XQC"])
 def test_the_successors_of_bro_learn_pendulum(name: str) -> None:
     assert score(successor(name).learn(4_000)) > GOOD
 
