@@ -21,6 +21,8 @@ from sb3_sample.learner.target import bootstrap, td_target, values
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.networks import (
     NETWORKS,
+    BatchNorm,
+    BatchRenorm,
     EnsembleLayerNorm,
     EnsembleLinear,
     HiddenUnits,
@@ -40,6 +42,8 @@ __all__ = [
     "VALUE_HEADS",
     "AdamW",
     "Batch",
+    "BatchNorm",
+    "BatchRenorm",
     "BatchTransform",
     "CategoricalHead",
     "Column",

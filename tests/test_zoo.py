@@ -58,7 +58,7 @@ BUILT = [
 #: Those of the MBMA paper.
 ON_POLICY = sorted(name for name, entry in zoo.ALGORITHMS.items() if issubclass(entry.algorithm, SimulatedPPO))
 #: What came after BRO, each with settings of its own.
-SUCCESSORS = ("brc", "dr_q", "simba", "simbav2")
+SUCCESSORS = ("brc", "crossq", "dr_q", "flash_sac", "simba", "simbav2", "xqc")
 #: Algorithms with the settings that DAC, VPL and the regularization study (2403.00514) share.
 FAMILY = sorted(
     name

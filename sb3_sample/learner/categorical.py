@@ -7,7 +7,7 @@ import torch
 
 from sb3_sample.kinds import ABOVE_0, FINITE, TRUE_OR_FALSE, check_value, integer
 from sb3_sample.learner.batch import Batch
-from sb3_sample.learner.heads import ValueHead
+from sb3_sample.learner.heads import HalfSquaredHead, ValueHead
 from sb3_sample.learner.target import td_target
 
 
@@ -166,4 +166,8 @@ class HLGaussHead(CategoricalHead):
 
 
 #: Heads by the name that ``value_head`` takes.
-VALUE_HEADS: dict[str, type[ValueHead]] = {"categorical": CategoricalHead, "hl_gauss": HLGaussHead}
+VALUE_HEADS: dict[str, type[ValueHead]] = {
+    "categorical": CategoricalHead,
+    "half_squared": HalfSquaredHead,
+    "hl_gauss": HLGaussHead,
+}

@@ -51,6 +51,58 @@ class Exploration(Part):
         return {}
 
 
+class HeldNoise(Exploration):
+    """
+    FlashSAC's exploration: the actor's noise is held for some steps, ``tanh(mean + std * held)`` with mean and standard
+    deviation of each step. How many, n, is drawn with a probability proportional to ``n ** -exponent``, for all
+    environments at once. A noise outlives the end of an episode.
+
+    :param learner: the learner, whose networks exist already
+    :param exponent: of the distribution of n, at least 0
+    :param longest: largest n
+    :raises ValueError: if an argument is out of range
+    """
+
+    def __init__(self, learner: Learning, exponent: float = 2.0, longest: int = 16):
+        super().__init__(learner)
+        check_value("exponent", exponent, AT_LEAST_0)
+        check_value("longest", longest, integer(1))
+        weights = torch.arange(1, longest + 1, dtype=torch.float64) ** -float(exponent)
+        #: Probabilities that a noise is held for at most 1, 2, ... steps, (longest,), on the host.
+        self._cumulative = (weights.cumsum(0) / weights.sum()).float()
+        self._held: torch.Tensor | None = None
+        self._length = self._n_held = 0
+
+    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
+        mean, log_std = learner.actor.gaussian(learner.actor.features(observations))
+        held = self.hold(torch.randn_like(mean), float(torch.rand(())))
+        return learner.actor.act(mean, log_std.exp(), held)
+
+    def hold(self, fresh: torch.Tensor, uniform: float) -> torch.Tensor:
+        """
+        Take one step.
+
+        :param fresh: standard normal noise, (n_envs, A), used if none is held any longer
+        :param uniform: number in [0, 1), from which it then follows how long the new one is held
+        :return: the noise of the step, (n_envs, A)
+        """
+        held = self._held
+        if held is None or held.shape != fresh.shape or self._n_held >= self._length:
+            held, self._n_held = fresh, 0
+            # The last probability is 1, up to rounding.
+            self._length = 1 + min(int((self._cumulative <= uniform).sum()), len(self._cumulative) - 1)
+        self._held, self._n_held = held.to(fresh), self._n_held + 1
+        return self._held
+
+    def get_extra_state(self) -> dict[str, Any]:
+        held = None if self._held is None else self._held.tolist()
+        return {"held": held, "length": self._length, "n_held": self._n_held}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self._held = None if state["held"] is None else torch.tensor(state["held"])
+        self._length, self._n_held = int(state["length"]), int(state["n_held"])
+
+
 #: What may be meant by the spread of the critics.
 UNCERTAINTIES = ("epistemic", "aleatoric", "both")
 
@@ -442,6 +494,7 @@ class OptimisticGradient(Exploration):
 #: Choices by the name that the algorithm's ``exploration`` argument takes.
 EXPLORATIONS: dict[str, type[Exploration]] = {
     "actor": Exploration,
+    "held_noise": HeldNoise,
     "oac": OptimisticGradient,
     "optimistic_actor": OptimisticActor,
     "optimistic_shift": OptimisticShift,

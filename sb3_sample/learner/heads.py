@@ -73,6 +73,13 @@ class ValueHead(nn.Module):
         return losses.squared_error(q, target)
 
 
+class HalfSquaredHead(ValueHead):
+    """Head of scalar critics, trained by half the squared error, as in Stable-Baselines3 and CrossQ."""
+
+    def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        return super().loss(q, target) / 2
+
+
 class QuantileHead(ValueHead):
     """
     Head of critics with quantiles of the return, trained by the quantile Huber loss (BRO, algorithm 2, line 8).

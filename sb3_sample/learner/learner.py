@@ -86,6 +86,7 @@ class Learner:
     :param n_tasks: tasks that the observations tell apart
     :param target_update_interval: gradient steps between two updates of the targets; None: ``policy_delay``
     :param policy_delay: gradient steps between two of the actors' and of the temperature
+    :param actor_at_once: whether the first of ``policy_delay`` gradient steps is the actors', and not the last
     :param actor_first: whether actors and temperature learn before the critics, whose target is then of the new ones
     :param target_subset: how many critics, drawn at random, make the TD target; None: all
     :param actor_pessimism: a weight of pessimism for the actor's objective alone; None: the rule's
@@ -101,8 +102,8 @@ class Learner:
 
     #: Arguments that may be set between two gradient steps, with effect from the next one on.
     SETTINGS = (
-        "gamma", "tau", "target_update_interval", "policy_delay", "actor_first", "target_subset", "actor_pessimism",
-        "sam_radius", "learning_starts", "verbose", "compile",
+        "gamma", "tau", "target_update_interval", "policy_delay", "actor_at_once", "actor_first", "target_subset",
+        "actor_pessimism", "sam_radius", "learning_starts", "verbose", "compile",
     )  # fmt: skip
 
     pessimism_rule: Pessimism
@@ -128,6 +129,7 @@ class Learner:
         target_entropy: float | Sequence[float] | None = None,
         target_update_interval: int | None = 1,
         policy_delay: int = 1,
+        actor_at_once: bool = False,
         actor_first: bool = False,
         target_subset: int | None = None,
         actor_pessimism: float | None = None,
@@ -147,7 +149,7 @@ class Learner:
         self.gamma, self.tau = gamma, tau
         self.schedule = schedule
         self.target_update_interval, self.policy_delay = target_update_interval, policy_delay
-        self.actor_first = actor_first
+        self.actor_at_once, self.actor_first = actor_at_once, actor_first
         self.target_subset, self.actor_pessimism, self.sam_radius = target_subset, actor_pessimism, sam_radius
         self.learning_starts, self.compile = learning_starts, compile
         self.n_tasks, self._n_envs = n_tasks, 1
@@ -392,7 +394,9 @@ class Learner:
         """Set the rates of the step that is counted already; each optimizer goes by the steps that it took itself."""
         before = self.n_updates - 1
         of_critics = schedule.rate(before, self.planned_updates)
-        of_actors = schedule.rate(before // self.policy_delay, self.planned_updates)
+        # One ahead, at a start and after every delay, where the first of the steps is theirs.
+        ahead = self.policy_delay - 1 if self.actor_at_once else 0
+        of_actors = schedule.rate((before + ahead) // self.policy_delay, self.planned_updates)
         for optimizer in self.optimizers().values():
             for group in optimizer.param_groups:
                 if group.get("scheduled", True):
@@ -557,7 +561,7 @@ class Learner:
     def _what_moves(self) -> tuple[bool, bool]:
         """Whether the targets, and whether actors and temperature move in the gradient step that was just counted."""
         moves_targets = self.n_updates % (self.target_update_interval or self.policy_delay) == 0
-        return moves_targets, self.n_updates % self.policy_delay == 0
+        return moves_targets, (self.n_updates - self.actor_at_once) % self.policy_delay == 0
 
     def _transformed(self, batch: Batch, noise: Noise | None, extra: Extra | None) -> tuple[Batch, Noise, Extra | None]:
         noise = noise or Noise()
@@ -595,6 +599,9 @@ class Learner:
         metrics.update(of_critics)
         if moves_actor and not self.actor_first:
             metrics.update(self._learn_actors(batch, noise, alpha))
+        elif self.actor.trunk.statistics_every_step and not moves_actor:
+            with torch.no_grad():
+                self.actor.gaussian(self.actor.features(self.encoded(batch.observations)))
 
         # Pessimism.
         rule = self.pessimism_rule
@@ -630,7 +637,10 @@ class Learner:
         """Take the steps of actor, explorer and temperature."""
         # Actor, on the critics, and on their encoder if it is shared.
         observations = self.encoded(batch.observations)
-        actions, log_prob = self.actor.sample(observations, noise.actor)
+        if self.actor.trunk.stacks_actor_rows:
+            actions, log_prob = self.actor.sample(observations, noise.actor, self.encoded(batch.next_observations))
+        else:
+            actions, log_prob = self.actor.sample(observations, noise.actor)
         value = self._actor_value(values(self, self.critic, observations, actions))
         actor_loss = losses.actor_loss(log_prob, value, alpha.detach())
         self.minimize(self.actor.optimizer, actor_loss)

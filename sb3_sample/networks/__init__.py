@@ -1,9 +1,12 @@
 """Networks that know nothing of reinforcement learning."""
 
 from sb3_sample.networks.activations import CReLU
+from sb3_sample.networks.batch_norm import BatchNorm, BatchRenorm
+from sb3_sample.networks.batch_normed import CrossQNet, XQCNet
 from sb3_sample.networks.bronet import BroNet
 from sb3_sample.networks.dormant import neuron_scores, recycle
 from sb3_sample.networks.ensemble import EnsembleLayerNorm, EnsembleLinear
+from sb3_sample.networks.flash import FlashNet
 from sb3_sample.networks.initialization import init_orthogonal, linear
 from sb3_sample.networks.mlp import MLP
 from sb3_sample.networks.network import HiddenUnits, Network, widened
@@ -18,18 +21,25 @@ from sb3_sample.networks.unit_norm import UnitEnsembleLinear, UnitLinear, UnitNo
 NETWORKS: dict[str, type[Network]] = {
     "mlp": MLP,
     "bronet": BroNet,
+    "crossq": CrossQNet,
+    "flash": FlashNet,
     "simba": SimbaNet,
     "simbav2": SimbaV2Net,
     "spectral": SpectralNet,
+    "xqc": XQCNet,
 }
 
 __all__ = [
     "MLP",
     "NETWORKS",
+    "BatchNorm",
+    "BatchRenorm",
     "BroNet",
     "CReLU",
+    "CrossQNet",
     "EnsembleLayerNorm",
     "EnsembleLinear",
+    "FlashNet",
     "HiddenUnits",
     "Network",
     "RunningMoments",
@@ -42,6 +52,7 @@ __all__ = [
     "UnitEnsembleLinear",
     "UnitLinear",
     "UnitNorm",
+    "XQCNet",
     "init_orthogonal",
     "linear",
     "neuron_scores",

@@ -48,7 +48,11 @@ class Network(nn.Module):
     #: targets), "target" from the target critics' own pass over the same rows; None: a pass each. Where rows are
     #: stacked, everything else (actors' objectives, rules of pessimism, TD targets' actions) sees the network in
     #: evaluation mode, so that running statistics are those of the stacked rows alone.
-    stacks_rows: ClassVar[str | None] = None
+    stacks_rows: str | None = None
+    #: Whether an actor's own step stacks the current and the next rows too, of which the current ones are learned from.
+    stacks_actor_rows: bool = False
+    #: Whether an actor's running statistics move in every gradient step, also where ``policy_delay`` has it not learn.
+    statistics_every_step: bool = False
 
     #: Gain of the output layer's kernel, unless its owner asks for another.
     head_gain: ClassVar[float] = DEFAULT_GAIN

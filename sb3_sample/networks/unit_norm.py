@@ -8,17 +8,28 @@ from sb3_sample.networks.ensemble import EnsembleLinear
 
 class UnitNorm(nn.Module):
     """
-    Addition to a dense layer: :meth:`project` divides the input weights of each unit by their length, per copy. Biases
-    are left alone. Forward passes do not, so that whoever changes the weights has to project them.
+    Addition to a dense layer: :meth:`project` divides the input weights of each unit by their length, per copy. Forward
+    passes do not, so that whoever changes the weights has to project them.
     """
 
     weight: torch.Tensor
+    #: Whether a unit's bias counts as one of its weights; False: biases are left alone.
+    joint_bias: bool = False
 
     @torch.no_grad()
     def project(self) -> None:
         """Bring the weights back to length 1, in place."""
         # The inputs are axis 1 of (out, in) and of (E, in, out) alike.
-        self.weight.div_(torch.linalg.vector_norm(self.weight, dim=1, keepdim=True).clamp_min(1e-8))
+        length = torch.linalg.vector_norm(self.weight, dim=1, keepdim=True)
+        if not self.joint_bias:
+            self.weight.div_(length.clamp_min(1e-8))
+            return
+        bias = self.bias
+        assert isinstance(bias, torch.Tensor)
+        # A bias is (out,), or (E, 1, out).
+        length = torch.hypot(length, bias.view_as(length)).clamp_min(1e-8)
+        self.weight.div_(length)
+        bias.div_(length.view_as(bias))
 
 
 class UnitLinear(UnitNorm, nn.Linear):

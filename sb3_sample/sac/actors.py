@@ -14,7 +14,7 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, check_value
+from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, FINITE, TRUE_OR_FALSE, check_value
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
 from sb3_sample.networks import Network, RunningNorm, project_weights
@@ -23,12 +23,14 @@ from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
 
 # The log standard deviation is squashed into this interval by a tanh.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
+#: Arguments of a Gaussian actor that say how.
+LOG_STD_ARGUMENTS = ("log_std_min", "log_std_max", "clip_log_std")
 
 
 class Actor(BasePolicy):
     """
     Tanh-Gaussian actor: ``a = tanh(mean + std * noise)``, the log standard deviation squashed by a tanh into
-    [-10, 2] (BRO, section B.1; bounds and squashing as in the published code).
+    [-10, 2] (BRO, section B.1; bounds and squashing as in the published code), or clipped.
 
     :param observation_space: observation space
     :param action_space: action space, a bounded Box; the actor works on [-1, 1]
@@ -37,6 +39,10 @@ class Actor(BasePolicy):
     :param features_extractor: extractor of the observation's features
     :param normalize_images: whether images are divided by 255
     :param shares_encoder: whether the extractor is the critics', whose features are read without gradient
+    :param log_std_min: lower bound of the log standard deviation
+    :param log_std_max: upper bound
+    :param clip_log_std: whether it is clipped to them, without a gradient outside, instead of squashed by a tanh
+    :raises ValueError: if an argument is out of range
     """
 
     action_space: spaces.Box
@@ -57,6 +63,9 @@ class Actor(BasePolicy):
         features_extractor: BaseFeaturesExtractor,
         normalize_images: bool = True,
         shares_encoder: bool = False,
+        log_std_min: float = LOG_STD_MIN,
+        log_std_max: float = LOG_STD_MAX,
+        clip_log_std: bool = False,
     ):
         super().__init__(
             with_plain_sizes(observation_space),
@@ -65,6 +74,12 @@ class Actor(BasePolicy):
             normalize_images=normalize_images,
             squash_output=True,
         )
+        check_value("log_std_min", log_std_min, FINITE)
+        check_value("log_std_max", log_std_max, FINITE)
+        check_value("clip_log_std", clip_log_std, TRUE_OR_FALSE)
+        if not log_std_min < log_std_max:
+            raise ValueError(f"log_std_min must lie below log_std_max={log_std_max}, not be {log_std_min}")
+        self.log_std_min, self.log_std_max, self.clip_log_std = log_std_min, log_std_max, clip_log_std
         self.shares_encoder = shares_encoder
         if shares_encoder:
             self.share(features_extractor)
@@ -80,6 +95,7 @@ class Actor(BasePolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         own = {"features_extractor": self.features_extractor, "shares_encoder": self.shares_encoder}
+        own |= {name: getattr(self, name) for name in LOG_STD_ARGUMENTS}
         return {**super()._get_constructor_parameters(), **self._network_args, **own}
 
     def share(self, encoder: nn.Module) -> None:
@@ -135,18 +151,32 @@ class Actor(BasePolicy):
         :return: mean and log standard deviation of the pre-tanh Gaussian, (B, A) each
         """
         h = self.trunk(features)
-        half_range = (LOG_STD_MAX - LOG_STD_MIN) / 2
-        return self.mean(h), LOG_STD_MIN + half_range * (1 + torch.tanh(self.log_std(h)))
+        if self.clip_log_std:
+            return self.mean(h), self.log_std(h).clamp(self.log_std_min, self.log_std_max)
+        half_range = (self.log_std_max - self.log_std_min) / 2
+        return self.mean(h), self.log_std_min + half_range * (1 + torch.tanh(self.log_std(h)))
 
-    def sample(self, obs: PyTorchObs | Encoded, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    def sample(
+        self,
+        obs: PyTorchObs | Encoded,
+        noise: torch.Tensor | None = None,
+        following: PyTorchObs | Encoded | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """
         Sample an action, reparameterised.
 
         :param obs: observations, (B, O), or a dict of them, or their features
         :param noise: standard normal noise, (B, A); drawn if None
+        :param following: further observations, stacked below these in the forward pass, for the sake of batch
+            statistics; None for none
         :return: action in [-1, 1], (B, A), and its log-probability, (B, 1)
         """
-        mean, log_std = self.gaussian(self.features(obs))
+        features = self.features(obs)
+        if following is None:
+            mean, log_std = self.gaussian(features)
+        else:
+            rows = self.gaussian(torch.cat((features, self.features(following))))
+            mean, log_std = (each[: len(features)] for each in rows)
         noise = torch.randn_like(mean) if noise is None else noise
         x = mean + log_std.exp() * noise
         return torch.tanh(x), tanh_gaussian_log_prob(x, noise, log_std)
@@ -280,15 +310,24 @@ class DeterministicActor(Actor):
         mean = self.mean(self.trunk(features))
         return mean, torch.full_like(mean, self.log_exploration_noise)
 
-    def sample(self, obs: PyTorchObs | Encoded, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    def sample(
+        self,
+        obs: PyTorchObs | Encoded,
+        noise: torch.Tensor | None = None,
+        following: PyTorchObs | Encoded | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """
         The action that the actor learns through: no noise, and 0 for the log-probability that it has not.
 
         :param obs: observations, (B, O), or a dict of them
         :param noise: ignored, there is none
+        :param following: further observations, stacked below these in the forward pass; None for none
         :return: action in [-1, 1], (B, A), and zeros, (B, 1)
         """
-        action = torch.tanh(self.mean(self.trunk(self.features(obs))))
+        features = self.features(obs)
+        rows = features if following is None else torch.cat((features, self.features(following)))
+        action = torch.tanh(self.mean(self.trunk(rows)))
+        action = action if following is None else action[: len(features)]
         return action, action.new_zeros(action.shape[0], 1)
 
     def smoothed(self, obs: PyTorchObs, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:

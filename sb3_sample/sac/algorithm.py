@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_program, default_of
 from sb3_sample.console import say
+from sb3_sample.constructor import Given
 from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, not_finite
 from sb3_sample.learner.batch import SLOTS, Batch, Noise
 from sb3_sample.learner.execution import (
@@ -93,7 +94,7 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         "action_noise": Kept.EVERYWHERE,
     }
 
-    def _construct(self, given: dict[str, Any]) -> None:
+    def _construct(self, given: Given) -> None:
         check_program(type(self), given)
         checks.check_use_sde(given["use_sde"])
         if given["policy"] == "MlpPolicy" and is_multi_task(getattr(given["env"], "observation_space", None)):

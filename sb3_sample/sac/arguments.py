@@ -116,8 +116,8 @@ class SACArguments(Resumable):
     value_head: str | type[ValueHead] | None = argument(
         default=None, kind=one_of(VALUE_HEADS, ValueHead).or_none("scalars or quantiles")
     )
-    """"categorical", "hl_gauss", or a class derived from ``ValueHead``, in the place of those two; with
-    ``n_quantiles=None``"""
+    """"categorical", "hl_gauss", "half_squared" (scalars, half the squared error), or a class derived from
+    ``ValueHead``, in the place of those two; with ``n_quantiles=None``"""
     value_head_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
     """its arguments"""
     pessimism: float | str | type[Pessimism] = argument(default=1.0)
@@ -134,14 +134,16 @@ class SACArguments(Resumable):
     )
     """share of the transitions that is held out of training, in [0, 1); "vpl" learns from them"""
     exploration: str | type[Exploration] = argument(default="actor", kind=one_of(EXPLORATIONS, Exploration))
-    """policy that acts while training: "actor", "oac", "optimistic_actor" (DAC), "optimistic_shift" (BRO), or a class
-    derived from ``Exploration``"""
+    """policy that acts while training: "actor", "held_noise" (FlashSAC), "oac", "optimistic_actor" (DAC),
+    "optimistic_shift" (BRO), or a class derived from ``Exploration``"""
     exploration_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
     """its arguments"""
     backbone: str = argument(default="sac")
     """"sac", or "td3": a deterministic actor, without entropy"""
     policy_delay: int = argument(default=1, kind=integer(1))
     """gradient steps between two of the actors' and of the temperature"""
+    actor_at_once: bool = argument(default=False, kind=TRUE_OR_FALSE)
+    """whether the first of ``policy_delay`` gradient steps is the actors', and not the last (XQC, FlashSAC)"""
     actor_first: bool = argument(default=False, kind=TRUE_OR_FALSE)
     """whether actors and temperature learn before the critics in a gradient step, whose target is then of the new
     actor and temperature (SimbaV2, FlashSAC)"""
@@ -158,8 +160,8 @@ class SACArguments(Resumable):
     ratio, which later calls do not change"""
     warm_up_steps: int = argument(default=0, kind=integer(0))
     """planned gradient steps that come before the decay, in which the rate rises linearly to ``learning_rate``"""
-    warm_up_learning_rate: float = argument(default=0.0, kind=AT_LEAST_0)
-    """rate from which it rises"""
+    warm_up_learning_rate: float | None = argument(default=0.0, kind=AT_LEAST_0.or_none("learning_rate"))
+    """rate from which it rises; None: ``learning_rate``, which it then keeps"""
     resets: Sequence[int] | int = argument(default=())
     """environment steps at which all parameters start anew, counted in transitions over the model's life, of each task
     where several take a step together; or one integer for every so many"""

@@ -4,7 +4,7 @@ from typing import Any, ClassVar
 
 from sb3_sample.constructor import argument
 from sb3_sample.kinds import AT_LEAST_0, integer
-from sb3_sample.learner.categorical import VALUE_HEADS
+from sb3_sample.learner.categorical import VALUE_HEADS, CategoricalHead
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.learner.reward_scale import RewardScale
@@ -62,7 +62,9 @@ class BRC(SAC):
 
     def _full_value_head_kwargs(self) -> dict[str, Any]:
         kwargs: dict[str, Any] = super()._full_value_head_kwargs()
-        return {"v_min": -10.0, "v_max": 10.0, **kwargs} if self.value_head in VALUE_HEADS else kwargs
+        cls = VALUE_HEADS.get(self.value_head) if isinstance(self.value_head, str) else None
+        is_categorical = cls is not None and issubclass(cls, CategoricalHead)
+        return {"v_min": -10.0, "v_max": 10.0, **kwargs} if is_categorical else kwargs
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         kwargs: dict[str, Any] = {

@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_sample.constructor import argument
+from sb3_sample.constructor import Given, argument
 from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, Kind, integer, is_number
 from sb3_sample.learner.debiased_rq import DebiasedRQLearner, EmbeddingLoss
 from sb3_sample.learner.heads import HuberHead, ValueHead
@@ -127,7 +127,7 @@ class DebiasedRQ(SAC):
     backbone: str = argument(default="td3")
     """"td3"; no other"""
 
-    def _construct(self, given: dict[str, Any]) -> None:
+    def _construct(self, given: Given) -> None:
         #: Transitions and ends of episodes that were stored over the model's life, each in a slot of the buffer.
         self.num_slots = 0
         # Ends of the latest step, which count with the next one.

@@ -257,7 +257,7 @@ class HasLearner:
         """Take up what ``target_entropy`` says, which is a number afterwards, or a list of them, one a task."""
         checks.check_target_entropy(self)
         if self.target_entropy == "auto":
-            self._target_entropy = -get_action_dim(self.action_space) / 2
+            self._target_entropy = self._auto_target_entropy(get_action_dim(self.action_space))
         elif isinstance(self.target_entropy, Sequence):
             targets = [float(each) for each in self.target_entropy]
             self._target_entropy = targets if self.n_tasks > 1 else targets[0]
@@ -265,6 +265,13 @@ class HasLearner:
             self._target_entropy = float(self.target_entropy)
         if BACKBONES[self.backbone].has_entropy:
             self.target_entropy = self._target_entropy
+
+    def _auto_target_entropy(self: Any, action_dim: int) -> float:
+        """
+        :param action_dim: dimension of the actions
+        :return: what ``target_entropy="auto"`` means
+        """
+        return -action_dim / 2
 
     def _full_exploration_kwargs(self: Any) -> dict[str, Any]:
         """
@@ -342,12 +349,13 @@ class HasLearner:
     def _make_schedule(self: Any) -> LearningRateSchedule | None:
         if self.learning_rate_schedule is None:
             return None
+        peak, start = self.lr_schedule(1), self.warm_up_learning_rate
         return LearningRateSchedule(
             self.learning_rate_schedule,
-            self.lr_schedule(1),
+            peak,
             self.final_learning_rate,
             self.warm_up_steps,
-            self.warm_up_learning_rate,
+            peak if start is None else start,
         )
 
     def _optimizers(self: Any) -> dict[str, torch.optim.Optimizer]:

@@ -25,7 +25,7 @@ from sb3_sample.learner.batch import Encoded
 from sb3_sample.networks import Network, RunningNorm
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.optim import AdamW
-from sb3_sample.sac.actors import BACKBONES, Actor, DeterministicActor
+from sb3_sample.sac.actors import BACKBONES, LOG_STD_ARGUMENTS, Actor, DeterministicActor
 from sb3_sample.sac.critics import CriticEnsemble
 from sb3_sample.sac.multi_task import TaskOneHot, reads_one_hot
 from sb3_sample.sac.trunks import network_args
@@ -39,9 +39,9 @@ class SACPolicy(BasePolicy):
     :param action_space: action space, a bounded Box
     :param lr_schedule: learning rate schedule; its value at the start is used here
     :param net_arch: widths of the hidden layers as in Stable-Baselines3, a list or ``dict(pi=[...], qf=[...])``;
-        for the network "mlp" only, the same as ``hidden_sizes`` in the network's arguments
-    :param activation_fn: activation of the network "mlp"
-    :param critic_network: trunk of the critics, "mlp", "bronet", "spectral", or a class derived from ``Network``
+        for the networks "mlp", "crossq" and "xqc" only, the same as ``hidden_sizes`` in the network's arguments
+    :param activation_fn: activation of these networks
+    :param critic_network: trunk of the critics by its name in ``NETWORKS``, or a class derived from ``Network``
     :param critic_network_kwargs: its arguments (``hidden_sizes``, ``layer_norm``, ``dropout``, ...; ``width``,
         ``n_blocks``)
     :param actor_network: trunk of the actor, the same
@@ -52,8 +52,8 @@ class SACPolicy(BasePolicy):
     :param features_extractor_kwargs: its arguments
     :param normalize_images: whether images are divided by 255
     :param backbone: "sac" for a tanh-Gaussian actor, "td3" for a deterministic one with a target actor
-    :param actor_kwargs: arguments of the actor: with "td3" ``exploration_noise``, ``target_noise``,
-        ``target_noise_clip``
+    :param actor_kwargs: arguments of the actor: with "sac" ``log_std_min``, ``log_std_max``, ``clip_log_std``, with
+        "td3" ``exploration_noise``, ``target_noise``, ``target_noise_clip``
     :param optimizer_class: optimizer of actor and critics
     :param optimizer_kwargs: its arguments, but for the learning rate
     :param critic_optimizer_kwargs: arguments of the critics' optimizer alone, over ``optimizer_kwargs``
@@ -145,10 +145,11 @@ class SACPolicy(BasePolicy):
         check_value("actor_kwargs", actor_kwargs, DICT)
         check_value("critic_optimizer_kwargs", critic_optimizer_kwargs, DICT)
         actor_kwargs = dict(actor_kwargs or {})
-        allowed = ("exploration_noise", "target_noise", "target_noise_clip") if backbone == "td3" else ()
+        of_noise = ("exploration_noise", "target_noise", "target_noise_clip")
+        allowed = of_noise if backbone == "td3" else LOG_STD_ARGUMENTS
         for name in actor_kwargs:
             if name not in allowed:
-                raise ValueError(f"actor_kwargs has {name!r}, but backbone={backbone!r} takes {allowed or 'none'}")
+                raise ValueError(f"actor_kwargs has {name!r}, but backbone={backbone!r} takes {allowed}")
         self._actor_class, self._actor_args = BACKBONES[backbone], (actor_args, actor_kwargs)
         self.share_features_extractor = share_features_extractor
         if share_features_extractor:

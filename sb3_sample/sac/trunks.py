@@ -11,6 +11,9 @@ from sb3_sample.kinds import DICT, check_value, chosen, integer
 from sb3_sample.networks import NETWORKS, Network, widened
 from sb3_sample.networks.modes import evaluated
 
+#: Names of the networks that ``net_arch`` and ``activation_fn`` describe.
+OF_HIDDEN_LAYERS = ("mlp", "crossq", "xqc")
+
 
 def network_args(
     who: str,
@@ -27,7 +30,7 @@ def network_args(
     for name, key, value in (("net_arch", "hidden_sizes", net_arch), ("activation_fn", "activation_fn", activation_fn)):
         if value is None:
             continue
-        if network != "mlp":
+        if network not in OF_HIDDEN_LAYERS:
             raise ValueError(
                 f"{name} describes an MLP, but {who}_network is {network!r}: use {who}_network_kwargs, "
                 f"or {who}_network='mlp'"

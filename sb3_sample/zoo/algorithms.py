@@ -22,8 +22,11 @@ from sb3_sample.sac import (
     SRSAC,
     TOPSAC,
     VPLSAC,
+    XQC,
     BROFast,
+    CrossQ,
     DebiasedRQ,
+    FlashSAC,
     RegularizedSAC,
     SimBa,
     SimbaV2,
@@ -57,8 +60,10 @@ ALGORITHMS: dict[str, ZooAlgorithm] = {
     "bro": ZooAlgorithm(BRO, search.BRO_SPACE),
     "bro_fast": ZooAlgorithm(BROFast, search.BRO_FAST_SPACE),
     "bro_td3": ZooAlgorithm(BROTD3, search.BRO_TD3_SPACE),
+    "crossq": ZooAlgorithm(CrossQ, search.CROSSQ_SPACE),
     "dac": ZooAlgorithm(DAC, search.DAC_SPACE),
     "dr_q": ZooAlgorithm(DebiasedRQ, search.DR_Q_SPACE),
+    "flash_sac": ZooAlgorithm(FlashSAC, search.FLASH_SPACE),
     "gpl_sac": ZooAlgorithm(GPLSAC, search.GPL_SPACE),
     "mbma_ppo": ZooAlgorithm(MBMAPPO, search.MBMA_SPACE),
     "mbpo_ppo": ZooAlgorithm(MBPOPPO, search.MBPO_SPACE),
@@ -72,6 +77,7 @@ ALGORITHMS: dict[str, ZooAlgorithm] = {
     "sr_sac": ZooAlgorithm(SRSAC, search.SR_SAC_SPACE),
     "top_sac": ZooAlgorithm(TOPSAC, search.TOP_SPACE),
     "vpl_sac": ZooAlgorithm(VPLSAC, search.VPL_SPACE),
+    "xqc": ZooAlgorithm(XQC, search.XQC_SPACE),
 }
 
 

@@ -124,6 +124,25 @@ SIMBAV2_SPACE: Space = {
     "final_learning_rate": _float(1e-6, 1e-3, log=True),
     "replay_ratio": _int(1, 8, log=True),
 }
+CROSSQ_SPACE: Space = {
+    # Without target networks.
+    **{name: suggest for name, suggest in OFF_POLICY_SPACE.items() if name != "tau"},
+    "policy_delay": _int(1, 4),
+    "replay_ratio": _int(1, 4),
+}
+XQC_SPACE: Space = {
+    **OFF_POLICY_SPACE,
+    "final_learning_rate": _float(1e-6, 1e-3, log=True),
+    "policy_delay": _int(1, 4),
+    "replay_ratio": _int(1, 8, log=True),
+}
+FLASH_SPACE: Space = {
+    **OFF_POLICY_SPACE,
+    "final_learning_rate": _float(1e-6, 1e-3, log=True),
+    "target_std": _float(0.05, 0.5, log=True),
+    "policy_delay": _int(1, 4),
+    "replay_ratio": _int(1, 4),
+}
 BRC_SPACE: Space = {
     **OFF_POLICY_SPACE,
     "pessimism": _float(0.0, 1.0),

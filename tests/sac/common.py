@@ -26,8 +26,11 @@ from sb3_sample.sac import (
     SRSAC,
     TOPSAC,
     VPLSAC,
+    XQC,
     BROFast,
+    CrossQ,
     DebiasedRQ,
+    FlashSAC,
     RegularizedSAC,
     SimBa,
     SimbaV2,
@@ -56,6 +59,8 @@ TINY_SAC: dict[str, Any] = dict(
     policy_kwargs={"net_arch": [8, 8]},
     device="cpu",
 )
+#: FlashSAC's networks, made small.
+TINY_FLASH: dict[str, Any] = {f"{who}_network_kwargs": {"width": 8, "n_blocks": 1} for who in ("critic", "actor")}
 
 
 TINY_DR_Q: dict[str, Any] = dict(
@@ -229,6 +234,10 @@ MAKERS: dict[str, Callable[..., Any]] = {
         redo_period=5,
     ),
     "DebiasedRQ": _maker(sac, DebiasedRQ, **TINY_DR_Q),
+    "CrossQ": _maker(sac, CrossQ),
+    "CrossQ+WN": _maker(sac, CrossQ, weight_norm=True),
+    "XQC": _maker(sac, XQC),
+    "FlashSAC": _maker(sac, FlashSAC, policy_kwargs=TINY_FLASH),
 }
 #: One of each kind of part, for the slower tests.
 REPRESENTATIVE = ["SAC", "BRO", "BROTD3", "DAC", "VPLSAC", "OPLSAC", "TOPSAC", "RegularizedSAC", "DebiasedRQ"]

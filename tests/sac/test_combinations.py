@@ -22,6 +22,8 @@ from sb3_sample import (
     SAC,
     TOPSAC,
     VPLSAC,
+    XQC,
+    CrossQ,
     FadedReplayBuffer,
     PrioritizedReplayBuffer,
     RegularizedSAC,
@@ -119,7 +121,11 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
             ("critic_network", "model_size=None"),
         ),
     ],
-    '`net_arch`, `activation_fn` with a network other than `"mlp"`': [
+    "`batch_size=1` with `CrossQ`, `XQC`": [
+        (CrossQ, {"batch_size": 1}, ("batch_size", "batch norm")),
+        (XQC, {"batch_size": 1}, ("batch_size", "batch norm")),
+    ],
+    '`net_arch`, `activation_fn` with a network other than `"mlp"`, `"crossq"`, `"xqc"`': [
         (BRO, {"policy_kwargs": {**TINY_BRO["policy_kwargs"], "net_arch": [8]}}, ("net_arch", "bronet")),
         (
             BRO,
@@ -161,12 +167,14 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
             ("normalize_observations=True", "Discrete(8)"),
         ),
     ],
-    "`n_critics` of `SimBa`, `SimbaV2`, `weight_decay` of `SimBa`, `BRC` also in `policy_kwargs`; `critic_network…` in "
-    "`BRC` without `critic_width=None`": [
+    "`n_critics` of `SimBa`, `SimbaV2`, `weight_decay` of `SimBa`, `BRC`, `CrossQ`, `weight_norm` of `CrossQ` also in "
+    "`policy_kwargs`; `critic_network…` in `BRC` without `critic_width=None`": [
         (SimBa, {"policy_kwargs": {"n_critics": 2}}, ("n_critics", "policy_kwargs")),
         (SimbaV2, {"policy_kwargs": {"n_critics": 2}}, ("n_critics", "policy_kwargs")),
         (SimBa, {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}}, ("weight_decay", "optimizer_kwargs")),
         (BRC, {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}}, ("weight_decay", "optimizer_kwargs")),
+        (CrossQ, {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}}, ("weight_decay", "optimizer_kwargs")),
+        (CrossQ, {"policy_kwargs": {"actor_network_kwargs": {"weight_norm": True}}}, ("weight_norm", "policy_kwargs")),
         (BRC, {"policy_kwargs": {"critic_network": "mlp"}}, ("critic_network", "critic_width=None")),
     ],
     "`multitask`, `task_temperatures` with observations that do not tell the task": [

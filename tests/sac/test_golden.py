@@ -28,6 +28,7 @@ from sb3_sample.networks import MLP, BroNet, SimbaV2Net
 from sb3_sample.networks.ensemble import EnsembleLayerNorm, EnsembleLinear
 from sb3_sample.networks.simbav2 import HyperHead
 from sb3_sample.sac import SAC
+from tests.sac import golden_batch_norm
 from tests.sac.common import COMPILES
 from tests.sac.test_execution import captured
 
@@ -860,12 +861,27 @@ def brc_sequence(data: dict[str, np.ndarray], name: str, meta: dict[str, Any]) -
             np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=0, err_msg=f"{name}/state/{key}[{t}]")
 
 
+class XQCUpdates(golden_batch_norm.XQCUpdates, Updates):
+    """XQC's."""
+
+
+class WeightNormUpdates(golden_batch_norm.WeightNormUpdates, Updates):
+    """CrossQ+WN's."""
+
+
+class FlashSACUpdates(golden_batch_norm.FlashSACUpdates, Updates):
+    """FlashSAC's."""
+
+
 #: By the beginning of a file's name, of which the longest counts: the updates of a method, and its sequences.
 METHODS: dict[str, type[Updates]] = {
     "brc_": BRCUpdates,
     "bro_": BROUpdates,
     "dac_": DACUpdates,
+    "flashsac_": FlashSACUpdates,
     "simbav2_": SimbaV2Updates,
+    "xqc_": XQCUpdates,
+    "xqc_crossq_wn_": WeightNormUpdates,
 }
 SEQUENCES: dict[str, Callable[[dict[str, np.ndarray], str, dict[str, Any]], None]] = {
     "brc_": brc_sequence,

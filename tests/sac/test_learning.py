@@ -20,6 +20,9 @@ from sb3_sample import (
     SRSAC,
     TOPSAC,
     VPLSAC,
+    XQC,
+    CrossQ,
+    FlashSAC,
     RegularizedSAC,
     SimBa,
     SimbaV2,
@@ -114,11 +117,20 @@ def successor(name: str) -> SAC:
         return BRC("MlpPolicy", "Pendulum-v1", critic_width=64, **actor, **kwargs)
     if name == "SimbaV2":
         return SimbaV2("MlpPolicy", "Pendulum-v1", final_learning_rate=5e-4, **both, **kwargs)
+    if name == "FlashSAC":
+        return FlashSAC("MlpPolicy", "Pendulum-v1", final_learning_rate=5e-4, **both, **kwargs)
+    layers = {"policy_kwargs": {"net_arch": [64, 64]}}
+    if name == "XQC":
+        return XQC("MlpPolicy", "Pendulum-v1", final_learning_rate=1e-4, **layers, **kwargs)
+    if name == "CrossQ":
+        return CrossQ("MlpPolicy", "Pendulum-v1", **layers, **kwargs)
+    if name == "CrossQ+WN":
+        return CrossQ("MlpPolicy", "Pendulum-v1", weight_norm=True, **layers, **kwargs)
     return SimBa("MlpPolicy", "Pendulum-v1", **both, **kwargs)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["BRC", "SimBa", "SimbaV2"])
+@pytest.mark.parametrize("name", ["BRC", "CrossQ", "CrossQ+WN", "FlashSAC", "SimBa", "SimbaV2", "XQC"])
 def test_the_successors_of_bro_learn_pendulum(name: str) -> None:
     assert score(successor(name).learn(4_000)) > GOOD
 

@@ -29,7 +29,7 @@ FAST: dict[str, dict[str, Any]] = {
 SLOW: dict[str, dict[str, Any]] = {
     **{name: {"algorithm": name} for name in (
         "SAC", "BROFast", "BROTD3", "DAC", "SRSAC", "OAC", "TOPSAC", "GPLSAC", "OPLSAC", "RegularizedSAC", "SimBa",
-        "SimbaV2", "BRC", "DebiasedRQ", "QMA", "MBPO",
+        "SimbaV2", "BRC", "DebiasedRQ", "CrossQ", "CrossQ+WN", "XQC", "FlashSAC", "QMA", "MBPO",
     )},
     **{f"{name}, workers": {"algorithm": name, "env": WORKERS4} for name in ("BRO", "OPLSAC", "MBMA", "QMA", "MBPO")},
     **{f"{name}, {env}": {"algorithm": name, "env": {"env": env}} for name in ("BRO", "MBMA")
