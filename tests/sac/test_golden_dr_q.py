@@ -42,6 +42,11 @@ REPLAYS = [path for path in FILES if "capacity" in meta_of(path)]
 UPDATES = [path for path in FILES if path not in REPLAYS]
 
 
+def replays_with(group: str) -> list[Path]:
+    """Files of the replay that have a group of keys."""
+    return [path for path in REPLAYS if any(key.startswith(group) for key in np.load(path))]
+
+
 class Limits(NamedTuple):
     """Largest differences: info relative to max(1, its size), gradients and moments to the array's largest element."""
 
@@ -54,7 +59,10 @@ class Limits(NamedTuple):
 def limits(path: Path) -> Limits:
     if meta_of(path)["dtype"].startswith("float64"):
         return Limits(1e-10, 1e-10, 1e-9, 1e-9)
-    return Limits(1e-4, 2e-5) if "edge" in path.stem else Limits()
+    with np.load(path) as data:
+        largest = max(np.abs(data[key]).max() for key in data if key.endswith("/rewards"))
+    # Losses and gradients of large rewards are sums of large numbers.
+    return Limits(1e-4, 2e-5) if "edge" in path.stem or largest > 1_000 else Limits()
 
 
 class Shapes(gym.Env):
@@ -185,7 +193,7 @@ class Replay:
     def _start(self) -> None:
         stored = {key.removeprefix("init/") for key in self.data if key.startswith("init/")}
         assert stored == self.named.keys()
-        start = self.meta["start"]
+        start = self.meta.get("start", {})
         optimizers = self.learner.optimizers()
         with torch.no_grad():
             for name, (parameter, view) in self.named.items():
@@ -194,12 +202,12 @@ class Replay:
                 if f"{key}/first_moment" in self.data:
                     module = name.split("/")[0]
                     state = optimizers[f"{module}.optimizer"].state[parameter]
-                    state["step"] = torch.tensor(float(start[module]))
+                    state["step"] = torch.tensor(float(start.get(module, 0)))
                     for ours, theirs in (("exp_avg", "first_moment"), ("exp_avg_sq", "second_moment")):
                         state[ours] = torch.zeros_like(parameter)
                         view(state[ours]).copy_(self.tensor(f"{key}/{theirs}"))
-        self.model._n_updates = start["training_steps_done"]
-        self.weights.max_priority = start["max_priority"]
+        self.model._n_updates = start.get("training_steps_done", 0)
+        self.weights.max_priority = start.get("max_priority", 1.0)
 
     @property
     def weights(self) -> DrawWeights:
@@ -257,13 +265,13 @@ class Replay:
                 self.encode(i, due)
             self.update(i)
             self.parameters(i)
-        done = self.meta["updates_done_at_end"]
+        done = self.meta.get("updates_done_at_end", {})
         for name, (parameter, view) in self.named.items():
             module = name.split("/")[0]
             if module.startswith("target_"):
                 continue
             state = self.learner.optimizers()[f"{module}.optimizer"].state.get(parameter, {})
-            if state:
+            if state and module in done:
                 assert state["step"].item() == done[module]
             for ours, theirs in (("exp_avg", "first_moment"), ("exp_avg_sq", "second_moment")):
                 key = f"final_adam/{name}/{theirs}"
@@ -369,9 +377,9 @@ class Replay:
         errors = learner.td_errors
         assert errors is not None
         self.info(i, "priority", self.weights.priorities(errors.numpy()))
-        np.testing.assert_allclose(
-            self.weights.priority[: len(errors)], self.data[f"info/{i}/priority"], rtol=max(self.limits.info, 1e-7)
-        )
+        if f"info/{i}/priority" in self.data:
+            stored = self.weights.priority[: len(errors)]
+            np.testing.assert_allclose(stored, self.data[f"info/{i}/priority"], rtol=max(self.limits.info, 1e-7))
         self.info(i, "max_priority", self.weights.max_priority)
         self.gradients(f"gradient/{i}", ("critic", "actor"))
 
@@ -535,10 +543,11 @@ def test_golden_replay(path: Path) -> None:
             weights.set_priorities(index[1], data[f"sample/{t}/new_priority"])
         np.testing.assert_array_equal(weights.priority[holds], data["state/priority"][t][holds])
         assert weights.max_priority == pytest.approx(data["state/max_priority"][t], rel=1e-7)
-    assert n_windows and n_over_ends
+    assert n_windows or not meta["sample_at"]
+    assert n_over_ends or path.parent != OWN_FOLDER
 
 
-@pytest.mark.parametrize("path", REPLAYS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", replays_with("ageing/"), ids=lambda path: path.stem)
 def test_golden_ageing(path: Path) -> None:
     data, meta = dict(np.load(path)), meta_of(path)
     weights = DrawWeights(2, meta["forget_decay"], meta["forget_floor"], 0.4, 1.0)
@@ -549,7 +558,7 @@ def test_golden_ageing(path: Path) -> None:
         assert weights.faded()[0] == pytest.approx(clamped, rel=1e-3)
 
 
-@pytest.mark.parametrize("path", REPLAYS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", replays_with("warm_up/"), ids=lambda path: path.stem)
 def test_golden_warm_up(path: Path) -> None:
     """When actions stop to be random, when training begins, and when targets are copied."""
     data, meta = dict(np.load(path)), meta_of(path)
@@ -596,7 +605,7 @@ def test_golden_warm_up(path: Path) -> None:
         np.testing.assert_array_equal(np.array(values), data[f"warm_up/{name}"], err_msg=name)
 
 
-@pytest.mark.parametrize("path", REPLAYS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", replays_with("two_hot/"), ids=lambda path: path.stem)
 def test_golden_two_hot(path: Path) -> None:
     data, meta = dict(np.load(path)), meta_of(path)
     rewards, logits = (torch.as_tensor(data[f"two_hot/{name}"]) for name in ("reward", "logits"))
