@@ -207,7 +207,7 @@ MAKERS: dict[str, Callable[..., Any]] = {
         sac,
         BRC,
         critic_width=8,
-        value_head_kwargs={"n_atoms": 11},
+        value_head_kwargs={"n_atoms": 21},
         policy_kwargs={"actor_network_kwargs": {"width": 8, "n_blocks": 1}},
     ),
     "RegularizedSAC": _maker(
@@ -241,6 +241,9 @@ def state(model: SAC) -> dict[str, torch.Tensor]:
 
     for name, value in model.get_parameters().items():
         walk(name, value)
+    if model.learner.schedule is not None:
+        # Each step sets the rates that it takes.
+        flat = {name: value for name, value in flat.items() if not name.endswith("/lr")}
     return flat
 
 
