@@ -123,10 +123,9 @@ class Cluster:
             return self._workers
         if (now := time.monotonic()) - self._looked > LOOK_EVERY:
             self._looked = now
+            gpus = self._gpus
             self._room = sum(
-                int(min(each.get("CPU", 0) / self._threads, each.get("GPU", 0) / (self._gpus or math.inf)))
-                if self._gpus
-                else int(each.get("CPU", 0) / self._threads)
+                int(min(each["CPU"] / self._threads, math.inf if gpus is None else each["GPU"] / gpus))
                 for each in _machines()
             )
         return self._room

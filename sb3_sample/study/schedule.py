@@ -337,14 +337,16 @@ class Scheduler:
             run = self._pending[0]
             idle = [worker for worker in self._workers if worker.run is None]
             fitting = [worker for worker in idle if worker.kind == run.kind]
-            if fitting:
+            slots = self._crew.slots()
+            if fitting and len(self._workers) <= slots:
                 worker = fitting[0]
+            elif len(self._workers) >= slots:
+                if not idle:
+                    return
+                idle[0].leave()
+                self._workers.remove(idle[0])
+                continue
             else:
-                if len(self._workers) >= self._crew.slots():
-                    if not idle:
-                        return
-                    idle[0].leave()
-                    self._workers.remove(idle[0])
                 worker = self._crew.hire(self._events)
                 self._workers.append(worker)
             self._pending.popleft()

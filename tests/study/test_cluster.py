@@ -14,7 +14,8 @@ import pytest
 pytest.importorskip("rl_zoo3")
 
 from sb3_sample import cli, study
-from sb3_sample.study import cluster
+from sb3_sample.study import cluster, schedule
+from sb3_sample.study.runs import StudyFolder
 from tests.study import nothing
 from tests.study.test_kill import ROOT, outcome, settled
 
@@ -45,7 +46,7 @@ def test_arguments_of_a_cluster_are_checked_at_the_door(tmp_path: Path, monkeypa
     path = tmp_path / "plan.yml"
     path.write_text(PLAN)
     for options, words in (
-        (["--ray", "auto"], "needs Ray. Install it with: pip install -e \".[cluster]\""),
+        (["--ray", "auto"], 'needs Ray. Install it with: pip install -e ".[cluster]"'),
         (["--gpus", "0.5"], "give --ray too, not --gpus 0.5 alone"),
     ):
         with pytest.raises(SystemExit) as caught:
@@ -69,6 +70,42 @@ def test_a_machine_that_does_not_see_the_folder_says_so(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="must be one that all machines of the cluster have"):
         cluster.make(str(tmp_path / "elsewhere"), nothing.plan(1).runs[0].as_json(), [], 1)
     assert not (tmp_path / "elsewhere").exists()
+
+
+def test_as_many_runs_at_once_as_the_machines_have_room_for(tmp_path: Path, monkeypatch) -> None:
+    there = [{"CPU": 5.0, "GPU": 1.0}, {"CPU": 16.0, "GPU": 0.0}, {"CPU": 3.0, "GPU": 2.0}, {"CPU": 1.0, "GPU": 4.0}]
+    monkeypatch.setattr(cluster, "_machines", lambda: there)
+    monkeypatch.setattr(cluster, "LOOK_EVERY", -1.0)
+    assert cluster.Cluster("auto", tmp_path, None, 2, None).slots() == 2 + 8 + 1
+    shares = cluster.Cluster("auto", tmp_path, None, 1, 0.25)
+    assert shares.slots() == 4 + 0 + 3 + 1
+    assert cluster.Cluster("auto", tmp_path, None, 1, 2.0).slots() == 0 + 0 + 1 + 1
+    assert cluster.Cluster("auto", tmp_path, 7, 1, 2.0).slots() == 7
+    del there[0]
+    assert shares.slots() == 4
+
+
+class Shrinking(schedule.Processes):
+    """Three places, of which one is left as soon as a run has ended."""
+
+    def slots(self) -> int:
+        made = Path(self._command[-1]) / "made.txt"
+        return 1 if made.exists() and "end" in made.read_text() else 3
+
+
+def test_fewer_runs_at_once_when_there_is_less_room(tmp_path: Path) -> None:
+    plan, folder = nothing.plan(8, sleep=0.3), StudyFolder(tmp_path)
+    folder.enter(plan)
+    crew = Shrinking([*nothing.COMMAND, str(tmp_path)], 3, 1)
+    scheduler = schedule.Scheduler(plan.runs, folder, crew, 0, 1, "cpu", lambda _: None)
+    assert scheduler.run().counts["done"] == 8
+    lines = (tmp_path / "made.txt").read_text().splitlines()
+    open_runs, most = 0, []
+    for line in lines:
+        open_runs += 1 if line.startswith("begin") else -1
+        most.append(open_runs)
+    # The three that were under way end; after that there is one at a time.
+    assert max(most[6:]) == 1 and len(lines) == 16
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +158,7 @@ def test_a_study_whose_cluster_loses_machines_ends_where_an_undisturbed_one_does
     assert study.status(disturbed).counts["running"] == 2
     machines.remove_node(second, allow_graceful=False)
     # Then the process that goes on with the lost run dies with the scheduler.
-    lost = next(seed for seed in (3, 4) if wait_for_end(processes[seed], seconds=20))
+    lost = first_to_end(processes)
     other = 7 - lost
     while newest(disturbed, other) < 1_200:
         assert scheduler.poll() is None
@@ -132,31 +169,33 @@ def test_a_study_whose_cluster_loses_machines_ends_where_an_undisturbed_one_does
     # Ctrl-C: a training under way finishes its turn and saves.
     scheduler = start(plan, disturbed, machines.address)
     process = checkpointed(disturbed, lost, 900, scheduler)
+    said_before = (disturbed / f"state/SAC/Pendulum-v1/{lost}.txt").read_text()
     scheduler.send_signal(signal.SIGINT)
     said = scheduler.communicate(timeout=200)[0]
     assert scheduler.returncode == 130 and "the same command goes on" in said
     assert process not in processes.values()
     found = study.status(disturbed)
     assert not found.counts["running"] and not found.failures
-    assert newest(disturbed, lost) % 300, "no checkpoint was written when it was told to stop"
+    printed = (disturbed / f"state/SAC/Pendulum-v1/{lost}.txt").read_text().removeprefix(said_before)
+    assert "finishing the turn" in printed and "saved at" in printed
 
     scheduler = start(plan, disturbed, machines.address)
     said = scheduler.communicate(timeout=500)[0]
     assert scheduler.returncode == 0 and "2 done, 0 running, 0 failed, 0 waiting" in said, said
+    assert [each.outcome.attempts for each in study.status(disturbed).runs] == [0, 0]
     for seed in (3, 4):
         mine, undisturbed = dict(outcome(disturbed, seed)), dict(outcome(whole, seed))
         assert undisturbed.keys() == mine.keys() and undisturbed["steps"] == 2500
         assert [name for name in undisturbed if not np.array_equal(undisturbed[name], mine[name])] == []
-        assert study.status(disturbed).runs[0].outcome.attempts == 0
-    assert "saved at" in (disturbed / f"state/SAC/Pendulum-v1/{lost}.txt").read_text()
 
 
-def wait_for_end(process: int, seconds: float) -> bool:
-    end = time.monotonic() + seconds
+def first_to_end(processes: dict[int, int]) -> int:
+    end = time.monotonic() + 100
     while time.monotonic() < end:
-        try:
-            os.kill(process, 0)
-        except ProcessLookupError:
-            return True
+        for seed, process in processes.items():
+            try:
+                os.kill(process, 0)
+            except ProcessLookupError:
+                return seed
         time.sleep(0.05)
-    return False
+    raise AssertionError("no process has ended")
