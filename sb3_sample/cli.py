@@ -126,8 +126,8 @@ def _errors(command: str) -> Iterator[None]:
 @contextlib.contextmanager
 def _arguments(command: str) -> Iterator[None]:
     """
-    What this package or the zoo says of an argument is told of without a traceback. An error of anything else, an
-    environment for one, keeps it, and so does a training that diverges.
+    Print errors of arguments, of this package or the zoo, without a traceback. Any other error, such as an
+    environment's, keeps its traceback, and so does a training that diverges.
     """
     from sb3_sample.faults import TrainingDiverged
 

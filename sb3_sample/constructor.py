@@ -84,6 +84,14 @@ class Constructed:
     #: By name, the arguments of the constructor.
     constructor_arguments: ClassVar[dict[str, Argument]] = {}
 
+    @classmethod
+    def place_of(cls, name: str) -> str:
+        """
+        :param name: of what is no argument of the constructor
+        :return: how it is passed otherwise, as the message of the error has it; empty if it is not
+        """
+        return ""
+
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         cls.constructor_arguments = _declared(cls)
@@ -205,7 +213,7 @@ def _constructor(cls: type[Constructed], signature: inspect.Signature) -> Callab
         try:
             bound = signature.bind(self, *args, **kwargs)
         except TypeError as error:
-            raise TypeError(f"{type(self).__name__}: {error}{_meant(signature, kwargs)}") from None
+            raise TypeError(f"{type(self).__name__}: {error}{_meant(type(self), signature, kwargs)}") from None
         bound.apply_defaults()
         given = dict(bound.arguments)
         del given["self"]
@@ -219,10 +227,13 @@ def _constructor(cls: type[Constructed], signature: inspect.Signature) -> Callab
     return __init__
 
 
-def _meant(signature: inspect.Signature, kwargs: dict[str, Any]) -> str:
-    """The argument that was meant, if a name is close to one."""
-    for name in kwargs.keys() - signature.parameters.keys():
-        close = difflib.get_close_matches(name, signature.parameters, 1)
-        if close:
+def _meant(cls: type[Constructed], signature: inspect.Signature, kwargs: dict[str, Any]) -> str:
+    """Where an unknown argument belongs, or the argument that was meant, if a name is close to one."""
+    unknown = [name for name in kwargs if name not in signature.parameters]
+    for name in unknown:
+        if place := cls.place_of(name):
+            return f". It is passed as {place}"
+    for name in unknown:
+        if close := difflib.get_close_matches(name, signature.parameters, 1):
             return f". Did you mean {close[0]!r}?"
     return ""

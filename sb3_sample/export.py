@@ -46,7 +46,7 @@ _FIXED_BATCH = (
 
 
 class Exportable:
-    """What a model gains that can be exported."""
+    """Base of the algorithms whose policies can be exported."""
 
     def export(self, path: str | os.PathLike[str], vec_normalize: VecNormalize | None = None) -> tuple[Path, Path]:
         """
@@ -216,7 +216,7 @@ def _inputs(space: spaces.Space) -> dict[str, spaces.Space]:
 
 
 def _metadata(model: BaseAlgorithm, policy: _RawPolicy) -> dict[str, str]:
-    """What the files say of themselves; the values are text, those of several parts JSON."""
+    """Metadata of the files; the values are text, those of several parts JSON."""
     action = policy.action_space
     return {
         "exported_by": f"sb3_sample {__version__}",

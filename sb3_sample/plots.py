@@ -42,7 +42,7 @@ MAX_TABLE_STEPS = 10
 @dataclass(frozen=True)
 class Run:
     """
-    What was measured in one run.
+    The measurements of one run.
 
     :param label: name of the curve that the run is a seed of
     :param path: the run's folder

@@ -112,6 +112,15 @@ def test_a_name_that_is_none_is_refused_with_the_one_that_was_meant() -> None:
         BRO("MlpPolicy")  # type: ignore[call-arg]
 
 
+def test_an_argument_of_the_policy_is_refused_with_its_place() -> None:
+    with pytest.raises(TypeError, match=r"'n_critics'\. It is passed as policy_kwargs=dict\(n_critics=\.\.\.\)$"):
+        BRO("MlpPolicy", "Pendulum-v1", n_critics=5)  # type: ignore[call-arg]
+    with pytest.raises(TypeError, match=r"'ortho_init'\. It is passed as policy_kwargs=dict\(ortho_init=\.\.\.\)$"):
+        MBMAPPO("MlpPolicy", "Pendulum-v1", ortho_init=False)  # type: ignore[call-arg]
+    with pytest.raises(TypeError, match="'observation_space'$"):
+        BRO("MlpPolicy", "Pendulum-v1", observation_space=None)  # type: ignore[call-arg]
+
+
 class Frugal(BROFast):
     """BRO Fast, with other numbers, and one of its own."""
 

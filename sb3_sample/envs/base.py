@@ -1,4 +1,4 @@
-"""What the suites share: the check of their arguments, the missing library's message and the choice of an OpenGL."""
+"""Parts that the suites share: checks of arguments, the missing library's message, the choice of an OpenGL."""
 
 import contextlib
 import ctypes

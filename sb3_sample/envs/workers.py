@@ -93,7 +93,7 @@ class EnvironmentDied(RuntimeError):
 
 
 class _Failure(NamedTuple):
-    """What a worker answers when it ends by an exception."""
+    """Message of a worker that ends by an exception."""
 
     trace: str
 

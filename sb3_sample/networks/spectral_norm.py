@@ -9,7 +9,7 @@ from sb3_sample.networks.ensemble import EnsembleLinear
 
 class SpectralNorm(nn.Module):
     """
-    What the two layers below add to a dense layer: ``weight / sigma(weight)``, per copy.
+    Spectral normalisation of a dense layer, for the two layers below: ``weight / sigma(weight)``, per copy.
 
     The largest singular value is ``sigma = u' weight v``. Its vectors u and v follow the kernel by one power iteration
     at each forward pass in training mode; in evaluation mode they stay. They are buffers, saved with the layer, and

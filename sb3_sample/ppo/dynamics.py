@@ -172,7 +172,7 @@ class Standardizer(nn.Module):
 
 class Prediction(NamedTuple):
     """
-    What a model says of one step.
+    A model's prediction of one step.
 
     :param next_observations: (B, O)
     :param rewards: (B,)

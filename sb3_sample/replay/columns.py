@@ -189,7 +189,7 @@ class HasColumns:
 
     def writers(self) -> tuple[tuple[str, Callable[[Given], Any]], ...]:
         """
-        What turns a step into rows.
+        The functions that turn a step into rows.
 
         :return: by the name of a column, those of the observations first: from the arguments of ``add`` to its row
         """

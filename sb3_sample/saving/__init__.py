@@ -1,4 +1,4 @@
-"""What is kept of models and of training: files that run no code, and checkpoints."""
+"""Files of models and replay buffers, which run no code, and checkpoints of trainings."""
 
 from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.encoding import NotPortable

@@ -140,7 +140,7 @@ def _keeps_more(cls: type) -> bool:
 
 
 def _data_of(cls: type) -> dict[str, Any]:
-    """What of a class' own attributes may be data that a program changes."""
+    """The own attributes of a class that may be data which a program changes."""
     return {
         name: value
         for name, value in vars(cls).items()
@@ -453,7 +453,7 @@ class Restorer:
                 vars(owner)[name] = value
 
     def _restored(self, described: dict[str, Node], own: dict[str, Any], place: str) -> Iterator[tuple[str, Any]]:
-        """What was described by name, without what names other files than what is there."""
+        """Restored attributes by name, without those that name other files than the object's present ones."""
         for name, node in described.items():
             present = own.get(name)
             if not is_elsewhere(name, node, present):

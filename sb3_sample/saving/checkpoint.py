@@ -234,7 +234,7 @@ class Checkpointer:
 
     @contextlib.contextmanager
     def _restoring(self, state: dict[str, Any]) -> Iterator[None]:
-        """What the content of a checkpoint makes raise is said to be its fault, in one kind of error."""
+        """Turn errors that the content of a checkpoint raises into ``BadFile``, which names it."""
         try:
             yield
         except (ParametersDoNotFit, EnvironmentDied, OSError):
@@ -253,7 +253,7 @@ class Checkpointer:
             yield segment.first, self._read(segment.path, SEGMENT_KIND)
 
     def _read(self, path: str, kind: str) -> Any:
-        """What a file in the run's folder holds."""
+        """Content of a file in the run's folder."""
         assert self._folder is not None
         with self._folder.opened(path) as file:
             tree, tensors = container.read(file, kind)

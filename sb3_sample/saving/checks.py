@@ -1,4 +1,4 @@
-"""What of a model's file is looked at before torch and the algorithms see it, who take much on trust."""
+"""Checks of a model's file before torch and the algorithms use it, which check little themselves."""
 
 import collections.abc
 import functools
@@ -94,8 +94,8 @@ def check_names(model: Any, attributes: dict[str, Any], name: str) -> None:
 
 def check_sizes(model: Any, name: str, given: Collection[str]) -> None:
     """
-    What is allocated without torch, or object by object, and so out of the budget's sight, as far as it is not
-    ``given`` by the caller.
+    Limit sizes that the budget does not see, since they are allocated without torch or object by object; those that
+    the caller has ``given`` are not limited.
     """
     if type(model.n_envs) is not int or not 1 <= model.n_envs <= MAX_ENVS:
         raise BadFile(f"{name}: n_envs must lie in [1, {MAX_ENVS}], not be {model.n_envs!r:.100}")

@@ -1,4 +1,4 @@
-"""What a file may hold: which classes and functions it may name, and objects of which classes. Nothing else."""
+"""The classes and functions that a file may name, and the classes of the objects that it may hold."""
 
 import contextlib
 import contextvars
@@ -44,8 +44,8 @@ _imports = contextvars.ContextVar("imports", default=True)
 @contextlib.contextmanager
 def importing_nothing() -> Iterator[None]:
     """
-    What is read meanwhile names classes and functions of modules that the program has imported. A checkpoint is read
-    so: it may name whatever the program consists of, and must not say what else is run.
+    Restrict what is read meanwhile to classes and functions of modules that the program has imported. A checkpoint is
+    read so: it may name whatever the program consists of, and must not say what else is run.
     """
     token = _imports.set(False)
     try:
@@ -156,7 +156,7 @@ def has_state(cls: type) -> bool:
 
 def may_be_set(cls: type, name: str) -> bool:
     """
-    What a file may set on an object, and so what is written of one: never what its class does.
+    Whether a file may set an attribute on an object, and so whether it is written: never a class's behaviour.
 
     :param cls: the object's class
     :param name: name of an attribute

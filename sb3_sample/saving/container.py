@@ -71,7 +71,7 @@ PathOrFile = str | pathlib.Path | IO[bytes]
 
 
 class TooLarge(ValueError):
-    """What would be more than a reader takes, and is not written."""
+    """Content larger than a reader takes, which is not written."""
 
 
 # ---------------------------------------------------------------- writing

@@ -1,4 +1,4 @@
-"""What ``encoding.py`` wrote, read: nothing is made but what this file and the tables of ``classes.py`` name."""
+"""Reading of values that ``encoding.py`` wrote: nothing is made but what this file and ``classes.py`` name."""
 
 import base64
 import binascii

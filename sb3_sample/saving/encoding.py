@@ -109,7 +109,7 @@ class Encoder:
 
     @contextlib.contextmanager
     def all_or_nothing(self) -> Iterator[None]:
-        """What is refused leaves nothing of what was written of it before."""
+        """Remove what was written of a value that is refused half-way."""
         before = [(kept, len(kept)) for kept in (self.tensors, self.foreign)]
         try:
             yield

@@ -20,7 +20,7 @@ _CONSTANTS = (type(None), bool, int, float, complex, str, bytes)
 
 
 class OtherKind(ValueError):
-    """What a function would hold is of another kind than what it holds."""
+    """A function's variable is of another kind than the one that a checkpoint has for it."""
 
 
 def name_of(function: Any) -> str:

@@ -1,4 +1,4 @@
-"""What tells a run from another: its arguments, as far as two programs can be compared by them."""
+"""Identity of a run: its arguments, as far as two programs can be compared by them."""
 
 import json
 from hashlib import sha256

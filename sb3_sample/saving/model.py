@@ -34,8 +34,8 @@ Self = TypeVar("Self", bound="SafeFiles")
 
 class SafeFiles(BaseAlgorithm):
     """
-    What an algorithm's class gains that stands before Stable-Baselines3's among its bases: ``save``, ``load`` and
-    ``set_parameters`` with files that hold JSON and tensors, and run no code. See docs/saving.md.
+    Base of the algorithms, before Stable-Baselines3's, with ``save``, ``load`` and ``set_parameters`` for files that
+    hold JSON and tensors, and run no code. See docs/saving.md.
     """
 
     _kept: ClassVar[dict[str, Kept]] = {

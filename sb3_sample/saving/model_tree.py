@@ -39,7 +39,7 @@ _SECTIONS = ("classes", "attributes", "parameters", "metadata")
 
 class Description:
     """
-    What is written of a model.
+    The content of a model's file, to be written.
 
     :param model: the algorithm
     :param exclude: attributes to leave out, besides those that always are
@@ -129,7 +129,7 @@ class Description:
 
 class Content:
     """
-    What a model's file holds.
+    The content of a model's file, as read.
 
     :param file: the file
     :param cls: the class that is to be loaded

@@ -1,4 +1,4 @@
-"""What is looked at of an optimizer's state before torch takes it."""
+"""Checks of an optimizer's state before torch takes it."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What is said, once, of what a model's files lack and of what reading them needs."""
+"""The one warning of what a model's files lack, and what reading them needs."""
 
 import warnings
 from collections.abc import Sequence

@@ -38,8 +38,8 @@ _ARRAYS = (np.ndarray, torch.Tensor)
 
 class SafeReplayBuffers(OffPolicyAlgorithm):
     """
-    What an algorithm's class gains that stands before Stable-Baselines3's among its bases: ``save_replay_buffer`` and
-    ``load_replay_buffer`` with files that run no code. See docs/saving.md.
+    Base of the algorithms, before Stable-Baselines3's, with ``save_replay_buffer`` and ``load_replay_buffer`` for files
+    that run no code. See docs/saving.md.
     """
 
     def save_replay_buffer(
@@ -189,7 +189,7 @@ def _encode_attribute(buffer: ReplayBuffer, value: Any, name: str, encoder: Leni
 
 
 def _encode_info(info: dict[Any, Any], name: str, encoder: Lenient) -> Any:
-    """What an environment said of a step, without what no file can hold."""
+    """The info of a step, without values that no file can hold."""
     pairs = [(key, encoder.attempt(item, f"{name}.{key}")) for key, item in info.items() if type(key) is str]
     return {"dict": {key: tree for key, tree in pairs if not is_left_out(tree)}}
 

@@ -412,8 +412,7 @@ def _checkpoints(root: Folder) -> list[tuple[int, str]]:
 
 def _needed(root: Folder) -> dict[str, Any]:
     """
-    What the checkpoints' manifests say of the rows that they need. One that is damaged needs none: they would be found
-    to be missing.
+    Rows that the checkpoints need, by their manifests. A damaged one needs none: its rows would be found missing.
 
     :raises OSError: a manifest is there and cannot be read at present
     """

@@ -32,7 +32,7 @@ _SKIPPED = (
 
 class _Helper:
     """
-    What is put into an environment of another process.
+    Object put into an environment of another process.
 
     :param env: the environment
     """

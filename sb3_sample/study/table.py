@@ -216,8 +216,8 @@ def _agents_of_study(folder: Path) -> dict[str, str]:
 
 def labelled(source: str | Path) -> tuple[str | None, Path]:
     """
-    :param source: a folder, ``"LABEL=FOLDER"``, or a table's file
-    :return: the label, None without one, and the path
+    :param source: a folder or table, or "LABEL=FOLDER"
+    :return: the label, if there is one, and the path
     :raises ValueError: the label is empty
     """
     label, equals, path = str(source).partition("=")

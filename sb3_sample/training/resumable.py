@@ -67,6 +67,12 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
         vars(self).update(given)
         return theirs
 
+    @classmethod
+    def place_of(cls, name: str) -> str:
+        of_policy = inspect.signature(cls.policy_aliases["MlpPolicy"]).parameters.get(name)
+        is_choice = of_policy is not None and of_policy.default is not inspect.Parameter.empty
+        return f"policy_kwargs=dict({name}=...)" if is_choice else ""
+
     def _setup_model(self) -> None:
         self._check_arguments()
         names = "policy_kwargs", "replay_buffer_kwargs"

@@ -20,7 +20,7 @@ _PLOT_KIND = "plotted runs"
 
 class Refused(Exception):
     """
-    What is refused while the zoo runs, which takes a ``ValueError`` for a model that it can get from a hub.
+    A refusal while the zoo runs, which would take a ``ValueError`` for a model to be got from a hub.
     """
 
 

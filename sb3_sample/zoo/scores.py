@@ -67,7 +67,7 @@ class NormalizedRuns(PlottedRuns):
 
 
 def _unit(task: str, runs: dict[str, Any]) -> float:
-    """What a task's scores are divided by."""
+    """Divisor of a task's scores."""
     score = score_of(_env_id(task))
     if score is not None and score.metric == "success_rate":
         scores = np.concatenate([np.ravel(runs["mean"]), np.ravel(runs["last_evals"])])

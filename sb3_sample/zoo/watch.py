@@ -1,4 +1,4 @@
-"""What ``sb3-sample enjoy`` and ``record_video`` do besides the zoo's: ``--run-dir``, and files that run no code."""
+"""Additions of ``sb3-sample enjoy`` and ``record_video`` to the zoo's: ``--run-dir``, and files that run no code."""
 
 import argparse
 import contextlib
@@ -43,7 +43,7 @@ def watch_parser(command: str) -> argparse.ArgumentParser:
 @contextlib.contextmanager
 def watching(options: argparse.Namespace, arguments: Sequence[str], *modules: Any) -> Iterator[list[str]]:
     """
-    What ``enjoy`` and ``record_video`` need while they run.
+    Prepare the zoo for ``enjoy`` and ``record_video``.
 
     :param options: what ``watch_parser`` has parsed
     :param arguments: the rest of the command line
@@ -59,7 +59,7 @@ def watching(options: argparse.Namespace, arguments: Sequence[str], *modules: An
 
 
 def _given(arguments: Sequence[str]) -> argparse.Namespace:
-    """What a command line says of the algorithm and the environment's arguments, in whatever spelling the zoo takes."""
+    """Algorithm and environment's arguments of a command line, in any spelling that the zoo takes."""
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo")
     parser.add_argument("--env-kwargs", nargs="+", default=[])
@@ -151,7 +151,7 @@ class _Watch:
 
 
 def _shapes(space: gym.Space) -> Any:
-    """What of a space a model cannot do without."""
+    """The properties of a space in which a model and its environment must agree."""
     if isinstance(space, gym.spaces.Dict):
         return {name: _shapes(part) for name, part in space.items()}
     return type(space), space.shape

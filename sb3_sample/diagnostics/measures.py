@@ -1,0 +1,96 @@
+"""
+Quantities of the papers (Overestimation, Overfitting and Plasticity, section 3; VPL, appendix E.2) from the numbers
+that they are made of: no model, no environment.
+
+Shapes use the letters E critics, B batch, N neurons.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+
+class Rollout(NamedTuple):
+    """The n steps of the policy that followed a state and action, in the critic's units."""
+
+    #: the critics' mean at the first state and action
+    value: float
+    #: (n,), the first one that of the first state and action
+    rewards: np.ndarray
+    #: (n,), of the actions taken
+    log_probs: np.ndarray
+    #: whether the last step ended the episode, other than by a time limit
+    terminated: bool
+
+
+def discounted_return(rewards: np.ndarray, gamma: float, terminated: bool) -> float:
+    """
+    The discounted return of a rollout. After a termination nothing follows. Where a rollout was merely cut (by a time
+    limit, or by its own length) its mean reward goes on for ever, with the weight ``gamma ** n / (1 - gamma)``.
+
+    :param rewards: (n,)
+    :param gamma: discount factor, below 1
+    :param terminated: whether the episode ended with the last reward, other than by a time limit
+    :return: the return
+    """
+    n = len(rewards)
+    seen = float(np.sum(rewards * gamma ** np.arange(n)))
+    return seen if terminated else seen + gamma**n / (1 - gamma) * float(rewards.mean())
+
+
+def average_value(rewards: np.ndarray, log_probs: np.ndarray, alpha: float, gamma: float, terminated: bool) -> float:
+    """
+    VPL, equation 22: ``(mean reward - alpha * mean log pi) / (1 - gamma)``. The factor is the sum of the geometric
+    series of a task without end; if the episode terminated, the sum of its first n terms takes its place.
+
+    :param rewards: (n,)
+    :param log_probs: log-probabilities of the actions, (n,)
+    :param alpha: temperature
+    :param gamma: discount factor, below 1
+    :param terminated: whether the episode ended with the last reward, other than by a time limit
+    :return: the value
+    """
+    horizon = (1 - gamma ** len(rewards) if terminated else 1) / (1 - gamma)
+    return float(horizon * (rewards.mean() - alpha * log_probs.mean()))
+
+
+def effective_rank(features: torch.Tensor, delta: float = 0.01) -> torch.Tensor:
+    """
+    Effective rank of feature matrices (Kumar et al. 2020): the least k such that the k largest singular values sum to
+    at least ``1 - delta`` of the sum of all of them. 0 for a matrix of zeros; at most the smaller of B and N.
+
+    :param features: (..., B, N)
+    :param delta: the share that may be missing, in (0, 1)
+    :return: (...), NaN for a matrix that is not finite
+    """
+    finite = torch.isfinite(features).all(dim=-1).all(dim=-1)
+    # On the CPU since not every device has float64; the sums need it.
+    features = torch.where(finite[..., None, None], features, 0.0).cpu().double()
+    sums = torch.linalg.svdvals(features).cumsum(dim=-1)
+    # sums[k - 1] is the sum of k values, and that of none is 0.
+    total = sums[..., -1:]
+    rank = (sums < (1 - delta) * total).sum(dim=-1) + (total[..., 0] > 0)
+    return torch.where(finite.cpu(), rank.double(), torch.nan)
+
+
+def dormant_shares(scores: dict[str, torch.Tensor], threshold: float) -> dict[str, float]:
+    """
+    Share of the neurons whose score is at most the threshold (Sokar et al. 2023), copies taken together.
+
+    :param scores: scores of a network by layer, (E, N) or (N,)
+    :param threshold: up to which score a neuron is dormant
+    :return: the share by layer, and under "" that of all neurons together; nothing if there is no layer
+    """
+    dormant = {name: (layer <= threshold).double().flatten() for name, layer in scores.items()}
+    if dormant:
+        dormant[""] = torch.cat(list(dormant.values()))
+    return {name: layer.mean().item() for name, layer in dormant.items()}
+
+
+def global_norm(tensors: list[torch.Tensor]) -> float:
+    """
+    :param tensors: parameters or gradients
+    :return: the L2 norm of all their elements together
+    """
+    return torch.stack([torch.linalg.vector_norm(tensor.detach()) for tensor in tensors]).norm().item()
