@@ -97,10 +97,11 @@ def _add_sources(parser: argparse.ArgumentParser, pictures: bool = False) -> Non
     parser.set_defaults(endings=endings)
 
 
-def add_scores(parser: argparse.ArgumentParser, groups: bool = True) -> None:
+def add_scores(parser: argparse.ArgumentParser, groups: bool = True, planned: bool = True) -> None:
     """
     :param parser: of a command that makes scores
     :param groups: whether it takes groups of tasks
+    :param planned: whether these can be those of a study's plan
     """
     parser.add_argument(
         "--score",
@@ -115,8 +116,8 @@ def add_scores(parser: argparse.ArgumentParser, groups: bool = True) -> None:
             "--groups",
             nargs="+",
             metavar="GROUP",
-            help=f"groups of tasks, of the study's plan and of {', '.join(GROUPS)} (default: the plan's, or "
-            f"{', '.join(DEFAULT_GROUPS)})",
+            help=f"groups of tasks, of {'the study plan and ' if planned else ''}{', '.join(GROUPS)} (default: "
+            f"{'those of the plan, or ' if planned else ''}{', '.join(DEFAULT_GROUPS)})",
         )
 
 
