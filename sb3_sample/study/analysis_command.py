@@ -24,6 +24,7 @@ from sb3_sample.study.aggregate import (
     performance_profiles,
     probability_of_improvement,
 )
+from sb3_sample.study.comparison import chosen_groups, comparison
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -96,10 +97,11 @@ def _add_sources(parser: argparse.ArgumentParser, pictures: bool = False) -> Non
     parser.set_defaults(endings=endings)
 
 
-def add_scores(parser: argparse.ArgumentParser, groups: bool = True) -> None:
+def add_scores(parser: argparse.ArgumentParser, groups: bool = True, planned: bool = True) -> None:
     """
     :param parser: of a command that makes scores
     :param groups: whether it takes groups of tasks
+    :param planned: whether these can be those of a study's plan
     """
     parser.add_argument(
         "--score",
@@ -114,7 +116,8 @@ def add_scores(parser: argparse.ArgumentParser, groups: bool = True) -> None:
             "--groups",
             nargs="+",
             metavar="GROUP",
-            help=f"groups of tasks, of {', '.join(GROUPS)} (default: {', '.join(DEFAULT_GROUPS)})",
+            help=f"groups of tasks, of {'the study plan and ' if planned else ''}{', '.join(GROUPS)} (default: "
+            f"{'those of the plan, or ' if planned else ''}{', '.join(DEFAULT_GROUPS)})",
         )
 
 
@@ -163,6 +166,10 @@ def _read(options: argparse.Namespace, *more: str) -> pd.DataFrame:
     if curves:
         parts.append(tables.published_curves(curves))
     return pd.concat(parts, ignore_index=True)
+
+
+def _groups(options: argparse.Namespace, table: pd.DataFrame) -> Any:
+    return chosen_groups(comparison(options.sources).groups, options.groups, table)
 
 
 def _shared(options: argparse.Namespace, *names: str) -> dict[str, Any]:
@@ -297,15 +304,15 @@ def _run_aggregate(options: argparse.Namespace) -> None:
         if options.improvement and options.common:
             raise ValueError("--common is not of --improvement, which compares each pair on the tasks that both have")
         table = _read(options)
-        shared = _shared(options, *_INTERVALS)
+        groups, shared = _groups(options, table), _shared(options, *_INTERVALS)
         if options.improvement:
-            found = probability_of_improvement(table, options.steps[0], options.groups, **shared)
+            found = probability_of_improvement(table, options.steps[0], groups, **shared)
         elif options.profile:
             found = performance_profiles(
-                table, options.steps[0], options.profile, options.groups, common=options.common, **shared
+                table, options.steps[0], options.profile, groups, common=options.common, **shared
             )
         else:
-            found = aggregate(table, options.steps, options.groups, common=options.common, **shared)
+            found = aggregate(table, options.steps, groups, common=options.common, **shared)
         _put(found, options.output)
 
 
@@ -317,8 +324,8 @@ def _add_marginalize(parser: argparse.ArgumentParser) -> None:
         type=_factor,
         dest="factors",
         metavar="[NAME=]ARGUMENT[,...]",
-        help="arguments of which one choice each was made, several that are one choice under a name (default: each "
-        "argument in which the runs of a task differ)",
+        help="arguments of which one choice each was made, several that are one choice under a name (default: the "
+        "plan's factors, or each argument in which the runs of a task differ)",
     )
     parser.add_argument("--order", type=int, default=1, help="how many factors are fixed (default: 1)")
     _add_ends(parser)
@@ -328,9 +335,11 @@ def _add_marginalize(parser: argparse.ArgumentParser) -> None:
 
 def _run_marginalize(options: argparse.Namespace) -> None:
     with refusing("marginalize"):
-        factors = None if options.factors is None else dict(options.factors)
-        shared = _shared(options, "by", "groups", "last", *_INTERVALS)
-        _put(analysis.marginalize(_read(options), factors, options.order, **shared), options.output)
+        table = _read(options)
+        factors = comparison(options.sources).factors if options.factors is None else dict(options.factors)
+        shared = _shared(options, "by", "last", *_INTERVALS)
+        found = analysis.marginalize(table, factors or None, options.order, groups=_groups(options, table), **shared)
+        _put(found, options.output)
 
 
 def _add_correlate(parser: argparse.ArgumentParser) -> None:
@@ -362,7 +371,7 @@ def _run_correlate(options: argparse.Namespace) -> None:
             _put(analysis.regress(table, options.metrics, **shared), options.output)
             return
         found = analysis.correlate(
-            table, options.metrics, by=options.by, groups=options.groups, level=options.level, **shared
+            table, options.metrics, by=options.by, groups=_groups(options, table), level=options.level, **shared
         )
         _put(found, options.output, lambda: _draw_correlations(found, options.by))
 
@@ -375,15 +384,18 @@ def _add_heatmap(parser: argparse.ArgumentParser) -> None:
         "--value", default="score", metavar="METRIC", help="score, or a metric as hours (default: score)"
     )
     parser.add_argument("--step", type=steps_of, help="simulator step (default: the last that all runs reach)")
-    parser.add_argument("--group", default="all", help=f"of tasks, of {', '.join(GROUPS)} (default: all)")
+    parser.add_argument(
+        "--group", default="all", help=f"of tasks, of the study's plan and of {', '.join(GROUPS)} (default: all)"
+    )
     add_scores(parser, groups=False)
 
 
 def _run_heatmap(options: argparse.Namespace) -> None:
     with refusing("heatmap"):
         table = _read(options, *([] if options.value == "score" else [options.value]))
-        shared = _shared(options, "value", "step", "group")
-        found = analysis.heatmap(table, options.x, options.y, **shared)
+        group = comparison(options.sources).groups.get(options.group, options.group)
+        shared = _shared(options, "value", "step")
+        found = analysis.heatmap(table, options.x, options.y, group=group, **shared)
         shown = found.reset_index().rename(columns={options.y: f"{options.y} \\ {options.x}"})
         _put(shown, options.output, lambda: _draw_heatmap(found, options.value))
 
@@ -398,7 +410,8 @@ def _add_cost(parser: argparse.ArgumentParser) -> None:
 def _run_cost(options: argparse.Namespace) -> None:
     with refusing("cost"):
         shared = _shared(options, "common", *_INTERVALS)
-        found = analysis.cost(_read(options), options.steps, options.groups, **shared)
+        table = _read(options)
+        found = analysis.cost(table, options.steps, _groups(options, table), **shared)
         _put(found, options.output, lambda: _draw_cost(found))
 
 
