@@ -258,7 +258,7 @@ class HasLearner:
         checks.check_target_entropy(self)
         if self.target_entropy == "auto":
             self._target_entropy = self._auto_target_entropy(get_action_dim(self.action_space))
-        elif isinstance(self.target_entropy, Sequence):
+        elif isinstance(self.target_entropy, Sequence) and not isinstance(self.target_entropy, str):
             targets = [float(each) for each in self.target_entropy]
             self._target_entropy = targets if self.n_tasks > 1 else targets[0]
         else:
