@@ -71,7 +71,11 @@ def _factor(text: str) -> tuple[str, list[str]]:
     return name, names
 
 
-def _add_sources(parser: argparse.ArgumentParser, pictures: bool = False) -> None:
+def add_sources(parser: argparse.ArgumentParser, pictures: bool = False) -> None:
+    """
+    :param parser: gets the runs that a command reads, and its output
+    :param pictures: whether the command draws
+    """
     parser.add_argument(
         "sources",
         nargs="*",
@@ -92,7 +96,11 @@ def _add_sources(parser: argparse.ArgumentParser, pictures: bool = False) -> Non
     parser.set_defaults(endings=endings)
 
 
-def _add_scores(parser: argparse.ArgumentParser, groups: bool = True) -> None:
+def add_scores(parser: argparse.ArgumentParser, groups: bool = True) -> None:
+    """
+    :param parser: gets how tasks are scored
+    :param groups: whether it gets groups of tasks too
+    """
     parser.add_argument(
         "--score",
         nargs="+",
@@ -219,7 +227,7 @@ def _put(table: pd.DataFrame, output: Path | None, draw: Callable[[], "Figure"] 
 
 
 def _add_table(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser)
+    add_sources(parser)
     parser.add_argument(
         "--curves",
         nargs="+",
@@ -256,9 +264,9 @@ def _run_table(options: argparse.Namespace) -> None:
 
 
 def _add_aggregate(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser)
+    add_sources(parser)
     _add_steps(parser)
-    _add_scores(parser)
+    add_scores(parser)
     _add_intervals(parser)
     parser.add_argument(
         "--improvement", action="store_true", help="the probability that one agent is better than another, by pair"
@@ -294,7 +302,7 @@ def _run_aggregate(options: argparse.Namespace) -> None:
 
 
 def _add_marginalize(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser)
+    add_sources(parser)
     parser.add_argument(
         "--factor",
         nargs="+",
@@ -306,7 +314,7 @@ def _add_marginalize(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--order", type=int, default=1, help="how many factors are fixed (default: 1)")
     _add_ends(parser)
-    _add_scores(parser)
+    add_scores(parser)
     _add_intervals(parser, analysis.STUDY_REPS)
 
 
@@ -318,7 +326,7 @@ def _run_marginalize(options: argparse.Namespace) -> None:
 
 
 def _add_correlate(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser, pictures=True)
+    add_sources(parser, pictures=True)
     parser.add_argument(
         "--metrics",
         nargs="+",
@@ -331,7 +339,7 @@ def _add_correlate(parser: argparse.ArgumentParser) -> None:
         "--regress", action="store_true", help="least squares of the score on each metric, task by task, instead"
     )
     _add_ends(parser)
-    _add_scores(parser)
+    add_scores(parser)
 
 
 def _run_correlate(options: argparse.Namespace) -> None:
@@ -352,7 +360,7 @@ def _run_correlate(options: argparse.Namespace) -> None:
 
 
 def _add_heatmap(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser, pictures=True)
+    add_sources(parser, pictures=True)
     parser.add_argument("-x", required=True, metavar="ARGUMENT", help="argument of the columns, as model_size")
     parser.add_argument("-y", required=True, metavar="ARGUMENT", help="argument of the rows, as replay_ratio")
     parser.add_argument(
@@ -360,7 +368,7 @@ def _add_heatmap(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--step", type=_steps, help="simulator step (default: the last that all runs reach)")
     parser.add_argument("--group", default="all", help=f"of tasks, of {', '.join(GROUPS)} (default: all)")
-    _add_scores(parser, groups=False)
+    add_scores(parser, groups=False)
 
 
 def _run_heatmap(options: argparse.Namespace) -> None:
@@ -373,9 +381,9 @@ def _run_heatmap(options: argparse.Namespace) -> None:
 
 
 def _add_cost(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser, pictures=True)
+    add_sources(parser, pictures=True)
     _add_steps(parser)
-    _add_scores(parser)
+    add_scores(parser)
     _add_intervals(parser)
 
 
@@ -389,7 +397,13 @@ def _run_cost(options: argparse.Namespace) -> None:
 # ---------------------------------------------------------------- pictures
 
 
-def _figure(width: float, height: float) -> "Figure":
+def new_figure(width: float, height: float) -> "Figure":
+    """
+    :param width: inches
+    :param height: inches
+    :return: an empty figure
+    :raises ImportError: matplotlib is not installed
+    """
     with needing_matplotlib():
         from matplotlib.figure import Figure
 
@@ -415,7 +429,7 @@ def _cells(values: pd.DataFrame) -> Iterator[tuple[tuple[int, int], float]]:
 
 
 def _draw_heatmap(values: pd.DataFrame, name: str) -> "Figure":
-    figure = _figure(2 + 0.9 * values.shape[1], 1.5 + 0.6 * values.shape[0])
+    figure = new_figure(2 + 0.9 * values.shape[1], 1.5 + 0.6 * values.shape[0])
     axes = figure.add_subplot()
     figure.colorbar(_draw_grid(axes, values, cmap="viridis"), label="IQM of the scores" if name == "score" else name)
     axes.set_xlabel(values.columns.name)
@@ -427,7 +441,7 @@ def _draw_correlations(found: pd.DataFrame, by: list[str]) -> "Figure":
     parts = list(found.groupby(["group", *by], sort=False))
     variables = list(found["x"].unique())
     size = 1.5 + 0.7 * len(variables)
-    figure = _figure((size + 0.5) * len(parts), size)
+    figure = new_figure((size + 0.5) * len(parts), size)
     for axes, (head, part) in zip(figure.subplots(1, len(parts), squeeze=False)[0], parts, strict=True):
         matrix = part.pivot(index="x", columns="y", values="spearman").loc[variables, variables]
         matrix = matrix.rename(index=_last_word, columns=_last_word)
@@ -442,7 +456,7 @@ def _last_word(metric: str) -> str:
 
 def _draw_cost(found: pd.DataFrame) -> "Figure":
     groups = list(found["group"].unique())
-    figure = _figure(4.5 * len(groups), 4)
+    figure = new_figure(4.5 * len(groups), 4)
     for axes, group in zip(figure.subplots(1, len(groups), squeeze=False)[0], groups, strict=True):
         for agent, rows in found[found["group"] == group].dropna(subset="hours").groupby("agent", sort=False):
             lines = axes.plot(rows["hours"], rows["iqm"], marker="o" if len(rows) < 3 else None, label=agent)

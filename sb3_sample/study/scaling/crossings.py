@@ -227,9 +227,7 @@ def _common(seeds: np.ndarray, steps: np.ndarray, scores: np.ndarray) -> tuple[n
     return common, np.stack(kept)
 
 
-def _resets(
-    arguments: dict[str, Any], given: int | Sequence[int] | None, repeat: int, last: int
-) -> tuple[float, ...]:
+def _resets(arguments: dict[str, Any], given: int | Sequence[int] | None, repeat: int, last: int) -> tuple[float, ...]:
     """Simulator steps of the resets of a run, up to its last evaluation."""
     gradient_steps = arguments.get("reset_gradient_steps")
     if given is None and gradient_steps is not None:

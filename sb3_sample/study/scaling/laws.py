@@ -26,10 +26,10 @@ _ITERATIONS = 200
 
 class HyperparameterLaw(NamedTuple):
     """
-    Best value of a hyperparameter by replay ratio σ: ``intercepts[task] * σ ** slope``.
+    Best value of a hyperparameter by replay ratio sigma: ``intercepts[task] * sigma ** slope``.
 
     :param slope: shared by all tasks
-    :param intercepts: value at σ = 1 by task
+    :param intercepts: value at sigma = 1 by task
     """
 
     slope: float
@@ -64,7 +64,9 @@ def fit_hyperparameter(values: pd.DataFrame) -> HyperparameterLaw:
     """
     missing = {"task", "replay_ratio", "value"} - set(values)
     if missing:
-        raise ValueError(f"values must have columns task, replay_ratio and value; missing: {', '.join(sorted(missing))}")
+        raise ValueError(
+            f"values must have columns task, replay_ratio and value; missing: {', '.join(sorted(missing))}"
+        )
     rows = values.dropna(subset=["value"])
     if not len(rows):
         raise ValueError("values must have at least one row with a value")
@@ -100,9 +102,10 @@ def shared_slope(x: np.ndarray, groups: np.ndarray, y: np.ndarray) -> tuple[np.n
 
 class DataLaw(NamedTuple):
     """
-    Environment steps by replay ratio σ: ``d_min * (1 + (beta / σ) ** alpha)`` (paper, D.5).
+    Environment steps by replay ratio sigma: ``d_min * (1 + (beta / sigma) ** alpha)`` (paper, D.5).
 
-    The authors' code fits ``c + (σ / b) ** -a`` and prints it as ``c * (1 + (σ / b) ** -a)``; the two are equal with
+    The authors' code fits ``c + (sigma / b) ** -a`` and prints it as ``c * (1 + (sigma / b) ** -a)``; the two are
+    equal with
     ``beta = b * c ** (-1 / a)`` in the place of ``b``, which is what stands here.
 
     :param d_min: steps at infinite replay ratio; a number, or (R,) of R laws
@@ -262,7 +265,7 @@ def fit_logs(
 
 
 def _start(x: np.ndarray, logs: np.ndarray, bound: np.ndarray, alpha: float | None) -> np.ndarray:
-    """Best points of a grid, (R, 3): logarithms of the two terms at σ = 1 and of the exponent."""
+    """Best points of a grid, (R, 3): logarithms of the two terms at sigma = 1 and of the exponent."""
     rates = np.geomspace(0.1, 6, _GRID_ALPHA) if alpha is None else np.array([alpha])
     scales = np.linspace(x.min() - 4, x.max() + 6, _GRID_BETA)
     rate, scale = (each.reshape(-1) for each in np.meshgrid(rates, scales, indexing="ij"))
@@ -365,8 +368,8 @@ def shared_alpha(
 
 class SizeLaw(NamedTuple):
     """
-    Environment steps by replay ratio σ and parameters N of the critics: ``c * (1 + (a / σ) ** alpha + (b / N) ** beta)``
-    (follow-up).
+    Environment steps by replay ratio sigma and parameters N of the critics: ``c * (1 + (a / sigma) ** alpha +
+    (b / N) ** beta)`` (follow-up).
 
     :param c: steps at infinite replay ratio and size
     :param a: replay ratio at which its term is 1
