@@ -191,19 +191,24 @@ class BudgetLaw(NamedTuple):
     """
     Best replay ratio by budget F = C + δ D: ``coefficient * F ** exponent`` (4.5).
 
-    :param coefficient: at a budget of one FLOP
+    :param log_coefficient: natural logarithm of the coefficient, the replay ratio at a budget of one FLOP
     :param exponent: of the budget
     """
 
-    coefficient: Any
+    log_coefficient: Any
     exponent: Any
+
+    @property
+    def coefficient(self) -> Any:
+        """The replay ratio at a budget of one FLOP."""
+        return np.exp(self.log_coefficient)
 
     def replay_ratio(self, budget: float | np.ndarray) -> Any:
         """
         :param budget: FLOPs
         :return: the replay ratio
         """
-        return self.coefficient * np.asarray(budget, float) ** self.exponent
+        return np.exp(self.log_coefficient + self.exponent * np.log(np.asarray(budget, float)))
 
 
 def fit_budget(budget: Sequence[float] | np.ndarray, replay_ratio: Sequence[float] | np.ndarray) -> BudgetLaw:
@@ -226,7 +231,7 @@ def fit_budget(budget: Sequence[float] | np.ndarray, replay_ratio: Sequence[floa
     if not (spread > 1e-12).all():
         raise ValueError("budgets must differ: an exponent cannot be had from one")
     exponent = (centred * y).sum(axis=-1) / spread
-    return BudgetLaw(np.exp(y.mean(axis=-1) - exponent * x.mean(axis=-1))[()], exponent[()])
+    return BudgetLaw((y.mean(axis=-1) - exponent * x.mean(axis=-1))[()], exponent[()])
 
 
 def noise_scale(

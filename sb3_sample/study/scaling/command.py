@@ -283,8 +283,8 @@ def page(laws: Laws) -> str:
     if "budget" in found:
         words = {name: _words(value) for name, value in found["budget"].items()}
         parts.append(
-            "\nbest replay ratio = coefficient · F^exponent: coefficient "
-            f"{words['coefficient']}, exponent {words['exponent']}"
+            "\nBest replay ratio = coefficient · F^exponent: logarithm of the coefficient "
+            f"{words['log_coefficient']}, exponent {words['exponent']}"
         )
         held = laws.budgets().iloc[-2:]
         law = laws.budget_laws()[0]

@@ -84,8 +84,8 @@ def fit(
     lower bound; a task that reaches it at less than half of the replay ratios has no median and is left out, by name.
     Compute and budget follow from these.
 
-    Intervals are BCa over seeds: everything from the choice of hyperparameters on is done again for each sample, with
-    the configurations of the data law kept.
+    Intervals are of the bootstrap over seeds (:mod:`sb3_sample.study.scaling.intervals`): everything from the choice of
+    hyperparameters on is done again for each sample, with the configurations of the data law kept.
 
     :param table: of :func:`~sb3_sample.study.read`
     :param levels: of the return, of 0 to 1000; the authors' ten if None
@@ -130,9 +130,7 @@ def fit(
         notes.append("one task: slopes and exponents are its own, and nothing says that they hold for others")
     samples = {n: draw(rng, reps, n) for n in n_seeds}
     whole = {n: np.arange(n)[None] for n in n_seeds}
-    # Without the i-th seed of every configuration, as one of as many groups as the fewest seeds.
-    left = {n: np.array([np.delete(np.arange(n), i) for i in range(fewest)]) for n in n_seeds}
-    stages = [whole, samples] + ([left] if fewest > 1 else [])
+    stages = [whole, samples]
     if fewest < 2:
         notes.append("one seed a configuration: there are no intervals")
     elif fewest < 5:

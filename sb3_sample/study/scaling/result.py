@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_sample.study.scaling.budget import BudgetLaw, ComputeLaw, fit_budget
-from sb3_sample.study.scaling.intervals import bca
+from sb3_sample.study.scaling.intervals import interval
 from sb3_sample.study.scaling.laws import DataLaw, HyperparameterLaw
 
 #: Largest budgets that are held out of the budget's law (appendix D).
@@ -39,7 +39,7 @@ class Estimate(NamedTuple):
         return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]"
 
 
-#: Numbers of all seeds (1,), of the bootstrap samples (R,), and without one seed each (n,). The last may be missing.
+#: Numbers of all seeds (1,), and of the bootstrap samples (R,).
 Stages = Sequence[np.ndarray]
 
 
@@ -50,7 +50,7 @@ class Hyperparameter:
 
     :param values: what was chosen: task, replay_ratio, name, value, std, decided, edge
     :param tasks: of the law
-    :param slopes: (1,), (R,), (n,)
+    :param slopes: (1,), (R,)
     :param intercepts: the same with an axis of tasks
     """
 
@@ -91,7 +91,7 @@ class Level:
     :param points: (S,) mean environment steps by replay ratio
     :param censored: (S,) where a task does not reach the level, so that its mean is a lower bound
     :param factors: by which the mean is the steps of a task, (tasks,)
-    :param laws: of (1,), (R,), (n,)
+    :param laws: of (1,), (R,)
     """
 
     level: float
@@ -191,13 +191,13 @@ class Laws:
 
     def interval(self, stages: Stages) -> Estimate:
         """
-        :param stages: (1,), (R,), (n,)
+        :param stages: (1,), (R,)
         :return: the number with its 95% interval
         """
         value = float(stages[0][0])
-        if len(stages) < 3 or self.seeds < 2:
+        if self.seeds < 2:
             return Estimate(value)
-        low, high = bca(stages[0][0], stages[1], stages[2], n=self.seeds)
+        low, high = interval(stages[1], self.seeds)
         return Estimate(value, float(low), float(high))
 
     def level(self, level: float | None = None) -> Level:
@@ -218,7 +218,7 @@ class Laws:
         """
         :param level: of the fit; the largest if None
         :param task: one of the level's; the mean over the tasks if None
-        :return: laws of (1,), (R,), (n,)
+        :return: laws of (1,), (R,)
         """
         if not self.has_compute:
             raise ValueError("compute needs the size of the critics and the batch size, which these laws do not have")
@@ -267,7 +267,7 @@ class Laws:
 
     def budget_laws(self) -> list[BudgetLaw]:
         """
-        :return: laws of all but the two largest budgets, of (1,), (R,), (n,)
+        :return: laws of all but the two largest budgets, of (1,), (R,)
         :raises ValueError: there are fewer than four levels, or no compute
         """
         if len(self.levels) < HELD_OUT + 2:
