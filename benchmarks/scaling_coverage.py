@@ -4,9 +4,10 @@ How often intervals of the scaling laws cover what the same computation finds wi
     python benchmarks/scaling_coverage.py [--seeds 3 5 10] [--repetitions 200] [--reps 150]
 
 Made-up runs of three tasks at five replay ratios, with known laws: each seed learns at a speed of its own (standard
-deviation 25%), and its evaluations, one every 1% of the steps to 700, have noise (60 of 1000). Of the levels 400 and 700
-d_min, beta, alpha and the fitted steps at four replay ratios, one of them outside of the runs. Prints the share of repetitions in
-which an interval of 95% holds the thousand seeds' value: plain percentiles, those of sb3_sample, and BCa.
+deviation 25%), and its evaluations, one every 1% of the steps to 700, have noise (60 of 1000). Of the levels 400 and
+700 d_min, beta, alpha and the fitted steps at four replay ratios, one of them outside of the runs. Prints the share of
+repetitions in which an interval of 95% holds the thousand seeds' value: plain percentiles, those of sb3_sample, and
+BCa.
 """
 
 import argparse
