@@ -84,7 +84,7 @@ def main() -> None:
             runs = made_up(rng, n)
             point, reps = laws(runs, np.arange(n)[None])[0], laws(runs, draw(rng, options.reps, n))
             without = laws(runs, np.array([np.delete(np.arange(n), i) for i in range(n)]))
-            found = {"percentiles": interval(reps, None), "sb3_sample": interval(reps, n)}
+            found = {"percentiles": interval(point, reps, None), "sb3_sample": interval(point, reps, n)}
             found["BCa"] = bca(point, reps, without)
             for name, (low, high) in found.items():
                 hits[name] += (low <= truth) & (truth <= high)

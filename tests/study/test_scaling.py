@@ -433,14 +433,27 @@ def test_intervals_cover_a_mean() -> None:
     for _ in range(400):
         values = rng.normal(1.0, 1.0, n)
         reps = values[rng.integers(0, n, (500, n))].mean(axis=1)
-        for i, (low, high) in enumerate((interval(reps, None), interval(reps, n))):
+        for i, (low, high) in enumerate((interval(values.mean(), reps, None), interval(values.mean(), reps, n))):
             covered[i] += low <= 1 <= high
     # Measured: 0.91 and 0.96.
     assert covered[0] / 400 < covered[1] / 400
     assert 0.92 <= covered[1] / 400 <= 0.99
 
 
+def test_few_seeds_have_intervals_beyond_their_samples() -> None:
+    rng = np.random.default_rng(4)
+    covered = np.zeros(2)
+    for _ in range(300):
+        values = np.exp(rng.normal(0, 0.3, 3))
+        reps = np.exp(np.log(values)[rng.integers(0, 3, (300, 3))].mean(axis=1))
+        point = np.exp(np.log(values).mean())
+        for i, (low, high) in enumerate((interval(point, reps, None), interval(point, reps, 3))):
+            covered[i] += 0 < low <= 1 <= high
+    assert covered[0] < 0.85 * 300
+    assert covered[1] >= 0.9 * 300
+
+
 def test_an_interval_of_samples_without_values_is_none() -> None:
     reps = np.array([[1.0, np.nan], [2.0, np.nan], [3.0, np.nan], [np.inf, 4.0]])
-    low, high = interval(reps, None)
+    low, high = interval(np.array([2.0, 4.0]), reps, None)
     assert 1 <= low[0] <= high[0] <= 3 and np.isnan(low[1]) and np.isnan(high[1])

@@ -197,7 +197,7 @@ class Laws:
         value = float(stages[0][0])
         if self.seeds < 2:
             return Estimate(value)
-        low, high = interval(stages[1], self.seeds)
+        low, high = interval(stages[0][0], stages[1], self.seeds)
         return Estimate(value, float(low), float(high))
 
     def level(self, level: float | None = None) -> Level:
