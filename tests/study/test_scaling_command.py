@@ -53,7 +53,7 @@ def test_errors_are_one_line(table: Path, tmp_path: Path, capsys: pytest.Capture
     laws.write_text("{}")
     for command, words in (
         (["fit", str(table), *LEVELS], "agent must be given"),
-        (["fit", f"BRO={table}", "--levels", "5000"], "none of 5000 is"),
+        (["fit", f"BRO={table}", "--levels", "5000"], "give a level that they reach"),
         (["fit"], "sources must be at least one folder"),
         (["fit", f"BRO={table}", "--delta", "-1", *LEVELS], "delta above 0"),
         (["predict", str(laws), "--budget", "1e15"], "is no file of scaling laws"),
