@@ -155,10 +155,13 @@ def _run_plan(options: argparse.Namespace) -> None:
 
 
 def _add_fit(parser: argparse.ArgumentParser) -> None:
-    add_sources(parser)
-    add_scores(parser, groups=False)
-    parser.set_defaults(endings=(".json",))
+    add_sources(parser, output="file of the laws to write (.json)")
     parser.add_argument("--page", type=Path, metavar="FILE", help="write the page that is printed to this file (.md)")
+    _add_options(parser)
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    add_scores(parser, groups=False)
     parser.add_argument(
         "--levels", nargs="+", type=float, metavar="RETURN", help="of 0 to 1000 (default: the authors' ten, 200 to 800)"
     )
@@ -367,8 +370,8 @@ def _run_predict(options: argparse.Namespace) -> None:
 
 
 def _add_plot(parser: argparse.ArgumentParser) -> None:
-    _add_fit(parser)
-    parser.set_defaults(endings=())
+    add_sources(parser, output="folder of the pictures")
+    _add_options(parser)
     parser.add_argument("--format", choices=("png", "svg"), default="png", help="of the pictures (default: png)")
 
 
