@@ -119,6 +119,9 @@ def test_the_authors_budget_laws_from_their_stored_fits() -> None:
 def test_all_proposals_of_the_authors_follow_from_their_fits() -> None:
     fits = pd.read_csv(LAWS / "hyperparameter_fits.csv").set_index(["domain", "fit", "quantity", "environment"])
     proposals = pd.read_csv(LAWS / "proposed_hyperparameters.csv")
+    # Those of the agent with one batch size and learning rate are of no fit.
+    proposals = proposals[proposals["fit"] != "constant"]
+    assert len(proposals) == 154
     for row in proposals.itertuples():
         of = fits.loc[(row.domain, row.fit, "batch_size", row.environment)]
         batch = 10 ** (of["intercept_log10"] + of["slope"] * np.log10(row.sigma))

@@ -353,13 +353,13 @@ def shared_alpha(
             found.append((np.where(bound & (residual > 0), 0.0, residual) ** 2).sum())
         return np.array(found)
 
-    rates = np.geomspace(0.05, 10, 40)
+    rates = np.geomspace(0.05, 10, 20)
     chosen = int(error(rates).argmin())
     low, high = rates[max(chosen - 1, 0)], rates[min(chosen + 1, len(rates) - 1)]
     for _ in range(3):
-        rates = np.linspace(low, high, 11)
+        rates = np.linspace(low, high, 7)
         chosen = int(error(rates).argmin())
-        low, high = rates[max(chosen - 1, 0)], rates[min(chosen + 1, 10)]
+        low, high = rates[max(chosen - 1, 0)], rates[min(chosen + 1, 6)]
     return float((low + high) / 2)
 
 
