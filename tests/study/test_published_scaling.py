@@ -155,6 +155,6 @@ def test_the_two_largest_replay_ratios_are_predicted(found: pd.DataFrame) -> Non
     errors = held_out(found)
     assert len(errors) == 100
     mean = errors["error"].abs().groupby(errors["size"], sort=False).mean()
-    # The paper's table 5 has 7.8% and 10.6%, of batch sizes and learning rates that were fitted.
-    print(errors.pivot_table(index="size", columns="replay_ratio", values="error", aggfunc=lambda x: np.abs(x).mean()))
-    assert mean.max() < 0.5 and mean.mean() < 0.25
+    # Measured: 10.0% over all, 14.2% for the smallest size. The paper's table 5 has 7.8% and 10.6%, of batch sizes and
+    # learning rates that were fitted.
+    assert mean.max() < 0.18 and mean.mean() < 0.12
