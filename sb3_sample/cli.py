@@ -1,6 +1,6 @@
 """
-The command ``sb3-sample``: the zoo's commands with the algorithms of this package in them, ``plot``, ``study`` and
-``variance``.
+The command ``sb3-sample``: the zoo's commands with the algorithms of this package in them, ``plot``, ``study``,
+``scaling`` and ``variance``.
 """
 
 import argparse
@@ -218,15 +218,29 @@ def _variance(arguments: list[str]) -> None:
     variance(arguments)
 
 
-def _study(arguments: list[str]) -> None:
-    from sb3_sample.study.command import main as study
-
+@contextlib.contextmanager
+def _extras() -> Iterator[None]:
+    """An extra that is not installed is told of without a traceback."""
     try:
-        study(arguments)
+        yield
     except ImportError as error:
         if isinstance(error.__cause__, ModuleNotFoundError):
             sys.exit(f"sb3-sample: {error}")
         raise
+
+
+def _study(arguments: list[str]) -> None:
+    from sb3_sample.study.command import main as study
+
+    with _extras():
+        study(arguments)
+
+
+def _scaling(arguments: list[str]) -> None:
+    from sb3_sample.study.scaling.command import main as scaling
+
+    with _extras():
+        scaling(arguments)
 
 
 COMMANDS: dict[str, Command] = {
@@ -235,6 +249,7 @@ COMMANDS: dict[str, Command] = {
     "record_video": Command(_record_video, "write a video of a trained agent"),
     "plot": Command(_plot, "draw the runs of a task, mean and range over seeds, beside the published curves"),
     "study": Command(_study, "make the runs of a plan: agents, tasks, seeds and a grid of arguments"),
+    "scaling": Command(_scaling, "fit scaling laws: batch size, learning rate and replay ratio for a budget"),
     "variance": Command(_variance, "measure a policy gradient's variance: more actions or a longer trajectory?"),
     "plot_train": Command(_zoo_plot("plot_train"), "draw the return of the training episodes"),
     "all_plots": Command(_zoo_plot("all_plots"), "draw and tabulate the evaluations of several runs"),

@@ -76,7 +76,12 @@ def _factor(text: str) -> tuple[str, list[str]]:
     return name, names
 
 
-def _add_sources(parser: argparse.ArgumentParser, pictures: bool = False) -> None:
+def add_sources(parser: argparse.ArgumentParser, pictures: bool = False, output: str = "") -> None:
+    """
+    :param parser: gets the runs that a command reads, and its output
+    :param pictures: whether the command draws
+    :param output: help of the output, where it is not a table or a picture
+    """
     parser.add_argument(
         "sources",
         nargs="*",
@@ -93,7 +98,7 @@ def _add_sources(parser: argparse.ArgumentParser, pictures: bool = False) -> Non
         help="published runs besides, every seed of them: BRO, 'BRO Fast'",
     )
     endings = _TABLES + (_PICTURES if pictures else ())
-    parser.add_argument("-o", "--output", type=Path, help=f"file to write ({', '.join(endings)})")
+    parser.add_argument("-o", "--output", type=Path, help=output or f"file to write ({', '.join(endings)})")
     parser.set_defaults(endings=endings)
 
 
@@ -242,7 +247,7 @@ def _put(table: pd.DataFrame, output: Path | None, draw: Callable[[], "Figure"] 
 
 
 def _add_table(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser)
+    add_sources(parser)
     parser.add_argument(
         "--curves",
         nargs="+",
@@ -279,7 +284,7 @@ def _run_table(options: argparse.Namespace) -> None:
 
 
 def _add_aggregate(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser)
+    add_sources(parser)
     _add_steps(parser)
     add_scores(parser)
     add_intervals(parser)
@@ -317,7 +322,7 @@ def _run_aggregate(options: argparse.Namespace) -> None:
 
 
 def _add_marginalize(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser)
+    add_sources(parser)
     parser.add_argument(
         "--factor",
         nargs="+",
@@ -343,7 +348,7 @@ def _run_marginalize(options: argparse.Namespace) -> None:
 
 
 def _add_correlate(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser, pictures=True)
+    add_sources(parser, pictures=True)
     parser.add_argument(
         "--metrics",
         nargs="+",
@@ -377,7 +382,7 @@ def _run_correlate(options: argparse.Namespace) -> None:
 
 
 def _add_heatmap(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser, pictures=True)
+    add_sources(parser, pictures=True)
     parser.add_argument("-x", required=True, metavar="ARGUMENT", help="argument of the columns, as model_size")
     parser.add_argument("-y", required=True, metavar="ARGUMENT", help="argument of the rows, as replay_ratio")
     parser.add_argument(
@@ -401,7 +406,7 @@ def _run_heatmap(options: argparse.Namespace) -> None:
 
 
 def _add_cost(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser, pictures=True)
+    add_sources(parser, pictures=True)
     _add_steps(parser)
     add_scores(parser)
     add_intervals(parser)
@@ -418,7 +423,13 @@ def _run_cost(options: argparse.Namespace) -> None:
 # ---------------------------------------------------------------- pictures
 
 
-def _figure(width: float, height: float) -> "Figure":
+def new_figure(width: float, height: float) -> "Figure":
+    """
+    :param width: inches
+    :param height: inches
+    :return: an empty figure
+    :raises ImportError: matplotlib is not installed
+    """
     with needing_matplotlib():
         from matplotlib.figure import Figure
 
@@ -444,7 +455,7 @@ def _cells(values: pd.DataFrame) -> Iterator[tuple[tuple[int, int], float]]:
 
 
 def _draw_heatmap(values: pd.DataFrame, name: str) -> "Figure":
-    figure = _figure(2 + 0.9 * values.shape[1], 1.5 + 0.6 * values.shape[0])
+    figure = new_figure(2 + 0.9 * values.shape[1], 1.5 + 0.6 * values.shape[0])
     axes = figure.add_subplot()
     figure.colorbar(_draw_grid(axes, values, cmap="viridis"), label="IQM of the scores" if name == "score" else name)
     axes.set_xlabel(values.columns.name)
@@ -456,7 +467,7 @@ def _draw_correlations(found: pd.DataFrame, by: list[str]) -> "Figure":
     parts = list(found.groupby(["group", *by], sort=False))
     variables = list(found["x"].unique())
     size = 1.5 + 0.7 * len(variables)
-    figure = _figure((size + 0.5) * len(parts), size)
+    figure = new_figure((size + 0.5) * len(parts), size)
     for axes, (head, part) in zip(figure.subplots(1, len(parts), squeeze=False)[0], parts, strict=True):
         matrix = part.pivot(index="x", columns="y", values="spearman").loc[variables, variables]
         matrix = matrix.rename(index=_last_word, columns=_last_word)
@@ -471,7 +482,7 @@ def _last_word(metric: str) -> str:
 
 def _draw_cost(found: pd.DataFrame) -> "Figure":
     groups = list(found["group"].unique())
-    figure = _figure(4.5 * len(groups), 4)
+    figure = new_figure(4.5 * len(groups), 4)
     for axes, group in zip(figure.subplots(1, len(groups), squeeze=False)[0], groups, strict=True):
         for agent, rows in found[found["group"] == group].dropna(subset="hours").groupby("agent", sort=False):
             lines = axes.plot(rows["hours"], rows["iqm"], marker="o" if len(rows) < 3 else None, label=agent)
