@@ -197,7 +197,7 @@ def test_groups_and_factors_come_with_the_folder(plan_of, tmp_path: Path) -> Non
 #: Plans with many agents or large critics, each of which is made once to have its arguments checked.
 MANY = {
     "bro_ablation", "bro_scaling", "bro_scaling_small", "mbma", "mbma_small", "regularization", "regularization_small",
-    "scaling_laws_dmc", "scaling_laws_dmc_small", "scaling_laws_gym", "scaling_laws_gym_small",
+    "scaling_dmc", "scaling_dmc_small", "scaling_gym", "scaling_gym_small",
 }  # fmt: skip
 #: Runs of the papers' studies: agents, tasks and seeds as the papers state them.
 RUNS = {
@@ -214,8 +214,8 @@ RUNS = {
     "mbma": 4 * 14 * 15,
     "mbma_quadruped": 3 * 2 * 8,
     "mbma_humanoid": 3 * 2 * 8,
-    "scaling_laws_dmc": 4 * 5 * 4 * 7 * 10,
-    "scaling_laws_gym": 4 * 3 * 5 * 4 * 8,
+    "scaling_dmc": 4 * 5 * 4 * 7 * 10,
+    "scaling_gym": 4 * 3 * 5 * 4 * 8,
 }
 
 
