@@ -312,7 +312,7 @@ def _data(
     for i, level in enumerate(levels):
         reached = np.isfinite(steps[0][0, :, :, i])
         # A median of the replay ratios is there if more than half reach the level.
-        kept: np.ndarray = reached.all(axis=1) if loss == "squared" else 2 * reached.sum(axis=1) > len(ratios)
+        kept = np.asarray(reached.all(axis=1) if loss == "squared" else 2 * reached.sum(axis=1) > len(ratios))
         enough = reached[kept].all(axis=0).sum() if kept.any() else 0
         if enough < 3:
             notes.append(
