@@ -241,7 +241,7 @@ def state(model: SAC) -> dict[str, torch.Tensor]:
 
     for name, value in model.get_parameters().items():
         walk(name, value)
-    if model.learner.schedule is not None:
+    if getattr(getattr(model, "learner", None), "schedule", None) is not None:
         # Each step sets the rates that it takes.
         flat = {name: value for name, value in flat.items() if not name.endswith("/lr")}
     return flat
