@@ -38,8 +38,8 @@ class UpdateSchedule:
         if self.compiled is not None:
             return
         n_updates = self._updates_in(n_steps - max(self.learning_starts - self.num_transitions, 0))
-        # What keeps the step from being compiled is worth a warning only where it was asked for, but for an old torch,
-        # which is easily renewed.
+        # Warn of reasons not to compile only where compiling was asked for, and of an old torch, which is easily
+        # renewed.
         foreign = foreign_parts(self.learner) if n_updates >= PAYS_FROM else []
         if foreign and self.verbose >= 1:
             verb = "does" if len(foreign) == 1 else "do"
@@ -92,7 +92,7 @@ class UpdateSchedule:
 
     @property
     def _n_of_warm_up(self: Any) -> int:
-        """What ``learning_starts`` counts: transitions over the model's life."""
+        """Count of ``learning_starts``: transitions over the model's life."""
         return self.num_transitions
 
     @property
