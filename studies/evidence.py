@@ -39,7 +39,7 @@ COMPLETE = ".complete"
 #: How often a run is tried that fails.
 ATTEMPTS = 2
 #: Settings of a run that change no result.
-FREE = {"checkpoint_freq", "gym_packages"}
+FREE = {"checkpoint_freq", "gym_packages", "measure"}
 
 
 # ---------------------------------------------------------------- with the standard library: what runs where

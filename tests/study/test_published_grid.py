@@ -78,6 +78,7 @@ def test_a_part_of_the_grid(grid: pd.DataFrame) -> None:
         read_grid(REFERENCE / "bro_grid.npz", ratios=[3])
 
 
+@pytest.mark.slow
 def test_the_statistics_in_the_package_are_those_of_the_grid() -> None:
     """Of the one configuration whose tasks have different numbers of runs, with the intervals."""
     module = runpy.run_path(str(ROOT / "studies" / "published_grid.py"))

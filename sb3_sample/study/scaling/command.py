@@ -63,6 +63,13 @@ def _add_plan(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-params", "--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="further arguments, as of train"
     )
+    parser.add_argument(
+        "--measure",
+        type=float,
+        metavar="STEPS",
+        help="have the runs measure the noise scale of their gradients and their overfitting every so many steps, for "
+        "figures 4, 10 and 11",
+    )
     parser.add_argument("--gym-packages", nargs="+", default=[], help="modules that register environments")
 
 
@@ -116,6 +123,8 @@ def plan_text(options: argparse.Namespace) -> str:
         f"steps: {int(options.steps)}",
         f"evaluation: {{every: {every}, episodes: {options.episodes}}}",
     ]
+    if options.measure is not None:
+        lines.append(f"measure: {options.measure:g}")
     if options.gym_packages:
         lines.append(f"gym_packages: [{', '.join(options.gym_packages)}]")
     return "\n".join(lines) + "\n"
@@ -169,6 +178,11 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--loss", choices=("log", "squared"), default="log", help="of the data law (default: log)")
     parser.add_argument(
+        "--online",
+        action="store_true",
+        help="the returns of training episodes in place of evaluations, as the authors' code has them",
+    )
+    parser.add_argument(
         "--keep-after-reset",
         action="store_true",
         help="count evaluations after a reset before the mean is back, as the authors' code does",
@@ -183,10 +197,34 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 def _table(options: argparse.Namespace) -> pd.DataFrame:
     if not options.sources and not options.published:
         raise ValueError("sources must be at least one folder or table, or --published runs")
-    parts = [tables.read(options.sources)] if options.sources else []
+    if options.online and options.published:
+        raise ValueError("published runs have no online returns: give --online or --published, not both")
+    metrics = (*tables.METRICS, "online_*") if options.online else tables.METRICS
+    parts = [tables.read(options.sources, metrics)] if options.sources else []
     if options.published:
         parts.append(tables.published_runs(options.published))
-    return pd.concat(parts, ignore_index=True)
+    table = pd.concat(parts, ignore_index=True)
+    return online(table) if options.online else table
+
+
+def online(table: pd.DataFrame) -> pd.DataFrame:
+    """
+    :param table: of :func:`~sb3_sample.study.read`, with ``online_return`` or ``online_success_rate``
+    :return: the same with these in the place of ``return`` and ``success_rate``
+    :raises ValueError: a run does not have them
+    """
+    prefix = "online_"
+    there = table["metric"].str.startswith(prefix)
+    evaluated = table["metric"].isin([metric.removeprefix(prefix) for metric in tables.ONLINE])
+    runs = set(table.loc[there, tables.RUN].itertuples(index=False, name=None))
+    for run in table.loc[evaluated, tables.RUN].itertuples(index=False, name=None):
+        if run not in runs:
+            agent, _, task, seed = run
+            raise ValueError(
+                f"online needs the Monitor files of all runs, and {agent} on {task}, seed {seed}, has none"
+            )
+    kept = table[~evaluated]
+    return kept.assign(metric=kept["metric"].str.removeprefix(prefix)).reset_index(drop=True)
 
 
 def _fitted(options: argparse.Namespace, table: pd.DataFrame) -> Laws:
