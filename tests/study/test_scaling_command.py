@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pandas as pd
@@ -9,6 +10,9 @@ import pytest
 
 from sb3_sample import cli, study
 from sb3_sample.study import scaling
+from sb3_sample.study.reporting import figures as report_figures
+from sb3_sample.study.reporting import laws as report_laws
+from sb3_sample.study.reporting import pieces
 from sb3_sample.study.scaling import figures
 from sb3_sample.study.table import COLUMNS, to_json
 
@@ -139,6 +143,47 @@ def test_online_returns(table: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
         cli.main(["scaling", "fit", f"BRO={table}", *LEVELS, "--online"])
     with pytest.raises(SystemExit, match="published runs have no online returns"):
         cli.main(["scaling", "fit", f"BRO={table}", "-p", "BRO", *LEVELS, "--online"])
+
+
+def test_the_laws_are_in_the_report(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("jinja2")
+    pytest.importorskip("rliable.library")
+    file = tmp_path / "laws.json"
+    cli.main(["scaling", "fit", f"BRO={table}", *LEVELS, "-o", str(file)])
+    said = capsys.readouterr().out
+    command = ["study", "report", str(table), "--curves", "none", "--reps", "5", "--laws", str(file)]
+    with mock.patch.object(report_figures, "png", lambda figure: figure.name.encode()):
+        cli.main([*command, "--markdown", str(tmp_path / "report.md")])
+    page = (tmp_path / "report.md").read_text()
+    assert (tmp_path / "report_files" / "scaling.png").exists()
+    section = page.partition("Scaling laws")[2].partition("Costs")[0]
+    # Every number of the page of "fit".
+    rows = [line for line in said.splitlines() if line.startswith("| ") and "---" not in line]
+    assert len(rows) > 20
+    plain = section.replace("\\", "")
+    for row in rows:
+        for cell in row.strip("| ").split(" | "):
+            assert cell in plain, cell
+    for limit in said.partition("## Limits")[2].partition("Saved")[0].strip().splitlines():
+        assert limit.removeprefix("- ") in plain
+    (tmp_path / "none.json").write_text("{}")
+    with pytest.raises(SystemExit, match="is no file of scaling laws"):
+        cli.main([*command[:-1], str(tmp_path / "none.json"), "-o", str(tmp_path / "r.html")])
+
+
+def test_the_reports_figure_has_laws_and_points(table: Path) -> None:
+    pytest.importorskip("matplotlib")
+    laws = scaling.fit(study.read(f"BRO={table}"), [300, 500, 700], reps=4)
+    figure = report_laws.scaling(laws).parts[1]
+    assert isinstance(figure, pieces.Figure) and len(figure.panels) == 3
+    steps = figure.panels[0]
+    assert isinstance(steps, pieces.Lines)
+    for level in laws.levels:
+        lines = [line for line in steps.lines if line.agent.name == f"level {level.level:.0f}"]
+        assert [len(line.x) for line in lines] == [60, 1, 1, 1, 1]
+        assert [line.y[0] for line in lines[1:]] == level.points.tolist()
+        np.testing.assert_allclose(lines[0].y, level.law().steps(np.array(lines[0].x)))
+    assert report_figures.png(figure).startswith(b"\x89PNG")
 
 
 def test_a_plan_is_one_that_study_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
