@@ -14,9 +14,11 @@ import sb3_sample.envs  # noqa: F401  # registers the ids
 from sb3_sample.study import step_times
 from sb3_sample.study.advice import SUITES, Advice, advise, published_grid
 from sb3_sample.study.analysis_command import markdown, refusing
-from sb3_sample.study.cores import free_cores
+from sb3_sample.study.cores import idle_cores
 from sb3_sample.study.step_times import StepTimes
 
+#: Part of a core that others may use while steps are measured.
+BUSY = 0.3
 #: Where a suite's success rate takes the place of a return.
 _MEASURES = {"dmc": "return over 1,000", "metaworld": "success rate", "myosuite": "success rate"}
 
@@ -96,8 +98,11 @@ def _times(threads: int, options: argparse.Namespace) -> StepTimes:
     kept = None if options.again else step_times.stored(threads, options.device)
     if kept is not None:
         return kept
-    if get_device(options.device).type == "cpu" and free_cores() < threads:
-        say(f"{threads} threads are measured, and fewer cores are free at present: the step times will be too long")
+    if get_device(options.device).type == "cpu" and idle_cores() < threads - BUSY:
+        say(
+            f"fewer cores are free than the {threads} that steps are measured on: they will seem too long. Measure "
+            "again (--again) when nothing else runs"
+        )
     times = step_times.measure(threads, options.device, quick=options.quick, say=say)
     if not options.quick:
         say(f"kept in {step_times.keep(times)}")

@@ -179,7 +179,8 @@ def measure(
             if not quick:
                 reason = why_not_compiled(model.learner)
                 how = "compiled" if reason is None else "captured" if place.type == "cuda" else "eager"
-                model = _model(size, place, compile=reason is None)
+                # Not False, which on a GPU would keep it from being captured.
+                model = _model(size, place, compile="auto" if reason else True)
             start = time.perf_counter()
             _train(model)
             first = time.perf_counter() - start
@@ -204,7 +205,7 @@ def _threads(threads: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _model(size: str, device: torch.device, compile: bool = False) -> Any:
+def _model(size: str, device: torch.device, compile: bool | str = False) -> Any:
     """BRO with random transitions in its buffer."""
     model = BRO("MlpPolicy", _Shapes(), model_size=size, buffer_size=2_000, seed=0, device=device, compile=compile)
     model.set_logger(Logger(None, []))

@@ -183,6 +183,14 @@ def test_what_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     assert step_times.environment_seconds(gym.make("Pendulum-v1"), 0.0) > 0
 
 
+def test_without_a_compiler_steps_are_eager(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(step_times, "SECONDS", 0.01)
+    monkeypatch.setattr(step_times, "MODEL_SIZES", {"0.55M": (1, 128)})
+    monkeypatch.setattr(step_times, "why_not_compiled", lambda learner: "there is no compiler")
+    found = step_times.measure(1, "cpu")
+    assert found.how == "eager" and found.gradient_step["0.55M"] > 0
+
+
 @pytest.mark.slow
 def test_compiled_steps_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(step_times, "SECONDS", 0.1)
@@ -226,6 +234,28 @@ def test_the_command_measures_once(measured: list[bool], cache: Path, capsys: py
     for word in ("value-scaling.github.io", "No number stands for fewer than 25,000 steps", "Interpolated"):
         assert word in first
     assert "rough" not in first and "beyond" not in first
+
+
+def test_a_busy_machine_is_told_of(
+    measured: list[bool], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [
+        "advise",
+        "--hours",
+        "4",
+        "--env",
+        "Pendulum-v1",
+        "--suite",
+        "dmc",
+        "--threads",
+        "2",
+        "--device",
+        "cpu",
+    ]
+    for idle, told in ((1.8, False), (1.2, True)):
+        monkeypatch.setattr(advice_command, "idle_cores", lambda idle=idle: idle)
+        cli.main([*arguments, "--again"])
+        assert ("fewer cores are free than the 2" in capsys.readouterr().err) == told
 
 
 def test_rough_times_are_said_to_be_rough_and_not_kept(
