@@ -5,6 +5,7 @@ tasks ("Compute-Optimal Scaling for Value-Based Deep RL", Fu et al. 2025; ``data
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ class Advice:
     :param suite: "dmc", "metaworld" or "myosuite"
     :param env: id of the environment of the command
     :param hours: that there are
+    :param options: further ones of the command
     :param table: a row a size and replay ratio, best first: ``model_size``, ``replay_ratio``, ``steps`` in these hours,
         a million at most; ``hours`` of them; ``iqm``, ``low``, ``high``, NaN below the first published evaluation;
         ``ends_early``, whether a million steps take less than the hours
@@ -52,6 +54,7 @@ class Advice:
     suite: str
     env: str
     hours: float
+    options: tuple[str, ...]
     table: pd.DataFrame
 
     @property
@@ -71,9 +74,10 @@ class Advice:
         ratio, size = int(self.best["replay_ratio"]), self.best["model_size"]
         # In the published code two gradient steps a step go with the first reset only, BRO Fast.
         algo, params = ("bro_fast", "") if ratio == 2 else ("bro", f" replay_ratio:{ratio}")
+        options = "".join(f"{option} " for option in self.options)
         return (
             f"sb3-sample train --algo {algo} --env {self.env} -n {int(self.best['steps'])} --eval-freq {EVERY} "
-            f"--eval-episodes {EPISODES} -params model_size:\"'{size}'\"{params}"
+            f"--eval-episodes {EPISODES} {options}-params model_size:\"'{size}'\"{params}"
         )
 
 
@@ -85,6 +89,7 @@ def advise(
     suite: str = "dmc",
     env: str | None = None,
     episode: int = 1_000,
+    options: Sequence[str] = (),
 ) -> Advice:
     """
     Find the size and replay ratio that get furthest in some hours: of each of the 25 published configurations the
@@ -99,6 +104,7 @@ def advise(
     :param suite: of the published runs: "dmc", "metaworld" or "myosuite"
     :param env: id of the environment of the command; a task of the suite if None
     :param episode: steps of an episode
+    :param options: further ones of the command
     :return: the answer
     :raises ValueError: an argument is out of range, or no configuration makes the 25,000 steps of the first published
         evaluation in these hours
@@ -140,4 +146,4 @@ def advise(
         )
     # Among equal returns the one that is there earlier.
     table = table.sort_values(["iqm", "hours"], ascending=[False, True], ignore_index=True)
-    return Advice(suite, env or SUITES[suite][1], float(hours), table)
+    return Advice(suite, env or SUITES[suite][1], float(hours), tuple(options), table)

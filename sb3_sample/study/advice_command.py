@@ -70,7 +70,10 @@ def _run(options: argparse.Namespace) -> None:
         environment = step_times.environment_seconds(env)
     episode = getattr(env.spec, "max_episode_steps", None) or 1_000
     times = _times(threads, options)
-    found = advise(options.hours, times, environment, suite=suite, env=env_id, episode=episode)
+    # What the times are of, the training is to have.
+    given = [] if options.threads is None else [f"--num-threads {threads}"]
+    given += [] if options.device == "auto" else [f"--device {options.device}"]
+    found = advise(options.hours, times, environment, suite=suite, env=env_id, episode=episode, options=given)
     if options.json:
         print(json.dumps(_as_json(found, times, environment), indent=2))
     else:

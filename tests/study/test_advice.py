@@ -230,7 +230,7 @@ def test_the_command_measures_once(measured: list[bool], cache: Path, capsys: py
     assert measured == [False, False]
     found = advise(1.5, times(), 0.002, episode=200)
     assert f"{found.best['model_size']} at replay ratio {found.best['replay_ratio']}: {found.best['steps']:,}" in first
-    assert "--env Pendulum-v1 -n" in first
+    assert "--env Pendulum-v1 -n" in first and " --num-threads 2 --device cpu -params " in first
     for word in ("value-scaling.github.io", "No number stands for fewer than 25,000 steps", "Interpolated"):
         assert word in first
     assert "rough" not in first and "beyond" not in first
