@@ -6,6 +6,8 @@ from typing import Any
 import torch
 from torch.optim import Optimizer
 
+from sb3_sample.tracing import is_tracing
+
 # With weight decay the step takes three passes over the parameters. On a CPU they run over pieces that fit the
 # cache, all passes on one piece before the next: 2**18 floats are 1 MiB of parameters.
 CHUNK = 2**18
@@ -145,7 +147,7 @@ class AdamW(Optimizer):
                 (p, _laid_out_like(p, g), self.state[p]["exp_avg"], self.state[p]["exp_avg_sq"], steps[j])
                 for j, p, g in used
             ]
-            if torch.compiler.is_compiling():
+            if is_tracing():
                 _plain_adamw(group, rows, self._rates[i])
                 continue
             rate = self._rates[i] if self.capturable else group["lr"]
@@ -160,18 +162,26 @@ class AdamW(Optimizer):
 
 
 def _plain_adamw(group: dict[str, Any], rows: list[tuple[torch.Tensor, ...]], rate: torch.Tensor) -> None:
-    """The step written out, for a compiler to fuse. The corrections, 1 minus nearly 1, need float64."""
+    """
+    The step written out for all parameters at once, which a compiler fuses. The corrections, 1 minus nearly 1, need
+    float64.
+    """
     beta1, beta2 = group["betas"]
-    for p, grad, exp_avg, exp_avg_sq, step in rows:
-        n = step.double()
-        size = (rate / (1 - beta1**n)).to(p.dtype)
-        root = (1 - beta2**n).rsqrt().to(p.dtype)
-        exp_avg.lerp_(grad, 1 - beta1)
-        exp_avg_sq.lerp_(grad * grad, 1 - beta2)
-        change = size * (exp_avg / (exp_avg_sq.sqrt() * root + group["eps"]))
-        if group["weight_decay"] != 0:
-            change = change + rate * group["weight_decay"] * p
-        p.sub_(change)
+    p, grad, exp_avg, exp_avg_sq, step = map(list, zip(*rows, strict=True))
+    sizes, roots = [], []
+    for of, n in zip(p, step, strict=True):
+        n = n.double()
+        sizes.append((rate / (1 - beta1**n)).to(of.dtype))
+        roots.append((1 - beta2**n).rsqrt().to(of.dtype))
+    torch._foreach_lerp_(exp_avg, grad, 1 - beta1)
+    torch._foreach_lerp_(exp_avg_sq, torch._foreach_mul(grad, grad), 1 - beta2)
+    change = torch._foreach_mul(torch._foreach_sqrt(exp_avg_sq), roots)
+    change = torch._foreach_div(exp_avg, torch._foreach_add(change, group["eps"]))
+    change = torch._foreach_mul(change, sizes)
+    if group["weight_decay"] != 0:
+        decay = [(rate * group["weight_decay"]).to(of.dtype) for of in p]
+        change = torch._foreach_add(change, torch._foreach_mul(p, decay))
+    torch._foreach_sub_(p, change)
 
 
 def _laid_out_like(p: torch.Tensor, grad: torch.Tensor) -> torch.Tensor:

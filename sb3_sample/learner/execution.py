@@ -1,5 +1,5 @@
 """
-Execution of the gradient step: operation by operation, compiled by ``torch.compile``, or captured as a CUDA graph.
+Execution of the gradient step: operation by operation, compiled by Inductor, or captured as a CUDA graph.
 
 All three run the same function, ``Learner.gradient_step``, which is independent of them: it takes the batch and all the
 noise as tensors, does not branch on the value of a tensor, and counts nothing outside of tensors.
@@ -7,15 +7,15 @@ noise as tensors, does not branch on the value of a tensor, and counts nothing o
 
 import re
 import time
-import types
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
 from sb3_sample.console import say
 from sb3_sample.optim import AdamW
+from sb3_sample.tracing import compile_graph, trace, undone
 
 #: With ``compile="auto"``, gradient steps in one ``learn`` from which on compiling pays: it takes the time of some
 #: thousand steps (docs/performance.md). A number of steps, not a measurement, so that a seed fixes the whole run.
@@ -27,17 +27,6 @@ Metrics = dict[str, torch.Tensor]
 #: Runs a function without its effects taking place, and gives back what repeats them, and its result, whose tensors
 #: each repetition fills anew.
 Recorder = Callable[[Callable[[], Metrics]], tuple[Callable[[], None], Metrics]]
-
-
-def _compilation_errors() -> tuple[type[Exception], ...]:
-    """
-    Errors of torch where it cannot compile: the first is raised where the tracing of gradients is switched off, the
-    last where the same was compiled for too many settings. Imported when needed, since it takes a second.
-    """
-    from torch._dynamo.exc import FailOnRecompileLimitHit, TorchDynamoException, Unsupported
-    from torch._inductor.exc import InductorError
-
-    return Unsupported, TorchDynamoException, InductorError, FailOnRecompileLimitHit
 
 
 def old_torch() -> str | None:
@@ -161,22 +150,21 @@ class Execution:
         recorder: Recorder | None = None,
         method: str = "gradient_step",
     ):
-        self.compiled, self.fall_back, self._method = compiled, fall_back, method
-        #: Seconds spent on compiling, over all inputs and settings that the step was compiled for.
-        self.seconds_compiling = 0.0
+        self.fall_back = fall_back
         self._step: Callable[..., Metrics] = getattr(type(learner), method)
-        if compiled:
-            # The compiler keeps what it made by the code object. With one for each model, models neither use each
-            # other's nor reach the limit of compilations together.
-            step: Any = self._step
-            own = types.FunctionType(
-                step.__code__.replace(), step.__globals__, step.__name__, step.__defaults__, step.__closure__
-            )
-            self._step = torch.compile(
-                own, fullgraph=True, dynamic=False, options={"guard_filter_fn": _settings_and_inputs}
-            )
-        self._captured = None if recorder is None else Captured(recorder)
+        self._compiled = Compiled(learner) if compiled else None
+        self._captured = None if recorder is None else Captured(learner, recorder)
         self._modules = _modules(learner)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the gradient step is compiled."""
+        return self._compiled is not None
+
+    @property
+    def seconds_compiling(self) -> float:
+        """Seconds spent on compiling, over all inputs and settings that the step was compiled for."""
+        return 0.0 if self._compiled is None else self._compiled.seconds
 
     def serves(self, learner: Any) -> bool:
         """
@@ -221,8 +209,10 @@ class Execution:
             if isinstance(optimizer, AdamW):
                 optimizer.capturable = self._captured is not None
                 optimizer.prepare()
+        if self._compiled is not None:
+            self._compiled.prepare(learner)
         if self._captured is not None:
-            self._captured.forget_if_stale(learner)
+            self._captured.forget_if_stale(learner, None if self._compiled is None else self._compiled.version)
 
     def __call__(self, learner: Any, *inputs: Any, eager: bool = False) -> Metrics:
         """
@@ -234,67 +224,146 @@ class Execution:
         :return: its result; that of a captured step is valid until the next one
         """
         if eager:
-            return getattr(type(learner), self._method)(learner, *inputs)  # type: ignore[no-any-return]
+            return self._step(learner, *inputs)
         if self._captured is not None:
             return self._captured(self._run, learner, inputs)
         return self._run(learner, *inputs)
 
     def _run(self, learner: Any, *inputs: Any) -> Metrics:
-        if not self.compiled:
+        if self._compiled is None:
             return self._step(learner, *inputs)
         try:
-            try:
-                return self._step(learner, *inputs)
-            except _compilation_errors()[0]:
-                # Not compiled yet for these inputs or settings: to trace gradients needs a switch.
-                return self._compile(learner, *inputs)
-        except _compilation_errors() as error:
-            # Raised before anything of the step has been run.
-            reason = str(error).strip().splitlines()[0]
-            if raised := re.search(r"raised exception (\w+\(.*\))", str(error)):
-                reason = f"it raises {raised[1]}"
-            if "RecompileLimit" in type(error).__name__:
-                reason = "a setting that it reads changes again and again, and each change has it compiled anew"
+            return self._compiled(self._step, learner, inputs)
+        except CannotCompile as error:
+            # Raised before anything of the step has taken effect.
             if not self.fall_back:
-                if raised:
-                    # Eagerly it is raised as it is, from its place.
-                    getattr(type(learner), self._method)(learner, *inputs)
                 raise RuntimeError(
-                    f"compile=True, but the gradient step cannot be compiled: {reason}. Pass compile=False, or 'auto'"
+                    f"compile=True, but the gradient step cannot be compiled: {error}. Pass compile=False, or 'auto'"
                 ) from error
-            warnings.warn(f"The gradient step is not compiled, as it cannot be: {reason}", stacklevel=2)
-            self.compiled = learner.compiled = False
-            self._step = getattr(type(learner), self._method)
+            warnings.warn(f"The gradient step is not compiled, as it cannot be: {error}", stacklevel=2)
+            self._compiled, learner.compiled = None, False
             return self._step(learner, *inputs)
 
-    def _compile(self, learner: Any, *inputs: Any) -> Metrics:
+
+class CannotCompile(Exception):
+    """Error of a gradient step that can be run but not compiled."""
+
+
+class _Program(NamedTuple):
+    """A compiled gradient step, for one kind of inputs."""
+
+    #: What was traced, in words, and the tensors beside the state that it reads.
+    code: str
+    further: list[torch.Tensor]
+    function: Callable[..., Sequence[torch.Tensor]]
+    #: Names of its results.
+    names: list[str]
+
+
+class Compiled:
+    """
+    Compiled gradient steps of a learner, one for each kind of inputs.
+
+    A compiled step holds all numbers and words that it read when it was traced. If one of those that it may have read
+    changes, it is traced anew, in about a second, and compiled anew if what was traced differs. Parameters, moments,
+    counts of steps and learning rates are tensors, which it is given.
+
+    :param learner: the learner
+    """
+
+    #: Programs that are made before it is taken that a setting changes all the time.
+    MAX_PROGRAMS = 8
+
+    def __init__(self, learner: Any):
+        #: Seconds spent on tracing and compiling.
+        self.seconds = 0.0
+        #: Number of changes of settings that were found.
+        self.version = 0
+        self._programs: dict[Any, tuple[int, _Program]] = {}
+        self._n_made = 0
+        self._of_modules = list(_of_modules(learner))
+        self._state: list[torch.Tensor] = []
+        self._settings = _Settings(learner, private=True)
+
+    def prepare(self, learner: Any) -> None:
+        """
+        Look for other settings and other tensors.
+
+        :param learner: the learner
+        """
+        self._state = [*self._of_modules, *_of_optimizers(learner)]
+        if self._settings.have_changed():
+            self.version += 1
+
+    def __call__(self, step: Callable[..., Metrics], learner: Any, inputs: tuple[Any, ...]) -> Metrics:
+        """
+        Run one gradient step, compiled for its kind of inputs and for the settings in force.
+
+        :param step: the step
+        :param learner: its first argument
+        :param inputs: its other arguments
+        :return: its result
+        :raises CannotCompile: if it cannot be compiled; nothing has taken effect
+        """
+        kind = _kind(inputs)
+        version, program = self._programs.get(kind, (-1, None))
+        if program is None or version != self.version:
+            program = self._made(step, learner, inputs, program)
+            self._programs[kind] = self.version, program
+            if all(version == self.version for version, _ in self._programs.values()):
+                self._settings.did_not_change_the_step()
+        with torch.no_grad():
+            results = program.function(*self._state, *program.further, *_tensors(inputs))
+        return dict(zip(program.names, results, strict=True))
+
+    def _made(
+        self, step: Callable[..., Metrics], learner: Any, inputs: tuple[Any, ...], old: _Program | None
+    ) -> _Program:
+        """A program for the inputs: the old one if it would come out the same."""
+        start = time.perf_counter()
+        own = _like(inputs, torch.clone)
+        names: list[str] = []
+
+        def run(*tensors: torch.Tensor) -> list[torch.Tensor]:
+            given = iter(tensors)
+            metrics = step(learner, *_like(own, lambda _: next(given)))
+            names[:] = metrics
+            return list(metrics.values())
+
+        further: list[torch.Tensor] = []
+        try:
+            graph = trace(run, self._state, _tensors(own))
+            # Tensors that are neither state nor input: as inputs, so that their values are those of the day.
+            further = [getattr(graph, str(node.target)) for node in graph.graph.nodes if node.op == "get_attr"]
+            if further:
+                graph = trace(run, [*self._state, *further], _tensors(own))
+        except Exception as error:
+            # An error of the step itself is raised as it is, from its place.
+            with undone(self._state, learner.device):
+                step(learner, *inputs)
+            raise CannotCompile(str(error).strip().splitlines()[0]) from error
+        if old is not None and graph.code == old.code and _are_same(further, old.further):
+            return old
+        self._settings.changed_the_step()
+        self._n_made += 1
+        if self._n_made > self.MAX_PROGRAMS:
+            raise CannotCompile("a setting that it reads changes again and again, and each change has it compiled anew")
         if learner.verbose >= 1:
             say("Compiling the gradient step ...")
-        start = time.perf_counter()
-        with torch._dynamo.config.patch(trace_autograd_ops=True):
-            metrics = self._step(learner, *inputs)
-        seconds = time.perf_counter() - start
-        self.seconds_compiling += seconds
+        code = graph.code
+        try:
+            with torch.no_grad():
+                function = compile_graph(graph, [*self._state, *further, *_tensors(own)])
+        except Exception as error:
+            raise CannotCompile(f"{type(error).__name__}: {error}".strip().splitlines()[0]) from error
+        self.seconds += time.perf_counter() - start
         if learner.verbose >= 1:
-            say(f"Compiled in {seconds:.1f} s")
-        return metrics
+            say(f"Compiled in {time.perf_counter() - start:.1f} s")
+        return _Program(code, further, function, names)
 
 
-def _settings_and_inputs(guards: Sequence[Any]) -> list[bool]:
-    """
-    Select the conditions of a compiled step that are checked before each step.
-
-    Most conditions are on parameters, modules and functions, and checking them takes as long as a small network's
-    forward pass. :meth:`Execution.serves` checks them instead. A learning rate may change: it is read from a tensor.
-    """
-    settings = ("CONSTANT_MATCH", "EQUALS_MATCH", "GRAD_MODE", "GLOBAL_STATE", "DETERMINISTIC_ALGORITHMS")
-    inputs = ("batch", "noise", "extra", "moves_targets", "moves_actor")
-
-    def matters(guard: Any) -> bool:
-        of_input = guard.name.removeprefix("L['").startswith(inputs)
-        return of_input or (guard.guard_type in settings and not guard.name.endswith("['lr']"))
-
-    return [matters(guard) for guard in guards]
+def _are_same(ours: Sequence[torch.Tensor], theirs: Sequence[torch.Tensor]) -> bool:
+    return len(ours) == len(theirs) and all(a is b for a, b in zip(ours, theirs, strict=True))
 
 
 def _tensors(inputs: Any) -> list[torch.Tensor]:
@@ -348,26 +417,30 @@ class Captured:
     If one of them moves to another place (loading, a reinitialised optimizer), or a number outside of tensors changes,
     :meth:`forget_if_stale` drops the captured steps, and they are captured anew.
 
+    :param learner: the learner
     :param recorder: what captures
     """
 
     #: Steps of each kind that are run as they are before one is captured, as CUDA's libraries set themselves up.
     WARM_UP = 3
 
-    def __init__(self, recorder: Recorder):
+    def __init__(self, learner: Any, recorder: Recorder):
         self._recorder = recorder
+        self._of_modules = list(_of_modules(learner))
+        self._settings = _Settings(learner, private=False)
         self._runs: dict[Any, int] = {}
         self._recorded: dict[Any, tuple[Any, Callable[[], None], Metrics]] = {}
         self._held: Any = None
 
-    def forget_if_stale(self, learner: Any) -> None:
+    def forget_if_stale(self, learner: Any, program: int | None = None) -> None:
         """
         Drop the captured steps if the model has other tensors or other settings than at their capture.
 
         :param learner: the learner
+        :param program: number of the compiled steps that are captured, if they are
         """
-        now = _places(learner), _settings(learner)
-        if now != self._held:
+        now = [program, *(t.data_ptr() for t in (*self._of_modules, *_of_optimizers(learner)))]
+        if self._settings.have_changed() or now != self._held:
             self._recorded.clear()
             self._held = now
 
@@ -413,15 +486,24 @@ def _modules(learner: Any) -> tuple[Any, ...]:
     return (*map(id, (*networks, *parts, learner.head)), *groups)
 
 
-def _places(learner: Any) -> tuple[int, ...]:
-    """Addresses of all tensors that a gradient step reads or writes, without its inputs."""
+def _of_modules(learner: Any) -> Iterable[torch.Tensor]:
+    """Parameters and buffers that a gradient step reads or writes, each once."""
     modules = (learner.networks, learner.head, learner.temperature, learner.explorer, learner.pessimism_rule)
-    tensors = [t for module in modules for t in (*module.parameters(), *module.buffers())]
+    tensors = (t for module in modules for t in (*module.parameters(), *module.buffers()))
+    return {id(t): t for t in tensors}.values()
+
+
+def _of_optimizers(learner: Any) -> list[torch.Tensor]:
+    """Moments, counts of steps and learning rates of a learner's optimizers."""
+    tensors: list[torch.Tensor] = []
     for optimizer in learner.optimizers().values():
-        tensors += [t for state in optimizer.state.values() for t in state.values() if isinstance(t, torch.Tensor)]
-        if isinstance(optimizer, AdamW):
+        # Counts of steps are places in one vector, which comes after them.
+        own = isinstance(optimizer, AdamW)
+        for state in optimizer.state.values():
+            tensors += [t for k, t in state.items() if isinstance(t, torch.Tensor) and not (own and k == "step")]
+        if own:
             tensors += optimizer.read_tensors()
-    return tuple(t.data_ptr() for t in tensors)
+    return tensors
 
 
 #: Public numbers of a part or of the learner that are no settings: they move with the run, and the gradient step does
@@ -429,19 +511,51 @@ def _places(learner: Any) -> tuple[int, ...]:
 NO_SETTINGS = {"arm", "training", "gradients_are_stale"}
 
 
-def _settings(learner: Any) -> list[Any]:
-    """Numbers and words that a gradient step may read: the learner's own, its modules' and its optimizers'."""
+class _Settings:
+    """
+    Numbers and words that a gradient step may read: the learner's own, its modules' and its optimizers'.
 
-    def plain(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-        return {name: value for name, value in values if isinstance(value, (int, float, str, type(None)))}
+    :param learner: the learner
+    :param private: whether private ones count in classes from outside of this package, whose own have public names
+    """
 
-    roots = (learner.networks, learner.head, learner.explorer, learner.pessimism_rule)
-    modules = [module for root in roots for module in root.modules()]
-    settings: list[Any] = []
-    for owner in (learner, *modules):
-        public = ((k, v) for k, v in vars(owner).items() if not k.startswith("_") and k not in NO_SETTINGS)
-        settings.append(plain(public))
-    for optimizer in learner.optimizers().values():
-        for group in optimizer.param_groups:
-            settings.append({k: v for k, v in group.items() if k not in ("params", "lr")})
-    return settings
+    def __init__(self, learner: Any, private: bool):
+        roots = (learner.networks, learner.head, learner.explorer, learner.pessimism_rule)
+        modules = [module for root in roots for module in root.modules()]
+        self._held: list[tuple[dict[str, Any], str, Any]] = []
+        for owner in (learner, *modules):
+            of_torch = type(owner).__module__.split(".")[0] == "torch"
+            every = private and not of_torch and not _is_ours(type(owner))
+            for name, value in vars(owner).items():
+                is_plain = isinstance(value, (int, float, str, type(None)))
+                if is_plain and (every or not name.startswith("_")) and name not in NO_SETTINGS:
+                    self._held.append((vars(owner), name, value))
+        for optimizer in learner.optimizers().values():
+            for group in optimizer.param_groups:
+                self._held += [(group, name, value) for name, value in group.items() if name not in ("params", "lr")]
+        #: Places of those that changed, and changed nothing in the step.
+        self._unread: set[int] = set()
+        self._changed: set[int] = set()
+
+    def have_changed(self) -> bool:
+        """
+        :return: whether one has another value than at the last call
+        """
+        changed = [
+            (i, values[name])
+            for i, (values, name, value) in enumerate(self._held)
+            if (now := values.get(name)) is not value and now != value
+        ]
+        for i, value in changed:
+            self._held[i] = (*self._held[i][:2], value)
+        self._changed.update({i for i, _ in changed} - self._unread)
+        return any(i not in self._unread for i, _ in changed)
+
+    def changed_the_step(self) -> None:
+        """Take note that the changes so far made another step."""
+        self._changed, self._unread = set(), set()
+
+    def did_not_change_the_step(self) -> None:
+        """Take note that the changes since the last call of :meth:`changed_the_step` made no other step."""
+        self._unread |= self._changed
+        self._changed = set()

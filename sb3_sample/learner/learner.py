@@ -33,6 +33,7 @@ from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
 from sb3_sample.networks.unit_norm import project_weights
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
+from sb3_sample.tracing import is_tracing
 
 #: Among a gradient step's results, the TD errors that are no metric.
 _TD_ERRORS = "td_errors"
@@ -720,7 +721,7 @@ class Learner:
     @staticmethod
     def _descend(optimizer: Optimizer, gradients: Sequence[torch.Tensor | None]) -> None:
         """Take one step of an optimizer with gradients in the order of its parameters."""
-        if torch.compiler.is_compiling():
+        if is_tracing():
             assert isinstance(optimizer, AdamW)
             optimizer.apply(gradients)
             return

@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 
 from sb3_sample.learner.q_values import QValues
+from sb3_sample.tracing import is_tracing
 
 
 def td_target(
@@ -163,7 +164,7 @@ def quantile_huber(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """
     if isinstance(q, QValues):
         q = q.tensor  # An autograd Function would not take it for a tensor: no gradient.
-    compute = _huber_pairs if torch.compiler.is_compiling() else _huber_sorted
+    compute = _huber_pairs if is_tracing() else _huber_sorted
     loss: torch.Tensor = _KnownGradient.apply(q, target, compute, 1)[0]
     return loss.squeeze(0)
 

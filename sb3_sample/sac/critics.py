@@ -88,15 +88,14 @@ class CriticEnsemble(BaseModel):
         """
         return self.head(self.trunk(self.inputs(obs, actions)))
 
-    def forward(self, obs: PyTorchObs, actions: torch.Tensor) -> QValues | torch.Tensor:
+    def forward(self, obs: PyTorchObs, actions: torch.Tensor) -> QValues:
         """
         :param obs: observations, (B, O), or a dict of them
         :param actions: actions in [-1, 1], (B, A)
-        :return: Stable-Baselines3's tuple of E tensors, (B, K) each, that is a tensor (E, B, K) too; where it is being
-            compiled, the tensor alone
+        :return: Stable-Baselines3's tuple of E tensors, (B, K) each, that is a tensor (E, B, K) too
         """
         q = self.q_values(obs, actions)
-        return q if torch.compiler.is_compiling() else QValues(q)
+        return QValues(q)
 
     def q1_forward(self, obs: PyTorchObs, actions: torch.Tensor) -> torch.Tensor:
         """
