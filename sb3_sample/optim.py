@@ -51,7 +51,7 @@ class AdamW(Optimizer):
         self.capturable = False
         # The groups' learning rates as a tensor, and the numbers that it holds.
         self._rates: torch.Tensor | None = None
-        self._rates_held: list[float] = []
+        self._rates_held: list[float | tuple[float, ...]] = []
         # By group, how many steps each parameter has taken.
         self._steps: list[torch.Tensor] = []
 
@@ -102,17 +102,21 @@ class AdamW(Optimizer):
     @torch.no_grad()
     def prepare_rates(self) -> None:
         """Bring the tensors with the learning rates up to date, which change with the steps in a schedule."""
-        rates = [float(group["lr"]) for group in self.param_groups]
+        # Of stacked parameters of several learners, a group may have a rate for each.
+        rates = [lr if isinstance(lr := group["lr"], tuple) else float(lr) for group in self.param_groups]
         first = self.param_groups[0]["params"][0]
         device = first.device
         # torch's fused kernel reads a float32 on a GPU.
         dtype = torch.float64 if first.dtype is torch.float64 and device.type == "cpu" else torch.float32
         is_held = self._rates is not None and self._rates.device == device and self._rates.dtype is dtype
-        if self._rates is None or not is_held or len(self._rates_held) != len(rates):
-            self._rates, self._rates_held = torch.tensor(rates, dtype=dtype, device=device), rates
-        elif self._rates_held != rates:
-            self._rates.copy_(torch.tensor(rates, dtype=dtype))
-            self._rates_held = rates
+        if is_held and self._rates_held == rates:
+            return
+        values = torch.tensor(rates, dtype=dtype)
+        if self._rates is None or not is_held or self._rates.shape != values.shape:
+            self._rates = values.to(device)
+        else:
+            self._rates.copy_(values)
+        self._rates_held = rates
 
     def read_tensors(self) -> list[torch.Tensor]:
         """
@@ -142,14 +146,18 @@ class AdamW(Optimizer):
             if len(used) == len(params):
                 steps.add_(1)
             else:
-                steps[[j for j, _, _ in used]] += 1
+                steps[..., [j for j, _, _ in used]] += 1
             rows: list[tuple[torch.Tensor, ...]] = [
-                (p, _laid_out_like(p, g), self.state[p]["exp_avg"], self.state[p]["exp_avg_sq"], steps[j])
+                (p, _laid_out_like(p, g), self.state[p]["exp_avg"], self.state[p]["exp_avg_sq"], steps[..., j])
                 for j, p, g in used
             ]
-            if is_tracing():
+            differ = self._rates.dim() > 1 or isinstance(group["weight_decay"], torch.Tensor)
+            if is_tracing() or differ:
                 _plain_adamw(group, rows, self._rates[i])
                 continue
+            if steps.dim() > 1:
+                # Learners side by side have taken as many.
+                rows = [(*tensors, step[0]) for *tensors, step in rows]
             rate = self._rates[i] if self.capturable else group["lr"]
             if group["weight_decay"] == 0:
                 _adam(group, rate, *zip(*rows, strict=True))
@@ -164,24 +172,31 @@ class AdamW(Optimizer):
 def _plain_adamw(group: dict[str, Any], rows: list[tuple[torch.Tensor, ...]], rate: torch.Tensor) -> None:
     """
     The step written out for all parameters at once, which a compiler fuses. The corrections, 1 minus nearly 1, need
-    float64.
+    float64. Counts of steps, rates and decays may be those of S learners, whose parameters are stacked.
     """
     beta1, beta2 = group["betas"]
     p, grad, exp_avg, exp_avg_sq, step = map(list, zip(*rows, strict=True))
     sizes, roots = [], []
     for of, n in zip(p, step, strict=True):
         n = n.double()
-        sizes.append((rate / (1 - beta1**n)).to(of.dtype))
-        roots.append((1 - beta2**n).rsqrt().to(of.dtype))
+        sizes.append(_by_learner(rate / (1 - beta1**n), of))
+        roots.append(_by_learner((1 - beta2**n).rsqrt(), of))
     torch._foreach_lerp_(exp_avg, grad, 1 - beta1)
     torch._foreach_lerp_(exp_avg_sq, torch._foreach_mul(grad, grad), 1 - beta2)
     change = torch._foreach_mul(torch._foreach_sqrt(exp_avg_sq), roots)
     change = torch._foreach_div(exp_avg, torch._foreach_add(change, group["eps"]))
     change = torch._foreach_mul(change, sizes)
-    if group["weight_decay"] != 0:
-        decay = [(rate * group["weight_decay"]).to(of.dtype) for of in p]
-        change = torch._foreach_add(change, torch._foreach_mul(p, decay))
+    decay = group["weight_decay"]
+    if isinstance(decay, torch.Tensor) or decay != 0:
+        decays = [_by_learner(rate * decay, of) for of in p]
+        change = torch._foreach_add(change, torch._foreach_mul(p, decays))
     torch._foreach_sub_(p, change)
+
+
+def _by_learner(values: torch.Tensor, p: torch.Tensor) -> torch.Tensor:
+    """A number, or one for each of S learners, (S,), in the shape and type in which a parameter takes it."""
+    values = values.to(p.dtype)
+    return values.view(-1, *[1] * (p.dim() - 1)) if values.dim() == 1 else values
 
 
 def _laid_out_like(p: torch.Tensor, grad: torch.Tensor) -> torch.Tensor:

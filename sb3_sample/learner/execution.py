@@ -154,7 +154,7 @@ class Execution:
         self._step: Callable[..., Metrics] = getattr(type(learner), method)
         self._compiled = Compiled(learner) if compiled else None
         self._captured = None if recorder is None else Captured(learner, recorder)
-        self._modules = _modules(learner)
+        self._modules = learner.identities()
 
     @property
     def compiled(self) -> bool:
@@ -173,7 +173,7 @@ class Execution:
         :param learner: the learner
         :return: whether it still has the networks, parts, optimizers and loss that this was made for
         """
-        return self._modules == _modules(learner)
+        return self._modules == learner.identities()
 
     @classmethod
     def of(cls, learner: Any, method: str = "gradient_step") -> "Execution":
@@ -313,7 +313,7 @@ class Compiled:
             if all(version == self.version for version, _ in self._programs.values()):
                 self._settings.did_not_change_the_step()
         with torch.no_grad():
-            results = program.function(*self._state, *program.further, *_tensors(inputs))
+            results = program.function(*self._state, *program.further, *tensors_of(inputs))
         return dict(zip(program.names, results, strict=True))
 
     def _made(
@@ -321,22 +321,22 @@ class Compiled:
     ) -> _Program:
         """A program for the inputs: the old one if it would come out the same."""
         start = time.perf_counter()
-        own = _like(inputs, torch.clone)
+        own = inputs_like(inputs, torch.clone)
         names: list[str] = []
 
         def run(*tensors: torch.Tensor) -> list[torch.Tensor]:
             given = iter(tensors)
-            metrics = step(learner, *_like(own, lambda _: next(given)))
+            metrics = step(learner, *inputs_like(own, lambda _: next(given)))
             names[:] = metrics
             return list(metrics.values())
 
         further: list[torch.Tensor] = []
         try:
-            graph = trace(run, self._state, _tensors(own))
+            graph = trace(run, self._state, tensors_of(own))
             # Tensors that are neither state nor input: as inputs, so that their values are those of the day.
             further = [getattr(graph, str(node.target)) for node in graph.graph.nodes if node.op == "get_attr"]
             if further:
-                graph = trace(run, [*self._state, *further], _tensors(own))
+                graph = trace(run, [*self._state, *further], tensors_of(own))
         except Exception as error:
             # An error of the step itself is raised as it is, from its place.
             with undone(self._state, learner.device):
@@ -353,7 +353,7 @@ class Compiled:
         code = graph.code
         try:
             with torch.no_grad():
-                function = compile_graph(graph, [*self._state, *further, *_tensors(own)])
+                function = compile_graph(graph, [*self._state, *further, *tensors_of(own)])
         except Exception as error:
             raise CannotCompile(f"{type(error).__name__}: {error}".strip().splitlines()[0]) from error
         self.seconds += time.perf_counter() - start
@@ -366,12 +366,17 @@ def _are_same(ours: Sequence[torch.Tensor], theirs: Sequence[torch.Tensor]) -> b
     return len(ours) == len(theirs) and all(a is b for a, b in zip(ours, theirs, strict=True))
 
 
-def _tensors(inputs: Any) -> list[torch.Tensor]:
-    """Tensors of nested tuples and dicts, in a fixed order."""
+def tensors_of(inputs: Any) -> list[torch.Tensor]:
+    """
+    List the tensors of nested tuples and dicts.
+
+    :param inputs: the tuples and dicts
+    :return: their tensors, in a fixed order
+    """
     if isinstance(inputs, torch.Tensor):
         return [inputs]
     values = inputs.values() if isinstance(inputs, dict) else inputs if isinstance(inputs, tuple) else ()
-    return [tensor for value in values for tensor in _tensors(value)]
+    return [tensor for value in values for tensor in tensors_of(value)]
 
 
 def _kind(inputs: Any) -> Any:
@@ -383,14 +388,20 @@ def _kind(inputs: Any) -> Any:
     return tuple(map(_kind, inputs)) if isinstance(inputs, tuple) else inputs
 
 
-def _like(inputs: Any, make: Callable[[torch.Tensor], torch.Tensor]) -> Any:
-    """Copy of nested tuples and dicts with other tensors."""
+def inputs_like(inputs: Any, make: Callable[[torch.Tensor], torch.Tensor]) -> Any:
+    """
+    Copy nested tuples and dicts with other tensors.
+
+    :param inputs: the tuples and dicts
+    :param make: makes a tensor of each, in the order of :func:`tensors_of`
+    :return: the same with what was made
+    """
     if isinstance(inputs, torch.Tensor):
         return make(inputs)
     if isinstance(inputs, dict):
-        return {key: _like(value, make) for key, value in inputs.items()}
+        return {key: inputs_like(value, make) for key, value in inputs.items()}
     if isinstance(inputs, tuple):
-        values = [_like(value, make) for value in inputs]
+        values = [inputs_like(value, make) for value in inputs]
         return type(inputs)(*values) if hasattr(inputs, "_fields") else tuple(values)
     return inputs
 
@@ -458,10 +469,10 @@ class Captured:
         if runs <= self.WARM_UP:
             return _aside(lambda: step(learner, *inputs)) if learner.device.type == "cuda" else step(learner, *inputs)
         if kind not in self._recorded:
-            own = _like(inputs, torch.clone)
+            own = inputs_like(inputs, torch.clone)
             self._recorded[kind] = (own, *self._recorder(lambda: step(learner, *own)))
         own, repeat, metrics = self._recorded[kind]
-        torch._foreach_copy_(_tensors(own), _tensors(inputs))
+        torch._foreach_copy_(tensors_of(own), tensors_of(inputs))
         repeat()
         # The caller adds to what it is given.
         return dict(metrics)
@@ -477,19 +488,9 @@ def _aside(run: Callable[[], Metrics]) -> Metrics:
     return metrics
 
 
-def _modules(learner: Any) -> tuple[Any, ...]:
-    """Identities of the objects that a compiled or captured step was made for."""
-    critics = (learner.critic, learner.critic.trunk, learner.critic_target, learner.critic_target.trunk)
-    networks = (learner.actor, learner.actor.trunk, *critics, learner.temperature)
-    parts = (learner.explorer, learner.pessimism_rule, *learner.optimizers().values())
-    groups = [len(group["params"]) for optimizer in learner.optimizers().values() for group in optimizer.param_groups]
-    return (*map(id, (*networks, *parts, learner.head)), *groups)
-
-
 def _of_modules(learner: Any) -> Iterable[torch.Tensor]:
     """Parameters and buffers that a gradient step reads or writes, each once."""
-    modules = (learner.networks, learner.head, learner.temperature, learner.explorer, learner.pessimism_rule)
-    tensors = (t for module in modules for t in (*module.parameters(), *module.buffers()))
+    tensors = (t for module in learner.step_modules() for t in (*module.parameters(), *module.buffers()))
     return {id(t): t for t in tensors}.values()
 
 
@@ -502,7 +503,7 @@ def _of_optimizers(learner: Any) -> list[torch.Tensor]:
         for state in optimizer.state.values():
             tensors += [t for k, t in state.items() if isinstance(t, torch.Tensor) and not (own and k == "step")]
         if own:
-            tensors += optimizer.read_tensors()
+            tensors += optimizer.readtensors_of()
     return tensors
 
 
@@ -520,8 +521,7 @@ class _Settings:
     """
 
     def __init__(self, learner: Any, private: bool):
-        roots = (learner.networks, learner.head, learner.explorer, learner.pessimism_rule)
-        modules = [module for root in roots for module in root.modules()]
+        modules = [module for root in learner.step_modules() for module in root.modules()]
         self._held: list[tuple[dict[str, Any], str, Any]] = []
         for owner in (learner, *modules):
             of_torch = type(owner).__module__.split(".")[0] == "torch"

@@ -15,6 +15,7 @@ from torch.optim import Optimizer
 
 from sb3_sample.learner import first_step, losses
 from sb3_sample.learner.batch import SLOTS, Batch, CriticStep, Extra, Noise
+from sb3_sample.learner.descent import Descent, descend
 from sb3_sample.learner.execution import Execution
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
@@ -33,7 +34,6 @@ from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
 from sb3_sample.networks.unit_norm import project_weights
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
-from sb3_sample.tracing import is_tracing
 
 #: Among a gradient step's results, the TD errors that are no metric.
 _TD_ERRORS = "td_errors"
@@ -175,6 +175,10 @@ class Learner:
             self.temperature_optimizer = AdamW(self.temperature.parameters(), lr=learning_rate, betas=betas)
         self._parts_mode = ModeSwitch(*self.parts().values())
         self._execution: Execution | None = None
+        #: Chooses how the gradient steps are run: takes the learner and the method's name.
+        self.make_execution: Callable[[Any, str], Any] = Execution.of
+        #: Steps of optimizers and targets.
+        self.descent = Descent()
         #: Whether ``.grad`` holds the gradients of another gradient step than the last, as a compiled one leaves none.
         self.gradients_are_stale = False
         # Whether the shapes of a gradient step, and those of the explorer's actions, were checked.
@@ -445,6 +449,26 @@ class Learner:
 
     # ---------------------------------------------------------------- the update
 
+    def step_modules(self) -> tuple[nn.Module, ...]:
+        """
+        List the modules of the gradient step.
+
+        :return: modules that a gradient step reads or writes
+        """
+        return self.networks, self.head, self.temperature, self.explorer, self.pessimism_rule
+
+    def identities(self) -> tuple[int, ...]:
+        """
+        Identify what a compiled or captured gradient step is made for.
+
+        :return: identities of networks, parts, optimizers and loss, and the optimizers' numbers of parameters
+        """
+        critics = (self.critic, self.critic.trunk, self.critic_target, self.critic_target.trunk)
+        optimizers = self.optimizers().values()
+        objects = (self.actor, self.actor.trunk, *critics, self.temperature, self.explorer, self.pessimism_rule)
+        sizes = (len(group["params"]) for optimizer in optimizers for group in optimizer.param_groups)
+        return (*map(id, (*objects, *optimizers, self.head)), *sizes)
+
     @property
     def seconds_compiling(self) -> float:
         """Seconds spent on compiling the gradient step."""
@@ -461,7 +485,7 @@ class Learner:
         :return: runner of the gradient steps
         """
         if self._execution is None or not self._execution.serves(self):
-            self._execution = Execution.of(self)
+            self._execution = self.make_execution(self, "gradient_step")
         self._execution.prepare(self)
         return self._execution
 
@@ -684,8 +708,8 @@ class Learner:
 
     def _follow(self, target: Any, online: Any) -> None:
         """Take one step of Polyak averaging; with ``tau=1`` the target is the online network."""
+        self.descent.follow(target, online, self.tau)
         with torch.no_grad():
-            torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), weight=self.tau)
             # Running statistics, as in Stable-Baselines3.
             statistics = zip(target.statistics(), online.statistics(), strict=True)
             for ours, theirs in statistics:
@@ -705,30 +729,16 @@ class Learner:
             self.sam_radius,
             [len(p) if id(p) in copied else None for p in parameters],
         )
-        self._descend(self.critic.optimizer, gradients)
+        descend(self.critic.optimizer, gradients)
 
-    @staticmethod
-    def minimize(optimizer: Optimizer, loss: torch.Tensor) -> None:
+    def minimize(self, optimizer: Optimizer, loss: torch.Tensor) -> None:
         """
         Take one step of an optimizer. Only its own parameters get a gradient, also where the loss depends on others.
 
         :param optimizer: the optimizer
         :param loss: scalar
         """
-        parameters = [p for group in optimizer.param_groups for p in group["params"]]
-        Learner._descend(optimizer, torch.autograd.grad(loss, parameters, allow_unused=True))
-
-    @staticmethod
-    def _descend(optimizer: Optimizer, gradients: Sequence[torch.Tensor | None]) -> None:
-        """Take one step of an optimizer with gradients in the order of its parameters."""
-        if is_tracing():
-            assert isinstance(optimizer, AdamW)
-            optimizer.apply(gradients)
-            return
-        parameters = [p for group in optimizer.param_groups for p in group["params"]]
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            parameter.grad = gradient
-        optimizer.step()
+        self.descent.minimize(optimizer, loss)
 
     # ---------------------------------------------------------------- its state
 

@@ -138,8 +138,6 @@ class EmbeddedCritics(CriticEnsemble):
         """
         with torch.no_grad():
             states = obs.features if isinstance(obs, Encoded) else self.extract_features(obs, self._encoder)
-            if not actions.requires_grad:
-                return self._encoder.pair(states, actions)  # type: ignore[no-any-return]
         return self._encoder.pair(states, actions)  # type: ignore[no-any-return]
 
     def statistics(self) -> list[torch.Tensor]:

@@ -514,7 +514,7 @@ def test_parts_of_ones_own_are_compiled_when_asked_for(monkeypatch: pytest.Monke
         """Not made to be compiled: its number changes at every step."""
 
         def before_updates(self, agent: SAC) -> None:
-            self._beta += 0.01
+            self.constant += 0.01
 
     monkeypatch.setattr(update_schedule, "PAYS_FROM", 5)
     monkeypatch.setitem(PESSIMISMS, "own", Own)
