@@ -313,7 +313,8 @@ class Compiled:
             if all(version == self.version for version, _ in self._programs.values()):
                 self._settings.did_not_change_the_step()
         with torch.no_grad():
-            results = program.function(*self._state, *program.further, *tensors_of(inputs))
+            given = (x.contiguous() for x in tensors_of(inputs))
+            results = program.function(*self._state, *program.further, *given)
         return dict(zip(program.names, results, strict=True))
 
     def _made(
@@ -321,7 +322,7 @@ class Compiled:
     ) -> _Program:
         """A program for the inputs: the old one if it would come out the same."""
         start = time.perf_counter()
-        own = inputs_like(inputs, torch.clone)
+        own = inputs_like(inputs, lambda x: x.clone(memory_format=torch.contiguous_format))
         names: list[str] = []
 
         def run(*tensors: torch.Tensor) -> list[torch.Tensor]:
@@ -503,7 +504,7 @@ def _of_optimizers(learner: Any) -> list[torch.Tensor]:
         for state in optimizer.state.values():
             tensors += [t for k, t in state.items() if isinstance(t, torch.Tensor) and not (own and k == "step")]
         if own:
-            tensors += optimizer.readtensors_of()
+            tensors += optimizer.read_tensors()
     return tensors
 
 

@@ -12,12 +12,20 @@ import torch
 from torch import nn
 
 from sb3_sample.learner.descent import StackedDescent
-from sb3_sample.learner.execution import Execution, Metrics, cuda_graph, inputs_like, tensors_of, why_not_compiled
+from sb3_sample.learner.execution import (
+    NO_SETTINGS,
+    Execution,
+    Metrics,
+    cuda_graph,
+    inputs_like,
+    tensors_of,
+    why_not_compiled,
+)
 from sb3_sample.learner.learner import Learner
 from sb3_sample.optim import AdamW
 
 #: Numbers of a learner that its gradient step does not read, or reads from its inputs.
-_NOT_READ = {"learning_starts", "verbose", "compile", "learning_rate", "gamma"}
+_NOT_READ = {"learning_starts", "verbose", "compile", "learning_rate", "gamma", "training"} | NO_SETTINGS
 
 
 class _Networks(nn.Module):
@@ -360,4 +368,4 @@ def _shapes(learner: Learner) -> list[torch.Size]:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    return isinstance(value, float)

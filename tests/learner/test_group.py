@@ -14,7 +14,7 @@ from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.pessimism import LearnedPessimism
 from tests.sac.common import COMPILES, MAKERS, random_batch, sac, state
-from tests.sac.test_execution import ROUNDING, TOLERANCE, WITHOUT_GRADIENT, Recorder
+from tests.sac.test_execution import FEW_STEPS, ROUNDING, TOLERANCE, WITHOUT_GRADIENT, Recorder
 
 
 class Seat:
@@ -44,16 +44,35 @@ class Seat:
         return results[self.index]
 
 
-def together(learners: Sequence[Learner], step: Callable[[int], None]) -> LearnerGroup:
+def together(
+    learners: Sequence[Learner], step: Callable[[int], None], group: LearnerGroup | None = None
+) -> LearnerGroup:
     """Run a function of the index for every learner, in threads, so that their gradient steps are one."""
-    group = LearnerGroup(learners)
+    group = group or LearnerGroup(learners)
     barrier, inputs = threading.Barrier(len(learners)), [None] * len(learners)
     for i, learner in enumerate(learners):
         learner._execution = Seat(group, i, inputs, barrier)
     with ThreadPoolExecutor(len(learners)) as pool:
-        for future in [pool.submit(step, i) for i in range(len(learners))]:
-            future.result(timeout=300)
+
+        def run(i: int) -> None:
+            try:
+                step(i)
+            except BaseException:
+                barrier.abort()
+                raise
+
+        futures = [pool.submit(run, i) for i in range(len(learners))]
+    for error in filter(None, (future.exception() for future in futures)):
+        if not isinstance(error, threading.BrokenBarrierError):
+            raise error
     return group
+
+
+class GroupRecorder(Recorder):
+    def _memory(self) -> list[torch.Tensor]:
+        group: Any = self.model
+        tensors = [t for module in group.step_modules() for t in (*module.parameters(), *module.buffers())]
+        return tensors + [t for o in group.optimizers().values() for s in o.state.values() for t in s.values()]
 
 
 def models_of(maker: str, n: int, **kwargs: Any) -> list[Any]:
@@ -101,8 +120,6 @@ def differences(a: Any, b: Any) -> tuple[float, float]:
 
 #: Of whose steps something cannot be batched.
 REFUSED = {"RegularizedSAC": "sam_radius"}
-#: Gradient steps of those whose rounding grows fast, through batch norm over eight rows; others take 50.
-FEW_STEPS = {"XQC": 10}
 
 
 def assert_alike(maker: str, ours: Sequence[Any], theirs: Sequence[Any]) -> None:
@@ -126,3 +143,76 @@ def test_each_is_what_it_is_alone(maker: str) -> None:
         model.learner.forget_execution()
         take(model, 3)
     assert_alike(maker, alone, others)
+
+
+@pytest.mark.parametrize("how", [pytest.param("compiled", marks=COMPILES), "captured"])
+def test_compiled_and_captured_groups(how: str) -> None:
+    alone, others = models_of("SAC", 2), models_of("SAC", 2)
+    for model in alone:
+        take(model, 20)
+    learners = [model.learner for model in others]
+    for learner in learners:
+        learner.compiled = how == "compiled"
+    group = LearnerGroup(learners)
+    recorder = None
+    if how == "captured":
+        recorder = GroupRecorder(group)
+        group._execution = Execution(group, False, False, recorder, "mapped_step")
+    together(learners, lambda i: take(others[i], 20), group)
+    assert_alike("SAC", alone, others)
+    if recorder is not None:
+        assert recorder.n_recordings == 1 and recorder.n_repetitions == 17
+    else:
+        assert group.compiled and group.seconds_compiling > 0
+
+
+@pytest.mark.parametrize(
+    ("maker", "arguments"),
+    [
+        ("SAC", {"learning_rate": [1e-3, 1e-4]}),
+        ("SAC", {"tau": [0.1, 0.5], "gamma": [0.9, 0.99]}),
+        ("SAC", {"target_entropy": [-1.0, 1.0], "pessimism": [0.2, 0.7]}),
+        ("BRO", {"learning_rate": [1e-3, 1e-4], "tau": [0.1, 0.5], "gamma": [0.9, 0.99]}),
+        ("BRO", {"weight_decay": [1e-1, 1e-4]}),
+    ],
+)
+def test_numbers_may_differ(maker: str, arguments: dict[str, Sequence[Any]]) -> None:
+    def models() -> list[Any]:
+        made = []
+        for i in range(2):
+            own = {name: values[i] for name, values in arguments.items()}
+            (model,) = models_of(maker, 1, **own)
+            made.append(model)
+        return made
+
+    alone, others = models(), models()
+    for model in alone:
+        take(model, 20)
+    learners = [model.learner for model in others]
+    together(learners, lambda i: take(others[i], 20))
+    assert_alike(maker, alone, others)
+    assert differences(alone[0], alone[1])[0] > 1e-4
+
+
+def test_resets_clear_moments_in_a_group() -> None:
+    alone, others = (models_of("BRO", 2, reset_gradient_steps=20) for _ in range(2))
+    for model in alone:
+        take(model, 50)
+    together([model.learner for model in others], lambda i: take(others[i], 50))
+    assert [model.plasticity.n_done for model in (*alone, *others)] == [2] * 4
+    # Fresh networks are drawn from generators that the threads share.
+    assert all(int(s["step"]) == 10 for m in others for s in m.critic.optimizer.state.values())
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "reason"),
+    [
+        ([{}, {"policy_kwargs": {"net_arch": [8, 9]}}], "same shapes"),
+        ([{}, {"policy_delay": 2}], "policy_delay"),
+        ([{}, {"pessimism": "gpl"}], "learners must .*"),
+        ([{"policy_kwargs": {"net_arch": [8], "optimizer_class": torch.optim.RMSprop}}] * 2, "RMSprop"),
+    ],
+)
+def test_what_differs_is_named(kwargs: list[dict[str, Any]], reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        LearnerGroup([sac(compile=False, **of).learner for of in kwargs])
