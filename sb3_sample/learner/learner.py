@@ -174,6 +174,8 @@ class Learner:
             self.temperature_optimizer = AdamW(self.temperature.parameters(), lr=learning_rate, betas=betas)
         self._parts_mode = ModeSwitch(*self.parts().values())
         self._execution: Execution | None = None
+        #: Chooses how the gradient steps are run: takes the learner and the method's name.
+        self.make_execution: Callable[[Any, str], Any] = Execution.of
         #: Whether ``.grad`` holds the gradients of another gradient step than the last, as a compiled one leaves none.
         self.gradients_are_stale = False
         # Whether the shapes of a gradient step, and those of the explorer's actions, were checked.
@@ -460,7 +462,7 @@ class Learner:
         :return: runner of the gradient steps
         """
         if self._execution is None or not self._execution.serves(self):
-            self._execution = Execution.of(self)
+            self._execution = self.make_execution(self, "gradient_step")
         self._execution.prepare(self)
         return self._execution
 
