@@ -36,6 +36,7 @@ from sb3_sample.sac import (
     SimBa,
     SimbaV2,
 )
+from sb3_sample.sac.many import train_many
 from sb3_sample.training.task_evaluation import MultiTaskEvalCallback, evaluate_tasks
 from sb3_sample.version import __version__
 
@@ -81,4 +82,5 @@ __all__ = [
     "evaluate_tasks",
     "make_env",
     "multi_task_env",
+    "train_many",
 ]

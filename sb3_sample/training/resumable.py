@@ -22,6 +22,7 @@ from sb3_sample.saving.checkpoint import Checkpointer, refuse_second_call
 from sb3_sample.saving.encoding import Lenient
 from sb3_sample.saving.model_tree import Description
 from sb3_sample.saving.notice import say_once
+from sb3_sample.training.seats import begin, seated
 
 Self = TypeVar("Self", bound="Resumable")
 
@@ -158,11 +159,12 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
             self._on_environment_reset()
         self._before_training()
         say_once(self, self._described(), stacklevel=4)
-        with Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
+        with seated(self) as seat, Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
             checkpointer.resume(total_timesteps)
             self._before_turns()
             callback.on_training_start(locals(), globals())
             checkpointer.start()
+            begin(seat)
             while self.num_timesteps < total_timesteps:
                 if not self._turn(checkpointer.callback, log_interval):
                     break
