@@ -33,8 +33,9 @@ class LeftWithTheOthers(BaseException):
 class Joint(Protocol):
     """Gradient steps of several learners as one."""
 
-    #: Seconds spent on compiling.
-    seconds_compiling: float
+    @property
+    def seconds_compiling(self) -> float:
+        """Seconds spent on compiling."""
 
     def step(self, inputs: Sequence[tuple[Any, ...]]) -> list[dict[str, torch.Tensor]]:
         """

@@ -5,6 +5,7 @@ All three run the same function, ``Learner.gradient_step``, which is independent
 noise as tensors, does not branch on the value of a tensor, and counts nothing outside of tensors.
 """
 
+import inspect
 import re
 import time
 import warnings
@@ -21,7 +22,7 @@ from sb3_sample.tracing import compile_graph, trace, undone
 #: thousand steps (docs/performance.md). A number of steps, not a measurement, so that a seed fixes the whole run.
 PAYS_FROM = 20_000
 #: The first torch that a gradient step is compiled with.
-COMPILES_FROM = (2, 13)
+COMPILES_FROM = (2, 8)
 
 Metrics = dict[str, torch.Tensor]
 #: Runs a function without its effects taking place, and gives back what repeats them, and its result, whose tensors
@@ -245,6 +246,21 @@ class Execution:
             return self._step(learner, *inputs)
 
 
+def acting_of(learner: Any) -> "Captured | None":
+    """
+    Choose how actions of the training are computed.
+
+    :param learner: the learner
+    :return: what captures them; None where they are computed as they are: on a CPU, and for an explorer that does not
+        take its noise as an argument
+    """
+    asked = learner.compile is True or (learner.compile == "auto" and not foreign_parts(learner))
+    takes_noise = "noise" in inspect.signature(learner.explorer.act).parameters
+    if learner.device.type != "cuda" or not asked or not takes_noise:
+        return None
+    return Captured(learner, cuda_graph, optimizers=False)
+
+
 class CannotCompile(Exception):
     """Error of a gradient step that can be run but not compiled."""
 
@@ -431,13 +447,14 @@ class Captured:
 
     :param learner: the learner
     :param recorder: what captures
+    :param optimizers: whether what is captured reads the optimizers' tensors
     """
 
     #: Steps of each kind that are run as they are before one is captured, as CUDA's libraries set themselves up.
     WARM_UP = 3
 
-    def __init__(self, learner: Any, recorder: Recorder):
-        self._recorder = recorder
+    def __init__(self, learner: Any, recorder: Recorder, optimizers: bool = True):
+        self._recorder, self._optimizers = recorder, optimizers
         self._of_modules = list(_of_modules(learner))
         self._settings = _Settings(learner, private=False)
         self._runs: dict[Any, int] = {}
@@ -451,7 +468,8 @@ class Captured:
         :param learner: the learner
         :param program: number of the compiled steps that are captured, if they are
         """
-        now = [program, *(t.data_ptr() for t in (*self._of_modules, *_of_optimizers(learner)))]
+        tensors = [*self._of_modules, *(_of_optimizers(learner) if self._optimizers else ())]
+        now = [program, *(t.data_ptr() for t in tensors)]
         if self._settings.have_changed() or now != self._held:
             self._recorded.clear()
             self._held = now

@@ -28,16 +28,26 @@ class Exploration(Part):
     def __init__(self, learner: Learning):
         super().__init__()
 
-    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
+    def draw(self, like: torch.Tensor) -> torch.Tensor:
         """
-        Sample the actions of the training.
+        Draw the noise of one step.
+
+        :param like: tensor of the noise's shape and type, (B, A)
+        :return: standard normal noise, (B, A)
+        """
+        return torch.randn_like(like)
+
+    def act(self, learner: Learning, observations: Any, noise: torch.Tensor | None = None) -> torch.Tensor:
+        """
+        Sample the actions of the training. With the noise given it is a function of tensors: on a GPU it is captured.
 
         :param learner: the learner
         :param observations: tensors on the device of the model, (B, O) or a dict of them
+        :param noise: from :meth:`draw`, (B, A); drawn if None
         :return: actions in [-1, 1], (B, A)
         """
         mean, log_std = learner.actor.gaussian(learner.actor.features(observations))
-        return learner.actor.act(mean, log_std.exp(), torch.randn_like(mean))
+        return learner.actor.act(mean, log_std.exp(), self.draw(mean) if noise is None else noise)
 
     def update(self, learner: Learning, batch: Batch, noise: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         """
@@ -73,10 +83,8 @@ class HeldNoise(Exploration):
         self._held: torch.Tensor | None = None
         self._length = self._n_held = 0
 
-    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
-        mean, log_std = learner.actor.gaussian(learner.actor.features(observations))
-        held = self.hold(torch.randn_like(mean), float(torch.rand(())))
-        return learner.actor.act(mean, log_std.exp(), held)
+    def draw(self, like: torch.Tensor) -> torch.Tensor:
+        return self.hold(torch.randn_like(like), float(torch.rand(())))
 
     def hold(self, fresh: torch.Tensor, uniform: float) -> torch.Tensor:
         """
@@ -215,11 +223,11 @@ class OptimisticExploration(Exploration):
         """Weight of the divergence in the actor's loss."""
         return kl_weight
 
-    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
+    def act(self, learner: Learning, observations: Any, noise: torch.Tensor | None = None) -> torch.Tensor:
         features = learner.actor.features(observations)
         mean, log_std = learner.actor.gaussian(features)
         mean, std = self._gaussian(observations, features, mean, log_std.exp())
-        return learner.actor.act(mean, self.std_multiplier * std, torch.randn_like(std))
+        return learner.actor.act(mean, self.std_multiplier * std, self.draw(std) if noise is None else noise)
 
     def update(self, learner: Learning, batch: Batch, noise: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         observations = learner.encoded(batch.observations)
@@ -413,9 +421,10 @@ class OptimisticActor(OptimisticExploration):
         mean, log_std = self.actor.gaussian(self.actor.features(observations))
         return mean, log_std.exp()
 
-    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
+    def act(self, learner: Learning, observations: Any, noise: torch.Tensor | None = None) -> torch.Tensor:
         mean, log_std = self.actor.gaussian(self.actor.features(observations))
-        return self.actor.act(mean, self.std_multiplier * log_std.exp(), torch.randn_like(mean))
+        noise = self.draw(mean) if noise is None else noise
+        return self.actor.act(mean, self.std_multiplier * log_std.exp(), noise)
 
     def _kl(self, learner: Learning, optimistic: Any, pessimistic: Any) -> torch.Tensor:
         if self.kl_direction == "pessimistic_to_optimistic":
@@ -486,9 +495,9 @@ class OptimisticGradient(Exploration):
         length = (scaled * gradient).sum(dim=1, keepdim=True).sqrt()
         return mean + math.sqrt(2 * self.kl_radius) * scaled / (length + 1e-6), std
 
-    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
+    def act(self, learner: Learning, observations: Any, noise: torch.Tensor | None = None) -> torch.Tensor:
         mean, std = self.shifted_mean(learner, observations)
-        return learner.actor.act(mean, std, torch.randn_like(std))
+        return learner.actor.act(mean, std, self.draw(std) if noise is None else noise)
 
 
 #: Choices by the name that the algorithm's ``exploration`` argument takes.

@@ -16,7 +16,7 @@ from torch.optim import Optimizer
 from sb3_sample.learner import first_step, losses
 from sb3_sample.learner.batch import SLOTS, Batch, CriticStep, Extra, Noise
 from sb3_sample.learner.descent import Descent, descend
-from sb3_sample.learner.execution import Execution
+from sb3_sample.learner.execution import Captured, Execution, acting_of
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.observation_statistics import ObservationStatistics
@@ -177,6 +177,8 @@ class Learner:
         self._execution: Execution | None = None
         #: Chooses how the gradient steps are run: takes the learner and the method's name.
         self.make_execution: Callable[[Any, str], Any] = Execution.of
+        # The explorer, and what captures its actions.
+        self._acting: tuple[Exploration, Captured | None] | None = None
         #: Steps of optimizers and targets.
         self.descent = Descent()
         #: Whether ``.grad`` holds the gradients of another gradient step than the last, as a compiled one leaves none.
@@ -476,7 +478,7 @@ class Learner:
 
     def forget_execution(self) -> None:
         """Drop the execution: how the gradient steps are run is decided anew before the next one."""
-        self._execution = None
+        self._execution = self._acting = None
 
     def prepared_execution(self) -> Execution:
         """
@@ -540,11 +542,35 @@ class Learner:
         :return: actions in [-1, 1], (B, A)
         :raises ValueError: if the explorer's first actions are something else
         """
-        actions = self.explorer.act(self, observations)
+        actions = self._actions(observations)
         if not self._checked_actions:
             first_step.check_actions(self, observations, actions)
             self._checked_actions = True
         return actions
+
+    def _actions(self, observations: Any) -> torch.Tensor:
+        """The explorer's actions, on a GPU by a captured graph."""
+        if self._acting is None or self._acting[0] is not self.explorer:
+            self._acting = self.explorer, acting_of(self)
+        acting = self._acting[1]
+        if acting is None:
+            actions: torch.Tensor = self.explorer.act(self, observations)
+            return actions
+        first = next(iter(observations.values())) if isinstance(observations, dict) else observations
+        dtype = next(self.actor.parameters()).dtype
+        noise = self.explorer.draw(torch.empty(len(first), self.actor.action_dim, dtype=dtype, device=self.device))
+        acting.forget_if_stale(self)
+        return acting(type(self).action_step, self, (observations, noise))["actions"]
+
+    def action_step(self, observations: Any, noise: torch.Tensor) -> dict[str, torch.Tensor]:
+        """
+        Compute the explorer's actions, on tensors only: this function is captured.
+
+        :param observations: tensors on the learner's device, (B, O), or a dict of them
+        :param noise: from the explorer's ``draw``, (B, A)
+        :return: "actions", in [-1, 1], (B, A)
+        """
+        return {"actions": self.explorer.act(self, observations, noise)}
 
     def step(
         self, batch: Batch, noise: Noise | None = None, extra: Extra | None = None, eager: bool = False

@@ -8,6 +8,7 @@ import torch
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_sample.learner.execution import Execution
+from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.learner.learner import Learner
 from sb3_sample.lockstep import BEGIN, ENVIRONMENTS, MADE, Joint, Seat, present
 
@@ -20,7 +21,7 @@ def joint_of(learners: Sequence[Learner]) -> Joint | None:
     :return: what takes one step of each at once; None where each takes its own, one after the other
     :raises ValueError: if something of theirs cannot be batched, or differs that must not; the message names it
     """
-    return None
+    return LearnerGroup(learners) if learners[0].device.type == "cuda" else None
 
 
 class Member:

@@ -153,6 +153,10 @@ SHARED_NAMES = {
 }
 
 
+#: Where the models compute.
+DEVICE = "cpu"
+
+
 class Updates:
     """
     The updates of one file, and a model that replays them. A method is a subclass: how its model is built from the
@@ -214,7 +218,7 @@ class Updates:
     # ---------------------------------------------------------------- of all
 
     def tensor(self, key: str) -> torch.Tensor:
-        return torch.as_tensor(self.data[key])
+        return torch.as_tensor(self.data[key]).to(DEVICE)
 
     def load(self) -> None:
         stored = {key.removeprefix("init/"): value for key, value in self.data.items() if key.startswith("init/")}
@@ -222,7 +226,7 @@ class Updates:
         with torch.no_grad():
             for name, value in stored.items():
                 assert self.named[name].shape == value.shape, name
-                self.named[name].copy_(torch.as_tensor(self.arranged(name, value)))
+                self.named[name].copy_(torch.as_tensor(self.arranged(name, value)).to(DEVICE))
 
     def run(self) -> int:
         """Replay the updates and compare; gives how many numbers were compared."""
@@ -326,7 +330,7 @@ class BROUpdates(Updates):
             learning_rate=optimizers["critic"]["lr"],
             adjustment_learning_rate=optimizers["optimism"]["lr"],
             buffer_size=1,
-            device="cpu",
+            device=DEVICE,
             compile=compile,
         )
 
@@ -615,7 +619,7 @@ class SimbaV2Updates(Updates):
 
 
 def simbav2(obs_dim: int, act_dim: int, **kwargs: Any) -> SimbaV2:
-    return SimbaV2("MlpPolicy", Shapes(obs_dim, act_dim), buffer_size=1, device="cpu", **kwargs)
+    return SimbaV2("MlpPolicy", Shapes(obs_dim, act_dim), buffer_size=1, device=DEVICE, **kwargs)
 
 
 def normalizer_state(model: Any) -> dict[str, Any]:
@@ -697,7 +701,7 @@ class BRCUpdates(Updates):
                 "n_critics": dims["critics"],
             },
             buffer_size=1,
-            device="cpu",
+            device=DEVICE,
             compile=compile,
         )
 
@@ -845,7 +849,7 @@ def brc_sequence(data: dict[str, np.ndarray], name: str, meta: dict[str, Any]) -
         value_head_kwargs={"v_min": -meta["v_max"], "v_max": meta["v_max"]},
         critic_width=4,
         buffer_size=1,
-        device="cpu",
+        device=DEVICE,
     )
     get = lambda key: data[f"{name}/{key}"]  # noqa: E731
     rewards, tasks = torch.as_tensor(get("query_reward"))[:, None], torch.as_tensor(get("query_task"))[:, None]
