@@ -154,7 +154,7 @@ def _captured(model: Any, warm_up: int = 3) -> Any:
 def test_groups_are_the_cpu(maker: str) -> None:
     assert maker not in REFUSED
     here = [model_on("cpu", maker, seed=seed) for seed in range(3)]
-    there = [model_on("cpu", maker, "captured", seed=seed) for seed in range(3)]
+    there = [model_on("cuda", maker, "captured", seed=seed) for seed in range(3)]
     for model in here:
         take(model, 30)
     group = LearnerGroup([model.learner for model in there])
@@ -172,7 +172,7 @@ def test_groups_are_the_cpu(maker: str) -> None:
 
 def test_compiled_groups() -> None:
     here = [model_on("cpu", "BRO", seed=seed) for seed in range(2)]
-    there = [model_on("cpu", "BRO", "compiled", seed=seed) for seed in range(2)]
+    there = [model_on("cuda", "BRO", "compiled", seed=seed) for seed in range(2)]
     for model in here:
         take(model, 30)
     group = LearnerGroup([model.learner for model in there])
