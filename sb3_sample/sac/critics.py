@@ -17,6 +17,7 @@ from torch import nn
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.q_values import QValues
 from sb3_sample.networks import Network, RunningNorm, project_weights
+from sb3_sample.sac.features import features_of
 from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
 
 
@@ -74,7 +75,7 @@ class CriticEnsemble(BaseModel):
             return torch.cat((obs.features, actions), dim=1)
         assert isinstance(self.features_extractor, BaseFeaturesExtractor)
         seen: PyTorchObs = obs if self.observation_norm is None else self.observation_norm(obs)
-        return torch.cat((self.extract_features(seen, self.features_extractor), actions), dim=1)
+        return torch.cat((features_of(self, seen, self.features_extractor), actions), dim=1)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         own = {**self._network_args, "features_extractor": self.features_extractor, "n_critics": self.n_critics}
