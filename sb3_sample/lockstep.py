@@ -22,7 +22,7 @@ MADE, BEGIN, GRADIENT_STEP, ENVIRONMENTS = "made", "begin", "gradient step", "en
 #: What else a training can be at.
 _READY, _ENDED = "ready", "ended"
 #: Seconds that trainings have to end by themselves when they are told to leave at once.
-PATIENCE = 5.0
+PATIENCE = 30.0
 _HERE = threading.local()
 
 
@@ -79,6 +79,8 @@ class Seat:
 
     def __init__(self, name: str, body: Callable[[], None], folder: Path | None = None):
         self.name, self.body, self.folder = name, body, folder
+        #: Called each time that it is this training's turn.
+        self.on_turn: Callable[[], None] = lambda: None
         self.at = _READY
         self.turn = threading.Lock()
         self.turn.acquire()
@@ -122,7 +124,7 @@ class Seat:
         if isinstance(stop, (KeyboardInterrupt, SystemExit)):
             raise type(stop)(*stop.args)
         if stop is not None or (self.group.failed and not (self.saves and self.takes_part)):
-            raise LeftWithTheOthers
+            raise LeftWithTheOthers(f"ended with the others of its group: {stop!r}" if stop else "") from stop
 
     def step(self, inputs: tuple[Any, ...]) -> dict[str, torch.Tensor] | None:
         """
@@ -255,6 +257,7 @@ class Group:
         following.turn.release()
         seat.turn.acquire()
         seat.generators.put_back()
+        seat.on_turn()
 
     def _following(self) -> Seat | None:
         """Whose turn it is next; None when all have ended."""
