@@ -85,9 +85,10 @@ def _train(arguments: list[str]) -> None:
 
     options, rest = _own_options(runs.train_parser(), arguments)
     with _arguments("train"), _errors("train"), reading(options.allow_pickle, options.trusted_modules):
-        start = runs.plan(options, rest)
-        _set_command_line("train", rest if start is None else start.arguments)
-        runs.train(start)
+        if options.seeds is not None:
+            runs.train_seeds(options, rest)
+        else:
+            runs.train(runs.plan(options, rest), rest)
 
 
 def _enjoy(arguments: list[str]) -> None:

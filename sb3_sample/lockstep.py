@@ -22,7 +22,7 @@ MADE, BEGIN, GRADIENT_STEP, ENVIRONMENTS = "made", "begin", "gradient step", "en
 #: What else a training can be at.
 _READY, _ENDED = "ready", "ended"
 #: Seconds that trainings have to end by themselves when they are told to leave at once.
-PATIENCE = 5.0
+PATIENCE = 30.0
 _HERE = threading.local()
 
 
@@ -80,6 +80,8 @@ class Seat:
 
     def __init__(self, name: str, body: Callable[[], None], folder: Path | None = None):
         self.name, self.body, self.folder = name, body, folder
+        #: Called each time that it is this training's turn.
+        self.on_turn: Callable[[], None] = lambda: None
         self.at = _READY
         self.turn = threading.Lock()
         self.turn.acquire()
@@ -123,14 +125,15 @@ class Seat:
         if isinstance(stop, (KeyboardInterrupt, SystemExit)):
             raise type(stop)(*stop.args)
         if stop is not None or (self.group.failed and not (self.saves and self.takes_part)):
-            raise LeftWithTheOthers
+            raise LeftWithTheOthers(f"ended with the others of its group: {stop!r}" if stop else "") from stop
 
     def step(self, inputs: tuple[Any, ...]) -> dict[str, torch.Tensor] | None:
         """
         Take a gradient step with the others.
 
         :param inputs: the arguments of ``Learner.gradient_step``
-        :return: its result; None where there are no others, so that it has still to be taken
+        :return: its result; None where there are no others, or theirs is of another kind, so that it has still to be
+            taken
         """
         if len(self.group.stepping()) < 2:
             return None
@@ -138,6 +141,15 @@ class Seat:
         self.meet(GRADIENT_STEP)
         self.inputs, answer, self.answer = None, self.answer, None
         return answer
+
+    def folders_beside(self) -> list[Path]:
+        """
+        :return: folders of the runs that are to be continued from the same step as this one
+        """
+        if not (self.aligned and self.with_others):
+            return []
+        others = (seat for seat in self.group.seats if seat is not self and seat.aligned and seat.with_others)
+        return [seat.folder for seat in others if seat.folder is not None]
 
     def leaves(self, now: int) -> bool:
         """
@@ -179,8 +191,8 @@ class Group:
         self.failed: list[Seat] = []
         #: Environment steps at which all leave.
         self.leaves_at: int | None = None
-        #: By folder, the checkpoint from which each run goes on; None before that is known.
-        self.starts: dict[Path, Any] | None = None
+        #: Checkpoints from which the runs go on (``run_folder.Starts``); None before that is known.
+        self.starts: Any = None
         self._joint: Joint | None = None
         self._over = threading.Event()
 
@@ -246,6 +258,7 @@ class Group:
         following.turn.release()
         seat.turn.acquire()
         seat.generators.put_back()
+        seat.on_turn()
 
     def _following(self) -> Seat | None:
         """Whose turn it is next; None when all have ended."""
@@ -300,8 +313,10 @@ class Group:
             self._joint = self._joint_of(seats)
         if self._joint is None:
             return
-        inputs = [seat.inputs for seat in seats]
-        for seat, answer in zip(seats, self._joint.step(inputs), strict=True):  # type: ignore[arg-type]
+        inputs = [seat.inputs or () for seat in seats]
+        if not all(_are_alike(inputs[0], each) for each in inputs):
+            return
+        for seat, answer in zip(seats, self._joint.step(inputs), strict=True):
             seat.answer = answer
 
     @property
@@ -329,6 +344,17 @@ class Group:
         if seat.with_others:
             self.part()
         seat.takes_part = False
+
+
+def _are_alike(a: Any, b: Any) -> bool:
+    """Whether two learners' inputs differ in numbers only: one may have further transitions, or update its targets."""
+    if isinstance(a, torch.Tensor):
+        return isinstance(b, torch.Tensor) and a.shape == b.shape
+    if isinstance(a, dict):
+        return isinstance(b, dict) and a.keys() == b.keys() and all(_are_alike(a[key], b[key]) for key in a)
+    if isinstance(a, tuple):
+        return isinstance(b, tuple) and len(a) == len(b) and all(map(_are_alike, a, b))
+    return type(a) is type(b) and (isinstance(a, float) or a == b)
 
 
 # ---------------------------------------------------------------- generators

@@ -127,7 +127,7 @@ def train_many(
         Seat(f"the learner of seed {seed}", functools.partial(train, index), folders[index])
         for index, seed in enumerate(names)
     ]
-    run(seats, checkpoint)
+    train_together(seats, checkpoint)
     if diverged:
         words = "; ".join(f"seed {names[index]}: {error}" for index, error in sorted(diverged.items()))
         warnings.warn(
@@ -137,7 +137,7 @@ def train_many(
     return models
 
 
-def run(seats: Sequence[Seat], folder: str | Path | None) -> None:
+def train_together(seats: Sequence[Seat], folder: str | Path | None) -> None:
     """
     Make trainings in lockstep.
 

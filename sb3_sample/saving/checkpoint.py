@@ -27,6 +27,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_sample.console import LossyLog
 from sb3_sample.envs.workers import EnvironmentDied, end_with_this_process
 from sb3_sample.faults import HoldBack, check_finite_parameters
+from sb3_sample.lockstep import Seat, seat_of
 from sb3_sample.saving import container, run_folder, training_state, vec_envs
 from sb3_sample.saving.attributes import DoesNotFit
 from sb3_sample.saving.callbacks import CallbackStates, environments, walk, without_progress_bar
@@ -96,6 +97,8 @@ class Checkpointer:
             self._held = HoldBack(callback)
             self._held.model = model
         self._folder: RunFolder | None = None
+        #: Its place among trainings in lockstep, if it has one.
+        self._seat = seat_of(model)
         #: What was read of the checkpoint that the run goes on from.
         self._resumed: dict[str, Any] | None = None
         self._manifest: dict[str, Any] = {"segments": {}}
@@ -138,13 +141,29 @@ class Checkpointer:
         # The step count at which this call begins is part of what the run is: a further call begins at another one.
         begin = str(model.num_timesteps)
         self._identity = {**identity_of(model), "num_timesteps": [begin, begin]}
-        found = self._folder.newest_good()
+        found = self._folder.newest_good() if self._seat is None else self._start_of(self._seat)
         if found is not None:
             folder, self._manifest = found
             self._resumed = self._read(f"{folder.name}/{STATE}", KIND)
             _check_parts(self._resumed, folder / STATE)
             self._check_identity(self._resumed["identity"])
             self._resumed["path"] = folder
+
+    def _start_of(self, seat: Seat) -> tuple[Path, dict[str, Any]] | None:
+        """Where a run of a group goes on: all of them at the newest step that each has."""
+        assert self._folder is not None
+        seat.folder = self._folder.path
+        if not seat.aligned:
+            return self._folder.newest_good()
+        group = seat.group
+        if group.starts is None:
+            folders = [each.folder for each in group.seats if each.aligned and each.folder is not None]
+            group.starts = run_folder.common_starts(folders)
+        if self._folder.path in group.starts.paths:
+            return self._folder.go_back_to(group.starts.paths[self._folder.path])
+        found = self._folder.newest_good()
+        seat.alone = found is not None or group.starts.steps > 0
+        return found
 
     def _callbacks(self) -> Iterator[tuple[str, BaseCallback]]:
         return walk(without_progress_bar(self._callback))
@@ -277,11 +296,13 @@ class Checkpointer:
         self._progress = ProgressFile(self._folder.path)
         for env in self._environments()[1:]:
             end_with_this_process(env)
-        self._interrupts = Interrupts(self._environments(), self._folder.path)
+        self._interrupts = Interrupts(self._environments(), self._folder.path, self._seat)
         self._console = LossyLog(model.logger)
         model.logger.output_formats.append(self._progress)
         self._period = model.num_timesteps // self._every
         self._warn_of_losses()
+        if self._seat is not None:
+            self._seat.saves, self._folder.beside = True, self._seat.folders_beside
         if self._resumed is not None:
             self._restore_rest(self._resumed)
             self._resumed = None
@@ -346,12 +367,13 @@ class Checkpointer:
         :raises TrainingDiverged: something is not finite that would be saved
         :raises KeyboardInterrupt: after SIGINT
         :raises SystemExit: after SIGTERM
+        :raises LeftWithTheOthers: after the failure of another training in its group
         """
         if self._folder is None:
             return
         assert self._interrupts is not None and self._held is not None
         now = self._whole_at = self._model.num_timesteps
-        leaves = self._interrupts.received is not None
+        leaves = self._interrupts.leaves(now)
         due = now // self._every > self._period
         self._period = now // self._every
         try:

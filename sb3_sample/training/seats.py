@@ -108,8 +108,14 @@ def all_made(model: Any) -> None:
     """
     seat = present()
     if seat is not None:
-        seat.learner = model.learner
+        seat.learner, seat.aligned = model.learner, _is_aligned(model)
         seat.meet(MADE)
+
+
+def _is_aligned(model: Any) -> bool:
+    """Whether its turns end at the same environment steps as those of other seeds."""
+    train_freq = model.train_freq
+    return not (isinstance(train_freq, TrainFreq) and train_freq.unit is TrainFrequencyUnit.EPISODE)
 
 
 @contextlib.contextmanager
@@ -133,8 +139,6 @@ def seated(model: Any) -> Iterator[Seat | None]:
         return wait()
 
     seat.model, seat.learner = model, model.learner
-    train_freq = model.train_freq
-    seat.aligned = not (isinstance(train_freq, TrainFreq) and train_freq.unit is TrainFrequencyUnit.EPISODE)
     innermost.step_wait = step_wait
     try:
         yield seat

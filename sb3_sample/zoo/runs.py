@@ -11,8 +11,10 @@ import functools
 import json
 import os
 import re
+import sys
+import traceback
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,10 +29,14 @@ from stable_baselines3.common.monitor import Monitor, get_monitor_files
 from stable_baselines3.common.utils import get_latest_run_id
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_sample.lockstep import Seat, present
 from sb3_sample.run_logs import monitor_files, monitor_head
+from sb3_sample.sac.algorithm import SAC
+from sb3_sample.sac.many import train_together
 from sb3_sample.saving.folders import Folder, is_plain
 from sb3_sample.saving.training_state import argument_names
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
+from sb3_sample.training.seats import all_made
 from sb3_sample.zoo.algorithms import ALGORITHMS
 from sb3_sample.zoo.files import RunError, add_trust
 from sb3_sample.zoo.patches import managed_by, monitors_go_on
@@ -213,6 +219,15 @@ def train_parser() -> argparse.ArgumentParser:
         "and --env below the log folder that has "
         "the latest checkpoint; an error if there is none",
     )
+    group = parser.add_argument_group("many seeds in one process (our off-policy algorithms)")
+    group.add_argument(
+        "--seeds",
+        type=int,
+        nargs="+",
+        metavar="N",
+        help="How many seeds, from 0 on, or several seeds by name: a run of each, with a folder of its own, as by as "
+        "many commands with --seed; --run-dir then has the folders seed-0, seed-1 and so on (docs/many_learners.md)",
+    )
     add_trust(parser.add_argument_group("files that run no code (our algorithms)"))
     return parser
 
@@ -285,18 +300,119 @@ def _latest(arguments: Sequence[str]) -> Path:
     return max(found)[1]
 
 
-def train(start: Start | None) -> None:
+@contextlib.contextmanager
+def training() -> Iterator[Callable[[Start | None, Sequence[str]], None]]:
     """
-    The zoo's ``train``. It reads ``sys.argv``.
+    Have the zoo's ``train`` make our runs.
+
+    :return: makes a run of how it starts, None for one without checkpoints, and the command line for the zoo, without
+        our options. Trainings in lockstep call it at the same time
+    """
+    starts: dict[Seat | None, Start | None] = {}
+
+    def manager(*positional: Any, **named: Any) -> Manager:
+        start = starts[present()]
+        return Manager(*positional, **named) if start is None else RunManager(start, *positional, **named)
+
+    def train(start: Start | None, arguments: Sequence[str]) -> None:
+        starts[present()] = start
+        # The zoo reads it at once.
+        sys.argv = ["sb3-sample train", *arguments]
+        rl_zoo3.train.train()
+
+    with managed_by(manager, rl_zoo3.train):
+        yield train
+
+
+def train(start: Start | None, arguments: Sequence[str]) -> None:
+    """
+    Make a run as the zoo's ``train`` does.
 
     :param start: how a run with checkpoints starts; None for one without
+    :param arguments: command line for the zoo, without our options, of a run without checkpoints
     :raises RunError: if it cannot start or go on so
     :raises Refused: if an argument is no Python
     :raises KeyboardInterrupt: after Ctrl-C, when the zoo has saved the model
     """
-    manager = Manager if start is None else functools.partial(RunManager, start)
-    with managed_by(manager, rl_zoo3.train):
-        rl_zoo3.train.train()
+    with training() as make:
+        make(start, arguments if start is None else start.arguments)
+
+
+def train_seeds(options: argparse.Namespace, arguments: Sequence[str]) -> None:
+    """
+    Make a run of each seed, all in this process, as so many commands would.
+
+    :param options: what ``train_parser`` has parsed, with ``seeds``
+    :param arguments: the rest of the command line
+    :raises RunError: if they cannot start or go on so
+    :raises KeyboardInterrupt: after Ctrl-C, when the zoo has saved the models; a ``SystemExit`` after SIGTERM
+    :raises SystemExit: if a run has failed, after the end of the others
+    """
+    seeds = _seeds(options.seeds, arguments)
+    failed: dict[int, BaseException] = {}
+
+    def body(seed: int, start: Start | None, command: Sequence[str]) -> None:
+        try:
+            make(start, command)
+        except Exception as error:
+            seat = present()
+            assert seat is not None
+            if not seat.began:
+                raise
+            failed[seed] = error
+            print(f"The run of seed {seed} has failed, and the others go on:", file=sys.stderr)
+            traceback.print_exception(error)
+
+    seats = []
+    for seed in seeds:
+        folder = None if options.run_dir is None else options.run_dir / f"seed-{seed}"
+        command = [*arguments, "--seed", str(seed)]
+        start = plan(argparse.Namespace(**{**vars(options), "run_dir": folder}), command)
+        own = functools.partial(body, seed, start, command if start is None else start.arguments)
+        seats.append(Seat(f"the run of seed {seed}", own, folder))
+    saves = options.run_dir is not None or options.checkpoint_freq is not None
+    with training() as make:
+        try:
+            train_together(seats, (options.run_dir or Path("logs")) if saves else None)
+        except KeyboardInterrupt as error:
+            on = f"the same command with --run-dir {options.run_dir} goes on" if options.run_dir else "all were saved"
+            raise KeyboardInterrupt(f"interrupted; {on}") from error
+    if failed:
+        words = "; ".join(f"seed {seed}: {type(error).__name__}: {error}" for seed, error in failed.items())
+        print(f"sb3-sample train: {len(failed)} of {len(seeds)} runs have failed: {words}", file=sys.stderr)
+        raise SystemExit(1)
+
+
+def _seeds(given: Sequence[int], arguments: Sequence[str]) -> list[int]:
+    """The seeds that ``--seeds`` asks for, of a command line that can be one of many."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--algo", default="ppo")
+    for option in ("--seed", "-optimize", "--optimize-hyperparameters", "--progress", "-P", "--track"):
+        parser.add_argument(option, dest=option, nargs="?", const=True)
+    asked = vars(parser.parse_known_args(arguments)[0])
+    if not can_train_together(algo := asked.pop("algo")):
+        names = ", ".join(name for name in ALGORITHMS if can_train_together(name))
+        raise RunError(f"--seeds is for the off-policy algorithms of this package, {names}, not --algo {algo}")
+    for option, value in asked.items():
+        if value is not None:
+            raise RunError(f"{option} does not go with --seeds: leave one of them out")
+    if len(given) == 1:
+        if given[0] < 1:
+            raise RunError(f"--seeds must be at least 1, if it is how many, not {given[0]}")
+        return list(range(given[0]))
+    if wrong := [seed for seed in given if not 0 <= seed < 2**32]:
+        raise RunError(f"a seed of --seeds must be at least 0 and below {2**32}, not {wrong[0]}")
+    if len(set(given)) < len(given):
+        raise RunError(f"--seeds must differ, not {' '.join(map(str, given))}")
+    return list(given)
+
+
+def can_train_together(algo: str) -> bool:
+    """
+    :param algo: name of an algorithm
+    :return: whether runs of several seeds can be made in one process
+    """
+    return algo in ALGORITHMS and issubclass(ALGORITHMS[algo].algorithm, SAC)
 
 
 class Manager(ExperimentManager):
@@ -325,6 +441,7 @@ class Manager(ExperimentManager):
         return found
 
     def learn(self, model: BaseAlgorithm) -> None:
+        all_made(model)
         self._watched = _Watched(model, self._arguments)
         super().learn(self._watched)  # type: ignore[arg-type]  # all that the zoo's learn uses
 
@@ -404,7 +521,10 @@ class RunManager(Manager):
         is_ours = before and re.fullmatch(rf"{name}_\d+", Path(before).name)
         if before and is_ours and Path(before).parent == Path(str(self.tensorboard_log)):
             return before
-        return f"{self.tensorboard_log}/{name}_{get_latest_run_id(str(self.tensorboard_log), name) + 1}"
+        new = f"{self.tensorboard_log}/{name}_{get_latest_run_id(str(self.tensorboard_log), name) + 1}"
+        # At once: another run that is made beside this one gets another.
+        os.makedirs(new, exist_ok=True)
+        return new
 
     def create_callbacks(self) -> None:
         super().create_callbacks()

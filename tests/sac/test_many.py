@@ -2,8 +2,12 @@
 
 import collections
 import functools
+import os
 import random
+import shutil
+import signal
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -20,6 +24,7 @@ from sb3_sample import BRO, MBMAPPO, SAC, VPLSAC, DebiasedRQ, train_many
 from sb3_sample.learner.execution import Execution
 from sb3_sample.sac import many
 from sb3_sample.saving import training_state
+from sb3_sample.saving.run_folder import RunFolder, common_starts
 from tests.sac.common import TINY_BRO, TINY_DR_Q, TINY_SAC, Toy, state
 
 SEEDS = (3, 0, 5)
@@ -270,14 +275,18 @@ def test_a_model_that_is_trained_within_a_callback() -> None:
 
 
 class Poisoned(Toy):
-    """Gives rewards that no network can learn, from a step on."""
+    """The second one gives rewards that no network can learn, from a step on."""
 
     made = 0
 
     def __init__(self) -> None:
         Poisoned.made += 1
         self.poisoned = Poisoned.made == 2
-        super().__init__(poison=lambda total, o, r: (o, 1e38 if self.poisoned and total > 15 else r))
+        super().__init__()
+
+    def step(self, action: np.ndarray) -> Any:
+        observation, reward, *rest = super().step(action)
+        return observation, 1e38 if self.poisoned and self.total > 15 else reward, *rest
 
 
 def test_a_learner_that_diverges(joint: Any) -> None:
@@ -365,3 +374,169 @@ def test_what_cannot_be_taken_together(monkeypatch: pytest.MonkeyPatch) -> None:
             callback=lambda i: lambda *_: seen.append(i), **TINY_SAC,
         )  # fmt: skip
     assert seen == []
+
+
+# ---------------------------------------------------------------- checkpoints
+
+
+class Signal(BaseCallback):
+    """Sends this process a signal at a step."""
+
+    def __init__(self, at: int, number: int):
+        super().__init__()
+        self.at, self.number = at, number
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.at:
+            os.kill(os.getpid(), self.number)
+        return True
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        pass
+
+
+def trained(folder: Path, callback: Any = None, **arguments: Any) -> list[Any]:
+    given = {"seeds": SEEDS, "total_timesteps": 60, "checkpoint_freq": 10, **TINY_SAC, **arguments}
+    return train_many(SAC, "MlpPolicy", Toy, checkpoint=folder, callback=callback, **given)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+    return [learned(model) for model in trained(tmp_path_factory.mktemp("whole"))]
+
+
+def saved(folder: Path) -> list[list[int]]:
+    """Steps of the checkpoints of each run."""
+    return [sorted(int(path.name[-12:]) for path in (folder / f"seed-{seed}").glob("checkpoint-*")) for seed in SEEDS]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("index", [0, 1, 2])
+def test_a_signal_saves_all_at_the_same_step(number: int, index: int, tmp_path: Path, joint: Any, whole: Any) -> None:
+    before = signal.getsignal(number)
+    expected = KeyboardInterrupt if number == signal.SIGINT else SystemExit
+    with pytest.raises(expected):
+        trained(tmp_path, lambda i: Signal(33, number) if i == index else Signal(0, number))
+    assert signal.getsignal(number) is before
+    steps = saved(tmp_path)
+    assert len({each[-1] for each in steps}) == 1
+    assert steps[0][-1] in (33, 34)
+    models = trained(tmp_path, lambda i: Signal(0, number))
+    assert all(same(learned(model), own) for model, own in zip(models, whole, strict=True))
+    assert {each[-1] for each in saved(tmp_path)} == {60}
+
+
+def test_all_go_on_from_the_newest_step_that_every_folder_has(tmp_path: Path, joint: Any, whole: Any) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path, lambda i: Signal(43 if i == 0 else 0, signal.SIGINT))
+    steps = saved(tmp_path)
+    assert {tuple(each) for each in steps} == {(40, steps[0][1])}
+    # As if it had been killed before the last one of a run was written.
+    shutil.rmtree(tmp_path / "seed-0" / f"checkpoint-{steps[0][1]:012d}")
+    seen: list[int] = []
+    models = trained(tmp_path, lambda i: First(seen))
+    assert seen == [41, 41, 41]
+    assert all(same(learned(model), own) for model, own in zip(models, whole, strict=True))
+
+
+class First(Signal):
+    """Notes the first step."""
+
+    def __init__(self, seen: list[int]):
+        super().__init__(0, 0)
+        self.seen = seen
+
+    def _on_training_start(self) -> None:
+        self.first = True
+
+    def _on_step(self) -> bool:
+        if self.first:
+            self.seen.append(self.num_timesteps)
+        self.first = False
+        return True
+
+
+def test_runs_of_which_one_has_diverged_go_on(tmp_path: Path, joint: Any, whole: Any) -> None:
+    """It has left the others: it goes on from its own checkpoint, to the same end, and holds up nobody."""
+    found = []
+    for steps in (40, 60):
+        Poisoned.made = 0
+        with pytest.warns(UserWarning, match="1 of 3 learners have diverged, .* seed 0"):
+            models = train_many(
+                SAC, "MlpPolicy", Poisoned, seeds=SEEDS, total_timesteps=steps, checkpoint=tmp_path,
+                checkpoint_freq=10, **TINY_SAC,
+            )  # fmt: skip
+        found.append(learned(models[1]))
+        newest = [each[-1] for each in saved(tmp_path)]
+        assert newest[0] == newest[2] == steps
+        assert newest[1] == 10
+    # Not a number is not equal to itself.
+    assert repr(found[0]["counts"]) == repr(found[1]["counts"])
+    for i in (0, 2):
+        assert same(learned(models[i]), whole[i])
+
+
+def test_a_failure_has_the_others_save(tmp_path: Path, joint: Any, whole: Any) -> None:
+    with pytest.warns(UserWarning, match="has ended by LookupError. The others are saved"), pytest.raises(LookupError):
+        trained(tmp_path, lambda i: Raising() if i == 1 else None)
+    newest = [each[-1] for each in saved(tmp_path)]
+    assert newest[1] == 15
+    assert newest[0] == newest[2] == 16
+    models = trained(tmp_path)
+    assert all(same(learned(model), own) for model, own in zip(models, whole, strict=True))
+
+
+def write(run: Path, *steps: int, beside: Sequence[Path] = ()) -> list[int]:
+    """Write checkpoints of a run, in words of no meaning. Returns the steps of those that are there then."""
+    folder = RunFolder(run)
+    folder.beside = lambda: beside
+    for number in steps:
+        files = {name: (lambda file: file.write(b"of any kind")) for name in ("model.zip", "state.zip")}
+        folder.write(number, files, {}, {"circumstances": {}})
+    folder.close()
+    return [number for number, _ in reversed(folder.checkpoints())]
+
+
+def test_checkpoints_are_kept_until_all_runs_have_newer_ones(tmp_path: Path) -> None:
+    x, y, z = (tmp_path / name for name in "xyz")
+    # The others have none so far.
+    assert write(x, 0, 10, 20, 30, beside=[y, z]) == [0, 10, 20, 30]
+    write(y, 0, 10)
+    assert write(x, 40, beside=[y, z]) == [0, 10, 20, 30, 40]
+    write(z, 10, 20)
+    assert write(x, 50, beside=[y, z]) == [10, 20, 30, 40, 50]
+    write(y, 20, 30, beside=[x, z])
+    assert common_starts([x, y, z]).steps == 20
+    write(z, 30, 40, 50, beside=[x, y])
+    write(y, 40, 50, beside=[x, z])
+    assert write(x, 60, beside=[y, z]) == [50, 60]
+    # One that trains alone.
+    assert write(tmp_path / "alone", 10, 20, 30) == [20, 30]
+
+
+def test_where_runs_go_on(tmp_path: Path) -> None:
+    x, y, z = (tmp_path / name for name in "xyz")
+    assert common_starts([x, y, z]) == (0, {})
+    write(x, 20, 30)
+    write(y, 10, 20)
+    found = common_starts([x, y, z])
+    assert (found.steps, found.paths.keys()) == (20, {x, y})
+    # One that has left the others.
+    write(z, 20, 30)
+    write(x, 80, 90)
+    write(y, 80)
+    found = common_starts([x, y, z])
+    assert (found.steps, found.paths.keys()) == (80, {x, y})
+    run = RunFolder(x)
+    assert run.go_back_to(found.paths[x])[1]["steps"] == 80
+    run.close()
+    assert write(x) == [80]
+    # Damaged.
+    write(x, 90)
+    write(y, 90)
+    (x / "checkpoint-000000000090" / "model.zip").write_bytes(b"of other kind")
+    with pytest.warns(UserWarning, match=r"model.zip is damaged: .*\. The runs go on from 80 steps instead"):
+        assert common_starts([x, y]).steps == 80
