@@ -54,6 +54,10 @@ class AdamW(Optimizer):
         self._rates_held: list[float | tuple[float, ...]] = []
         # By group, how many steps each parameter has taken.
         self._steps: list[torch.Tensor] = []
+        # Number of parameters whose moments exist; another one if moments were cleared.
+        self._n_prepared = -1
+        #: Number of times that :meth:`prepare` has made tensors.
+        self.version = 0
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -78,6 +82,8 @@ class AdamW(Optimizer):
         stand in tensors. Compiled and captured steps, which know tensors only, then find both.
         """
         self.prepare_rates()
+        if len(self.state) == self._n_prepared == sum(len(group["params"]) for group in self.param_groups):
+            return
         device = self.param_groups[0]["params"][0].device
         for i, group in enumerate(self.param_groups):
             params = group["params"]
@@ -98,6 +104,8 @@ class AdamW(Optimizer):
         if any(p is not q for p, q in zip(self.state, parameters, strict=False)):
             ordered = {p: self.state.pop(p) for p in parameters if p in self.state}
             self.state.update(ordered)
+        self._n_prepared = len(self.state)
+        self.version += 1
 
     @torch.no_grad()
     def prepare_rates(self) -> None:
@@ -111,11 +119,15 @@ class AdamW(Optimizer):
         is_held = self._rates is not None and self._rates.device == device and self._rates.dtype is dtype
         if is_held and self._rates_held == rates:
             return
-        values = torch.tensor(rates, dtype=dtype)
-        if self._rates is None or not is_held or self._rates.shape != values.shape:
-            self._rates = values.to(device)
+        shapes = [[len(r) if isinstance(r, tuple) else 0 for r in of] for of in (rates, self._rates_held)]
+        if self._rates is None or not is_held or shapes[0] != shapes[1]:
+            self._rates = torch.tensor(rates, dtype=dtype, device=device)
         else:
-            self._rates.copy_(values)
+            for i, (rate, held) in enumerate(zip(rates, self._rates_held, strict=True)):
+                # Filled in, as a copy from the host would wait for a GPU.
+                for j, value in enumerate(rate if isinstance(rate, tuple) else (rate,)):
+                    if rate != held:
+                        (self._rates[i, j] if isinstance(rate, tuple) else self._rates[i]).fill_(value)
         self._rates_held = rates
 
     def read_tensors(self) -> list[torch.Tensor]:
@@ -128,6 +140,7 @@ class AdamW(Optimizer):
         # Called by load_state_dict, copy and pickle: what follows from the state is made anew by prepare.
         super().__setstate__(state)
         self.capturable, self._rates, self._rates_held, self._steps = False, None, [], []
+        self._n_prepared, self.version = -1, getattr(self, "version", 0)
 
     @torch.no_grad()
     def apply(self, gradients: Sequence[torch.Tensor | None]) -> None:

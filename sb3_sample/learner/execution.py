@@ -6,10 +6,11 @@ noise as tensors, does not branch on the value of a tensor, and counts nothing o
 """
 
 import inspect
+import operator
 import re
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -156,6 +157,7 @@ class Execution:
         self._compiled = Compiled(learner) if compiled else None
         self._captured = None if recorder is None else Captured(learner, recorder)
         self._modules = learner.identities()
+        self._optimizers = [o for o in learner.optimizers().values() if isinstance(o, AdamW)]
 
     @property
     def compiled(self) -> bool:
@@ -206,10 +208,9 @@ class Execution:
 
         :param learner: the learner
         """
-        for optimizer in learner.optimizers().values():
-            if isinstance(optimizer, AdamW):
-                optimizer.capturable = self._captured is not None
-                optimizer.prepare()
+        for optimizer in self._optimizers:
+            optimizer.capturable = self._captured is not None
+            optimizer.prepare()
         if self._compiled is not None:
             self._compiled.prepare(learner)
         if self._captured is not None:
@@ -297,9 +298,8 @@ class Compiled:
         self.version = 0
         self._programs: dict[Any, tuple[int, _Program]] = {}
         self._n_made = 0
-        self._of_modules = list(_of_modules(learner))
-        self._state: list[torch.Tensor] = []
-        self._settings = _Settings(learner, private=True)
+        self._tensors = _Tensors(learner)
+        self._settings = Settings(learner, private=True)
 
     def prepare(self, learner: Any) -> None:
         """
@@ -307,7 +307,7 @@ class Compiled:
 
         :param learner: the learner
         """
-        self._state = [*self._of_modules, *_of_optimizers(learner)]
+        self._tensors.renew()
         if self._settings.have_changed():
             self.version += 1
 
@@ -330,7 +330,7 @@ class Compiled:
                 self._settings.did_not_change_the_step()
         with torch.no_grad():
             given = (x.contiguous() for x in tensors_of(inputs))
-            results = program.function(*self._state, *program.further, *given)
+            results = program.function(*self._tensors.all, *program.further, *given)
         return dict(zip(program.names, results, strict=True))
 
     def _made(
@@ -349,14 +349,14 @@ class Compiled:
 
         further: list[torch.Tensor] = []
         try:
-            graph = trace(run, self._state, tensors_of(own))
+            graph = trace(run, self._tensors.all, tensors_of(own))
             # Tensors that are neither state nor input: as inputs, so that their values are those of the day.
             further = [getattr(graph, str(node.target)) for node in graph.graph.nodes if node.op == "get_attr"]
             if further:
-                graph = trace(run, [*self._state, *further], tensors_of(own))
+                graph = trace(run, [*self._tensors.all, *further], tensors_of(own))
         except Exception as error:
             # An error of the step itself is raised as it is, from its place.
-            with undone(self._state, learner.device):
+            with undone(self._tensors.all, learner.device):
                 step(learner, *inputs)
             raise CannotCompile(str(error).strip().splitlines()[0]) from error
         if old is not None and graph.code == old.code and _are_same(further, old.further):
@@ -370,7 +370,7 @@ class Compiled:
         code = graph.code
         try:
             with torch.no_grad():
-                function = compile_graph(graph, [*self._state, *further, *tensors_of(own)])
+                function = compile_graph(graph, [*self._tensors.all, *further, *tensors_of(own)])
         except Exception as error:
             raise CannotCompile(f"{type(error).__name__}: {error}".strip().splitlines()[0]) from error
         self.seconds += time.perf_counter() - start
@@ -454,9 +454,9 @@ class Captured:
     WARM_UP = 3
 
     def __init__(self, learner: Any, recorder: Recorder, optimizers: bool = True):
-        self._recorder, self._optimizers = recorder, optimizers
-        self._of_modules = list(_of_modules(learner))
-        self._settings = _Settings(learner, private=False)
+        self._recorder = recorder
+        self._tensors = _Tensors(learner, optimizers)
+        self._settings = Settings(learner, private=False)
         self._runs: dict[Any, int] = {}
         self._recorded: dict[Any, tuple[Any, Callable[[], None], Metrics]] = {}
         self._held: Any = None
@@ -468,8 +468,8 @@ class Captured:
         :param learner: the learner
         :param program: number of the compiled steps that are captured, if they are
         """
-        tensors = [*self._of_modules, *(_of_optimizers(learner) if self._optimizers else ())]
-        now = [program, *(t.data_ptr() for t in tensors)]
+        self._tensors.renew()
+        now = [program, *(t.data_ptr() for t in self._tensors.all)]
         if self._settings.have_changed() or now != self._held:
             self._recorded.clear()
             self._held = now
@@ -507,23 +507,39 @@ def _aside(run: Callable[[], Metrics]) -> Metrics:
     return metrics
 
 
-def _of_modules(learner: Any) -> Iterable[torch.Tensor]:
-    """Parameters and buffers that a gradient step reads or writes, each once."""
-    tensors = (t for module in learner.step_modules() for t in (*module.parameters(), *module.buffers()))
-    return {id(t): t for t in tensors}.values()
+class _Tensors:
+    """
+    Tensors that a gradient step reads or writes besides its inputs, each once: parameters and buffers, moments, counts
+    of steps and learning rates.
 
+    :param learner: the learner
+    :param optimizers: whether those of its optimizers are among them
+    """
 
-def _of_optimizers(learner: Any) -> list[torch.Tensor]:
-    """Moments, counts of steps and learning rates of a learner's optimizers."""
-    tensors: list[torch.Tensor] = []
-    for optimizer in learner.optimizers().values():
-        # Counts of steps are places in one vector, which comes after them.
-        own = isinstance(optimizer, AdamW)
-        for state in optimizer.state.values():
-            tensors += [t for k, t in state.items() if isinstance(t, torch.Tensor) and not (own and k == "step")]
-        if own:
-            tensors += optimizer.read_tensors()
-    return tensors
+    def __init__(self, learner: Any, optimizers: bool = True):
+        tensors = (t for module in learner.step_modules() for t in (*module.parameters(), *module.buffers()))
+        self._of_modules = list({id(t): t for t in tensors}.values())
+        self._optimizers = list(learner.optimizers().values()) if optimizers else []
+        self._versions: list[Any] = []
+        #: The tensors.
+        self.all: list[torch.Tensor] = self._of_modules
+
+    def renew(self) -> None:
+        """Look for tensors that optimizers have made since the last call."""
+        versions = [(getattr(o, "version", None), len(o.state)) for o in self._optimizers]
+        rates = [getattr(o, "_rates", None) for o in self._optimizers]
+        if self._versions and versions == self._versions[0] and all(map(operator.is_, rates, self._versions[1])):
+            return
+        self._versions = [versions, rates]
+        self.all = list(self._of_modules)
+        for optimizer in self._optimizers:
+            # Counts of steps are places in one vector, which comes after them.
+            own = isinstance(optimizer, AdamW)
+            for state in optimizer.state.values():
+                tensors = {k: t for k, t in state.items() if isinstance(t, torch.Tensor) and not (own and k == "step")}
+                self.all += tensors.values()
+            if own:
+                self.all += optimizer.read_tensors()
 
 
 #: Public numbers of a part or of the learner that are no settings: they move with the run, and the gradient step does
@@ -531,7 +547,7 @@ def _of_optimizers(learner: Any) -> list[torch.Tensor]:
 NO_SETTINGS = {"arm", "training", "gradients_are_stale"}
 
 
-class _Settings:
+class Settings:
     """
     Numbers and words that a gradient step may read: the learner's own, its modules' and its optimizers'.
 

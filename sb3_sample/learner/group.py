@@ -16,6 +16,7 @@ from sb3_sample.learner.execution import (
     NO_SETTINGS,
     Execution,
     Metrics,
+    Settings,
     cuda_graph,
     inputs_like,
     tensors_of,
@@ -91,17 +92,22 @@ class LearnerGroup:
         _check_alike(self.learners)
         self._networks = [_Networks(learner, method) for learner in self.learners]
         self._stacks = _Stacks(_by_name([networks.tensors() for networks in self._networks]))
+        #: By the optimizers' names, those of the stacked parameters, and each learner's.
         self._optimizers = self._stacked_optimizers()
+        self._of_each: dict[str, list[Any]] = {
+            path: [learner.optimizers()[path] for learner in self.learners] for path in self._optimizers
+        }
         self._descent = StackedDescent(
             {id(self._first.optimizers()[name]): optimizer for name, optimizer in self._optimizers.items()},
             self._parameters_by_network(),
         )
         #: Numbers that differ between learners: object of the first learner, attribute, (S,).
         self._differing: list[tuple[dict[str, Any], str, torch.Tensor]] = []
-        self._held: list[list[Any]] = []
-        self._places: list[Any] = []
+        self._settings = [Settings(learner, private=False) for learner in self.learners]
+        self._versions: list[int] = []
         self._execution: Execution | None = None
         stacks = self._stacks.by_name()
+        self._take_settings()
         for s, networks in enumerate(self._networks):
             for name, tensor in networks.tensors().items():
                 tensor.data = stacks[name].data[s]
@@ -165,24 +171,20 @@ class LearnerGroup:
 
     def _prepare(self) -> None:
         """Bring the stacks up to date with what has happened to the learners since the last step."""
-        for learner in self.learners:
-            for optimizer in learner.optimizers().values():
-                optimizer.prepare()  # type: ignore[attr-defined]
-        places = [t for learner in self.learners for o in learner.optimizers().values() for t in o.read_tensors()]  # type: ignore[attr-defined]
-        if len(places) != len(self._places) or any(a is not b for a, b in zip(places, self._places, strict=True)):
+        optimizers = [optimizer for of_each in self._of_each.values() for optimizer in of_each]
+        for optimizer in optimizers:
+            optimizer.prepare()
+        versions = [optimizer.version for optimizer in optimizers]
+        if versions != self._versions:
             # Moments were cleared, or loaded.
             self._take_moments()
-            self._places = [
-                t
-                for learner in self.learners
-                for o in learner.optimizers().values()
-                for t in o.read_tensors()  # type: ignore[attr-defined]
-            ]
+            self._versions = versions
         self._take_rates()
-        held = [[value for _, _, value in _settings(learner)] for learner in self.learners]
-        if held != self._held:
+        # Each looks at its own.
+        changed = [settings.have_changed() for settings in self._settings]
+        if any(changed):
             self._take_settings()
-            self._held = held
+            self._execution = None
         if self._execution is None:
             self._execution = self._made()
         self._execution.prepare(self)
@@ -252,7 +254,7 @@ class LearnerGroup:
     def _take_moments(self) -> None:
         """Have each learner's moments and counts of steps be rows of stacks."""
         for path, stacked in self._optimizers.items():
-            theirs = [learner.optimizers()[path] for learner in self.learners]
+            theirs = self._of_each[path]
             stacked.state.clear()
             stacked._steps = []
             for i, group in enumerate(stacked.param_groups):
@@ -271,11 +273,13 @@ class LearnerGroup:
                     optimizer._steps[i] = counts[s]  # type: ignore[attr-defined]
                     for j, p in enumerate(params):
                         optimizer.state[p]["step"] = counts[s, j]
+            stacked._n_prepared = len(stacked.state)
+            stacked.version += 1
 
     def _take_rates(self) -> None:
         """Pass the learning rates on: one for all where they are the same, else one for each."""
         for path, stacked in self._optimizers.items():
-            rates = [[g["lr"] for g in learner.optimizers()[path].param_groups] for learner in self.learners]
+            rates = [[g["lr"] for g in optimizer.param_groups] for optimizer in self._of_each[path]]
             same = all(of == rates[0] for of in rates)
             for i, group in enumerate(stacked.param_groups):
                 group["lr"] = rates[0][i] if same else tuple(of[i] for of in rates)
@@ -295,7 +299,7 @@ class LearnerGroup:
                 self._descent.tau = number
         for path, stacked in self._optimizers.items():
             for i, group in enumerate(stacked.param_groups):
-                decays = [learner.optimizers()[path].param_groups[i]["weight_decay"] for learner in self.learners]
+                decays = [optimizer.param_groups[i]["weight_decay"] for optimizer in self._of_each[path]]
                 same = all(decay == decays[0] for decay in decays)
                 group["weight_decay"] = decays[0] if same else torch.tensor(decays, device=self.device)
 

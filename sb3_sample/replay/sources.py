@@ -135,6 +135,8 @@ def draw_batches(
 
 def _cut(data: Batch, n_batches: int, batch_size: int) -> list[Batch]:
     """Cut one large batch into several."""
+    if n_batches == 1:
+        return [data]
 
     def cut(x: Any) -> list[Any]:
         if isinstance(x, (int, float)):

@@ -83,7 +83,8 @@ class Member:
 
         :param learner: the learner
         """
-        self._own.prepare(learner)
+        if not self._seat.group.steps_together:
+            self._own.prepare(learner)
 
     def __call__(self, learner: Learner, *inputs: Any, eager: bool = False) -> dict[str, torch.Tensor]:
         """
@@ -95,7 +96,10 @@ class Member:
         :return: its result
         """
         answer = None if eager else self._seat.step(inputs)
-        return self._own(learner, *inputs, eager=eager) if answer is None else answer
+        if answer is None:
+            self._own.prepare(learner)
+            answer = self._own(learner, *inputs, eager=eager)
+        return answer
 
 
 def all_made(model: Any) -> None:

@@ -273,7 +273,7 @@ class Updates:
 
     @staticmethod
     def check_numbers(key: str, ours: Any, theirs: Any, tolerance: float) -> None:
-        ours = ours.detach().numpy() if isinstance(ours, torch.Tensor) else np.asarray(ours)
+        ours = ours.detach().cpu().numpy() if isinstance(ours, torch.Tensor) else np.asarray(ours)
         assert ours.shape == theirs.shape, f"{key}: shape {ours.shape} instead of {theirs.shape}"
         ours, theirs = ours.astype(np.float64), theirs.astype(np.float64)
         with np.errstate(invalid="ignore"):
@@ -301,7 +301,7 @@ class Updates:
             limit = parameter_tolerance(n_updates)
             if name.startswith(self.learned_numbers):
                 limit = self.scalar_tolerances[n_updates >= 10]
-            error = np.abs(value.detach().double().numpy() - theirs).max()
+            error = np.abs(value.detach().double().cpu().numpy() - theirs).max()
             assert error <= limit, f"{prefix}{name}: off by {error:.2e}, allowed {limit:.0e}"
         self.check_more(prefix, n_updates)
 
@@ -311,7 +311,7 @@ class Updates:
         for name, value in self.named.items():
             if among(name):
                 theirs = self.arranged(name, self.data[prefix + name]).astype(np.float64)
-                dot += ((value.detach().double().numpy() - theirs) * theirs).sum()
+                dot += ((value.detach().double().cpu().numpy() - theirs) * theirs).sum()
                 square += (theirs**2).sum()
         return dot / square / (n_updates * self.model.learning_rate)
 
