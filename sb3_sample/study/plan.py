@@ -29,7 +29,7 @@ from sb3_sample.shallow_yaml import ShallowLoader
 #: Entries of a plan; those after the first four have defaults.
 ENTRIES = (
     "agents", "tasks", "seeds", "steps", "evaluation", "grid", "checkpoint_freq", "env_kwargs", "gym_packages",
-    "groups", "factors",
+    "groups", "factors", "measure",
 )  # fmt: skip
 REQUIRED = ENTRIES[:4]
 #: The published curves' evaluation.
@@ -67,6 +67,7 @@ class Run:
     :param checkpoint_freq: environment steps between two checkpoints
     :param env_kwargs: arguments of the environment
     :param gym_packages: modules that register environments
+    :param measure: environment steps between two measurements of the noise scale and of overfitting, none if 0
     """
 
     agent: str
@@ -81,6 +82,7 @@ class Run:
     checkpoint_freq: int = CHECKPOINT_FREQ
     env_kwargs: dict[str, Any] = dataclasses.field(default_factory=dict)
     gym_packages: tuple[str, ...] = ()
+    measure: int = 0
 
     @functools.cached_property
     def name(self) -> str:
@@ -117,15 +119,21 @@ class Run:
             command += ["--gym-packages", *self.gym_packages]
         if self.env_kwargs:
             command += ["--env-kwargs", *(f"{name}:{value!r}" for name, value in self.env_kwargs.items())]
-        if self.arguments:
-            command += ["-params", *(f"{name}:{value!r}" for name, value in self.arguments.items())]
+        arguments = dict(self.arguments)
+        if self.measure:
+            arguments["callback"] = {"sb3_sample.diagnostics.NoiseScaleCallback": {"every": self.measure}}
+        if arguments:
+            command += ["-params", *(f"{name}:{value!r}" for name, value in arguments.items())]
         return command
 
     def as_json(self) -> dict[str, Any]:
         """
         :return: the run as JSON has it
         """
-        return {**dataclasses.asdict(self), "gym_packages": list(self.gym_packages)}
+        found = {**dataclasses.asdict(self), "gym_packages": list(self.gym_packages)}
+        if not self.measure:
+            del found["measure"]  # as runs were written before there was one
+        return found
 
     @classmethod
     def of_json(cls, found: Any) -> "Run":
@@ -279,11 +287,26 @@ class _Reader:
         freq = CHECKPOINT_FREQ
         if "checkpoint_freq" in entries:
             freq = self._count(entries["checkpoint_freq"].value, "checkpoint_freq")
+        measure = self._count(entries["measure"].value, "measure") if "measure" in entries else 0
         env_kwargs = self._env_kwargs(entries)
         variants = list(self._variants(agents, grid))
+        if measure:
+            self._check_measured(entries["measure"].value, agents)
         runs = tuple(
             Run(
-                agent.name, agent.algo, arguments, point, task, seed, steps, every, episodes, freq, env_kwargs, packages
+                agent.name,
+                agent.algo,
+                arguments,
+                point,
+                task,
+                seed,
+                steps,
+                every,
+                episodes,
+                freq,
+                env_kwargs,
+                packages,
+                measure,
             )
             for seed in seeds
             for task in tasks
@@ -452,6 +475,16 @@ class _Reader:
         except (ValueError, TypeError, AssertionError) as error:
             where = f" with {', '.join(f'{k}={v!r}' for k, v in point.items())} of grid" if point else ""
             raise self._fail(agent.node, f"agent {agent.name!r}{where} cannot be made: {error}") from error
+
+    def _check_measured(self, node: yaml.Node, agents: list[_Agent]) -> None:
+        """The noise scale is of the critics of the off-policy family."""
+        from sb3_sample.sac import SAC
+
+        for agent in agents:
+            if not issubclass(_algorithms()[agent.algo].algorithm, SAC):
+                raise self._fail(
+                    node, f"measure is of off-policy agents, and {agent.name!r} is {agent.algo}: leave it out"
+                )
 
     def _groups(self, entries: Mapping[str, _Entry], tasks: list[str]) -> dict[str, list[str]]:
         if "groups" not in entries:

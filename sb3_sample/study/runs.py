@@ -295,8 +295,8 @@ def _check_same(path: Path, before: Iterable[Run], now: Iterable[Run]) -> None:
             continue
         here = run.as_json()
         free = {"checkpoint_freq", "gym_packages"} | ({"steps"} if run.steps >= there["steps"] else set())
-        for name in here.keys() - free:
-            if here[name] != there[name]:
+        for name in (here.keys() | there.keys()) - free:
+            if here.get(name) != there.get(name):
                 raise StudyError(
                     f"{path} has {run.title}, with {_pair(name, there, here)}. Nothing was changed: run the plan as it "
                     "was, or in another --folder"
@@ -304,4 +304,4 @@ def _check_same(path: Path, before: Iterable[Run], now: Iterable[Run]) -> None:
 
 
 def _pair(name: str, there: dict[str, Any], here: dict[str, Any]) -> str:
-    return f"{name} {there[name]!r:.200}, and the plan now says {here[name]!r:.200}"
+    return f"{name} {there.get(name)!r:.200}, and the plan now says {here.get(name)!r:.200}"
