@@ -39,14 +39,18 @@ class Curve(BaseCallback):
 
     def _on_step(self) -> bool:
         now = self.model.num_timesteps
-        if now % self.args.eval_freq == 0:
-            self.model.policy.set_training_mode(False)
-            mean, _ = evaluate_policy(self.model, self.env, self.args.episodes, deterministic=True)
-            row = (self.args.task, self.seed, now, f"{mean:.2f}", self.args.episodes)
-            updates: Any = self.model
-            with open(self.path, "a", newline="") as file:
-                csv.writer(file).writerow((*row, f"{time.time() - self.start:.0f}", updates._n_updates))
-        return now % 100 != 0 or time.time() < self.end
+        is_over = now % 100 == 0 and time.time() > self.end
+        if now % self.args.eval_freq == 0 or is_over:
+            self.evaluate(now)
+        return not is_over
+
+    def evaluate(self, now: int) -> None:
+        """Write the mean return of some episodes."""
+        mean, _ = evaluate_policy(self.model, self.env, self.args.episodes, deterministic=True)
+        model: Any = self.model
+        row = (self.args.task, self.seed, now, f"{mean:.2f}", self.args.episodes)
+        with open(self.path, "a", newline="") as file:
+            csv.writer(file).writerow((*row, f"{time.time() - self.start:.0f}", model._n_updates))
 
 
 def train(args: argparse.Namespace, seeds: list[int], end: float) -> None:
@@ -80,7 +84,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=3)
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(10)))
     parser.add_argument("--steps", type=int, default=100_000, help="of a learner")
-    parser.add_argument("--eval-freq", type=int, default=12_500)
+    parser.add_argument("--eval-freq", type=int, default=25_000)
     parser.add_argument("--episodes", type=int, default=5)
     parser.add_argument("--model-size", default="0.55M")
     parser.add_argument("--device", default="cuda")
