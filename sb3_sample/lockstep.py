@@ -87,7 +87,7 @@ class Seat:
         self.turn.acquire()
         self.generators = Generators()
         self.group: Group
-        #: The model whose ``learn`` takes part, and its learner.
+        #: The model whose ``learn`` takes part, and its learner, when they are made.
         self.model: Any = None
         self.learner: Any = None
         #: Whether its ``learn`` is under way, from the common beginning on.
@@ -226,8 +226,8 @@ class Group:
     def _make(self, seat: Seat) -> None:
         seat.turn.acquire()
         _HERE.seat = seat
-        seat.generators.put_back()
         try:
+            seat.generators.put_back()
             if self.stop is None and not self.failed:
                 seat.body()
         except BaseException as error:
@@ -235,7 +235,10 @@ class Group:
             if isinstance(error, Exception):
                 self.failed.append(seat)
         seat.at = _ENDED
-        self.leave(seat)
+        try:
+            self.leave(seat)
+        except Exception as error:
+            self.stop = error
         following = self._following()
         if following is None:
             self._over.set()

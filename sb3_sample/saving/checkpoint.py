@@ -160,7 +160,8 @@ class Checkpointer:
             folders = [each.folder for each in group.seats if each.aligned and each.folder is not None]
             group.starts = run_folder.common_starts(folders)
         if self._folder.path in group.starts.paths:
-            return self._folder.go_back_to(group.starts.paths[self._folder.path])
+            path = group.starts.paths[self._folder.path]
+            return path, self._folder.manifest_of(path)
         found = self._folder.newest_good()
         seat.alone = found is not None or group.starts.steps > 0
         return found
@@ -249,6 +250,9 @@ class Checkpointer:
                 if name in state["rings"]:
                     rows = [s for s in segments if s.ring == _file_name(name)]
                     ring.restore(state["rings"][name], self._pieces(rows))
+        if self._seat is not None:
+            # Some of those that are made together may have been a checkpoint ahead.
+            self._folder.go_back_to(model.num_timesteps)
         self._saved_at = self._whole_at = model.num_timesteps
 
     @contextlib.contextmanager

@@ -210,23 +210,27 @@ class RunFolder:
                 except OSError as error:
                     self._warn(f"{self.path / name} is damaged and cannot be renamed ({error})")
 
-    def go_back_to(self, path: Path) -> tuple[Path, dict[str, Any]]:
+    def manifest_of(self, path: Path) -> dict[str, Any]:
         """
-        Go on from a checkpoint that was found to be whole, and not from newer ones, which are removed: the run will
-        come to their steps again.
-
-        :param path: folder of the checkpoint
-        :return: the same, and its manifest
+        :param path: folder of a checkpoint that was found to be whole
+        :return: its manifest
         :raises Damaged: it is not what it was
         :raises OSError: it cannot be read
         """
+        with Folder.at(self.path) as root, root.inside(path.name) as folder:
+            return _read_manifest(folder)
+
+    def go_back_to(self, steps: int) -> None:
+        """
+        Remove checkpoints that are newer than the one that the run goes on from: it will come to their steps again.
+
+        :param steps: environment steps of that one
+        :raises OSError: one cannot be removed
+        """
         with Folder.at(self.path) as root:
-            with root.inside(path.name) as folder:
-                manifest = _read_manifest(folder)
-            for steps, name in _checkpoints(root):
-                if steps > manifest["steps"]:
+            for there, name in _checkpoints(root):
+                if there > steps:
                     self._remove(root, name)
-        return path, manifest
 
     @staticmethod
     def verify(path: Path) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from sb3_sample.learner.execution import Execution
 from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.learner.learner import Learner
-from sb3_sample.lockstep import BEGIN, ENVIRONMENTS, MADE, Joint, Seat, present
+from sb3_sample.lockstep import BEGIN, ENVIRONMENTS, MADE, Joint, Seat, present, seat_of
 
 
 def joint_of(learners: Sequence[Learner]) -> Joint | None:
@@ -112,7 +112,7 @@ def all_made(model: Any) -> None:
     """
     seat = present()
     if seat is not None:
-        seat.learner, seat.aligned = model.learner, _is_aligned(model)
+        seat.model, seat.learner, seat.aligned = model, model.learner, _is_aligned(model)
         seat.meet(MADE)
 
 
@@ -130,8 +130,8 @@ def seated(model: Any) -> Iterator[Seat | None]:
     :param model: the model, set up for ``learn``
     :return: its place; None where it trains alone, or within another training
     """
-    seat = present()
-    if seat is None or seat.model is not None:
+    seat = seat_of(model)
+    if seat is None:
         yield None
         return
     innermost = model.env.unwrapped
@@ -142,15 +142,15 @@ def seated(model: Any) -> Iterator[Seat | None]:
         seat.meet(ENVIRONMENTS)
         return wait()
 
-    seat.model, seat.learner = model, model.learner
     innermost.step_wait = step_wait
     try:
         yield seat
     finally:
         innermost.step_wait = wait
         seat.group.leave(seat)
-        model.learner.make_execution = Execution.of
-        model.learner.forget_execution()
+        if model.learner.make_execution != Execution.of:
+            model.learner.make_execution = Execution.of
+            model.learner.forget_execution()
 
 
 def begin(seat: Seat | None) -> None:

@@ -153,7 +153,7 @@ def alone(name: str) -> list[tuple[dict[str, Any], Noting]]:
     return found
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "DebiasedRQ")) for n in CASES])
 def test_each_learner_is_what_it_is_alone(name: str, joint: Any) -> None:
     cls, arguments, n_envs = CASES[name]
     noting = [Noting() for _ in SEEDS]
@@ -267,9 +267,15 @@ def test_a_model_that_is_trained_within_a_callback() -> None:
                 self.inner = SAC("MlpPolicy", Toy(), seed=0, **TINY_SAC).learn(15)
             return True
 
-    callbacks = [Inner(), Inner()]
-    train_many(SAC, "MlpPolicy", Toy, seeds=(1, 2), total_timesteps=20, callback=lambda i: callbacks[i], **TINY_SAC)
     own = SAC("MlpPolicy", Toy(), seed=0, **TINY_SAC).learn(15)
+    callbacks = [Inner(), Inner()]
+
+    def make(index: int) -> Inner:
+        before = SAC("MlpPolicy", Toy(), seed=0, **TINY_SAC).learn(15)
+        assert same(learned(before), learned(own))
+        return callbacks[index]
+
+    train_many(SAC, "MlpPolicy", Toy, seeds=(1, 2), total_timesteps=20, callback=make, **TINY_SAC)
     for each in callbacks:
         assert same(learned(each.inner), learned(own))
 
@@ -413,8 +419,11 @@ def saved(folder: Path) -> list[list[int]]:
     return [sorted(int(path.name[-12:]) for path in (folder / f"seed-{seed}").glob("checkpoint-*")) for seed in SEEDS]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("index", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("number", "index", "joint"),
+    [(signal.SIGINT, 0, "each its own"), (signal.SIGINT, 1, "together"), (signal.SIGTERM, 2, "together")],
+    indirect=["joint"],
+)
 def test_a_signal_saves_all_at_the_same_step(number: int, index: int, tmp_path: Path, joint: Any, whole: Any) -> None:
     before = signal.getsignal(number)
     expected = KeyboardInterrupt if number == signal.SIGINT else SystemExit
@@ -459,6 +468,7 @@ class First(Signal):
         return True
 
 
+@pytest.mark.parametrize("joint", ["together"], indirect=True)
 def test_runs_of_which_one_has_diverged_go_on(tmp_path: Path, joint: Any, whole: Any) -> None:
     """It has left the others: it goes on from its own checkpoint, to the same end, and holds up nobody."""
     found = []
@@ -479,6 +489,7 @@ def test_runs_of_which_one_has_diverged_go_on(tmp_path: Path, joint: Any, whole:
         assert same(learned(models[i]), whole[i])
 
 
+@pytest.mark.parametrize("joint", ["together"], indirect=True)
 def test_a_failure_has_the_others_save(tmp_path: Path, joint: Any, whole: Any) -> None:
     with pytest.warns(UserWarning, match="has ended by LookupError. The others are saved"), pytest.raises(LookupError):
         trained(tmp_path, lambda i: Raising() if i == 1 else None)
@@ -531,7 +542,8 @@ def test_where_runs_go_on(tmp_path: Path) -> None:
     found = common_starts([x, y, z])
     assert (found.steps, found.paths.keys()) == (80, {x, y})
     run = RunFolder(x)
-    assert run.go_back_to(found.paths[x])[1]["steps"] == 80
+    assert run.manifest_of(found.paths[x])["steps"] == 80
+    run.go_back_to(80)
     run.close()
     assert write(x) == [80]
     # Damaged.

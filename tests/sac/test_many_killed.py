@@ -66,7 +66,7 @@ def train(case: dict[str, Any], folder: str, together: bool, killed: tuple[int, 
     models = train_many(
         getattr(sb3_sample, case["algorithm"]), "MultiInputPolicy" if env == "goal" else "MlpPolicy", makes,
         seeds=SEEDS, total_timesteps=STEPS, checkpoint=folder, checkpoint_freq=EVERY, n_envs=case.get("n_envs", 1),
-        vec_env_cls=Forked if case.get("workers") else None, eval_env=None if case.get("normalize") else makes,
+        vec_env_cls=Forked if case.get("workers") else None, eval_env=makes,
         eval_freq=24, n_eval_episodes=1, **arguments,
     )  # fmt: skip
     found = {}

@@ -14,6 +14,7 @@ pytest.importorskip("rl_zoo3")
 
 from sb3_sample import cli, study
 from sb3_sample.saving.locks import take
+from sb3_sample.study import cluster
 from sb3_sample.study.plan import Plan, Run, read_plan
 from sb3_sample.study.runs import StudyFolder
 from sb3_sample.study.schedule import _batches
@@ -77,10 +78,14 @@ def test_each_run_has_its_own_outcome_output_and_lock(
         assert ("LookupError" in text) == (run.seed == 1)
         assert ("Saving to" in text) == (run.seed != 1)
     monkeypatch.setenv("HOW", "")
+    # As a task of a cluster, which answers to SIGTERM in its own way.
+    before = signal.getsignal(signal.SIGTERM)
     with capfd.disabled():
-        again = attempt_all(folder, group[:2], options, 1)
-    assert [each is not None and each.done for each in again] == [True, True]
-    assert again[0] == first
+        again = cluster.make(str(folder.path), [run.as_json() for run in group[:2]], options, 1)
+    signal.signal(signal.SIGTERM, before)
+    assert [each["done"] for each in again] == [True, True]
+    assert again[0] == first._asdict()
+    assert again[1]["steps_made"] == 50
 
 
 def test_an_estimate_is_of_runs_that_are_made_one_by_one(tmp_path: Path, capsys: Any) -> None:
@@ -91,15 +96,20 @@ def test_an_estimate_is_of_runs_that_are_made_one_by_one(tmp_path: Path, capsys:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("killed", [False, True])
-def test_a_study_of_batches_is_that_of_single_runs(tmp_path: Path, killed: bool) -> None:
+@pytest.mark.parametrize("how", ["undisturbed", "killed", "a task of a cluster"])
+def test_a_study_of_batches_is_that_of_single_runs(tmp_path: Path, how: str) -> None:
+    shared: dict[str, Any] = {"workers": 1, "device": "cpu"}
+    if how == "a task of a cluster":
+        pytest.importorskip("ray")
+        shared["ray"] = "local"
     (tmp_path / "plan.yml").write_text(PLAN)
     plan = read_plan(tmp_path / "plan.yml")
     study.run(plan, tmp_path / "single", workers=1, device="cpu")
-    if killed:
+    if how == "killed":
         threading.Thread(target=_kill, args=(tmp_path / "together",), daemon=True).start()
-    found = study.run(plan, tmp_path / "together", workers=1, device="cpu", batch_seeds=True)
+    found = study.run(plan, tmp_path / "together", batch_seeds=True, **shared)
     assert found.counts["done"] == 2
+    assert [each.outcome.attempts for each in found.runs] == [int(how == "killed")] * 2
     hosts = {(tmp_path / f"together/state/SAC/Pendulum-v1/{seed}.lock").read_text() for seed in (3, 4)}
     assert len(hosts) == 1
     for seed in (3, 4):
