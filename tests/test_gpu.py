@@ -4,6 +4,7 @@ What holds on a CPU holds on a GPU: the same numbers, captured and compiled as w
     pytest -m gpu            (make gpu)
 """
 
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import torch
 from sb3_sample import BRO, SAC, train_many
 from sb3_sample.faults import TrainingDiverged
 from sb3_sample.learner.batch import Batch, Extra, Noise
-from sb3_sample.learner.execution import Captured, Execution, cuda_graph, inputs_like, old_torch, why_not_compiled
+from sb3_sample.learner.execution import Captured, inputs_like, old_torch, why_not_compiled
 from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.learner.pessimism import LearnedPessimism
 from tests.learner.test_group import REFUSED, together
@@ -116,38 +117,13 @@ def test_golden(name: str, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     golden.replay(golden.OWN_FOLDER / f"{name}.npz", how)
 
 
-class _Count:
-    n_repetitions = 0
-
-
-def _captured(model: Any, warm_up: int = 3) -> Any:
-    """The test's recorder, with a graph in its place."""
-    count = _Count()
-
-    def record(run: Any) -> Any:
-        repeat, result = cuda_graph(run)
-
-        def counted() -> None:
-            count.n_repetitions += 1
-            repeat()
-
-        return counted, result
-
-    # Libraries set themselves up in steps that are taken back.
-    saved = {name: value.clone() for name, value in model.learner.networks.state_dict().items()}
+def _captured(model: Any, warm_up: int = 3) -> None:
+    """In the place of the test's recorder: steps are captured by graphs, after three that are run as they are."""
     learner = model.learner
-    model.learner._execution = Execution(learner, False, False, record)
-    take(model, 2)
-    learner.networks.load_state_dict(saved)
-    for optimizer in learner.optimizers().values():
-        optimizer.state.clear()
-    learner.restart(learner.temperature, learner._make_temperature(learner))
-    learner.restart(learner.pessimism_rule, learner.make_pessimism())
-    learner.restart(learner.explorer, learner.make_explorer())
-    learner._counts._n_updates = 0
-    learner._execution = Execution(learner, False, False, record)
-    learner._execution._captured.WARM_UP = warm_up
-    return count
+    model.compile = learner.compile = True
+    model.compiled = False
+    learner.forget_execution()
+    assert learner.prepared_execution()._captured is not None
 
 
 @pytest.mark.parametrize("maker", ["SAC", "BRO", "DAC", "VPLSAC", "SimbaV2", "FlashSAC"])
@@ -180,6 +156,28 @@ def test_compiled_groups() -> None:
     assert group.compiled and group.seconds_compiling > 0
     for ours, theirs in zip(here, there, strict=True):
         assert largest_difference(ours, theirs) < TOLERANCE
+
+
+def test_groups_go_on_after_resets() -> None:
+    """Weights are drawn anew in place, and moments are cleared, which moves them."""
+    drawing = threading.Lock()
+
+    def train(model: Any) -> None:
+        take(model, 12)
+        with drawing:
+            torch.manual_seed(model.seed)
+            model.learner.reinitialize()
+        take(model, 12)
+
+    here, there = ([model_on("cuda", "BRO", how, seed=seed) for seed in range(2)] for how in ("eager", "captured"))
+    for model in here:
+        train(model)
+    group = LearnerGroup([model.learner for model in there])
+    together(group.learners, lambda i: train(there[i]), group)
+    assert group._execution is not None and group._execution._captured is not None
+    for ours, theirs in zip(here, there, strict=True):
+        assert largest_difference(ours, theirs) < 10 * TOLERANCE
+    assert largest_difference(*there) > 1e-2
 
 
 def test_resets_and_schedules_under_capture() -> None:

@@ -23,7 +23,7 @@ from sb3_sample.tracing import compile_graph, trace, undone
 #: thousand steps (docs/performance.md). A number of steps, not a measurement, so that a seed fixes the whole run.
 PAYS_FROM = 20_000
 #: The first torch that a gradient step is compiled with.
-COMPILES_FROM = (2, 8)
+COMPILES_FROM = (2, 11)
 
 Metrics = dict[str, torch.Tensor]
 #: Runs a function without its effects taking place, and gives back what repeats them, and its result, whose tensors

@@ -194,14 +194,35 @@ def test_numbers_may_differ(maker: str, arguments: dict[str, Sequence[Any]]) -> 
     assert differences(alone[0], alone[1])[0] > 1e-4
 
 
-def test_resets_clear_moments_in_a_group() -> None:
-    alone, others = (models_of("BRO", 2, reset_gradient_steps=20) for _ in range(2))
+@pytest.mark.parametrize("how", ["eager", "captured", pytest.param("compiled", marks=[COMPILES, pytest.mark.slow])])
+def test_groups_go_on_after_resets(how: str) -> None:
+    """Weights are drawn anew in place, and moments are cleared, which moves them."""
+    alone, others = models_of("BRO", 2), models_of("BRO", 2)
+    drawing = threading.Lock()
+
+    def train(model: Any) -> None:
+        take(model, 12)
+        with drawing:
+            torch.manual_seed(model.seed)
+            model.learner.reinitialize()
+        take(model, 12)
+
     for model in alone:
-        take(model, 50)
-    together([model.learner for model in others], lambda i: take(others[i], 50))
-    assert [model.plasticity.n_done for model in (*alone, *others)] == [2] * 4
-    # Fresh networks are drawn from generators that the threads share.
-    assert all(int(s["step"]) == 10 for m in others for s in m.critic.optimizer.state.values())
+        train(model)
+    learners = [model.learner for model in others]
+    for learner in learners:
+        learner.compiled = how == "compiled"
+    group = LearnerGroup(learners)
+    if how == "captured":
+        group._execution = Execution(group, False, False, GroupRecorder(group), "mapped_step")
+    together(learners, lambda i: train(others[i]), group)
+    if how == "captured":
+        assert group._execution._captured._recorder.n_recordings == 2
+    for a, b in zip(alone, others, strict=True):
+        # The second twelve updates begin with those on which the gradients of a fresh network are large.
+        assert differences(a, b)[0] < 10 * TOLERANCE
+        assert all(int(state["step"]) == 12 for state in b.critic.optimizer.state.values())
+    assert differences(*others)[0] > 1e-2
 
 
 @pytest.mark.parametrize(

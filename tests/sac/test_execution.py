@@ -444,7 +444,7 @@ def test_without_a_compiler_training_goes_on_uncompiled(compile: Any, monkeypatc
 
 
 @pytest.mark.parametrize("compile", [True, "auto"])
-@pytest.mark.parametrize("version", ["2.11.0+cu130", "2.4.1", "1.13.1"])
+@pytest.mark.parametrize("version", ["2.10.0+cu130", "2.4.1", "1.13.1"])
 def test_an_old_torch_is_told_of_once(compile: Any, version: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over several models, calls of ``learn`` and a file that says to go on compiled; and the numbers are eager's."""
     monkeypatch.setattr(update_schedule, "PAYS_FROM", 5)
@@ -466,15 +466,15 @@ def test_an_old_torch_is_told_of_once(compile: Any, version: str, monkeypatch: p
         models[3].learn(30)
     said = [str(w.message) for w in caught if "not compiled" in str(w.message)]
     assert said == [
-        f"The gradient step is not compiled: that needs torch 2.13 or newer, and this is {version}. It is run eagerly, "
+        f"The gradient step is not compiled: that needs torch 2.11 or newer, and this is {version}. It is run eagerly, "
         "on a GPU captured"
     ]
     assert not any(model.compiled or model.learner._execution.compiled for model in models)
     assert not differing(state(models[0]), state(eager))
 
 
-@pytest.mark.parametrize(("version", "old"), [("2.13.0", False), ("2.13.0a0+git1234", False), ("2.14.1+cpu", False),
-                                              ("3.0.0", False), ("2.12.1", True), ("2.4", True)])  # fmt: skip
+@pytest.mark.parametrize(("version", "old"), [("2.11.0", False), ("2.11.0a0+git1234", False), ("2.14.1+cpu", False),
+                                              ("3.0.0", False), ("2.10.1", True), ("2.4", True)])  # fmt: skip
 def test_which_torch_is_old(version: str, old: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "__version__", version)
     assert (old_torch() is not None) is old
