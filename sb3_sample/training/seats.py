@@ -21,6 +21,7 @@ def joint_of(learners: Sequence[Learner]) -> Joint | None:
     :return: what takes one step of each at once; None where each takes its own, one after the other
     :raises ValueError: if something of theirs cannot be batched, or differs that must not; the message names it
     """
+    # On a CPU as many processes as cores are faster (docs/many_learners.md).
     return LearnerGroup(learners) if learners[0].device.type == "cuda" else None
 
 
