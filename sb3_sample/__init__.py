@@ -7,14 +7,33 @@ from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
 from sb3_sample.replay.dataset import Dataset
-from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
+from sb3_sample.replay.recording import record
+from sb3_sample.sac import (
+    BC,
+    BRO,
+    BROTD3,
+    DAC,
+    GPLSAC,
+    IQL,
+    OAC,
+    OPLSAC,
+    SAC,
+    SRSAC,
+    TD3BC,
+    TOPSAC,
+    VPLSAC,
+    BROFast,
+    RegularizedSAC,
+)
 from sb3_sample.version import __version__
 
 __all__ = [
+    "BC",
     "BRO",
     "BROTD3",
     "DAC",
     "GPLSAC",
+    "IQL",
     "MBMAPPO",
     "MBPOPPO",
     "OAC",
@@ -22,6 +41,7 @@ __all__ = [
     "QMAPPO",
     "SAC",
     "SRSAC",
+    "TD3BC",
     "TOPSAC",
     "VPLSAC",
     "BROFast",
@@ -36,4 +56,5 @@ __all__ = [
     "TrainingDiverged",
     "__version__",
     "make_env",
+    "record",
 ]

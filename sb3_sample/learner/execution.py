@@ -396,14 +396,15 @@ def _modules(learner: Any) -> tuple[Any, ...]:
     """Identities of the objects that a compiled or captured step was made for."""
     critics = (learner.critic, learner.critic.trunk, learner.critic_target, learner.critic_target.trunk)
     networks = (learner.actor, learner.actor.trunk, *critics, learner.temperature)
-    parts = (learner.explorer, learner.pessimism_rule, *learner.optimizers().values())
+    parts = (learner.explorer, learner.pessimism_rule, learner.objective, *learner.optimizers().values())
     groups = [len(group["params"]) for optimizer in learner.optimizers().values() for group in optimizer.param_groups]
     return (*map(id, (*networks, *parts, learner.head)), *groups)
 
 
 def _places(learner: Any) -> tuple[int, ...]:
     """Addresses of all tensors that a gradient step reads or writes, without its inputs."""
-    modules = (learner.networks, learner.head, learner.temperature, learner.explorer, learner.pessimism_rule)
+    parts = (learner.explorer, learner.pessimism_rule, learner.objective)
+    modules = (learner.networks, learner.head, learner.temperature, *parts)
     tensors = [t for module in modules for t in (*module.parameters(), *module.buffers())]
     for optimizer in learner.optimizers().values():
         tensors += [t for state in optimizer.state.values() for t in state.values() if isinstance(t, torch.Tensor)]
@@ -423,7 +424,7 @@ def _settings(learner: Any) -> list[Any]:
     def plain(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
         return {name: value for name, value in values if isinstance(value, (int, float, str, type(None)))}
 
-    roots = (learner.networks, learner.head, learner.explorer, learner.pessimism_rule)
+    roots = (learner.networks, learner.head, learner.explorer, learner.pessimism_rule, learner.objective)
     modules = [module for root in roots for module in root.modules()]
     settings: list[Any] = []
     for owner in (learner, *modules):

@@ -18,10 +18,12 @@ from sb3_sample.learner.batch import Batch, CriticStep, Extra, Noise
 from sb3_sample.learner.execution import Execution
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
+from sb3_sample.learner.objectives import Objective
 from sb3_sample.learner.observations import Observations
 from sb3_sample.learner.parts import Part, logged
 from sb3_sample.learner.pessimism import Pessimism, pessimistic_value
 from sb3_sample.learner.plasticity import ReDo, Resets
+from sb3_sample.learner.q_values import evaluate
 from sb3_sample.learner.randomness import OwnGenerators
 from sb3_sample.learner.scalars import FixedScalar, LogScalar
 from sb3_sample.learner.target import next_step, online_outputs, step_outputs, values
@@ -55,6 +57,7 @@ class Learner:
     :param plasticity: resets of networks, optimizers and learned numbers
     :param redo: recycling of dormant neurons; None for none
     :param make_transforms: each makes a batch transform for the learner, applied in this order
+    :param make_objective: makes a freshly initialised objective for the learner; None for that of soft actor-critic
     :param learning_rate: of actor, critics and temperature, at the start
     :param temperature_beta1: beta1 of the temperature's Adam
     :param gamma: discount factor of batches that have none of their own
@@ -94,6 +97,7 @@ class Learner:
         plasticity: Resets,
         redo: ReDo | None = None,
         make_transforms: Sequence[Callable[[Any], BatchTransform]] = (),
+        make_objective: Callable[[Any], Objective] | None = None,
         learning_rate: float = 3e-4,
         temperature_beta1: float = 0.9,
         gamma: float = 0.99,
@@ -114,6 +118,7 @@ class Learner:
     ):
         self._make_networks, self._make_temperature = make_networks, make_temperature
         self._make_pessimism, self._make_explorer = make_pessimism, make_explorer
+        self._make_objective = make_objective or (lambda learner: Objective())
         self.device, self.verbose, self.learning_rate = torch.device(device), verbose, learning_rate
         self.gamma, self.tau = gamma, tau
         self.target_update_interval, self.policy_delay = target_update_interval, policy_delay
@@ -128,6 +133,7 @@ class Learner:
             self.pessimism_rule = self.make_pessimism()
             self.explorer = self.make_explorer()
             self.transforms: Any = nn.ModuleList(make(self).to(self.device) for make in make_transforms)
+            self.objective = self._make_objective(self)
         self.plasticity, self.redo = plasticity, redo
         if redo is not None:
             redo.check(self)
@@ -214,6 +220,14 @@ class Learner:
         """
         return self.networks.make_actor()
 
+    def make_value(self) -> Any:
+        """
+        Make a value network.
+
+        :return: a network of the critics' kind that judges observations alone, (B, O) to (B, 1)
+        """
+        return self.networks.make_value()
+
     def make_optimizer(self, parameters: Iterable[nn.Parameter]) -> Optimizer:
         """
         Make an optimizer.
@@ -255,6 +269,7 @@ class Learner:
             "plasticity": self.plasticity,
         }
         parts |= {} if self.redo is None else {"redo": self.redo}
+        parts |= {"objective": self.objective} if self.objective.has_state else {}
         return parts | {f"transforms.{i}": transform for i, transform in enumerate(self.transforms)}
 
     def optimizers(self) -> dict[str, Optimizer]:
@@ -457,31 +472,37 @@ class Learner:
         :return: what to log, by name, scalars
         """
         alpha = self.temperature()
+        metrics, prepared = self.objective.prepare(self, batch)
+        step: CriticStep | None = None
 
-        # Critics, towards the targets' value of the actor's next action.
-        next_actions, entropy_bonus = next_step(self, batch, alpha, noise.critic)
-        q, next_q = step_outputs(self, batch, next_actions, noise.subset)
-        with torch.no_grad():
-            target = self.head.target(batch, next_q, self.pessimism_rule.value, entropy_bonus)
-        critic_loss = self.head.loss(q, target)
-        if self.sam_radius is None:
-            self.minimize(self.critic.optimizer, critic_loss)
-        else:
-            self._sharpness_aware_step(critic_loss, batch, next_actions, target)
-        self.critic.trunk.project()
-        q = self.head.values(q)
-        metrics = {"train/critic_loss": critic_loss, "train/q_mean": q.mean()}
+        if self.objective.learns_critics:
+            # Critics, towards the targets' value of the actor's next action, unless the objective has another target.
+            if prepared.target is None:
+                next_actions, entropy_bonus = next_step(self, batch, alpha, noise.critic)
+                q, next_q = step_outputs(self, batch, next_actions, noise.subset)
+                with torch.no_grad():
+                    target = self.head.target(batch, next_q, self.pessimism_rule.value, entropy_bonus)
+            else:
+                q, target = evaluate(self.critic, batch.observations, batch.actions), prepared.target
+            critic_loss = self.head.loss(q, target)
+            if self.sam_radius is None:
+                self.minimize(self.critic.optimizer, critic_loss)
+            else:
+                self._sharpness_aware_step(critic_loss, batch, next_actions, target)
+            self.critic.trunk.project()
+            q = self.head.values(q)
+            metrics.update({"train/critic_loss": critic_loss, "train/q_mean": q.mean()})
+            if prepared.target is None:
+                step = CriticStep(q.detach(), self.head.values(next_q), entropy_bonus, noise.subset)
 
-        # Targets, by Polyak averaging.
-        if moves_targets:
-            self._follow(self.critic_target, self.critic)
+            # Targets, by Polyak averaging.
+            if moves_targets:
+                self._follow(self.critic_target, self.critic)
 
         if moves_actor:
             # Actor, on the new critics, and on their new encoder if it is shared.
             observations = self.encoded(batch.observations)
-            actions, log_prob = self.actor.sample(observations, noise.actor)
-            value = self._actor_value(values(self, self.critic, observations, actions))
-            actor_loss = losses.actor_loss(log_prob, value, alpha.detach())
+            actor_loss, log_prob = self.objective.actor_loss(self, batch, observations, alpha, noise.actor, prepared)
             self.minimize(self.actor.optimizer, actor_loss)
             self.actor.trunk.project()
             metrics["train/actor_loss"] = actor_loss
@@ -492,7 +513,7 @@ class Learner:
             metrics.update(logged(self.explorer, "update", self.explorer.update(self, batch, noise.exploration)))
 
             # Temperature.
-            if self.actor.has_entropy:
+            if self.actor.has_entropy and log_prob is not None:
                 entropy = -log_prob.detach().mean()
                 metrics.update({"train/entropy": entropy, "train/ent_coef": alpha})
                 if self.temperature_optimizer is not None:
@@ -501,13 +522,18 @@ class Learner:
                     metrics["train/ent_coef_loss"] = temperature_loss
 
         # Pessimism.
-        step = CriticStep(q.detach(), self.head.values(next_q), entropy_bonus, noise.subset)
-        rule = self.pessimism_rule
-        metrics.update(logged(rule, "update", rule.update(self, batch, step, noise.pessimism, extra)))
+        if step is not None:
+            rule = self.pessimism_rule
+            metrics.update(logged(rule, "update", rule.update(self, batch, step, noise.pessimism, extra)))
         return {name: value.detach() for name, value in metrics.items()}
 
-    def _actor_value(self, q: torch.Tensor) -> torch.Tensor:
-        """Value of the ensemble in the actor's objective, (E, B, K) to (B, K)."""
+    def actor_value(self, q: torch.Tensor) -> torch.Tensor:
+        """
+        Value of the ensemble in the actor's objective.
+
+        :param q: (E, B, K)
+        :return: (B, K)
+        """
         if self.actor_pessimism is None:
             return self.pessimism_rule.value(q)
         return pessimistic_value(q, float(self.actor_pessimism))
@@ -618,6 +644,7 @@ class Learner:
         # The explorer's start may depend on the pessimism in force.
         self.restart(self.pessimism_rule, self.make_pessimism(), shrink)
         self.restart(self.explorer, self.make_explorer(), shrink)
+        self.restart(self.objective, self._make_objective(self), shrink)
         for optimizer in self.optimizers().values():
             optimizer.state.clear()
 

@@ -23,6 +23,8 @@ from sb3_sample.sac.trunks import keep_at_rest, make_trunk
 
 # The log standard deviation is squashed into this interval by a tanh.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
+#: Where the likelihood of an action on a bound is taken (IQL's published code clips the data there).
+LARGEST_ACTION = 1 - 1e-5
 
 
 class Actor(BasePolicy):
@@ -138,6 +140,18 @@ class Actor(BasePolicy):
         noise = torch.randn_like(mean) if noise is None else noise
         x = mean + log_std.exp() * noise
         return torch.tanh(x), tanh_gaussian_log_prob(x, noise, log_std)
+
+    def log_prob_of(self, obs: PyTorchObs | Encoded, actions: torch.Tensor) -> torch.Tensor:
+        """
+        Log-probability of given actions.
+
+        :param obs: observations, (B, O), or a dict of them, or their features
+        :param actions: in [-1, 1], (B, A); on a bound, where it is infinite, it is taken a little inside
+        :return: (B, 1)
+        """
+        mean, log_std = self.gaussian(self.features(obs))
+        x = torch.atanh(actions.clamp(-LARGEST_ACTION, LARGEST_ACTION))
+        return tanh_gaussian_log_prob(x, (x - mean) / log_std.exp(), log_std)
 
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
         """
@@ -258,6 +272,12 @@ class DeterministicActor(Actor):
     def action_log_prob(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor]:
         """
         :raises AttributeError: always; as with Stable-Baselines3's TD3, there is no distribution
+        """
+        raise AttributeError("a deterministic actor (backbone='td3') has no distribution of its actions")
+
+    def log_prob_of(self, obs: PyTorchObs | Encoded, actions: torch.Tensor) -> torch.Tensor:
+        """
+        :raises AttributeError: always; there is no distribution
         """
         raise AttributeError("a deterministic actor (backbone='td3') has no distribution of its actions")
 

@@ -126,3 +126,44 @@ class CriticEnsemble(BaseModel):
         :return: the parameters that each critic has a copy of, (E, ...) each: all but the features extractor's
         """
         return [*self.trunk.parameters(), *self.head.parameters()]
+
+
+class ValueNetwork(BaseModel):
+    """
+    Value of observations alone, by a network of the critics' kind.
+
+    :param observation_space: observation space
+    :param action_space: action space
+    :param network: class of the trunk
+    :param network_kwargs: its arguments
+    :param features_extractor: extractor of the observation's features
+    :param normalize_images: whether images are divided by 255
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        network: type[Network],
+        network_kwargs: dict[str, Any],
+        features_extractor: BaseFeaturesExtractor,
+        normalize_images: bool = True,
+    ):
+        super().__init__(
+            observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
+        )
+        self._network_args = {"network": network, "network_kwargs": network_kwargs}
+        self.trunk = make_trunk("critic_network", network, features_extractor.features_dim, network_kwargs)
+        self.head = linear(self.trunk.out_features, 1, None)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = {**self._network_args, "features_extractor": self.features_extractor}
+        return {**super()._get_constructor_parameters(), **own}
+
+    def forward(self, obs: PyTorchObs) -> torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them
+        :return: their value, (B, 1)
+        """
+        assert isinstance(self.features_extractor, BaseFeaturesExtractor)
+        return self.head(self.trunk(self.extract_features(obs, self.features_extractor)))

@@ -16,6 +16,7 @@ from sb3_sample.kinds import check_value, chosen, integer
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
 from sb3_sample.learner.heads import QuantileHead, ValueHead
 from sb3_sample.learner.learner import Counts, Learner
+from sb3_sample.learner.objectives import Objective
 from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
 from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.randomness import OwnGenerators
@@ -156,6 +157,8 @@ class HasLearner:
     """resets"""
     redo = OfLearner[ReDo | None]()
     """recycling of dormant neurons; None for none"""
+    objective = OfLearner[Objective]()
+    """what actor and critics learn from a batch"""
     head = OfLearner[nn.Module]()
     """value head of the critics"""
     transforms = OfLearner[nn.ModuleList]()
@@ -182,6 +185,7 @@ class HasLearner:
             plasticity=Resets(self.resets, self.reset_shrink, self.reset_gradient_steps),
             redo=None if self.redo_period is None else ReDo(self.redo_period, self.redo_threshold),
             make_transforms=[functools.partial(_make_transform, *each) for each in enumerate(self.batch_transforms)],
+            make_objective=self.make_objective,
             learning_rate=self.lr_schedule(1),
             temperature_beta1=self.temperature_beta1,
             target_entropy=self._target_entropy,
@@ -282,6 +286,13 @@ class HasLearner:
         make = chosen("pessimism", self.pessimism, PESSIMISMS, Pessimism)
         kwargs = self._full_pessimism_kwargs()
         return own_classes.make("pessimism", self.pessimism, make, Pessimism, learner, kwargs=kwargs)  # type: ignore[no-any-return]
+
+    def make_objective(self: Any, learner: Learner) -> Objective:
+        """
+        :param learner: whose it is
+        :return: a freshly initialised objective
+        """
+        return Objective()
 
     def _optimizers(self: Any) -> dict[str, torch.optim.Optimizer]:
         """Every optimizer by its path from the algorithm."""

@@ -25,7 +25,7 @@ from sb3_sample.networks import Network
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.optim import AdamW
 from sb3_sample.sac.actors import BACKBONES, Actor, DeterministicActor
-from sb3_sample.sac.critics import CriticEnsemble
+from sb3_sample.sac.critics import CriticEnsemble, ValueNetwork
 from sb3_sample.sac.trunks import network_args
 
 
@@ -134,6 +134,7 @@ class SACPolicy(BasePolicy):
             if name not in allowed:
                 raise ValueError(f"actor_kwargs has {name!r}, but backbone={backbone!r} takes {allowed or 'none'}")
         self._actor_class, self._actor_args = BACKBONES[backbone], (actor_args, actor_kwargs)
+        self._critic_args = critic_args
         self.share_features_extractor = share_features_extractor
         if share_features_extractor:
             self.critic = critics()
@@ -193,6 +194,18 @@ class SACPolicy(BasePolicy):
             normalize_images=self.normalize_images,
             shares_encoder=shared,
             **kwargs,
+        )
+
+    def make_value(self) -> ValueNetwork:
+        """
+        :return: a value network with the critics' settings, a features extractor of its own included
+        """
+        return ValueNetwork(
+            self.observation_space,
+            self.action_space,
+            *self._critic_args,
+            features_extractor=self.make_features_extractor(),
+            normalize_images=self.normalize_images,
         )
 
     def make_optimizer(self, parameters: Any, learning_rate: float, **kwargs: Any) -> torch.optim.Optimizer:

@@ -144,21 +144,22 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
         progress_bar: bool,
         checkpoint: str | pathlib.Path | None,
         checkpoint_freq: int,
+        learns_from: str = "",
     ) -> Self:
         """
         Train. The arguments are those of ``learn``, by the same names, since callbacks read them in its variables.
+
+        :param learns_from: what is learned from instead of the environment, which is left alone; empty for the
+            environment
         """
         total_timesteps = check_learn(self, locals())
         refuse_second_call(self, checkpoint)
-        resets_environment = reset_num_timesteps or self._last_obs is None
-        total_timesteps, callback = self._setup_learn(
+        total_timesteps, callback = self._set_up_training(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
-        if resets_environment:
-            self._on_environment_reset()
         self._before_training()
         say_once(self, self._described(), stacklevel=4)
-        with Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
+        with Checkpointer(self, callback, checkpoint, checkpoint_freq, learns_from) as checkpointer:
             checkpointer.resume(total_timesteps)
             self._before_turns()
             callback.on_training_start(locals(), globals())
@@ -172,6 +173,20 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
             check_finite_parameters(self)
             checkpointer.finish()
         return self
+
+    def _set_up_training(
+        self, total_timesteps: int, callback: MaybeCallback, reset_num_timesteps: bool, name: str, progress_bar: bool
+    ) -> tuple[int, BaseCallback]:
+        """
+        Set counters, log and callbacks up, and reset the environments where Stable-Baselines3 does.
+
+        :return: steps at the end of the training, and the callback
+        """
+        resets_environment = reset_num_timesteps or self._last_obs is None
+        set_up = self._setup_learn(total_timesteps, callback, reset_num_timesteps, name, progress_bar)
+        if resets_environment:
+            self._on_environment_reset()
+        return set_up
 
     def _described(self) -> Lenient:
         """
