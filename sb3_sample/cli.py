@@ -1,6 +1,6 @@
 """
-The command ``sb3-sample``: the zoo's commands with the algorithms of this package in them, ``plot``, ``study`` and
-``variance``.
+The command ``sb3-sample``: the zoo's commands with the algorithms of this package in them, ``plot``, ``study``,
+``dataset`` and ``variance``.
 """
 
 import argparse
@@ -229,12 +229,19 @@ def _study(arguments: list[str]) -> None:
         raise
 
 
+def _dataset(arguments: list[str]) -> None:
+    from sb3_sample.dataset_command import main as dataset
+
+    dataset(arguments)
+
+
 COMMANDS: dict[str, Command] = {
     "train": Command(_train, "train an agent, or search for hyperparameters"),
     "enjoy": Command(_enjoy, "run a trained agent"),
     "record_video": Command(_record_video, "write a video of a trained agent"),
     "plot": Command(_plot, "draw the runs of a task, mean and range over seeds, beside the published curves"),
     "study": Command(_study, "make the runs of a plan: agents, tasks, seeds and a grid of arguments"),
+    "dataset": Command(_dataset, "record, show and convert data sets for offline learning"),
     "variance": Command(_variance, "measure a policy gradient's variance: more actions or a longer trajectory?"),
     "plot_train": Command(_zoo_plot("plot_train"), "draw the return of the training episodes"),
     "all_plots": Command(_zoo_plot("all_plots"), "draw and tabulate the evaluations of several runs"),

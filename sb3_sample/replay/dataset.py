@@ -315,17 +315,23 @@ class Dataset:
             and the further columns by name, arrays
         """
         steps = self._steps
-        at = steps.at[rows]
         found = {
-            "observations": _take(steps.observations, at),
-            "actions": steps.actions[rows],
-            "rewards": steps.rewards[rows],
-            "terminations": steps.terminations[rows],
-            "truncations": steps.truncations[rows],
+            "observations": _take(steps.observations, steps.at[rows]),
+            **self.plain(rows),
             "next_observations": self._next_observations(rows),
             **_take(steps.columns, rows),
         }
         return {name: for_each(_numpy, values) for name, values in found.items()}
+
+    def plain(self, rows: slice | np.ndarray) -> dict[str, np.ndarray]:
+        """
+        Read transitions without their observations.
+
+        :param rows: which of them
+        :return: ``actions``, ``rewards``, ``terminations``, ``truncations``
+        """
+        names = ("actions", "rewards", "terminations", "truncations")
+        return {name: _numpy(getattr(self._steps, name)[rows]) for name in names}
 
     def episodes(self) -> Iterator[slice]:
         """

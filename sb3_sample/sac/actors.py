@@ -14,7 +14,7 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, check_value
+from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, check_value, number
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
 from sb3_sample.networks import Network, linear
@@ -23,6 +23,9 @@ from sb3_sample.sac.trunks import keep_at_rest, make_trunk
 
 # The log standard deviation is squashed into this interval by a tanh.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
+INITIAL_STD = number(
+    "lie between e^-10 and e^2", lambda value: value > 0 and LOG_STD_MIN < math.log(value) < LOG_STD_MAX
+)
 #: Where the likelihood of an action on a bound is taken (IQL's published code clips the data there).
 LARGEST_ACTION = 1 - 1e-5
 
@@ -39,6 +42,9 @@ class Actor(BasePolicy):
     :param features_extractor: extractor of the observation's features
     :param normalize_images: whether images are divided by 255
     :param shares_encoder: whether the extractor is the critics', whose features are read without gradient
+    :param initial_std: standard deviation before the squashing at the start, about; None: that of the published code,
+        e^-4. A likelihood of given actions starts from a wide one, lest its first gradients be thousands
+    :raises ValueError: if ``initial_std`` is out of range
     """
 
     action_space: spaces.Box
@@ -57,6 +63,7 @@ class Actor(BasePolicy):
         features_extractor: BaseFeaturesExtractor,
         normalize_images: bool = True,
         shares_encoder: bool = False,
+        initial_std: float | None = None,
     ):
         super().__init__(
             observation_space,
@@ -65,15 +72,22 @@ class Actor(BasePolicy):
             normalize_images=normalize_images,
             squash_output=True,
         )
+        check_value("initial_std", initial_std, INITIAL_STD.or_none())
         self.shares_encoder = shares_encoder
         if shares_encoder:
             self.share(features_extractor)
-        self._network_args = {"network": network, "network_kwargs": network_kwargs}
+        self._network_args: dict[str, Any] = {"network": network, "network_kwargs": network_kwargs}
         self.features_dim = features_extractor.features_dim
         self.action_dim = get_action_dim(action_space)
         self.trunk = make_trunk("actor_network", network, self.features_dim, network_kwargs)
         self.mean = linear(self.trunk.out_features, self.action_dim, None)
         self.log_std = linear(self.trunk.out_features, self.action_dim, None, gain=1.0)
+        if initial_std is not None:
+            self._network_args["initial_std"] = initial_std
+            half_range = (LOG_STD_MAX - LOG_STD_MIN) / 2
+            # Nearly the same for all observations, whatever their size.
+            self.log_std.weight.data.mul_(0.01)
+            nn.init.constant_(self.log_std.bias, math.atanh((math.log(initial_std) - LOG_STD_MIN) / half_range - 1))
         #: Stable-Baselines3's distribution of the actions, for its own use: nothing here reads it.
         self.action_dist = SquashedDiagGaussianDistribution(self.action_dim)
         keep_at_rest(self)

@@ -54,7 +54,7 @@ class BC(SAC):
             kwargs["critic_network_kwargs"] = {"hidden_sizes": (1,)}
         elif isinstance(arch, (list, tuple)):
             kwargs["net_arch"] = {"pi": list(arch), "qf": [1]}
-        return kwargs
+        return kwargs if self.deterministic else _starting_wide(kwargs)
 
     def _make_temperature(self, learner: Learner) -> LogScalar | FixedScalar:
         return FixedScalar(0.0).to(self.device)
@@ -102,6 +102,9 @@ class IQL(SAC):
         if self.policy_kwargs.get("share_features_extractor"):
             raise ValueError("share_features_extractor=True is not supported by IQL: its value network needs its own")
 
+    def _full_policy_kwargs(self) -> dict[str, Any]:
+        return _starting_wide(super()._full_policy_kwargs())
+
     def _make_temperature(self, learner: Learner) -> LogScalar | FixedScalar:
         return FixedScalar(0.0).to(self.device)
 
@@ -142,6 +145,11 @@ class TD3BC(SAC):
 
     def make_objective(self, learner: Learner) -> Objective:
         return ClonedValue(self.alpha)
+
+
+def _starting_wide(kwargs: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of a policy whose actor learns by the likelihood of actions, from a standard deviation of 1."""
+    return {**kwargs, "actor_kwargs": {"initial_std": 1.0, **(kwargs.get("actor_kwargs") or {})}}
 
 
 def _check_no_entropy(agent: SAC) -> None:

@@ -51,7 +51,7 @@ class SACPolicy(BasePolicy):
     :param normalize_images: whether images are divided by 255
     :param backbone: "sac" for a tanh-Gaussian actor, "td3" for a deterministic one with a target actor
     :param actor_kwargs: arguments of the actor: with "td3" ``exploration_noise``, ``target_noise``,
-        ``target_noise_clip``
+        ``target_noise_clip``; with "sac" ``initial_std``
     :param optimizer_class: optimizer of actor and critics
     :param optimizer_kwargs: its arguments, but for the learning rate
     :param critic_optimizer_kwargs: arguments of the critics' optimizer alone, over ``optimizer_kwargs``
@@ -129,10 +129,11 @@ class SACPolicy(BasePolicy):
         check_value("actor_kwargs", actor_kwargs, DICT)
         check_value("critic_optimizer_kwargs", critic_optimizer_kwargs, DICT)
         actor_kwargs = dict(actor_kwargs or {})
-        allowed = ("exploration_noise", "target_noise", "target_noise_clip") if backbone == "td3" else ()
+        of_backbone = {"td3": ("exploration_noise", "target_noise", "target_noise_clip")}
+        allowed = of_backbone.get(backbone, ("initial_std",))
         for name in actor_kwargs:
             if name not in allowed:
-                raise ValueError(f"actor_kwargs has {name!r}, but backbone={backbone!r} takes {allowed or 'none'}")
+                raise ValueError(f"actor_kwargs has {name!r}, but backbone={backbone!r} takes {allowed}")
         self._actor_class, self._actor_args = BACKBONES[backbone], (actor_args, actor_kwargs)
         self._critic_args = critic_args
         self.share_features_extractor = share_features_extractor
