@@ -89,10 +89,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _run(args: argparse.Namespace) -> None:
-    if args.command == "record":
-        data = _recorded(args)
-    else:
-        data = _read(args)
+    data = _recorded(args) if args.command == "record" else _read(args)
     if args.command != "info":
         data.to_minari(args.output)
         print(f"{len(data)} transitions of {data.n_episodes} episodes written to {args.output}")

@@ -19,7 +19,7 @@ class _Nothing(gym.Env[Any, Any]):
         self.observation_space, self.action_space = observation_space, action_space
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        raise RuntimeError("there is no environment in a training on a data set: pass env= to have one, or call set_env")
+        raise RuntimeError("there is no environment in a training on a data set: pass env=, or call set_env")
 
 
 class NoEnvironment(DummyVecEnv):

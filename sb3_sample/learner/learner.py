@@ -26,7 +26,7 @@ from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.q_values import evaluate
 from sb3_sample.learner.randomness import OwnGenerators
 from sb3_sample.learner.scalars import FixedScalar, LogScalar
-from sb3_sample.learner.target import next_step, online_outputs, step_outputs, values
+from sb3_sample.learner.target import next_step, online_outputs, step_outputs
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network

@@ -192,9 +192,7 @@ def advantage_weights(advantage: torch.Tensor, inverse_temperature: float, most:
     return (inverse_temperature * advantage).exp().clamp(max=most)
 
 
-def cloned_value_loss(
-    value: torch.Tensor, actions: torch.Tensor, cloned: torch.Tensor, weight: float
-) -> torch.Tensor:
+def cloned_value_loss(value: torch.Tensor, actions: torch.Tensor, cloned: torch.Tensor, weight: float) -> torch.Tensor:
     """
     Loss of an actor near given actions, ``mean((a - a*)^2) - lambda * mean(Q)`` with ``lambda = weight / mean(|Q|)``
     without gradient (Fujimoto and Gu 2021, eqs. 3 and 5).

@@ -513,8 +513,8 @@ def check_action_space(shape: tuple[int, ...], action_space: Any) -> None:
     bounded = isinstance(action_space, spaces.Box) and np.isfinite([action_space.low, action_space.high]).all()
     if not bounded or tuple(shape) != action_space.shape or not (action_space.low < action_space.high).all():
         raise ValueError(
-            f"actions of shape (N, {', '.join(map(str, shape))}) are none of action_space={action_space}, which must be a "
-            "bounded Box of their shape"
+            f"actions of shape (N, {', '.join(map(str, shape))}) are none of action_space={action_space}, which must "
+            "be a bounded Box of their shape"
         )
 
 

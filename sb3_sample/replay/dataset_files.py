@@ -127,9 +127,10 @@ def read_minari(id_or_path: Any, memory_map: Any) -> tuple["Steps", spaces.Space
             part = np.asarray(given[key]) if key in given else np.empty(0)
             part = part[:, None] if part.ndim == 1 else part
             if part.shape != (length + 1, *array.shape[1:]):
+                which = f"observations[{key!r}]" if key else "observations"
                 raise ValueError(
-                    f"{where}: {f'observations[{key!r}]' if key else 'observations'} must be one more than its {length} "
-                    f"steps, of shape {array.shape[1:]}, not {part.shape}"
+                    f"{where}: {which} must be one more than its {length} steps, of shape {array.shape[1:]}, not "
+                    f"{part.shape}"
                 )
             sets.put(f"{where}: observations", part, array[at : at + length + 1])
         for name, array in (("actions", steps.actions), ("rewards", steps.rewards)):

@@ -334,8 +334,8 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         """
         if self._prior_of is not None and self.prior_data is None:
             raise ValueError(
-                f"prior_data: this model learned with {checks.prior_words(self._prior_of)}, which its file does not hold: pass "
-                "prior_data= to load, or prior_data=None to go on without"
+                f"prior_data: this model learned with {checks.prior_words(self._prior_of)}, which its file does not "
+                "hold: pass prior_data= to load, or prior_data=None to go on without"
             )
         return self._learn(
             total_timesteps,

@@ -105,8 +105,8 @@ def check_dataset(name: str, dataset: Any, observation_space: Any, action_space:
     same = own.shape == other.shape and np.allclose([own.low, own.high], [other.low, other.high])
     if not same:
         raise ValueError(
-            f"{name} must have actions in the units of the model, {own}, not {other}: pass action_space= where the data "
-            "set is made"
+            f"{name} must have actions in the units of the model, {own}, not {other}: pass action_space= where the "
+            "data set is made"
         )
 
 

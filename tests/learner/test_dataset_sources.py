@@ -132,14 +132,16 @@ def test_d4rl_layout(tmp_path: Path) -> None:
         assert np.array_equal(found[name], rows[name][~cut]), name
     stay = ~found["terminations"]
     assert np.array_equal(found["next_observations"][stay], rows["next_observations"][~cut][stay])
-    with pytest.warns(UserWarning):
+    with pytest.warns(UserWarning, match="left out"):
         assert_same(data, Dataset.from_hdf5(path, action_space=BOX, memory_map=tmp_path))
 
 
 def test_what_of_a_d4rl_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="it lacks timeouts"):
         Dataset.from_hdf5(d4rl(tmp_path / "a.hdf5", timeouts=None), action_space=BOX)
-    with pytest.raises(ValueError, match="actions must lie within the bounds .* in the environment's units, not .*step"):
+    with pytest.raises(
+        ValueError, match="actions must lie within the bounds .* in the environment's units, not .*step"
+    ):
         Dataset.from_hdf5(d4rl(tmp_path / "b.hdf5"))
     with pytest.raises(ValueError, match="observations must be finite"):
         Dataset.from_hdf5(d4rl(tmp_path / "c.hdf5", observations=np.full((60, 3), np.nan)), action_space=BOX)
@@ -237,7 +239,9 @@ def test_record_takes_original_observations_of_a_normalized_environment() -> Non
     before = venv.obs_rms.mean.copy()
     data = record(Linear(), venv, 2)
     rows = data.rows(slice(None))
-    assert rows["observations"][:, 0].tolist() == list(range(7)) * 2 and rows["rewards"].tolist() == list(range(1, 8)) * 2
+    assert (
+        rows["observations"][:, 0].tolist() == list(range(7)) * 2 and rows["rewards"].tolist() == list(range(1, 8)) * 2
+    )
     np.testing.assert_array_equal(venv.obs_rms.mean, before)
     expected = np.clip(venv.normalize_obs(rows["observations"])[:, :2] / 10, -1, 1)
     np.testing.assert_allclose(rows["actions"], expected, rtol=1e-6)

@@ -25,7 +25,7 @@ def prior(n: int = 60, keys: tuple[str, ...] = (), **kwargs: Any) -> Dataset:
     """Transitions whose rewards tell them from the toys'."""
     rng = np.random.default_rng(0)
     observations: Any = rng.normal(size=(n, 3)).astype(np.float32)
-    observations = {key: observations for key in keys} if keys else observations
+    observations = dict.fromkeys(keys, observations) if keys else observations
     ends = np.ones(n)
     given = (observations, rng.uniform(-1, 1, (n, 2)).astype(np.float32), MARK + np.arange(n), ends, ends * 0)
     return Dataset.from_arrays(*given, **kwargs)
@@ -165,15 +165,15 @@ def test_checkpoints(cls: type[SAC], tmp_path: Path) -> None:
         return sac(cls=cls, prior_data=prior())
 
     whole = made().learn(30)
+
+    def interrupt(local: Any, all: Any) -> bool:
+        if local["self"].num_timesteps == 23:
+            raise KeyboardInterrupt
+        return True
+
     with pytest.raises(KeyboardInterrupt):
-
-        def interrupt(local: Any, all: Any) -> bool:
-            if local["self"].num_timesteps == 23:
-                raise KeyboardInterrupt
-            return True
-
         made().learn(30, interrupt, checkpoint=tmp_path / "run", checkpoint_freq=10)
-    np.random.seed(5)  # noqa: NPY002
+    np.random.seed(5)
     on = made().learn(30, checkpoint=tmp_path / "run", checkpoint_freq=10)
     assert not differing(state(whole), state(on))
     with pytest.raises(ValueError, match=r"prior_data='?Dataset\(50 .*was made with prior_data='?Dataset\(60"):
@@ -233,7 +233,7 @@ def test_offline_then_online_in_one_process_is_the_same(tmp_path: Path) -> None:
 
     whole = offline().learn(25)
     offline(checkpoint=tmp_path / "offline", checkpoint_freq=5)
-    np.random.seed(77)  # noqa: NPY002
+    np.random.seed(77)
     with pytest.warns(UserWarning, match="Nothing is left to train"):
         again = offline(checkpoint=tmp_path / "offline", checkpoint_freq=5)
     assert not differing(state(whole), state(again.learn(25, checkpoint=tmp_path / "online")))
