@@ -3,6 +3,8 @@ A table of the published runs of BRO at five replay ratios and five sizes, as ``
 
     python studies/published_grid.py bro_grid.npz grid.csv
     sb3-sample study heatmap grid.csv -x model_size -y replay_ratio --step 500k --group dmc
+    python studies/published_grid.py bro_grid.npz small.csv --ratios 2 --sizes 0.55M
+    sb3-sample study report runs/my_study --published small.csv
 
 The runs are of "Compute-Optimal Scaling for Value-Based Deep RL" (value-scaling.github.io, ``dmc_bro_ablations.zip``),
 gathered in one file: ``returns`` [replay ratio, size, task, seed, evaluation], labels of the axes, and ``n_runs``, how
@@ -11,6 +13,7 @@ the seeds may be shown with their source named.
 """
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,23 +24,35 @@ from sb3_sample.envs.suites import published_id
 from sb3_sample.study.table import COLUMNS, to_json
 
 
-def read_grid(path: str | Path, agent: str = "BRO, published") -> pd.DataFrame:
+def read_grid(
+    path: str | Path,
+    agent: str = "BRO, published",
+    ratios: Sequence[int] | None = None,
+    sizes: Sequence[str] | None = None,
+) -> pd.DataFrame:
     """
     :param path: of ``bro_grid.npz``
     :param agent: its name in the table
+    :param ratios: replay ratios; all if None
+    :param sizes: of the model; all if None
     :return: the runs, copies left out, with the arguments ``replay_ratio`` and ``model_size``
     """
     with np.load(path) as data:
         returns, n_runs, steps = data["returns"].astype(float), data["n_runs"], data["env_steps"]
-        ratios, sizes, seeds = data["replay_ratio"], data["size"], data["seed"]
+        ratio, size, seeds = data["replay_ratio"].tolist(), data["size"].tolist(), data["seed"]
         keys = list(zip(data["suite"], data["task"], strict=True))
+    for name, asked, known in (("ratios", ratios, ratio), ("sizes", sizes, size)):
+        if unknown := set(asked or ()) - set(known):
+            raise ValueError(f"{name} must be of {', '.join(map(str, known))}, not {', '.join(map(str, unknown))}")
     parts = []
     for i, j, k in np.ndindex(returns.shape[:3]):
+        if ratio[i] not in (ratios or ratio) or size[j] not in (sizes or size):
+            continue
         suite, task = map(str, keys[k])
         n = int(n_runs[i, j, k])
         head = {
             "agent": agent,
-            "arguments": to_json({"replay_ratio": int(ratios[i]), "model_size": str(sizes[j])}),
+            "arguments": to_json({"replay_ratio": ratio[i], "model_size": size[j]}),
             "task": published_id(suite, task),
             "seed": np.repeat(seeds[:n], len(steps)),
             "step": np.tile(steps, n),
@@ -54,8 +69,13 @@ def main() -> None:
     parser.add_argument("grid", type=Path, help="bro_grid.npz")
     parser.add_argument("output", type=Path, help=".csv or .parquet")
     parser.add_argument("--agent", default="BRO, published", help="name of the agent (default: BRO, published)")
+    parser.add_argument("--ratios", nargs="+", type=int, help="replay ratios (default: all)")
+    parser.add_argument("--sizes", nargs="+", help="sizes of the model, as 0.55M (default: all)")
     options = parser.parse_args()
-    study.write(read_grid(options.grid, options.agent), options.output)
+    try:
+        study.write(read_grid(options.grid, options.agent, options.ratios, options.sizes), options.output)
+    except ValueError as error:
+        parser.error(str(error))
 
 
 if __name__ == "__main__":

@@ -56,6 +56,20 @@ def test_what_is_said_of_installing_works_in_the_checkout() -> None:
     assert {"dmc", "metaworld", "zoo", "export", "plots"} <= extras <= set(setup_cfg()["options.extras_require"])
 
 
+def test_the_package_has_the_files_that_it_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a wheel as setuptools builds it by ``package_data``, whatever git has."""
+    dist = pytest.importorskip("setuptools.dist").Distribution({"script_name": "setup.py"})
+    monkeypatch.chdir(ROOT)
+    dist.parse_config_files(["setup.cfg"])
+    dist.include_package_data = False
+    command = dist.get_command_obj("build_py")
+    command.ensure_finalized()
+    packed = {Path(folder, file) for _, folder, _, files in command.data_files for file in files}
+    code = {Path(file) for _, _, file in command.find_all_modules()}
+    there = {path.relative_to(ROOT) for path in (ROOT / "sb3_sample").rglob("*.*") if "__pycache__" not in path.parts}
+    assert there - packed - code == set()
+
+
 @pytest.mark.parametrize("python", PYTHONS[1:])
 def test_the_pythons_have_the_same_versions_of_what_runs(python: str) -> None:
     first, other = pins(PYTHONS[0]), pins(python)

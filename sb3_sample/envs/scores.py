@@ -6,7 +6,7 @@ Scores on a common scale, by which tasks are averaged: what is measured of a tas
 * MuJoCo: the return over the value of table 1 of "Value-Based Deep RL Scales Predictably" (Rybkin et al. 2025).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sb3_sample.envs.registration import PACKAGE
 
@@ -23,6 +23,13 @@ class Score(NamedTuple):
     metric: str
     high: float = 1.0
     low: float = 0.0
+
+    def of(self, values: Any) -> Any:
+        """
+        :param values: what was measured, of any shape
+        :return: the scores, of the same shape
+        """
+        return (values - self.low) / (self.high - self.low)
 
 
 #: MuJoCo's tasks, by their names without version.

@@ -4,10 +4,14 @@ random generators and logger; and what tells one run from another.
 """
 
 import contextlib
+import functools
 import importlib.metadata
 import inspect
+import os
+import pathlib
 import platform
 import random
+import subprocess
 from typing import Any
 
 import gymnasium
@@ -169,4 +173,35 @@ def circumstances(device: torch.device) -> dict[str, str]:
     }
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):
         found["mujoco"] = importlib.metadata.version("mujoco")
-    return found
+    return found | {name: value for name, value in (("commit", commit()), ("processor", processor())) if value}
+
+
+@functools.cache
+def commit() -> str:
+    """
+    :return: the commit of the checkout that this package is imported from, with "-dirty" if files were changed since;
+        empty outside of a checkout and without git
+    """
+    root = pathlib.Path(__file__).parents[2]
+    if not (root / ".git").exists():
+        return ""
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    # A hook of git's has variables that name another checkout.
+    env = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    try:
+        found = subprocess.run(command, env=env, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return found.stdout.strip()
+
+
+@functools.cache
+def processor() -> str:
+    """
+    :return: the processor's name, as far as the system tells it
+    """
+    with contextlib.suppress(OSError), open("/proc/cpuinfo") as file:
+        for line in file:
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor()

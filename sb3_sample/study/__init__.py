@@ -8,6 +8,7 @@ from sb3_sample.study.aggregate import aggregate, performance_profiles, probabil
 from sb3_sample.study.analysis import correlate, cost, heatmap, marginalize, regress
 from sb3_sample.study.dry_run import Estimate, estimate
 from sb3_sample.study.plan import Plan, PlanError, Run, read_plan
+from sb3_sample.study.reporting.command import report
 from sb3_sample.study.runs import Outcome, StudyError
 from sb3_sample.study.schedule import Stopped, run
 from sb3_sample.study.states import RunStatus, Status, status
@@ -38,6 +39,7 @@ __all__ = [
     "read",
     "read_plan",
     "regress",
+    "report",
     "run",
     "status",
     "write",

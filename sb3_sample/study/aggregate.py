@@ -58,31 +58,9 @@ def scored(table: pd.DataFrame, scores: Scores | None = None) -> pd.DataFrame:
     :return: columns agent, arguments, task, seed, step, score, sorted by step within a run, the runs in their order
     :raises ValueError: a task has no score, or its runs have not recorded what it is made of
     """
-    measured = table[~table["metric"].str.contains("/") & (table["metric"] != "hours")]
-    given = {
-        task: score if isinstance(score, Score) else Score("return", float(score))
-        for task, score in (scores or {}).items()
-    }
-    parts = []
-    for task, rows in measured.groupby("task", sort=False):
-        score = given.get(task) or score_of(task)
-        if score is None:
-            raise ValueError(
-                f"scores must say how {task} is scored: there is a common scale for {SCORED} only. Give the return "
-                f"whose score is 1, scores={{{task!r}: 1000.0}} (--score {task}=1000), or Score(metric, high, low) "
-                f"(--score {task}=LOW:HIGH)"
-            )
-        if score.high == score.low:
-            raise ValueError(f"scores must have a high that is not low, not {task} {score}")
-        rows = rows[rows["metric"] == score.metric]
-        without = measured[measured["task"] == task].merge(rows[RUN].drop_duplicates(), how="left", indicator=True)
-        without = without[without["_merge"] == "left_only"]
-        if len(without):
-            raise ValueError(
-                f"{task} is scored by {score.metric}, which the runs of {', '.join(without['agent'].unique())} there "
-                "have not recorded; scores (--score) can name another metric"
-            )
-        parts.append(rows.assign(score=(rows["value"] - score.low) / (score.high - score.low)))
+    parts, reasons = _by_task(table, scores)
+    if reasons:
+        raise ValueError(next(iter(reasons.values())))
     if not parts:
         raise ValueError("table must have returns or success rates of runs, and has none")
     columns = [*RUN, "step", "score"]
@@ -101,6 +79,55 @@ def scored(table: pd.DataFrame, scores: Scores | None = None) -> pd.DataFrame:
             f"{row['step']:,}"
         )
     return found.reset_index(drop=True)
+
+
+def unscored(table: pd.DataFrame, scores: Scores | None = None) -> dict[str, str]:
+    """
+    :param table: of :func:`~sb3_sample.study.read`
+    :param scores: see :func:`scored`
+    :return: the tasks that :func:`scored` refuses, and why
+    """
+    return _by_task(table, scores)[1]
+
+
+def score_for(task: str, scores: Scores | None = None) -> Score | None:
+    """
+    :param task: id of an environment
+    :param scores: see :func:`scored`
+    :return: how it is scored, if there is a way
+    """
+    given = (scores or {}).get(task)
+    if given is None:
+        return score_of(task)
+    return given if isinstance(given, Score) else Score("return", float(given))
+
+
+def _by_task(table: pd.DataFrame, scores: Scores | None) -> tuple[list[pd.DataFrame], dict[str, str]]:
+    """The rows of each task with their scores; and the tasks that have none, with the reason."""
+    measured = table[~table["metric"].str.contains("/") & (table["metric"] != "hours")]
+    parts, reasons = [], {}
+    for task, rows in measured.groupby("task", sort=False):
+        score = score_for(task, scores)
+        if score is None:
+            reasons[task] = (
+                f"scores must say how {task} is scored: there is a common scale for {SCORED} only. Give the return "
+                f"whose score is 1, scores={{{task!r}: 1000.0}} (--score {task}=1000), or Score(metric, high, low) "
+                f"(--score {task}=LOW:HIGH)"
+            )
+            continue
+        if score.high == score.low:
+            raise ValueError(f"scores must have a high that is not low, not {task} {score}")
+        found = rows[rows["metric"] == score.metric]
+        without = rows.merge(found[RUN].drop_duplicates(), how="left", indicator=True)
+        without = without[without["_merge"] == "left_only"]
+        if len(without):
+            reasons[task] = (
+                f"{task} is scored by {score.metric}, which the runs of {', '.join(without['agent'].unique())} there "
+                "have not recorded; scores (--score) can name another metric"
+            )
+            continue
+        parts.append(found.assign(score=score.of(found["value"])))
+    return parts, reasons
 
 
 def named_apart(table: pd.DataFrame) -> pd.DataFrame:

@@ -35,8 +35,12 @@ _TABLES, _PICTURES = (".csv", ".parquet", ".md"), (".png", ".svg")
 # ---------------------------------------------------------------- arguments
 
 
-def _steps(text: str) -> int:
-    """A number of steps: 100000, 100_000, 100k, 1.5M."""
+def steps_of(text: str) -> int:
+    """
+    :param text: a number of steps, as 100000, 100_000, 100k, 1.5M
+    :return: the number
+    :raises ArgumentTypeError: it is none
+    """
     digits = text.replace("_", "")
     factor = {"k": 1_000, "M": 1_000_000}.get(digits[-1:], 1)
     try:
@@ -92,7 +96,11 @@ def _add_sources(parser: argparse.ArgumentParser, pictures: bool = False) -> Non
     parser.set_defaults(endings=endings)
 
 
-def _add_scores(parser: argparse.ArgumentParser, groups: bool = True) -> None:
+def add_scores(parser: argparse.ArgumentParser, groups: bool = True) -> None:
+    """
+    :param parser: of a command that makes scores
+    :param groups: whether it takes groups of tasks
+    """
     parser.add_argument(
         "--score",
         nargs="+",
@@ -110,7 +118,11 @@ def _add_scores(parser: argparse.ArgumentParser, groups: bool = True) -> None:
         )
 
 
-def _add_intervals(parser: argparse.ArgumentParser, reps: int = REPS) -> None:
+def add_intervals(parser: argparse.ArgumentParser, reps: int = REPS) -> None:
+    """
+    :param parser: of a command that makes intervals
+    :param reps: bootstrap samples by default
+    """
     parser.add_argument("--reps", type=int, default=reps, help=f"bootstrap samples (default: {reps:,})")
     parser.add_argument("--confidence", type=float, default=0.95, help="of the intervals (default: 0.95)")
     parser.add_argument("--seed", type=int, default=0, help="of the bootstrap (default: 0)")
@@ -120,7 +132,7 @@ def _add_steps(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--steps",
         nargs="+",
-        type=_steps,
+        type=steps_of,
         metavar="STEP",
         help="simulator steps, as 100k or 1M (default: all that the runs have in common)",
     )
@@ -164,8 +176,12 @@ _INTERVALS = ("reps", "confidence", "seed")
 
 
 @contextlib.contextmanager
-def _refusing(command: str) -> Iterator[None]:
-    """Errors of arguments, files and missing extras end the command with one line; warnings are a line each."""
+def refusing(command: str) -> Iterator[None]:
+    """
+    Errors of arguments, files and missing extras end the command with one line; warnings are a line each.
+
+    :param command: its name
+    """
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
         print(f"sb3-sample study {command}: {message}", file=sys.stderr)
@@ -237,7 +253,7 @@ def _add_table(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_table(options: argparse.Namespace) -> None:
-    with _refusing("table"):
+    with refusing("table"):
         table = _read(options, *options.metrics)
         runs = table.groupby([*tables.RUN, "metric"], sort=False, dropna=False)["step"].agg(["count", "max"])
         summary = (
@@ -258,8 +274,8 @@ def _run_table(options: argparse.Namespace) -> None:
 def _add_aggregate(parser: argparse.ArgumentParser) -> None:
     _add_sources(parser)
     _add_steps(parser)
-    _add_scores(parser)
-    _add_intervals(parser)
+    add_scores(parser)
+    add_intervals(parser)
     parser.add_argument(
         "--improvement", action="store_true", help="the probability that one agent is better than another, by pair"
     )
@@ -273,7 +289,7 @@ def _add_aggregate(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_aggregate(options: argparse.Namespace) -> None:
-    with _refusing("aggregate"):
+    with refusing("aggregate"):
         if (options.improvement or options.profile) and (options.steps is None or len(options.steps) != 1):
             raise ValueError(f"steps must be one step for --improvement and --profile, not {options.steps}")
         if options.improvement and options.profile:
@@ -306,12 +322,12 @@ def _add_marginalize(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--order", type=int, default=1, help="how many factors are fixed (default: 1)")
     _add_ends(parser)
-    _add_scores(parser)
-    _add_intervals(parser, analysis.STUDY_REPS)
+    add_scores(parser)
+    add_intervals(parser, analysis.STUDY_REPS)
 
 
 def _run_marginalize(options: argparse.Namespace) -> None:
-    with _refusing("marginalize"):
+    with refusing("marginalize"):
         factors = None if options.factors is None else dict(options.factors)
         shared = _shared(options, "by", "groups", "last", *_INTERVALS)
         _put(analysis.marginalize(_read(options), factors, options.order, **shared), options.output)
@@ -331,11 +347,11 @@ def _add_correlate(parser: argparse.ArgumentParser) -> None:
         "--regress", action="store_true", help="least squares of the score on each metric, task by task, instead"
     )
     _add_ends(parser)
-    _add_scores(parser)
+    add_scores(parser)
 
 
 def _run_correlate(options: argparse.Namespace) -> None:
-    with _refusing("correlate"):
+    with refusing("correlate"):
         if options.regress and (
             options.by or options.groups or (options.output and options.output.suffix in _PICTURES)
         ):
@@ -358,13 +374,13 @@ def _add_heatmap(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--value", default="score", metavar="METRIC", help="score, or a metric as hours (default: score)"
     )
-    parser.add_argument("--step", type=_steps, help="simulator step (default: the last that all runs reach)")
+    parser.add_argument("--step", type=steps_of, help="simulator step (default: the last that all runs reach)")
     parser.add_argument("--group", default="all", help=f"of tasks, of {', '.join(GROUPS)} (default: all)")
-    _add_scores(parser, groups=False)
+    add_scores(parser, groups=False)
 
 
 def _run_heatmap(options: argparse.Namespace) -> None:
-    with _refusing("heatmap"):
+    with refusing("heatmap"):
         table = _read(options, *([] if options.value == "score" else [options.value]))
         shared = _shared(options, "value", "step", "group")
         found = analysis.heatmap(table, options.x, options.y, **shared)
@@ -375,12 +391,12 @@ def _run_heatmap(options: argparse.Namespace) -> None:
 def _add_cost(parser: argparse.ArgumentParser) -> None:
     _add_sources(parser, pictures=True)
     _add_steps(parser)
-    _add_scores(parser)
-    _add_intervals(parser)
+    add_scores(parser)
+    add_intervals(parser)
 
 
 def _run_cost(options: argparse.Namespace) -> None:
-    with _refusing("cost"):
+    with refusing("cost"):
         shared = _shared(options, "common", *_INTERVALS)
         found = analysis.cost(_read(options), options.steps, options.groups, **shared)
         _put(found, options.output, lambda: _draw_cost(found))

@@ -12,6 +12,7 @@ from sb3_sample.exits import refuse
 from sb3_sample.study import analysis_command
 from sb3_sample.study.dry_run import estimate
 from sb3_sample.study.plan import PlanError, read_plan
+from sb3_sample.study.reporting import command as report_command
 from sb3_sample.study.runs import StudyError
 from sb3_sample.study.schedule import Stopped, free_cores, run
 from sb3_sample.study.states import RUNNING, STATES, Status, status
@@ -186,4 +187,5 @@ COMMANDS: dict[str, Command] = {
     "run": ("make the runs of a plan, or go on with them", _add_run, _run),
     "status": ("say what is done, running, failed and waiting of a study", _add_status, _status),
     **analysis_command.COMMANDS,
+    "report": report_command.COMMAND,
 }

@@ -145,7 +145,7 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
     training: list[Path] = []
     named = functools.cache(_agents_of_study)
     for source in given:
-        label, path = _labelled(source)
+        label, path = labelled(source)
         if path.suffix in (".csv", ".parquet") and path.is_file():
             table = load(path)
             tables.append(table if label is None else table.assign(agent=label))
@@ -214,7 +214,12 @@ def _agents_of_study(folder: Path) -> dict[str, str]:
     return {re.sub(r"[^\w.,=+()-]+", "-", run["agent"]): run["agent"] for run in runs}
 
 
-def _labelled(source: str | Path) -> tuple[str | None, Path]:
+def labelled(source: str | Path) -> tuple[str | None, Path]:
+    """
+    :param source: a folder or table, or "LABEL=FOLDER"
+    :return: the label, if there is one, and the path
+    :raises ValueError: the label is empty
+    """
     label, equals, path = str(source).partition("=")
     if isinstance(source, Path) or not equals or Path(source).exists():
         return None, Path(source)

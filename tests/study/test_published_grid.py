@@ -65,3 +65,13 @@ def test_the_grids_published_agents_are_those_of_the_package(grid: pd.DataFrame)
     theirs = grid[grid["arguments"] == '{"model_size": "4.92M", "replay_ratio": 2}']
     key = ["task", "seed", "step"]
     np.testing.assert_allclose(theirs.sort_values(key)["value"], ours.sort_values(key)["value"], rtol=1e-5, atol=1e-5)
+
+
+def test_a_part_of_the_grid(grid: pd.DataFrame) -> None:
+    read_grid = runpy.run_path(str(ROOT / "studies" / "published_grid.py"))["read_grid"]
+    part = read_grid(REFERENCE / "bro_grid.npz", ratios=[2], sizes=["0.55M"])
+    part = part[part["step"].isin(STEPS)].reset_index(drop=True)
+    whole = grid[grid["arguments"] == '{"model_size": "0.55M", "replay_ratio": 2}']
+    pd.testing.assert_frame_equal(part, whole.reset_index(drop=True))
+    with pytest.raises(ValueError, match=r"ratios must be of 1, 2, 5, 10, 15, not 3"):
+        read_grid(REFERENCE / "bro_grid.npz", ratios=[3])

@@ -1,0 +1,206 @@
+"""The numbers of a report: averages, profiles and improvement of its runs, each computed once, by ``aggregate.py``."""
+
+import dataclasses
+import itertools
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sb3_sample.study.aggregate import (
+    DEFAULT_GROUPS,
+    Groups,
+    Scores,
+    aggregate,
+    group_tasks,
+    performance_profiles,
+    probability_of_improvement,
+    scored,
+    unscored,
+)
+from sb3_sample.study.reporting.pieces import counted
+from sb3_sample.study.reporting.reading import Gathered
+from sb3_sample.study.table import RUN
+
+#: Points of a curve, at most.
+POINTS = 40
+#: Agents of which all pairs are compared; of more, the best with each other one.
+ALL_PAIRS = 6
+_MEASURED = ("return", "success_rate", "episode_length")
+
+
+@dataclasses.dataclass
+class Facts:
+    """
+    :param lacking: tasks without a score, with the reason
+    :param reason: why there are no averages; empty if there are
+    :param tasks: those that are averaged over
+    :param n_scored: how many have a score
+    :param steps: at which the averages are told
+    :param groups: of tasks, by name; the first is the one of profiles and improvement
+    :param averages: of :func:`~sb3_sample.study.aggregate`, at ``steps``
+    :param curves: the same along the training
+    :param profiles: at the last step, of the first group; None without averages
+    :param improvement: likewise, of pairs, the one with the better average first; None with one agent
+    :param all_pairs: whether all pairs are compared, not only those with the best
+    :param left_out: agents without averages, with the reason
+    :param notes: warnings
+    """
+
+    lacking: dict[str, str]
+    reason: str = ""
+    tasks: list[str] = dataclasses.field(default_factory=list)
+    n_scored: int = 0
+    steps: list[int] = dataclasses.field(default_factory=list)
+    groups: dict[str, list[str]] = dataclasses.field(default_factory=dict)
+    averages: pd.DataFrame | None = None
+    curves: pd.DataFrame | None = None
+    profiles: pd.DataFrame | None = None
+    improvement: pd.DataFrame | None = None
+    all_pairs: bool = True
+    left_out: dict[str, str] = dataclasses.field(default_factory=dict)
+    notes: list[str] = dataclasses.field(default_factory=list)
+
+    @property
+    def step(self) -> int:
+        """The step of profiles and improvement."""
+        return self.steps[-1]
+
+    @property
+    def group(self) -> str:
+        """The group of profiles and improvement."""
+        return next(iter(self.groups))
+
+    def at(self, step: int, group: str | None = None) -> pd.DataFrame:
+        """
+        :param step: of ``steps``
+        :param group: of ``groups``; the first if None
+        :return: the averages there, the highest first
+        """
+        assert self.averages is not None
+        rows = self.averages[(self.averages["step"] == step) & (self.averages["group"] == (group or self.group))]
+        return rows.sort_values("iqm", ascending=False, kind="stable")
+
+
+def compute(
+    gathered: Gathered,
+    *,
+    steps: Sequence[int] | None,
+    groups: Groups | None,
+    scores: Scores | None,
+    all_tasks: bool,
+    reps: int,
+    confidence: float,
+    seed: int,
+) -> Facts:
+    """
+    :param gathered: runs
+    :param steps: at which the averages are told; None for the last that half of each agent's runs have reached
+    :param groups: see :func:`~sb3_sample.study.aggregate`, as ``scores``, ``reps``, ``confidence`` and ``seed``
+    :param scores: likewise
+    :param all_tasks: average each agent over all its tasks, not over those that all agents have
+    :param reps: bootstrap samples
+    :param confidence: of the intervals
+    :param seed: of the bootstrap
+    :return: the numbers
+    :raises ValueError: an argument is out of range, or no run reaches a step
+    """
+    measured = gathered.table[gathered.table["metric"].isin(_MEASURED)]
+    facts = Facts(unscored(measured, scores))
+    rows = measured[~measured["task"].isin(list(facts.lacking))]
+    if not len(rows):
+        facts.reason = "No task of these runs has a score." if facts.lacking else "No run has been evaluated yet."
+        return facts
+    facts.n_scored = rows["task"].nunique()
+    runs = scored(rows, scores).groupby(RUN, sort=False, dropna=False)["step"]
+    ends = runs.agg(["min", "max", spacing]).reset_index()
+    own = ends[~ends["agent"].isin(gathered.published)]
+    facts.steps = sorted(steps) if steps else [_reached(own)]
+    reaching = ends[(ends["min"] <= facts.step) & (ends["max"] >= facts.step)]
+    if not len(reaching):
+        raise ValueError(f"steps must be within those of the runs, up to {own['max'].max():,}, not {facts.step:,}")
+    reaching = _comparable(reaching, own, gathered, facts, all_tasks)
+    facts.tasks = list(dict.fromkeys(reaching["task"]))
+    rows = rows.merge(reaching[RUN], on=RUN)
+    agents = [agent for agent in gathered.agents if agent in set(reaching["agent"])]
+    rows = rows.sort_values("agent", key=lambda names: names.map(agents.index), kind="stable")
+    facts.groups = _groups(groups, facts.tasks)
+    grid = _grid(rows, int(reaching["min"].max()), facts.step)
+    shared: dict[str, Any] = {"scores": scores, "reps": reps, "confidence": confidence, "seed": seed}
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", UserWarning)
+        # Apart, so that the numbers are those of "study aggregate": samples depend on how many steps there are.
+        facts.averages = aggregate(rows, facts.steps, facts.groups, **shared)
+        facts.curves = aggregate(rows, grid, facts.groups, **shared)
+        first = {facts.group: facts.groups[facts.group]}
+        best = list(facts.at(facts.step)["agent"])
+        facts.profiles = performance_profiles(rows, facts.step, groups=first, **shared)
+        facts.all_pairs = len(best) <= ALL_PAIRS
+        pairs = itertools.combinations(best, 2) if facts.all_pairs else ((best[0], other) for other in best[1:])
+        tasks_of = {agent: set(found) for agent, found in reaching.groupby("agent")["task"]}
+        chosen = [(x, y) for x, y in pairs if tasks_of[x] & tasks_of[y]]
+        if chosen:
+            facts.improvement = probability_of_improvement(rows, facts.step, first, pairs=chosen, **shared)
+    facts.notes += dict.fromkeys(str(warning.message) for warning in told)
+    return facts
+
+
+def spacing(steps: Any) -> int:
+    """
+    :param steps: of a run's evaluations, increasing
+    :return: steps between its last two; 0 if there is one
+    """
+    last = np.asarray(steps)[-2:]
+    return int(last[-1] - last[0])
+
+
+def _reached(ends: pd.DataFrame) -> int:
+    """The last step that half of the runs of each agent have reached, or will by their next evaluation."""
+    halves = ends.groupby("agent")["max"].apply(lambda last: sorted(last)[len(last) // 2])
+    step = int(halves.min())
+    # Episodes of a training do not all end at the same step.
+    near = ends[(ends["max"] < step) & (ends["max"] + ends["spacing"] > step)]
+    return int(min([step, *near["max"]]))
+
+
+def _comparable(
+    reaching: pd.DataFrame, own: pd.DataFrame, gathered: Gathered, facts: Facts, all_tasks: bool
+) -> pd.DataFrame:
+    """The runs of the tasks that all agents have, and of others' agents those that have them all, too."""
+    tasks = {agent: set(found) for agent, found in reaching.groupby("agent")["task"]}
+    ours = [agent for agent in gathered.agents if agent in tasks and agent not in gathered.published]
+    for agent in own["agent"].unique():
+        if agent not in tasks:
+            facts.left_out[agent] = f"no run of it was evaluated around {facts.step:,} steps"
+    if all_tasks or not ours:
+        return reaching
+    common = set.intersection(*(tasks[agent] for agent in ours))
+    if not common:
+        facts.notes.append("There is no task that all agents have reached that step on: each is averaged over its own.")
+        return reaching
+    for agent in tasks:
+        if not common <= tasks[agent]:
+            facts.left_out[agent] = f"it has {len(tasks[agent] & common)} of the {counted(len(common), 'task')}"
+    return reaching[reaching["task"].isin(common) & ~reaching["agent"].isin(list(facts.left_out))]
+
+
+def _groups(groups: Groups | None, tasks: list[str]) -> dict[str, list[str]]:
+    """The groups, of those that were not asked for only the ones that are not all tasks."""
+    found = {name: members for name, members in group_tasks(groups, tasks).items() if members}
+    if groups is None:
+        all_of_them = found[DEFAULT_GROUPS[0]]
+        found = {name: each for name, each in found.items() if name == DEFAULT_GROUPS[0] or each != all_of_them}
+    if not found:
+        raise ValueError(f"groups must have a task of the runs, and there is none in {', '.join(groups or ())}")
+    return found
+
+
+def _grid(rows: pd.DataFrame, first: int, last: int) -> list[int]:
+    """Steps of a curve, of the evaluations of all runs."""
+    steps = np.unique(rows["step"])
+    steps = steps[(first <= steps) & (steps <= last)]
+    if len(steps) > POINTS:
+        steps = steps[np.unique(np.linspace(0, len(steps) - 1, POINTS).round().astype(int))]
+    return [int(step) for step in steps]

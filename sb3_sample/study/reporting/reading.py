@@ -1,0 +1,206 @@
+"""Runs for a report: one table of them, those of others, the states of studies, and what the runs were made with."""
+
+import dataclasses
+import warnings
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+import pandas as pd
+
+from sb3_sample.plots import COLUMNS as CURVE_COLUMNS
+from sb3_sample.plots import Curve, find_runs
+from sb3_sample.run_logs import EVALUATIONS
+from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
+from sb3_sample.study import table as tables
+from sb3_sample.study.aggregate import named_apart
+from sb3_sample.study.plan import Run, read_plan
+from sb3_sample.study.reporting.pieces import counted
+from sb3_sample.study.runs import LIST, PLAN, checkpointed
+from sb3_sample.study.states import Status, status
+
+#: Where runs are, or a table of them.
+Source: TypeAlias = str | Path | pd.DataFrame
+#: Bytes of a plan, of a checkpoint's manifest, and of the records beside a table.
+_MAX_PLAN, _MAX_MANIFEST, _MAX_RECORDS = 2**20, 8 * 2**20, 64 * 2**20
+_MEASURED = ("return", "success_rate")
+
+
+@dataclasses.dataclass
+class Gathered:
+    """
+    Everything that a report is made of.
+
+    :param names: of the sources, as they were given
+    :param titles: the same without their folders, or their labels
+    :param table: runs, agents with different arguments named apart
+    :param published: the agents of it that others have measured
+    :param asked: names by which every seed of a published agent was asked for
+    :param curves: of others, of which there are statistics over seeds only, by task and metric
+    :param states: of the studies among the sources
+    :param plans: plans' texts, by folder or file
+    :param planned: runs of the plan that was given
+    :param made_with: of each run that says so, by what it was made: versions, device, processor, commit
+    :param notes: what was left out, and why
+    """
+
+    names: list[str]
+    titles: list[str]
+    table: pd.DataFrame
+    published: list[str]
+    asked: list[str]
+    curves: dict[tuple[str, str], list[Curve]]
+    states: list[Status]
+    plans: dict[str, str]
+    planned: list[Run]
+    made_with: list[dict[str, str]]
+    notes: list[str]
+
+    @property
+    def agents(self) -> list[str]:
+        """Agents, those of others last."""
+        found = list(self.table["agent"].unique())
+        return sorted(found, key=lambda agent: agent in self.published)
+
+    @property
+    def tasks(self) -> list[str]:
+        """Tasks of the table, in its order."""
+        return list(self.table["task"].unique())
+
+
+def gather(
+    sources: Source | Iterable[Source], published: Sequence[str | Path] = (), plan: str | Path | None = None
+) -> Gathered:
+    """
+    Read all that a report needs, each file once.
+
+    :param sources: as of :func:`~sb3_sample.study.read`, or tables
+    :param published: runs that others have made: names as of :func:`~sb3_sample.study.published_runs`, or files of
+        tables. Their tasks are those of the sources; without sources they are the runs that are compared
+    :param plan: file of a plan whose runs are to be found among them
+    :return: runs and states
+    :raises ValueError: there are neither, a file is damaged, or a name is unknown
+    :raises OSError: a file cannot be read
+    """
+    given: list[Source] = [sources] if isinstance(sources, (str, Path, pd.DataFrame)) else list(sources)
+    if not given and not published:
+        raise ValueError("sources must be at least one folder or table, or --published runs")
+    found = Gathered([], [], pd.DataFrame(columns=tables.COLUMNS), [], [], {}, [], {}, [], [], [])
+    parts: list[pd.DataFrame] = []
+    paths: list[str | Path] = []
+    for source in given:
+        if isinstance(source, pd.DataFrame):
+            found.names.append("a table")
+            found.titles.append("a table")
+            parts.append(source)
+            continue
+        found.names.append(str(source))
+        paths += _paths(source, found)
+    if plan is not None:
+        found.planned = list(read_plan(plan).runs)
+        found.plans[str(plan)] = read_regular(Path(plan), _MAX_PLAN).decode(errors="replace")
+    if paths:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always", UserWarning)
+            parts.append(tables.read(paths))
+        found.notes += [str(warning.message) for warning in told]
+    own = _measured(parts, found)
+    theirs = _measured([_published(name, found) for name in published], found)
+    if given:
+        theirs = theirs[theirs["task"].isin(own["task"].unique())]
+        theirs = theirs.assign(agent=[_marked(agent) for agent in theirs["agent"]])
+        found.published = list(theirs["agent"].unique())
+        if published and not len(theirs):
+            found.notes.append("The published runs have none of the tasks here, and are left out.")
+    found.names += [str(name) for name in published]
+    found.titles += [] if given else [Path(name).stem for name in published]
+    kept = [part for part in (own, theirs) if len(part)]
+    found.table = pd.concat(kept, ignore_index=True) if kept else own
+    return found
+
+
+def _marked(agent: str) -> str:
+    return agent if "published" in agent.lower() else f"{agent}, published"
+
+
+def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
+    """The runs of a source, those of a study that have been evaluated; its state and what its runs were made with."""
+    label, path = tables.labelled(source)
+    found.titles.append(label or (path.stem if path.is_file() else path.resolve().name))
+    if path.is_file():
+        found.made_with += _recorded(path.with_suffix(".json"))
+        return [source]
+    is_study = (path / LIST).is_file()
+    folders = []
+    try:
+        folders = find_runs(path)
+    except BadFile:
+        raise
+    except ValueError:  # there is none
+        if not is_study:
+            raise
+    if is_study:
+        found.states.append(status(path))
+        if (path / PLAN).is_file():
+            found.plans[str(source)] = read_regular(path / PLAN, _MAX_PLAN).decode(errors="replace")
+        evaluated = [folder for folder in folders if (folder / EVALUATIONS).exists()]
+        if len(evaluated) < len(folders):
+            found.notes.append(
+                f"{counted(len(folders) - len(evaluated), 'run')} of {source} without an evaluation yet: in no figure."
+            )
+        folders = evaluated
+    found.made_with += [made for folder in folders if (made := made_with(folder))]
+    return [folder if label is None else f"{label}={folder}" for folder in folders]
+
+
+def made_with(folder: Path) -> dict[str, str]:
+    """
+    :param folder: a run's
+    :return: what its last checkpoint was made with, by name; empty if there is none that says so
+    """
+    path = folder / f"checkpoint-{checkpointed(folder):012d}" / "manifest.json"
+    try:
+        manifest = parse_json(read_regular(path, _MAX_MANIFEST), str(path))
+    except (OSError, BadFile):  # none, or one that is being replaced
+        return {}
+    found = manifest.get("circumstances") if isinstance(manifest, dict) else None
+    return {str(name): str(value) for name, value in found.items()} if isinstance(found, dict) else {}
+
+
+def _recorded(path: Path) -> list[dict[str, str]]:
+    """What the runs of a table were made with, by the file beside it that ``studies/evidence.py`` writes."""
+    if not path.is_file():
+        return []
+    try:
+        records = parse_json(read_regular(path, _MAX_RECORDS), str(path))
+    except BadFile:  # of something else
+        return []
+    kept = [record for record in records if isinstance(record, dict)] if isinstance(records, list) else []
+    return [
+        {name: str(value) for name, value in record.items() if name != "run"}
+        for record in kept
+        if isinstance(record.get("run"), dict) and isinstance(record.get("commit"), str)
+    ]
+
+
+def _published(name: str | Path, found: Gathered) -> pd.DataFrame:
+    path = Path(name)
+    if path.suffix in (".csv", ".parquet"):
+        return tables.load(path)
+    found.asked.append(str(name).partition(" (")[0])
+    return tables.published_runs([str(name)])
+
+
+def _measured(parts: list[pd.DataFrame], found: Gathered) -> pd.DataFrame:
+    """The runs of tables, named apart; their rows of statistics over seeds become curves."""
+    parts = [part for part in parts if len(part)]
+    if not parts:
+        return found.table
+    table = pd.concat(parts, ignore_index=True)
+    heads = table["metric"].str.partition("/")
+    statistics = table["seed"].isna() & heads[0].isin(_MEASURED) & heads[2].isin(tables.STATISTICS)
+    for (agent, task, metric), rows in table[statistics].groupby(["agent", "task", heads[0]], sort=False):
+        data = rows.assign(name=heads[2]).pivot_table(index="step", columns="name", values="value").reset_index()
+        data = data.rename(columns={"step": "env_step"}).rename_axis(columns=None).reindex(columns=CURVE_COLUMNS)
+        found.curves.setdefault((task, metric), []).append(Curve(agent, data, published=True))
+    return named_apart(table[~statistics].reset_index(drop=True))

@@ -1,0 +1,137 @@
+"""The beginning of a report: what was compared, who is better and how sure that is, and what is missing."""
+
+import json
+import math
+from collections.abc import Sequence
+
+from sb3_sample.study.reporting.facts import Facts
+from sb3_sample.study.reporting.pieces import STEPS, Interval, counted, cut, interval_text, range_text
+from sb3_sample.study.reporting.reading import Gathered
+from sb3_sample.study.states import DONE
+from sb3_sample.study.table import RUN
+
+#: Agents that are named.
+NAMED = 3
+
+
+def summary(gathered: Gathered, facts: Facts) -> list[tuple[str, list[str]]]:
+    """
+    :param gathered: runs
+    :param facts: their numbers
+    :return: headings with sentences: what was compared, with which result, and what is missing
+    """
+    return [
+        ("Compared", _compared(gathered)),
+        ("Result", _result(facts)),
+        ("Missing", _missing(gathered, facts)),
+    ]
+
+
+def _compared(gathered: Gathered) -> list[str]:
+    own = [agent for agent in gathered.agents if agent not in gathered.published]
+    if not own:
+        planned = list(dict.fromkeys(each.run.variant for state in gathered.states for each in state.runs))
+        return ["Nothing yet.", *([f"Planned: {_listed(planned)}."] if planned else [])]
+    rows = gathered.table[gathered.table["agent"].isin(own)]
+    seeds = rows[RUN].drop_duplicates().groupby(["agent", "task"]).size()
+    ends = rows.groupby(RUN, dropna=False)["step"].max()
+    found = [
+        f"{_listed(own)}.",
+        f"{counted(rows['task'].nunique(), 'task')}, {range_text(seeds, 'seed')} each, up to {ends.max():,} {STEPS}.",
+    ]
+    return found + ([f"Beside them: {_listed(gathered.published)}."] if gathered.published else [])
+
+
+def _listed(names: Sequence[str]) -> str:
+    shown = names if len(names) <= NAMED + 1 else names[:NAMED]
+    more = len(names) - len(shown)
+    return ", ".join(cut(name) for name in shown) + (f" and {more} more" if more else "")
+
+
+def _result(facts: Facts) -> list[str]:
+    if facts.averages is None:
+        return [f"No averages. {facts.reason}"]
+    rows = facts.at(facts.step)
+    found = [(cut(row.agent), Interval(row.iqm, row.low, row.high)) for row in rows.itertuples()]
+    named = ", ".join(f"{agent} {interval_text(value)}" for agent, value in found[:NAMED])
+    more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
+    where = f"at {facts.step:,} steps over {counted(len(facts.tasks), 'task')}"
+    words = f"Interquartile mean of the scores {where}: {named}{more}."
+    if facts.improvement is None:
+        verdict = ["There is one agent." if len(found) == 1 else f"{found[0][0]} has the highest average."]
+    else:
+        best = facts.improvement.iloc[0]
+        verdict = _verdict(cut(best["x"]), cut(best["y"]), Interval(best["probability"], best["low"], best["high"]))
+    if all(math.isnan(value.low) for _, value in found):
+        verdict.append("There are no intervals, since no task has a second run: nothing is certain here.")
+    return [*verdict, words]
+
+
+def _verdict(x: str, y: str, chance: Interval) -> list[str]:
+    """What the probability of improvement says of the two agents with the highest averages."""
+    why = f"A run of {x} beats one of {y} on the same task with probability {interval_text(chance)}."
+    if math.isnan(chance.low):
+        return [f"{x} is ahead of {y}, without certainty.", why]
+    if chance.low > 0.5:
+        return [f"{x} is better than {y}.", why]
+    if chance.high < 0.5:
+        return [f"{x} has the highest average, but is worse than {y} on most tasks.", why]
+    return [f"{x} and {y} cannot be told apart.", why]
+
+
+def _missing(gathered: Gathered, facts: Facts) -> list[str]:
+    found = []
+    for state in gathered.states:
+        rest = ", ".join(f"{n} {name}" for name, n in state.counts.items() if name != DONE and n)
+        where = f" of {state.folder.path.name}" if len(gathered.states) > 1 else ""
+        found.append(
+            f"{state.counts[DONE]} of {counted(len(state.runs), 'planned run')}{where} are done"
+            + (f"; {rest}." if rest else ".")
+        )
+    if gathered.planned:
+        n = sum(map(len, missing(gathered).values()))
+        found.append(f"{len(gathered.planned) - n} of {counted(len(gathered.planned), 'planned run')} are here.")
+    if facts.steps:
+        own = gathered.table[~gathered.table["agent"].isin(gathered.published)]
+        short = int((own.groupby(RUN, dropna=False)["step"].max() < facts.step).sum())
+        if short:
+            found.append(f"{counted(short, 'run')} {'has' if short == 1 else 'have'} not got to {facts.step:,} steps.")
+    if pairs := holes(gathered):
+        found.append(f"{counted(len(pairs), 'pair')} of agent and task {'has' if len(pairs) == 1 else 'have'} no run.")
+    if facts.lacking:
+        found.append(f"{counted(len(facts.lacking), 'task')} {'has' if len(facts.lacking) == 1 else 'have'} no score.")
+    found += [f"{cut(agent)} is in no average: {reason}." for agent, reason in facts.left_out.items()]
+    return found or ["Nothing."]
+
+
+def holes(gathered: Gathered) -> list[tuple[str, str]]:
+    """
+    :param gathered: runs
+    :return: agents and tasks that have runs, but not with each other
+    """
+    own = gathered.table[~gathered.table["agent"].isin(gathered.published)]
+    there = set(zip(own["agent"], own["task"], strict=True))
+    return [(a, t) for a in own["agent"].unique() for t in own["task"].unique() if (a, t) not in there]
+
+
+def missing(gathered: Gathered) -> dict[tuple[str, str], list[int]]:
+    """
+    :param gathered: runs
+    :return: seeds of the given plan's runs that are not among them, by agent (with the grid's arguments) and task
+    """
+    own = gathered.table[~gathered.table["agent"].isin(gathered.published)]
+    there = own[RUN].drop_duplicates()
+    # Agents of a table that differ in their arguments have these behind their names.
+    names = [name.partition(" (")[0] for name in there["agent"]]
+    arguments = [json.loads(text) for text in there["arguments"]]
+    known = list(zip(there["agent"], names, arguments, there["task"], there["seed"], strict=True))
+    found: dict[tuple[str, str], list[int]] = {}
+    for run in gathered.planned:
+        if not any(
+            run.agent in (agent, name)
+            and (task, seed) == (run.task, run.seed)
+            and all(given.get(key) == value for key, value in run.grid.items())
+            for agent, name, given, task, seed in known
+        ):
+            found.setdefault((run.variant, run.task), []).append(run.seed)
+    return found
