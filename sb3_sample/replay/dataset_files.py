@@ -5,17 +5,15 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from sb3_sample.extras import install
-from sb3_sample.replay import dataset as sets
+from sb3_sample.replay import steps as sets
 from sb3_sample.replay.memory_map import check_folder, n_bytes, zeros
-
-if TYPE_CHECKING:
-    from sb3_sample.replay.dataset import Dataset, Steps
+from sb3_sample.replay.steps import Steps
 
 #: An id of Minari's: namespaces, a name, a version.
 _ID = re.compile(r"[\w-]+(/[\w-]+)*-v\d+")
@@ -78,7 +76,7 @@ def _is_id(id_or_path: Any) -> bool:
     return isinstance(id_or_path, str) and _ID.fullmatch(id_or_path) is not None
 
 
-def read_minari(id_or_path: Any, memory_map: Any) -> tuple["Steps", spaces.Space, spaces.Box]:
+def read_minari(id_or_path: Any, memory_map: Any) -> tuple[Steps, spaces.Space, spaces.Box]:
     """
     Read a data set of Minari's.
 
@@ -173,7 +171,7 @@ def _found(id_or_path: Any, minari: Any) -> Path:
     raise ValueError(f"id_or_path={os.fspath(id_or_path)!r} must be a data set of Minari's: there is none in {places}")
 
 
-def write_minari(data: "Dataset", id_or_path: Any, metadata: dict[str, Any]) -> None:
+def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> None:
     """
     Write a data set of Minari's.
 

@@ -92,7 +92,11 @@ class DatasetSource:
                 rewards=torch.from_numpy(venv.normalize_reward(batch.rewards.numpy()).astype(np.float32)),
             )
         device = self._model.device
-        return Batch(*(value if value is None else for_each(lambda part: part.to(device), value) for value in batch))
+        moved: dict[str, Any] = {
+            name: None if value is None else for_each(lambda part: part.to(device), value)
+            for name, value in batch._asdict().items()
+        }
+        return Batch(**moved)
 
 
 class ReplaySource:

@@ -85,6 +85,7 @@ class Actor(BasePolicy):
         if initial_std is not None:
             self._network_args["initial_std"] = initial_std
             half_range = (LOG_STD_MAX - LOG_STD_MIN) / 2
+            assert self.log_std.bias is not None
             # Nearly the same for all observations, whatever their size.
             self.log_std.weight.data.mul_(0.01)
             nn.init.constant_(self.log_std.bias, math.atanh((math.log(initial_std) - LOG_STD_MIN) / half_range - 1))

@@ -163,7 +163,7 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
             self.compiled = bool(self.compile)
         if self.prior_data is not None:
             self._take_prior_data(self.prior_data)
-        self._source = ReplaySource(self)
+        self._source: ReplaySource | DatasetSource = ReplaySource(self)
         self.learner = self._make_learner(networks=self.policy, counts=self)
         checks.check_rule(self)
         self._plain_attributes = plain_attributes(self)

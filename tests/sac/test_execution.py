@@ -59,7 +59,8 @@ class Recorder:
         self.n_recordings = self.n_repetitions = 0
 
     def _memory(self) -> list[torch.Tensor]:
-        modules = (self.model.policy, self.model.temperature, self.model.explorer, self.model.pessimism_rule)
+        parts = (self.model.explorer, self.model.pessimism_rule, self.model.objective)
+        modules = (self.model.policy, self.model.temperature, *parts)
         tensors = [t for module in modules for t in (*module.parameters(), *module.buffers())]
         for optimizer in self.model._optimizers().values():
             tensors += [t for s in optimizer.state.values() for t in s.values() if isinstance(t, torch.Tensor)]
@@ -157,7 +158,7 @@ def test_captured_is_eager(maker: str) -> None:
     # Learning rates are float32 there.
     assert largest_difference(model, other) < TOLERANCE
     # Every kind of step is warmed up three times.
-    n_kinds = 2 if maker == "BROTD3" else 1
+    n_kinds = 2 if maker in ("BROTD3", "TD3BC") else 1
     assert recorder.n_recordings == n_kinds
     assert recorder.n_repetitions == 50 - 3 * n_kinds
 
