@@ -24,6 +24,7 @@ import yaml
 
 from sb3_sample.envs.suites import SUITES
 from sb3_sample.kinds import check_value
+from sb3_sample.shallow_yaml import ShallowLoader
 
 #: Entries of a plan; those after the first four have defaults.
 ENTRIES = (
@@ -192,7 +193,7 @@ def read_plan(path: str | Path) -> Plan:
     return _Reader(Path(path)).read()
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(ShallowLoader):
     """Plain values; ``1e6`` is a number, as everywhere but in YAML 1.1."""
 
     def construct_yaml_float(self, node: yaml.ScalarNode) -> float:

@@ -22,6 +22,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from sb3_sample.saving.classes import resolve, within
 from sb3_sample.saving.untrusted import BadFile, read_regular
+from sb3_sample.shallow_yaml import ShallowLoader
 
 #: Bytes of a file, and values in it, where an alias counts as what it stands for: some hundred times what the zoo
 #: writes, and what is read in a moment.
@@ -44,7 +45,7 @@ _WORD = re.compile(r"(?![.~])[\w .:+-]{0,100}")
 # ---------------------------------------------------------------- YAML
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(ShallowLoader):
     """
     Makes plain values, tuples, and classes that a file may name.
 

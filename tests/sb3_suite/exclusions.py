@@ -147,7 +147,7 @@ _TQC = (
     *_excluded("The test", "IndexError: list index out of range", "test_save_load::test_save_load[*]"),
 )
 _CROSSQ = (
-    *_excluded("The test", "unexpected keyword argument 'renorm_warmup_steps'", "test_run::test_crossq"),
+    *_excluded("The test", "policy_kwargs has 'renorm_warmup_steps'", "test_run::test_crossq"),
     *_excluded("State-dependent exploration", "use_sde=True is not supported", "test_run::test_sde[*]"),
     *_excluded("The test", "IndexError: list index out of range", "test_save_load::test_save_load[*]"),
 )

@@ -126,6 +126,8 @@ BAD = [
     ("seeds:", "seed:", 11, "'seed' is no entry of a plan; did you mean 'seeds'. Allowed are agents, tasks"),
     ("steps: 1e5\n", "", 1, "a plan needs steps"),
     ("[0, 7]", "[0, 7", 12, "this is no YAML"),
+    ("[0, 7]", "[" * 5_000, 11, "nests deeper than 50"),
+    ("[0, 7]", "\n" + "- " * 5_000, 12, "nests deeper than 50"),
     ("    learning_starts: 500", "    learning_starts: 2020-01-01", 4, "a value must be a number"),
     ("0.55M", "!!python/name:os.system", 7, "a value must be a number"),
 ]  # fmt: skip
