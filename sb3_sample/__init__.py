@@ -1,15 +1,24 @@
 """Sample-efficient reinforcement learning for users of Stable-Baselines3."""
 
 from sb3_sample.diagnostics import DiagnosticsCallback
-from sb3_sample.envs import EnvironmentDied, SupervisedSubprocVecEnv, make_env
+from sb3_sample.envs import EnvironmentDied, SupervisedSubprocVecEnv, make_env, multi_task_env
 from sb3_sample.faults import TrainingDiverged
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.recording import record
+from sb3_sample.replay.weighted import (
+    FadedDictReplayBuffer,
+    FadedReplayBuffer,
+    PrioritizedDictReplayBuffer,
+    PrioritizedReplayBuffer,
+    WindowDictReplayBuffer,
+    WindowReplayBuffer,
+)
 from sb3_sample.sac import (
     BC,
+    BRC,
     BRO,
     BROTD3,
     DAC,
@@ -22,13 +31,21 @@ from sb3_sample.sac import (
     TD3BC,
     TOPSAC,
     VPLSAC,
+    XQC,
     BROFast,
+    CrossQ,
+    DebiasedRQ,
+    FlashSAC,
     RegularizedSAC,
+    SimBa,
+    SimbaV2,
 )
+from sb3_sample.training.task_evaluation import MultiTaskEvalCallback, evaluate_tasks
 from sb3_sample.version import __version__
 
 __all__ = [
     "BC",
+    "BRC",
     "BRO",
     "BROTD3",
     "DAC",
@@ -44,17 +61,32 @@ __all__ = [
     "TD3BC",
     "TOPSAC",
     "VPLSAC",
+    "XQC",
     "BROFast",
     "CompactDictReplayBuffer",
     "CompactReplayBuffer",
+    "CrossQ",
     "Dataset",
+    "DebiasedRQ",
     "DeviceReplayBuffer",
     "DiagnosticsCallback",
     "EnvironmentDied",
+    "FadedDictReplayBuffer",
+    "FadedReplayBuffer",
+    "FlashSAC",
+    "MultiTaskEvalCallback",
+    "PrioritizedDictReplayBuffer",
+    "PrioritizedReplayBuffer",
     "RegularizedSAC",
+    "SimBa",
+    "SimbaV2",
     "SupervisedSubprocVecEnv",
     "TrainingDiverged",
+    "WindowDictReplayBuffer",
+    "WindowReplayBuffer",
     "__version__",
+    "evaluate_tasks",
     "make_env",
+    "multi_task_env",
     "record",
 ]

@@ -1,6 +1,6 @@
 """
 The command ``sb3-sample``: the zoo's commands with the algorithms of this package in them, ``plot``, ``study``,
-``dataset`` and ``variance``.
+``dataset``, ``scaling`` and ``variance``.
 """
 
 import argparse
@@ -218,11 +218,11 @@ def _variance(arguments: list[str]) -> None:
     variance(arguments)
 
 
-def _study(arguments: list[str]) -> None:
-    from sb3_sample.study.command import main as study
-
+@contextlib.contextmanager
+def _extras() -> Iterator[None]:
+    """An extra that is not installed is told of without a traceback."""
     try:
-        study(arguments)
+        yield
     except ImportError as error:
         if isinstance(error.__cause__, ModuleNotFoundError):
             sys.exit(f"sb3-sample: {error}")
@@ -235,12 +235,27 @@ def _dataset(arguments: list[str]) -> None:
     dataset(arguments)
 
 
+def _study(arguments: list[str]) -> None:
+    from sb3_sample.study.command import main as study
+
+    with _extras():
+        study(arguments)
+
+
+def _scaling(arguments: list[str]) -> None:
+    from sb3_sample.study.scaling.command import main as scaling
+
+    with _extras():
+        scaling(arguments)
+
+
 COMMANDS: dict[str, Command] = {
     "train": Command(_train, "train an agent, or search for hyperparameters"),
     "enjoy": Command(_enjoy, "run a trained agent"),
     "record_video": Command(_record_video, "write a video of a trained agent"),
     "plot": Command(_plot, "draw the runs of a task, mean and range over seeds, beside the published curves"),
     "study": Command(_study, "make the runs of a plan: agents, tasks, seeds and a grid of arguments"),
+    "scaling": Command(_scaling, "fit scaling laws: batch size, learning rate and replay ratio for a budget"),
     "dataset": Command(_dataset, "record, show and convert data sets for offline learning"),
     "variance": Command(_variance, "measure a policy gradient's variance: more actions or a longer trajectory?"),
     "plot_train": Command(_zoo_plot("plot_train"), "draw the return of the training episodes"),

@@ -13,7 +13,7 @@ import functools
 import inspect
 import sys
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, cast, dataclass_transform
 
@@ -74,6 +74,19 @@ def argument(
     return Argument(alias or "", "", default, kind, kw_only is not False, of_training, keeps_place=kw_only is None)
 
 
+class Given(dict[str, Any]):
+    """
+    Values of a constructor's arguments, by their names.
+
+    :param values: the values
+    :param passed: names of the arguments that were passed, and are not at their defaults for want of a value
+    """
+
+    def __init__(self, values: Mapping[str, Any], passed: Iterable[str]):
+        super().__init__(values)
+        self.passed = frozenset(passed)
+
+
 @dataclass_transform(kw_only_default=True, eq_default=False, field_specifiers=(argument,))
 class Constructed:
     """
@@ -102,7 +115,7 @@ class Constructed:
             cls.__init__ = _constructor(cls, signature)  # type: ignore[method-assign, misc]
         cls.__doc__ = _with_meanings(cls, signature)
 
-    def _construct(self, given: dict[str, Any]) -> None:
+    def _construct(self, given: Given) -> None:
         """
         Construct the object.
 
@@ -214,8 +227,9 @@ def _constructor(cls: type[Constructed], signature: inspect.Signature) -> Callab
             bound = signature.bind(self, *args, **kwargs)
         except TypeError as error:
             raise TypeError(f"{type(self).__name__}: {error}{_meant(type(self), signature, kwargs)}") from None
+        passed = set(bound.arguments)
         bound.apply_defaults()
-        given = dict(bound.arguments)
+        given = Given(bound.arguments, passed)
         del given["self"]
         self._construct(given)
 

@@ -75,13 +75,8 @@ class AdamW(Optimizer):
         Bring everything that :meth:`apply` reads up to date: the moments exist, and the learning rates of the groups
         stand in tensors. Compiled and captured steps, which know tensors only, then find both.
         """
-        rates = [float(group["lr"]) for group in self.param_groups]
+        self.prepare_rates()
         device = self.param_groups[0]["params"][0].device
-        if self._rates is None or self._rates.device != device or len(self._rates_held) != len(rates):
-            self._rates, self._rates_held = torch.tensor(rates, dtype=torch.float32, device=device), rates
-        elif self._rates_held != rates:
-            self._rates.copy_(torch.tensor(rates, dtype=torch.float32))
-            self._rates_held = rates
         for i, group in enumerate(self.param_groups):
             params = group["params"]
             if i < len(self._steps) and all("step" in self.state[p] for p in params):
@@ -101,6 +96,21 @@ class AdamW(Optimizer):
         if any(p is not q for p, q in zip(self.state, parameters, strict=False)):
             ordered = {p: self.state.pop(p) for p in parameters if p in self.state}
             self.state.update(ordered)
+
+    @torch.no_grad()
+    def prepare_rates(self) -> None:
+        """Bring the tensors with the learning rates up to date, which change with the steps in a schedule."""
+        rates = [float(group["lr"]) for group in self.param_groups]
+        first = self.param_groups[0]["params"][0]
+        device = first.device
+        # torch's fused kernel reads a float32 on a GPU.
+        dtype = torch.float64 if first.dtype is torch.float64 and device.type == "cpu" else torch.float32
+        is_held = self._rates is not None and self._rates.device == device and self._rates.dtype is dtype
+        if self._rates is None or not is_held or len(self._rates_held) != len(rates):
+            self._rates, self._rates_held = torch.tensor(rates, dtype=dtype, device=device), rates
+        elif self._rates_held != rates:
+            self._rates.copy_(torch.tensor(rates, dtype=dtype))
+            self._rates_held = rates
 
     def read_tensors(self) -> list[torch.Tensor]:
         """
@@ -154,8 +164,8 @@ def _plain_adamw(group: dict[str, Any], rows: list[tuple[torch.Tensor, ...]], ra
     beta1, beta2 = group["betas"]
     for p, grad, exp_avg, exp_avg_sq, step in rows:
         n = step.double()
-        size = (rate / (1 - beta1**n)).float()
-        root = (1 - beta2**n).rsqrt().float()
+        size = (rate / (1 - beta1**n)).to(p.dtype)
+        root = (1 - beta2**n).rsqrt().to(p.dtype)
         exp_avg.lerp_(grad, 1 - beta1)
         exp_avg_sq.lerp_(grad * grad, 1 - beta2)
         change = size * (exp_avg / (exp_avg_sq.sqrt() * root + group["eps"]))

@@ -1,7 +1,8 @@
 """
 The public door for parts of one's own: everything here stays under this name, wherever it moves inside.
 
-A part is a class, accepted where a name is: ``pessimism=``, ``exploration=``, ``value_head=``, ``batch_transforms=``,
+A part is a class, accepted where a name is: ``pessimism=``, ``exploration=``, ``value_head=``, ``reward_scale=``,
+``batch_transforms=``,
 ``policy_kwargs=dict(critic_network=..., actor_network=...)``. An agent of one's own is a class that declares its
 arguments by ``argument``. docs/parts.md says what each has to have.
 """
@@ -9,14 +10,27 @@ arguments by ``argument``. docs/parts.md says what each has to have.
 from sb3_sample import kinds
 from sb3_sample.constructor import argument
 from sb3_sample.learner.batch import Batch, CriticStep, Extra, Noise
+from sb3_sample.learner.categorical import VALUE_HEADS, CategoricalHead
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration, OptimisticExploration
 from sb3_sample.learner.heads import QuantileHead, ValueHead
 from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.parts import Learning, Part
 from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, epistemic_std, pessimistic_value
+from sb3_sample.learner.reward_scale import REWARD_SCALES, RewardScale
 from sb3_sample.learner.target import bootstrap, td_target, values
 from sb3_sample.learner.transforms import BatchTransform
-from sb3_sample.networks import NETWORKS, EnsembleLayerNorm, EnsembleLinear, HiddenUnits, Network, linear
+from sb3_sample.networks import (
+    NETWORKS,
+    BatchNorm,
+    BatchRenorm,
+    EnsembleLayerNorm,
+    EnsembleLinear,
+    HiddenUnits,
+    Network,
+    UnitNorm,
+    linear,
+    project_weights,
+)
 from sb3_sample.optim import AdamW
 from sb3_sample.replay.columns import Column, Step
 
@@ -24,9 +38,14 @@ __all__ = [
     "EXPLORATIONS",
     "NETWORKS",
     "PESSIMISMS",
+    "REWARD_SCALES",
+    "VALUE_HEADS",
     "AdamW",
     "Batch",
+    "BatchNorm",
+    "BatchRenorm",
     "BatchTransform",
+    "CategoricalHead",
     "Column",
     "CriticStep",
     "EnsembleLayerNorm",
@@ -43,7 +62,9 @@ __all__ = [
     "Part",
     "Pessimism",
     "QuantileHead",
+    "RewardScale",
     "Step",
+    "UnitNorm",
     "ValueHead",
     "argument",
     "bootstrap",
@@ -51,6 +72,7 @@ __all__ = [
     "kinds",
     "linear",
     "pessimistic_value",
+    "project_weights",
     "td_target",
     "values",
 ]

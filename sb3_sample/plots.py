@@ -33,7 +33,7 @@ PUBLISHED = ("BRO", "BRO Fast", "SAC")
 #: What a table of a curve has, by environment step, over the seeds. The standard deviation is the sample's (n - 1).
 COLUMNS = ["env_step", "n_seeds", "mean", "std", "min", "max", "iqm"]
 #: The zoo's name of our algorithm, where it is not the published one's.
-ZOO_NAMES = {"sac": "sac_sample"}
+ZOO_NAMES = {"flashsac": "flash_sac", "sac": "sac_sample"}
 METRICS = {"return": "return", "success_rate": "success rate"}
 #: Rows of the printed table per curve.
 MAX_TABLE_STEPS = 10

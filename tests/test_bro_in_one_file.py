@@ -163,8 +163,10 @@ FILES = [path for path in golden.FILES if is_quantile_bro(path)]
 
 
 def test_files_are_there() -> None:
-    assert {path.stem for path in golden.OWN_FOLDER.glob("bro_quantile_*")} <= {path.stem for path in FILES}
-    assert FILES, f"no updates of BRO in {golden.FOLDER}"
+    own = {path.stem for path in golden.OWN_FOLDER.glob("bro_quantile_*")}
+    assert own
+    # Another folder may be without files of BRO.
+    assert golden.FOLDER != golden.OWN_FOLDER or own <= {path.stem for path in FILES}
 
 
 @pytest.mark.parametrize("path", FILES, ids=[path.stem for path in FILES])

@@ -229,8 +229,8 @@ def test_without_rliable_scores_are_as_they_were(rliable) -> None:
 SHORT = ["--env", "Pendulum-v1", "--eval-freq", "-1", "--device", "cpu"]
 QUICK = ("dac", "vpl_sac")
 NAMES = [
-    "bro", "bro_fast", "bro_td3", "dac", "gpl_sac", "oac", "opl_sac", "regularized_sac", "sac_sample", "sr_sac",
-    "top_sac", "vpl_sac",
+    "brc", "bro", "bro_fast", "bro_td3", "crossq", "dac", "dr_q", "flash_sac", "gpl_sac", "oac", "opl_sac",
+    "regularized_sac", "sac_sample", "simba", "simbav2", "sr_sac", "top_sac", "vpl_sac", "xqc",
 ]  # fmt: skip
 
 

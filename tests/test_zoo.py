@@ -57,9 +57,13 @@ BUILT = [
 ]
 #: Those of the MBMA paper.
 ON_POLICY = sorted(name for name, entry in zoo.ALGORITHMS.items() if issubclass(entry.algorithm, SimulatedPPO))
+#: What came after BRO, each with settings of its own.
+SUCCESSORS = ("brc", "crossq", "dr_q", "flash_sac", "simba", "simbav2", "xqc")
 #: Algorithms with the settings that DAC, VPL and the regularization study (2403.00514) share.
 FAMILY = sorted(
-    name for name, entry in zoo.ALGORITHMS.items() if not issubclass(entry.algorithm, BRO) and name not in ON_POLICY
+    name
+    for name, entry in zoo.ALGORITHMS.items()
+    if not issubclass(entry.algorithm, BRO) and name not in (*ON_POLICY, *SUCCESSORS)
 )
 
 
@@ -78,7 +82,8 @@ def arguments_of(name: str) -> dict[str, Any]:
 
 def small_buffer(name: str) -> dict[str, Any]:
     """What keeps a model's memory small."""
-    return {} if name in ON_POLICY else {"buffer_size": 1000}
+    width = {"critic_width": 16} if name == "brc" else {}
+    return {} if name in ON_POLICY else {"buffer_size": 1000, **width}
 
 
 def manager(name: str, env_id: str, folder: Path, **kwargs: Any) -> ExperimentManager:
@@ -269,6 +274,13 @@ def test_the_tasks_of_p1_have_entries_with_its_settings(name: str) -> None:
         assert (ours[env_id]["n_steps"], ours[env_id]["batch_size"]) == (4096, 128)
         if name != "qma_ppo":
             assert ours[env_id]["dynamics_buffer_size"] == 2_000_000 and ours[env_id]["dynamics_batch_size"] == 256
+
+
+def test_the_tasks_of_dr_q_have_its_action_repeat() -> None:
+    ours = {env_id: entry for env_id, entry in entries("dr_q").items() if env_id.startswith("dmc/")}
+    assert len(ours) == 28
+    assert all(entry["env_kwargs"] == {"action_repeat": 2} for entry in ours.values())
+    assert {2 * entry["n_timesteps"] for entry in ours.values()} == {1e6}
 
 
 @pytest.mark.parametrize("name", ON_POLICY)

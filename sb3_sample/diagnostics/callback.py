@@ -144,6 +144,8 @@ class DiagnosticsCallback(BaseCallback):
         model = self.model
         if not isinstance(model, SAC):
             raise TypeError(f"DiagnosticsCallback needs a model of sb3_sample.sac.SAC, not a {type(model).__name__}")
+        if model.n_tasks > 1:
+            raise ValueError(f"DiagnosticsCallback measures models of one task, and this one has {model.n_tasks}")
         if not model.gamma < 1:
             raise ValueError(f"gamma must be below 1 for the Monte-Carlo reference, not {model.gamma}")
         env = self._checked_env()
@@ -327,6 +329,8 @@ class DiagnosticsCallback(BaseCallback):
         normalize = self.model.get_vec_normalize_env()
         if normalize is not None:
             following = normalize.normalize_reward(following)
+        if self.model.reward_scaler is not None:
+            following = following / self.model.reward_scaler.divisor(None).item()
         return Rollout(value, following.astype(np.float64), np.array(log_probs), terminated)
 
     def _overfitting(self, training: Batch) -> dict[str, float]:
@@ -343,6 +347,8 @@ class DiagnosticsCallback(BaseCallback):
     def _td_error(self, batch: Batch) -> float:
         """Mean squared TD error of the critics' mean."""
         model = self.model
+        if model.reward_scaler is not None:
+            batch = model.reward_scaler.transform(batch, None)
         subset = None
         if model.target_subset is not None:
             subset = torch.from_numpy(self._rng.permutation(model.critic.n_critics)[: model.target_subset])
@@ -350,7 +356,7 @@ class DiagnosticsCallback(BaseCallback):
         next_q, entropy_bonus = bootstrap(model.learner, batch, model.temperature(), noise, subset)
         target = model.learner.head.target(batch, next_q, model.pessimism_rule.value, entropy_bonus)
         q = values(model.learner, model.critic, batch.observations, batch.actions)
-        return (q.mean(dim=(0, 2)) - target.mean(dim=1)).square().mean().item()
+        return (q.mean(dim=(0, 2)) - model.learner.head.mean_target(target).squeeze(1)).square().mean().item()
 
     def _networks(self, batch: Batch) -> dict[str, float]:
         """Disagreement, dormant neurons and rank, on a batch of the replay buffer."""
@@ -359,8 +365,7 @@ class DiagnosticsCallback(BaseCallback):
         q = values(self.model.learner, critic, batch.observations, batch.actions)
         if len(q) > 1:
             results["critic_disagreement"] = epistemic_std(q).mean().item()
-        extractor: Any = critic.features_extractor
-        x = torch.cat((critic.extract_features(batch.observations, extractor), batch.actions), dim=1)
+        x = critic.inputs(batch.observations, batch.actions)
         for who, scores in (
             ("critic", neuron_scores(critic.trunk, critic.head, x)),
             ("actor", neuron_scores(actor.trunk, None, actor.features(batch.observations))),

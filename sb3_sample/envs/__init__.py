@@ -5,6 +5,7 @@ The environments of the papers under short ids, registered with Gymnasium when t
 when an environment is made.
 """
 
+from sb3_sample.envs.multi_task import TaskEnv, multi_task_env
 from sb3_sample.envs.registration import (
     ALL_IDS,
     DMC_IDS,
@@ -27,6 +28,8 @@ __all__ = [
     "MYOSUITE_IDS",
     "EnvironmentDied",
     "SupervisedSubprocVecEnv",
+    "TaskEnv",
     "make_env",
+    "multi_task_env",
     "published_key",
 ]

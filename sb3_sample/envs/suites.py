@@ -162,6 +162,75 @@ MBMA = _dmc(
 #: MBMA, table 4: four harder tasks, 3M (quadruped) and 6M (humanoid) environment steps, action repeat 4.
 MBMA_HARD = _dmc("quadruped-walk", "quadruped-run", "humanoid-stand", "humanoid-walk")
 
+#: Dogs and humanoids, the seven hard tasks of DeepMind Control that BRC learns with one agent.
+DMC_HARD = DAC_NAMED
+#: Meta-World's MT10 and MT50, tasks for one agent, in the order of the library (``metaworld.env_dict``), whose position
+#: is a task's number.
+MT10 = _metaworld(
+    "reach",
+    "push",
+    "pick-place",
+    "door-open",
+    "drawer-open",
+    "drawer-close",
+    "button-press-topdown",
+    "peg-insert-side",
+    "window-open",
+    "window-close",
+)
+MT50 = _metaworld(
+    "assembly",
+    "basketball",
+    "bin-picking",
+    "box-close",
+    "button-press-topdown",
+    "button-press-topdown-wall",
+    "button-press",
+    "button-press-wall",
+    "coffee-button",
+    "coffee-pull",
+    "coffee-push",
+    "dial-turn",
+    "disassemble",
+    "door-close",
+    "door-lock",
+    "door-open",
+    "door-unlock",
+    "hand-insert",
+    "drawer-close",
+    "drawer-open",
+    "faucet-open",
+    "faucet-close",
+    "hammer",
+    "handle-press-side",
+    "handle-press",
+    "handle-pull-side",
+    "handle-pull",
+    "lever-pull",
+    "pick-place-wall",
+    "pick-out-of-hole",
+    "pick-place",
+    "plate-slide",
+    "plate-slide-side",
+    "plate-slide-back",
+    "plate-slide-back-side",
+    "peg-insert-side",
+    "peg-unplug-side",
+    "soccer",
+    "stick-push",
+    "stick-pull",
+    "push",
+    "push-wall",
+    "push-back",
+    "reach",
+    "reach-wall",
+    "shelf-place",
+    "sweep-into",
+    "sweep",
+    "window-open",
+    "window-close",
+)
+
 #: The lists by their names.
 SUITES: dict[str, tuple[str, ...]] = {
     name: tasks for name, tasks in list(globals().items()) if isinstance(tasks, tuple) and not name.startswith("_")

@@ -5,6 +5,9 @@ from typing import Any, NamedTuple, Protocol
 
 import torch
 
+#: Column of batches from a replay buffer with priorities: the slots that the transitions were drawn from, (B, 1).
+SLOTS = "slots"
+
 
 class Batch(NamedTuple):
     """
@@ -41,6 +44,45 @@ class Batch(NamedTuple):
             samples.rewards,
             gamma if discounts is None else discounts,
             getattr(samples, "columns", {}),
+        )
+
+
+class Windows(NamedTuple):
+    """
+    Consecutive steps of one environment each, H of them.
+
+    ``observations`` is that of the first step, (B, O) or a dict of such; ``actions``, in [-1, 1], (B, H, A);
+    ``next_observations`` (B, H, O) or a dict of such; ``dones``, 1 where the episode terminated (a time limit is 0),
+    and ``rewards``, (B, H). What follows a termination is of another episode, and means nothing. ``columns`` are those
+    of the first step.
+    """
+
+    observations: Any
+    actions: torch.Tensor
+    next_observations: Any
+    dones: torch.Tensor
+    rewards: torch.Tensor
+    columns: Mapping[str, torch.Tensor] = {}
+
+    def n_step(self, gamma: float) -> Batch:
+        """
+        Make transitions of H steps, whose reward is the discounted sum up to a termination.
+
+        :param gamma: discount factor of one step
+        :return: the transitions
+        """
+        alive = (1 - self.dones).cumprod(dim=1)
+        discounts = gamma ** torch.arange(alive.shape[1], dtype=alive.dtype, device=alive.device)
+        # The reward of the terminating step counts.
+        counts = torch.cat((torch.ones_like(alive[:, :1]), alive[:, :-1]), dim=1)
+        return Batch(
+            self.observations,
+            self.actions[:, 0],
+            for_each(lambda part: part[:, -1], self.next_observations),
+            1 - alive[:, -1:],
+            (self.rewards * counts * discounts).sum(dim=1, keepdim=True),
+            gamma ** alive.shape[1],
+            self.columns,
         )
 
 

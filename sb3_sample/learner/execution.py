@@ -147,13 +147,21 @@ class Execution:
     :param compiled: whether to compile
     :param fall_back: whether what cannot be compiled is run uncompiled, with a warning, instead of an error
     :param recorder: what captures; a CUDA graph on a GPU, None elsewhere: no capture
+    :param method: name of the learner's method that is run
     """
 
-    def __init__(self, learner: Any, compiled: bool, fall_back: bool, recorder: Recorder | None = None):
-        self.compiled, self.fall_back = compiled, fall_back
+    def __init__(
+        self,
+        learner: Any,
+        compiled: bool,
+        fall_back: bool,
+        recorder: Recorder | None = None,
+        method: str = "gradient_step",
+    ):
+        self.compiled, self.fall_back, self._method = compiled, fall_back, method
         #: Seconds spent on compiling, over all inputs and settings that the step was compiled for.
         self.seconds_compiling = 0.0
-        self._step: Callable[..., Metrics] = type(learner).gradient_step
+        self._step: Callable[..., Metrics] = getattr(type(learner), method)
         if compiled:
             # The compiler keeps what it made by the code object. With one for each model, models neither use each
             # other's nor reach the limit of compilations together.
@@ -177,11 +185,12 @@ class Execution:
         return self._modules == _modules(learner)
 
     @classmethod
-    def of(cls, learner: Any) -> "Execution":
+    def of(cls, learner: Any, method: str = "gradient_step") -> "Execution":
         """
         Choose how the gradient steps are run.
 
         :param learner: a learner whose ``compiled`` is decided
+        :param method: name of the learner's method that is run
         :return: what runs its gradient steps
         """
         if learner.compiled:
@@ -192,7 +201,7 @@ class Execution:
         # Parts of one's own may look at values on the host: captured only when asked for.
         asked = learner.compile is True or (learner.compile == "auto" and not foreign_parts(learner))
         captures = learner.device.type == "cuda" and asked and not _foreign_optimizers(learner)
-        return cls(learner, bool(learner.compiled), learner.compile == "auto", cuda_graph if captures else None)
+        return cls(learner, bool(learner.compiled), learner.compile == "auto", cuda_graph if captures else None, method)
 
     @property
     def leaves_gradients(self) -> bool:
@@ -222,7 +231,7 @@ class Execution:
         :return: its result; that of a captured step is valid until the next one
         """
         if eager:
-            return type(learner).gradient_step(learner, *inputs)
+            return getattr(type(learner), self._method)(learner, *inputs)  # type: ignore[no-any-return]
         if self._captured is not None:
             return self._captured(self._run, learner, inputs)
         return self._run(learner, *inputs)
@@ -246,13 +255,13 @@ class Execution:
             if not self.fall_back:
                 if raised:
                     # Eagerly it is raised as it is, from its place.
-                    type(learner).gradient_step(learner, *inputs)
+                    getattr(type(learner), self._method)(learner, *inputs)
                 raise RuntimeError(
                     f"compile=True, but the gradient step cannot be compiled: {reason}. Pass compile=False, or 'auto'"
                 ) from error
             warnings.warn(f"The gradient step is not compiled, as it cannot be: {reason}", stacklevel=2)
             self.compiled = learner.compiled = False
-            self._step = type(learner).gradient_step
+            self._step = getattr(type(learner), self._method)
             return self._step(learner, *inputs)
 
     def _compile(self, learner: Any, *inputs: Any) -> Metrics:

@@ -14,7 +14,7 @@ from sb3_sample.learner.parts import Learning, Part
 from sb3_sample.learner.pessimism import epistemic_std
 from sb3_sample.learner.scalars import BoundedLogScalar, LogScalar
 from sb3_sample.learner.target import values
-from sb3_sample.networks import NETWORKS, linear
+from sb3_sample.networks import NETWORKS, linear, widened
 from sb3_sample.optim import AdamW
 
 
@@ -49,6 +49,58 @@ class Exploration(Part):
         :return: what to log, by name, scalars
         """
         return {}
+
+
+class HeldNoise(Exploration):
+    """
+    FlashSAC's exploration: the actor's noise is held for some steps, ``tanh(mean + std * held)`` with mean and standard
+    deviation of each step. How many, n, is drawn with a probability proportional to ``n ** -exponent``, for all
+    environments at once. A noise outlives the end of an episode.
+
+    :param learner: the learner, whose networks exist already
+    :param exponent: of the distribution of n, at least 0
+    :param longest: largest n
+    :raises ValueError: if an argument is out of range
+    """
+
+    def __init__(self, learner: Learning, exponent: float = 2.0, longest: int = 16):
+        super().__init__(learner)
+        check_value("exponent", exponent, AT_LEAST_0)
+        check_value("longest", longest, integer(1))
+        weights = torch.arange(1, longest + 1, dtype=torch.float64) ** -float(exponent)
+        #: Probabilities that a noise is held for at most 1, 2, ... steps, (longest,), on the host.
+        self._cumulative = (weights.cumsum(0) / weights.sum()).float()
+        self._held: torch.Tensor | None = None
+        self._length = self._n_held = 0
+
+    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
+        mean, log_std = learner.actor.gaussian(learner.actor.features(observations))
+        held = self.hold(torch.randn_like(mean), float(torch.rand(())))
+        return learner.actor.act(mean, log_std.exp(), held)
+
+    def hold(self, fresh: torch.Tensor, uniform: float) -> torch.Tensor:
+        """
+        Take one step.
+
+        :param fresh: standard normal noise, (n_envs, A), used if none is held any longer
+        :param uniform: number in [0, 1), from which it then follows how long the new one is held
+        :return: the noise of the step, (n_envs, A)
+        """
+        held = self._held
+        if held is None or held.shape != fresh.shape or self._n_held >= self._length:
+            held, self._n_held = fresh, 0
+            # The last probability is 1, up to rounding.
+            self._length = 1 + min(int((self._cumulative <= uniform).sum()), len(self._cumulative) - 1)
+        self._held, self._n_held = held.to(fresh), self._n_held + 1
+        return self._held
+
+    def get_extra_state(self) -> dict[str, Any]:
+        held = None if self._held is None else self._held.tolist()
+        return {"held": held, "length": self._length, "n_held": self._n_held}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self._held = None if state["held"] is None else torch.tensor(state["held"])
+        self._length, self._n_held = int(state["length"]), int(state["n_held"])
 
 
 #: What may be meant by the spread of the critics.
@@ -222,6 +274,7 @@ class OptimisticShift(OptimisticExploration):
     :param adjustment_learning_rate: of optimism and weight, by Adam with beta1 = 0.5
     :param network: trunk of the shift network, one of ``NETWORKS``
     :param network_kwargs: its arguments; None: one block, 256 wide, for "bronet", the network's own otherwise
+    :param width_factor: by which its hidden layers are wider than that
     :raises ValueError: if an argument is out of range
     """
 
@@ -236,15 +289,18 @@ class OptimisticShift(OptimisticExploration):
         adjustment_learning_rate: float = 3e-5,
         network: str = "bronet",
         network_kwargs: dict[str, Any] | None = None,
+        width_factor: int = 1,
     ):
         super().__init__(learner, kl_target, std_multiplier, uncertainty, adjustment_learning_rate)
+        check_value("width_factor", width_factor, integer(1))
         if network not in NETWORKS:
             raise ValueError(f"network must be one of {sorted(NETWORKS)}, not {network!r}")
         actor = learner.actor
         action_dim = actor.action_dim
         if network_kwargs is None:
             network_kwargs = {"width": 256, "n_blocks": 1} if network == "bronet" else {}
-        self.trunk = NETWORKS[network](actor.features_dim + action_dim, **network_kwargs)
+        made = NETWORKS[network]
+        self.trunk = made(actor.features_dim + action_dim, **widened(made, network_kwargs, width_factor))
         # Without bias and nearly zero, so that the optimistic actor starts as the pessimistic one.
         self.shift = linear(self.trunk.out_features, action_dim, None, bias=False, gain=0.01)
         self.optimism = BoundedLogScalar("initial_optimism", initial_optimism)
@@ -295,8 +351,8 @@ class OptimisticActor(OptimisticExploration):
     :param initial_kl_weight: weight of the divergence at the start, above 0
     :param adjustment_learning_rate: of optimism and weight, by Adam with beta1 = 0.5
     :param kl_direction: "optimistic_to_pessimistic" or "pessimistic_to_optimistic"
-    :param reinitialize_every: environment steps, counted in transitions over the model's life, after which it starts
-        anew; None for never
+    :param reinitialize_every: environment steps, counted in transitions over the model's life, of each task where there
+        are several, after which it starts anew; None for never
     :raises ValueError: if an argument is out of range
     """
 
@@ -337,10 +393,10 @@ class OptimisticActor(OptimisticExploration):
         self._make_optimizers(
             learner, self.actor.parameters(), self.optimism_distance.parameters(), self.kl_weight.parameters()
         )
-        self._reached = learner.num_transitions
+        self._reached = learner.environment_steps
 
     def before_updates(self, learner: Learning) -> None:
-        every, before, now = self.reinitialize_every, self._reached, learner.num_transitions
+        every, before, now = self.reinitialize_every, self._reached, learner.environment_steps
         self._reached = now
         if every is not None and now // every > before // every:
             learner.restart(self, learner.make_explorer())
@@ -438,6 +494,7 @@ class OptimisticGradient(Exploration):
 #: Choices by the name that the algorithm's ``exploration`` argument takes.
 EXPLORATIONS: dict[str, type[Exploration]] = {
     "actor": Exploration,
+    "held_noise": HeldNoise,
     "oac": OptimisticGradient,
     "optimistic_actor": OptimisticActor,
     "optimistic_shift": OptimisticShift,

@@ -130,7 +130,7 @@ def _try(learner: Any, batch: Batch) -> None:
     value = _called(rule, "value", values, letters="q (E, B, K)")
     _check(rule, "value", value, "the ensemble's value", (n, values.shape[2]), "(B, K)")
 
-    next_q, entropy_bonus = bootstrap(learner, batch, learner.temperature(), torch.zeros_like(batch.actions))
+    next_q, entropy_bonus = bootstrap(learner, batch, learner.temperature_of(batch), torch.zeros_like(batch.actions))
     with torch.no_grad():
         target = _called(
             head, "target", batch, next_q, rule.value, entropy_bonus, letters="next_q (E, B, n_outputs), bonus (B, 1)"

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import ClassVar
 
 import torch
+import torch.nn.functional as F
 from torch import nn
 
 from sb3_sample.learner import losses
@@ -52,6 +53,15 @@ class ValueHead(nn.Module):
         """
         return td_target(batch, value(self.values(next_q)), entropy_bonus)
 
+    def mean_target(self, target: torch.Tensor) -> torch.Tensor:
+        """
+        Compute the value that a target stands for.
+
+        :param target: from :meth:`target`
+        :return: (B, 1)
+        """
+        return target.mean(dim=1, keepdim=True)
+
     def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """
         Compute the critics' loss.
@@ -61,6 +71,13 @@ class ValueHead(nn.Module):
         :return: scalar
         """
         return losses.squared_error(q, target)
+
+
+class HalfSquaredHead(ValueHead):
+    """Head of scalar critics, trained by half the squared error, as in Stable-Baselines3 and CrossQ."""
+
+    def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        return super().loss(q, target) / 2
 
 
 class QuantileHead(ValueHead):
@@ -76,3 +93,13 @@ class QuantileHead(ValueHead):
 
     def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         return losses.quantile_huber(q, target)
+
+
+class HuberHead(ValueHead):
+    """
+    Head of scalar critics, trained by the Huber loss with threshold 1, its mean over batch and critics (DR.Q; LAP,
+    Fujimoto et al. 2020).
+    """
+
+    def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        return F.smooth_l1_loss(q, target.expand_as(q))

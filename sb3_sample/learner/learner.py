@@ -4,8 +4,8 @@ Learner of the off-policy family: networks, targets, learned numbers, optimizers
 ``Learner.gradient_step`` is the whole gradient step, in the order of BRO's pseudo-code (BRO, algorithm 2).
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -14,23 +14,41 @@ from torch import nn
 from torch.optim import Optimizer
 
 from sb3_sample.learner import first_step, losses
-from sb3_sample.learner.batch import Batch, CriticStep, Extra, Noise
+from sb3_sample.learner.batch import SLOTS, Batch, CriticStep, Extra, Noise
 from sb3_sample.learner.execution import Execution
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
-from sb3_sample.learner.objectives import Objective
+from sb3_sample.learner.objectives import Objective, Prepared
+from sb3_sample.learner.observation_statistics import ObservationStatistics
 from sb3_sample.learner.observations import Observations
 from sb3_sample.learner.parts import Part, logged
 from sb3_sample.learner.pessimism import Pessimism, pessimistic_value
 from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.q_values import evaluate
 from sb3_sample.learner.randomness import OwnGenerators
-from sb3_sample.learner.scalars import FixedScalar, LogScalar
-from sb3_sample.learner.target import next_step, online_outputs, step_outputs
+from sb3_sample.learner.reward_scale import RewardScale, task_of
+from sb3_sample.learner.scalars import FixedScalar, LogScalar, TaskLogScalar
+from sb3_sample.learner.schedules import LearningRateSchedule
+from sb3_sample.learner.target import next_step, online_outputs, step_outputs, td_target
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
+from sb3_sample.networks.unit_norm import project_weights
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
+
+#: Among a gradient step's results, the TD errors that are no metric.
+_TD_ERRORS = "td_errors"
+
+
+def check_is_batch(batch: Any) -> None:
+    """
+    Check that something is a batch.
+
+    :param batch: anything
+    :raises ValueError: if it is none
+    """
+    if not isinstance(batch, Batch):
+        raise ValueError(f"batch must be a Batch, not {batch!r:.100}: data.sample(n) of a Dataset gives one")
 
 
 class Counts:
@@ -43,6 +61,8 @@ class Counts:
         self.num_transitions = 0
         #: Whether the gradient step is compiled; None while that is not decided.
         self.compiled: bool | None = None
+        #: Gradient steps planned, for the schedule of the learning rate; None while they are not known.
+        self.planned_updates: int | None = None
 
 
 class Learner:
@@ -57,14 +77,20 @@ class Learner:
     :param plasticity: resets of networks, optimizers and learned numbers
     :param redo: recycling of dormant neurons; None for none
     :param make_transforms: each makes a batch transform for the learner, applied in this order
+    :param make_reward_scaler: makes the rule that scales rewards for the learner, applied before them; None for none
     :param make_objective: makes a freshly initialised objective for the learner; None for that of soft actor-critic
     :param learning_rate: of actor, critics and temperature, at the start
+    :param schedule: learning rates over the planned gradient steps; None: as :meth:`set_learning_rate` says
     :param temperature_beta1: beta1 of the temperature's Adam
     :param gamma: discount factor of batches that have none of their own
     :param tau: weight of the new critics in the Polyak average of the targets
-    :param target_entropy: entropy that the learned temperature aims at
+    :param target_entropy: entropy that the learned temperature aims at; one for each task where each has a temperature
+        of its own, or the same for all; None: -|A|/2
+    :param n_tasks: tasks that the observations tell apart
     :param target_update_interval: gradient steps between two updates of the targets; None: ``policy_delay``
     :param policy_delay: gradient steps between two of the actors' and of the temperature
+    :param actor_at_once: whether the first of ``policy_delay`` gradient steps is the actors', and not the last
+    :param actor_first: whether actors and temperature learn before the critics, whose target is then of the new ones
     :param target_subset: how many critics, drawn at random, make the TD target; None: all
     :param actor_pessimism: a weight of pessimism for the actor's objective alone; None: the rule's
     :param sam_radius: radius of sharpness-aware minimisation of the critics' loss; None for none
@@ -79,8 +105,8 @@ class Learner:
 
     #: Arguments that may be set between two gradient steps, with effect from the next one on.
     SETTINGS = (
-        "gamma", "tau", "target_update_interval", "policy_delay", "target_subset", "actor_pessimism", "sam_radius",
-        "learning_starts", "verbose", "compile",
+        "gamma", "tau", "target_update_interval", "policy_delay", "actor_at_once", "actor_first", "target_subset",
+        "actor_pessimism", "sam_radius", "learning_starts", "verbose", "compile",
     )  # fmt: skip
 
     pessimism_rule: Pessimism
@@ -97,18 +123,23 @@ class Learner:
         plasticity: Resets,
         redo: ReDo | None = None,
         make_transforms: Sequence[Callable[[Any], BatchTransform]] = (),
+        make_reward_scaler: Callable[[Any], RewardScale] | None = None,
         make_objective: Callable[[Any], Objective] | None = None,
         learning_rate: float = 3e-4,
+        schedule: LearningRateSchedule | None = None,
         temperature_beta1: float = 0.9,
         gamma: float = 0.99,
         tau: float = 0.005,
-        target_entropy: float | None = None,
+        target_entropy: float | Sequence[float] | None = None,
         target_update_interval: int | None = 1,
         policy_delay: int = 1,
+        actor_at_once: bool = False,
+        actor_first: bool = False,
         target_subset: int | None = None,
         actor_pessimism: float | None = None,
         sam_radius: float | None = None,
         learning_starts: int = 0,
+        n_tasks: int = 1,
         compile: bool | str = False,
         device: torch.device | str = "cpu",
         verbose: int = 0,
@@ -121,19 +152,25 @@ class Learner:
         self._make_objective = make_objective or (lambda learner: Objective())
         self.device, self.verbose, self.learning_rate = torch.device(device), verbose, learning_rate
         self.gamma, self.tau = gamma, tau
+        self.schedule = schedule
         self.target_update_interval, self.policy_delay = target_update_interval, policy_delay
+        self.actor_at_once, self.actor_first = actor_at_once, actor_first
         self.target_subset, self.actor_pessimism, self.sam_radius = target_subset, actor_pessimism, sam_radius
         self.learning_starts, self.compile = learning_starts, compile
+        self.n_tasks, self._n_envs = n_tasks, 1
         self._counts = Counts() if counts is None else counts
         self._generators, self.head = generators, head.to(self.device)
         with self._random():
             self.networks = make_networks().to(self.device) if networks is None else networks
-            self.target_entropy = -self.actor.action_dim / 2 if target_entropy is None else target_entropy
+            self.target_entropy: float | torch.Tensor = 0.0
+            self.set_target_entropy(-self.actor.action_dim / 2 if target_entropy is None else target_entropy)
             self.temperature = make_temperature(self)
             self.pessimism_rule = self.make_pessimism()
             self.explorer = self.make_explorer()
+            self.reward_scaler = None if make_reward_scaler is None else make_reward_scaler(self).to(self.device)
             self.transforms: Any = nn.ModuleList(make(self).to(self.device) for make in make_transforms)
             self.objective = self._make_objective(self)
+        self.observation_statistics = None if self.observation_norm is None else ObservationStatistics()
         self.plasticity, self.redo = plasticity, redo
         if redo is not None:
             redo.check(self)
@@ -147,9 +184,10 @@ class Learner:
         self.gradients_are_stale = False
         # Whether the shapes of a gradient step, and those of the explorer's actions, were checked.
         self._checked_step = self._checked_actions = False
+        # TD errors of the last gradient step's batch.
+        self._td_errors: torch.Tensor | None = None
         # Whether a step was reported since the last gradient step.
         self._heard = False
-        self._n_envs = 1
         self.set_training_mode(False)
 
     def _random(self) -> AbstractContextManager[None]:
@@ -173,6 +211,11 @@ class Learner:
         return self.networks.critic_target
 
     @property
+    def observation_norm(self) -> Any:
+        """Running normalisation of the networks' observations; None for none."""
+        return self.networks.observation_norm
+
+    @property
     def n_updates(self) -> int:
         """Gradient steps taken over the learner's life."""
         return int(self._counts._n_updates)
@@ -183,9 +226,31 @@ class Learner:
         return int(self._counts.num_transitions)
 
     @property
+    def environment_steps(self) -> int:
+        """The same of each task, where several take a step together."""
+        return self.num_transitions // min(self.n_tasks, self.n_envs)
+
+    @property
     def n_envs(self) -> int:
         """Environments of the latest step that it was told of; 1 before."""
         return self._n_envs
+
+    @property
+    def planned_updates(self) -> int | None:
+        """Gradient steps planned, for the schedule of the learning rate; None while they are not known."""
+        return self._counts.planned_updates  # type: ignore[no-any-return]
+
+    @planned_updates.setter
+    def planned_updates(self, value: int | None) -> None:
+        self._counts.planned_updates = value
+
+    @property
+    def td_errors(self) -> torch.Tensor | None:
+        """
+        TD errors of the last gradient step, for the priorities of its transitions: absolute, the largest of any
+        critic's, from before the step, (B,). None if the batch came without the column ``slots``.
+        """
+        return self._td_errors
 
     @property
     def compiled(self) -> bool | None:
@@ -268,7 +333,8 @@ class Learner:
             "pessimism_rule": self.pessimism_rule,
             "plasticity": self.plasticity,
         }
-        parts |= {} if self.redo is None else {"redo": self.redo}
+        optional = ("redo", "observation_statistics", "reward_scaler")
+        parts |= {name: getattr(self, name) for name in optional if getattr(self, name) is not None}
         parts |= {"objective": self.objective} if self.objective.has_state else {}
         return parts | {f"transforms.{i}": transform for i, transform in enumerate(self.transforms)}
 
@@ -297,6 +363,32 @@ class Learner:
         self.networks.set_training_mode(mode)
         self._parts_mode(mode)
 
+    def set_target_entropy(self, value: float | Sequence[float]) -> None:
+        """
+        Set the entropy that the learned temperature aims at.
+
+        :param value: a number, or one for each task
+        """
+        if isinstance(value, Sequence):
+            targets = torch.tensor(value, dtype=torch.float32, device=self.device)
+            if isinstance(self.target_entropy, torch.Tensor):
+                # In place, where a captured gradient step reads it.
+                self.target_entropy.copy_(targets)
+            else:
+                self.target_entropy = targets
+        else:
+            self.target_entropy = value
+
+    def temperature_of(self, batch: Batch) -> torch.Tensor:
+        """
+        Look up the temperature of transitions.
+
+        :param batch: transitions
+        :return: a scalar with gradient, or (B, 1) where each task has its own
+        """
+        values: torch.Tensor = self.temperature()
+        return values[task_of(batch)] if isinstance(self.temperature, TaskLogScalar) else values
+
     def set_learning_rate(self, rate: float) -> None:
         """
         Set the learning rate.
@@ -308,7 +400,35 @@ class Learner:
                 if group.get("scheduled", True):
                     group["lr"] = rate
 
+    @property
+    def scheduled_rate(self) -> float | None:
+        """Learning rate of the critics' next step by the schedule; None without one."""
+        return None if self.schedule is None else self.schedule.rate(self.n_updates, self.planned_updates)
+
+    def _set_scheduled_rates(self, schedule: LearningRateSchedule) -> None:
+        """Set the rates of the step that is counted already; each optimizer goes by the steps that it took itself."""
+        before = self.n_updates - 1
+        of_critics = schedule.rate(before, self.planned_updates)
+        # One ahead, at a start and after every delay, where the first of the steps is theirs.
+        ahead = self.policy_delay - 1 if self.actor_at_once else 0
+        of_actors = schedule.rate((before + ahead) // self.policy_delay, self.planned_updates)
+        for optimizer in self.optimizers().values():
+            for group in optimizer.param_groups:
+                if group.get("scheduled", True):
+                    group["lr"] = of_critics if optimizer is self.critic.optimizer else of_actors
+            if isinstance(optimizer, AdamW):
+                optimizer.prepare_rates()
+
     # ---------------------------------------------------------------- what it is told
+
+    def on_observations(self, observations: Any) -> None:
+        """
+        Tell the parts of the observations that are acted on, before the actions of a step are chosen in training.
+
+        :param observations: arrays or tensors, (n_envs, O), or a dict of them
+        """
+        for part in self.parts().values():
+            part.on_observations(self, observations)
 
     def on_step(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """
@@ -369,15 +489,20 @@ class Learner:
         :return: what to log, by name, scalars on the learner's device
         :raises ValueError: if the batch is none
         """
-        if not isinstance(batch, Batch):
-            raise ValueError(f"batch must be a Batch, not {batch!r:.100}: data.sample(n) of a Dataset gives one")
+        check_is_batch(batch)
+        with self._updating():
+            return self.step(batch, noise, extra)
+
+    @contextmanager
+    def _updating(self) -> Iterator[None]:
+        """What :meth:`update` does around a gradient step."""
         with self._random():
             if self._heard:
                 self.before_updates()
             self.plasticity.before_gradient_steps(self, 1)
             self.set_training_mode(True)
             try:
-                return self.step(batch, noise, extra)
+                yield
             finally:
                 self.set_training_mode(False)
 
@@ -431,7 +556,7 @@ class Learner:
             extra = extra._replace(batch=extra.batch._replace(discounts=self.gamma))
         if not self._checked_step:
             first_step.check_batch("batch", batch)
-        if self.transforms:
+        if self.transforms or self.reward_scaler is not None:
             batch, noise, extra = self._transformed(batch, noise, extra)
         subset = None if self.target_subset is None else (self.target_subset, self.critic.n_critics)
         noise = (noise or Noise()).completed(batch, extra, subset)
@@ -439,16 +564,26 @@ class Learner:
             first_step.check(self, batch, extra)
             self._checked_step = True
         self._counts._n_updates += 1
-        moves_targets = self.n_updates % (self.target_update_interval or self.policy_delay) == 0
-        moves_actor = self.n_updates % self.policy_delay == 0
-        metrics = execution(self, batch, noise, extra, moves_targets, moves_actor, eager=eager)
+        if self.schedule is not None:
+            self._set_scheduled_rates(self.schedule)
+        metrics = execution(self, batch, noise, extra, *self._what_moves(), eager=eager)
+        self._td_errors = metrics.pop(_TD_ERRORS, None)
         self.gradients_are_stale = not (eager or execution.leaves_gradients)
         for part in self.parts().values():
             metrics.update(logged(part, "after_update", part.after_update(self, batch)))
         return metrics
 
+    def _what_moves(self) -> tuple[bool, bool]:
+        """Whether the targets, and whether actors and temperature move in the gradient step that was just counted."""
+        moves_targets = self.n_updates % (self.target_update_interval or self.policy_delay) == 0
+        return moves_targets, (self.n_updates - self.actor_at_once) % self.policy_delay == 0
+
     def _transformed(self, batch: Batch, noise: Noise | None, extra: Extra | None) -> tuple[Batch, Noise, Extra | None]:
         noise = noise or Noise()
+        if self.reward_scaler is not None:
+            batch = self.reward_scaler.transform(batch, None)
+            if extra is not None:
+                extra = extra._replace(batch=self.reward_scaler.transform(extra.batch, None))
         drawn = noise.transforms or tuple(transform.draw(batch) for transform in self.transforms)
         for transform, numbers in zip(self.transforms, drawn, strict=True):
             before, batch = batch, transform.transform(batch, numbers)
@@ -471,61 +606,98 @@ class Learner:
         :param moves_actor: whether actors and temperature learn in this step
         :return: what to log, by name, scalars
         """
-        alpha = self.temperature()
+        alpha = self.temperature_of(batch)
         metrics, prepared = self.objective.prepare(self, batch)
+        if self.actor_first and moves_actor:
+            metrics.update(self._learn_actors(batch, noise, alpha, prepared))
+            alpha = self.temperature_of(batch)
         step: CriticStep | None = None
-
         if self.objective.learns_critics:
-            # Critics, towards the targets' value of the actor's next action, unless the objective has another target.
-            if prepared.target is None:
-                next_actions, entropy_bonus = next_step(self, batch, alpha, noise.critic)
-                q, next_q = step_outputs(self, batch, next_actions, noise.subset)
-                with torch.no_grad():
-                    target = self.head.target(batch, next_q, self.pessimism_rule.value, entropy_bonus)
-            else:
-                q, target = evaluate(self.critic, batch.observations, batch.actions), prepared.target
-            critic_loss = self.head.loss(q, target)
-            if self.sam_radius is None:
-                self.minimize(self.critic.optimizer, critic_loss)
-            else:
-                self._sharpness_aware_step(critic_loss, batch, next_actions, target)
-            self.critic.trunk.project()
-            q = self.head.values(q)
-            metrics.update({"train/critic_loss": critic_loss, "train/q_mean": q.mean()})
-            if prepared.target is None:
-                step = CriticStep(q.detach(), self.head.values(next_q), entropy_bonus, noise.subset)
-
-            # Targets, by Polyak averaging.
-            if moves_targets:
-                self._follow(self.critic_target, self.critic)
-
-        if moves_actor:
-            # Actor, on the new critics, and on their new encoder if it is shared.
-            observations = self.encoded(batch.observations)
-            actor_loss, log_prob = self.objective.actor_loss(self, batch, observations, alpha, noise.actor, prepared)
-            self.minimize(self.actor.optimizer, actor_loss)
-            self.actor.trunk.project()
-            metrics["train/actor_loss"] = actor_loss
-            if self.networks.actor_target is not None:
-                self._follow(self.networks.actor_target, self.actor)
-
-            # Explorer, on the new critics and the new actor.
-            metrics.update(logged(self.explorer, "update", self.explorer.update(self, batch, noise.exploration)))
-
-            # Temperature.
-            if self.actor.has_entropy and log_prob is not None:
-                entropy = -log_prob.detach().mean()
-                metrics.update({"train/entropy": entropy, "train/ent_coef": alpha})
-                if self.temperature_optimizer is not None:
-                    temperature_loss = losses.temperature_loss(alpha, entropy, self.target_entropy)
-                    self.minimize(self.temperature_optimizer, temperature_loss)
-                    metrics["train/ent_coef_loss"] = temperature_loss
+            step, of_critics = self._learn_critics(batch, noise, alpha, moves_targets, prepared)
+            metrics.update(of_critics)
+        if moves_actor and not self.actor_first:
+            metrics.update(self._learn_actors(batch, noise, alpha, prepared))
+        elif self.actor.trunk.statistics_every_step and not moves_actor:
+            with torch.no_grad():
+                self.actor.gaussian(self.actor.features(self.encoded(batch.observations)))
 
         # Pessimism.
         if step is not None:
             rule = self.pessimism_rule
             metrics.update(logged(rule, "update", rule.update(self, batch, step, noise.pessimism, extra)))
         return {name: value.detach() for name, value in metrics.items()}
+
+    def _learn_critics(
+        self, batch: Batch, noise: Noise, alpha: torch.Tensor, moves_targets: bool, prepared: Prepared
+    ) -> tuple[CriticStep | None, dict[str, torch.Tensor]]:
+        """Take the critics' step, and that of their targets; None for what the rule of pessimism judges, if nothing."""
+        # Critics, towards the targets' value of the actor's next action, unless the objective has another target.
+        step: CriticStep | None = None
+        if prepared.target is None:
+            next_actions, entropy_bonus = next_step(self, batch, alpha, noise.critic)
+            q, next_q = step_outputs(self, batch, next_actions, noise.subset)
+            with torch.no_grad():
+                target = self.head.target(batch, next_q, self.pessimism_rule.value, entropy_bonus)
+        else:
+            q, target = evaluate(self.critic, batch.observations, batch.actions), prepared.target
+        critic_loss = self.head.loss(q, target)
+        if self.sam_radius is None:
+            self.minimize(self.critic.optimizer, critic_loss)
+        else:
+            self._sharpness_aware_step(critic_loss, batch, next_actions, target)
+        self.critic.project()
+        q = self.head.values(q)
+        metrics = {"train/critic_loss": critic_loss, "train/q_mean": q.mean()}
+        if prepared.target is None:
+            step = CriticStep(q.detach(), self.head.values(next_q), entropy_bonus, noise.subset)
+        if SLOTS in batch.columns:
+            metrics[_TD_ERRORS] = self._errors(batch, q, step, prepared)
+
+        # Targets, by Polyak averaging.
+        if moves_targets:
+            self._follow(self.critic_target, self.critic)
+        return step, metrics
+
+    def _learn_actors(
+        self, batch: Batch, noise: Noise, alpha: torch.Tensor, prepared: Prepared
+    ) -> dict[str, torch.Tensor]:
+        """Take the steps of actor, explorer and temperature."""
+        # Actor, on the critics, and on their encoder if it is shared.
+        observations = self.encoded(batch.observations)
+        actor_loss, log_prob = self.objective.actor_loss(self, batch, observations, alpha, noise.actor, prepared)
+        self.minimize(self.actor.optimizer, actor_loss)
+        self.actor.project()
+        metrics = {"train/actor_loss": actor_loss}
+        if self.networks.actor_target is not None:
+            self._follow(self.networks.actor_target, self.actor)
+
+        # Explorer, on the critics and the new actor.
+        metrics.update(logged(self.explorer, "update", self.explorer.update(self, batch, noise.exploration)))
+
+        # Temperature.
+        if self.actor.has_entropy and log_prob is not None:
+            entropy = -log_prob.detach().mean()
+            by_task = isinstance(self.temperature, TaskLogScalar)
+            metrics.update({"train/entropy": entropy, "train/ent_coef": alpha.mean() if by_task else alpha})
+            if self.temperature_optimizer is not None:
+                if by_task:
+                    targets = self.target_entropy
+                    targets = targets[task_of(batch)] if isinstance(targets, torch.Tensor) else targets
+                    temperature_loss = losses.temperature_loss(alpha, -log_prob, targets).mean()
+                else:
+                    temperature_loss = losses.temperature_loss(alpha, entropy, self.target_entropy)
+                self.minimize(self.temperature_optimizer, temperature_loss)
+                metrics["train/ent_coef_loss"] = temperature_loss
+        return metrics
+
+    @torch.no_grad()
+    def _errors(self, batch: Batch, q: torch.Tensor, step: CriticStep | None, prepared: Prepared) -> torch.Tensor:
+        """The largest absolute TD error of any critic, of the means over quantiles, (B,)."""
+        target = prepared.target
+        if target is None:
+            assert step is not None
+            target = td_target(batch, self.pessimism_rule.value(step.next_q), step.entropy_bonus)
+        return (q.mean(dim=2) - target.mean(dim=1)).abs().amax(dim=0)
 
     def actor_value(self, q: torch.Tensor) -> torch.Tensor:
         """
@@ -595,7 +767,12 @@ class Learner:
         :return: everything that later steps depend on, besides the arguments
         """
         state = {name: owner.state_dict() for name, owner in self._owners_of_state().items()}
-        counts = {"n_updates": self.n_updates, "num_transitions": self.num_transitions, "heard": self._heard}
+        counts = {
+            "n_updates": self.n_updates,
+            "num_transitions": self.num_transitions,
+            "planned_updates": self.planned_updates,
+            "heard": self._heard,
+        }
         generators = {} if self._generators is None else {"generators": self._generators.state_dict()}
         return {**state, "counts": counts, **generators}
 
@@ -613,7 +790,7 @@ class Learner:
             owner.load_state_dict(state[name])
         counts = state["counts"]
         self._counts._n_updates, self._counts.num_transitions = counts["n_updates"], counts["num_transitions"]
-        self._heard = counts["heard"]
+        self.planned_updates, self._heard = counts["planned_updates"], counts["heard"]
         if self._generators is not None:
             self._generators.load_state_dict(state["generators"])
 
@@ -639,7 +816,11 @@ class Learner:
 
         :param shrink: share of the old parameters that stays
         """
-        self.restart(self.networks, self._make_networks(), shrink)
+        fresh = self._make_networks()
+        if self.observation_norm is not None:
+            # They describe the replay, which stays.
+            fresh.observation_norm.load_state_dict(self.observation_norm.state_dict())
+        self.restart(self.networks, fresh, shrink)
         self.restart(self.temperature, self._make_temperature(self), shrink)
         # The explorer's start may depend on the pessimism in force.
         self.restart(self.pessimism_rule, self.make_pessimism(), shrink)
@@ -663,6 +844,7 @@ class Learner:
                 state[name] = torch.lerp(state[name].to(parameter.device), parameter.detach(), shrink)
         module.load_state_dict(state)
         if shrink > 0:
+            project_weights(module)
             # Quantities computed from the weights, such as the directions of spectral norms, are refreshed.
             for network in module.modules():
                 if isinstance(network, Network):

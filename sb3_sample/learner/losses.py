@@ -154,15 +154,15 @@ def actor_loss(log_prob: torch.Tensor, value: torch.Tensor, alpha: torch.Tensor 
     return (alpha * log_prob).mean() - value.mean()
 
 
-def temperature_loss(alpha: torch.Tensor, entropy: torch.Tensor, target_entropy: float) -> torch.Tensor:
+def temperature_loss(alpha: torch.Tensor, entropy: torch.Tensor, target_entropy: float | torch.Tensor) -> torch.Tensor:
     """
     Loss of the temperature, ``alpha * (H - H*)`` (BRO, algorithm 2, line 13). The gradient goes through ``alpha``
     itself, not its logarithm as in stable_baselines3.
 
-    :param alpha: temperature, with gradient, scalar
-    :param entropy: mean of ``-log pi`` over the batch, scalar
-    :param target_entropy: H*
-    :return: scalar
+    :param alpha: temperature, with gradient, scalar; (B, 1) where tasks have their own
+    :param entropy: mean of ``-log pi`` over the batch, scalar; ``-log pi`` itself, (B, 1), with temperatures by task
+    :param target_entropy: H*, a number, or (B, 1)
+    :return: scalar, or (B, 1), whose mean over the batch is the loss
     """
     return alpha * (entropy.detach() - target_entropy)
 

@@ -54,18 +54,35 @@ class Objective(Part):
         """
         Compute the actor's loss.
 
-        :param learner: the learner, after its critics' step
+        :param learner: the learner, after its critics' step, or before it with ``actor_first``
         :param batch: transitions
         :param observations: the batch's for the actor, encoded once if there is a shared encoder
-        :param alpha: temperature, a scalar
+        :param alpha: temperature, a scalar, or (B, 1) where tasks have their own
         :param noise: standard normal noise of the sampled actions, (B, A)
         :param prepared: from :meth:`prepare`
         :return: scalar; and the log-probability of the sampled actions, (B, 1), from which the temperature learns, None
             if it does not
         """
-        actions, log_prob = learner.actor.sample(observations, noise)
+        actions, log_prob = sampled(learner, batch, observations, noise)
         value = learner.actor_value(values(learner, learner.critic, observations, actions))
         return losses.actor_loss(log_prob, value, alpha.detach()), log_prob
+
+
+def sampled(
+    learner: Learning, batch: Batch, observations: Any, noise: torch.Tensor | None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """
+    Sample the actor's own actions, in a forward pass with the next rows where its network asks for them.
+
+    :param learner: the learner
+    :param batch: transitions
+    :param observations: the batch's for the actor
+    :param noise: standard normal noise, (B, A)
+    :return: actions in [-1, 1], (B, A), and their log-probability, (B, 1)
+    """
+    if learner.actor.trunk.stacks_actor_rows:
+        return learner.actor.sample(observations, noise, learner.encoded(batch.next_observations))  # type: ignore[no-any-return]
+    return learner.actor.sample(observations, noise)  # type: ignore[no-any-return]
 
 
 class Cloning(Objective):
@@ -111,7 +128,7 @@ class ClonedValue(Objective):
         noise: torch.Tensor | None,
         prepared: Prepared,
     ) -> tuple[torch.Tensor, torch.Tensor | None]:
-        actions, _ = learner.actor.sample(observations, noise)
+        actions, _ = sampled(learner, batch, observations, noise)
         value = learner.actor_value(values(learner, learner.critic, observations, actions))
         return losses.cloned_value_loss(value.mean(dim=1), actions, batch.actions, self.weight), None
 
@@ -149,7 +166,7 @@ class ImplicitQ(Objective):
         v = self.value(batch.observations)
         loss = losses.expectile_loss(q - v, self.expectile)
         learner.minimize(self.optimizer, loss)
-        self.value.trunk.project()
+        self.value.project()
         with torch.no_grad():
             assert batch.discounts is not None
             advantage = q - self.value(batch.observations)

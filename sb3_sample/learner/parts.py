@@ -41,10 +41,13 @@ class Learning(Protocol):
     """
     Interface of the learner to its parts.
 
-    ``actor``, ``critic`` and ``critic_target`` are the networks, ``temperature()`` the entropy's weight, a scalar,
-    ``head`` gives the meaning of the critics' outputs, ``gamma`` is the discount factor. ``n_updates`` counts gradient
-    steps; ``num_transitions`` counts the environments' transitions over the learner's life, of which the first
-    ``learning_starts`` have random actions.
+    ``actor``, ``critic`` and ``critic_target`` are the networks, ``temperature()`` the entropy's weight, a scalar, or
+    (n_tasks,) where each task has its own, ``temperature_of(batch)`` that of transitions,
+    ``head`` gives the meaning of the critics' outputs, ``gamma`` is the discount factor, ``target_entropy`` what the
+    temperature aims at, ``observation_norm`` the networks' running normalisation, None for none. ``n_updates`` counts
+    gradient steps; ``num_transitions`` counts the environments' transitions over the learner's life, of which the first
+    ``learning_starts`` have random actions; ``environment_steps`` the same of each task, where several take a step
+    together.
     """
 
     @property
@@ -72,6 +75,12 @@ class Learning(Protocol):
     def gamma(self) -> float: ...
 
     @property
+    def target_entropy(self) -> float | torch.Tensor: ...
+
+    @property
+    def observation_norm(self) -> Any: ...
+
+    @property
     def learning_starts(self) -> int: ...
 
     @property
@@ -84,7 +93,18 @@ class Learning(Protocol):
     def num_transitions(self) -> int: ...
 
     @property
+    def environment_steps(self) -> int: ...
+
+    @property
     def n_envs(self) -> int: ...
+
+    def temperature_of(self, batch: Batch) -> torch.Tensor:
+        """
+        Look up the temperature of transitions.
+
+        :param batch: transitions
+        :return: a scalar, or (B, 1) where each task has its own
+        """
 
     def next_actions(self, observations: Any, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """
@@ -198,6 +218,7 @@ class Networks(Protocol):
     critic: Any
     critic_target: Any
     actor_target: Any
+    observation_norm: Any
 
     def next_actions(self, obs: Any, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]: ...
 
@@ -253,6 +274,14 @@ class Part(nn.Module):
         Called when the environments were reset, whose episodes so far have no end in the replay buffer.
 
         :param learner: the learner
+        """
+
+    def on_observations(self, learner: Learning, observations: Any) -> None:
+        """
+        Called before the actions of a step are chosen while training, also where they are random.
+
+        :param learner: the learner
+        :param observations: that are acted on, arrays or tensors, (n_envs, O), or a dict of them
         """
 
     def on_step(self, learner: Learning, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:

@@ -45,6 +45,8 @@ def pessimistic_value(q: torch.Tensor, beta: torch.Tensor | float) -> torch.Tens
     :param beta: pessimism, at least 0
     :return: (B, K)
     """
+    if q.shape[0] == 1:
+        return q[0]
     if isinstance(beta, float):
         if beta == 0:
             return q.mean(dim=0)
@@ -274,7 +276,7 @@ class LearnedPessimism(Pessimism):
     ) -> CriticStep:
         """Compute what the critics' step computes, on other transitions."""
         with torch.no_grad():
-            next_q, entropy_bonus = bootstrap(learner, batch, learner.temperature(), noise, subset)
+            next_q, entropy_bonus = bootstrap(learner, batch, learner.temperature_of(batch), noise, subset)
             q = values(learner, learner.critic, batch.observations, batch.actions)
             return CriticStep(q, learner.head.values(next_q), entropy_bonus, subset)
 

@@ -23,9 +23,9 @@ class Resets(Part):
     parameter becomes ``shrink * old + (1 - shrink) * fresh``, target networks and learned numbers (on the scale on
     which they are learned, that of the logarithm for a temperature) included; the optimizers start anew.
 
-    A step counts transitions over the model's life, warm-up included and independent of ``num_timesteps``, which
-    ``learn`` zeroes; the reset happens at the first update at or after it. The step reached is saved with the model, so
-    that a loaded one does not reset again.
+    A step counts transitions over the model's life, of each task where several take a step together, warm-up included
+    and independent of ``num_timesteps``, which ``learn`` zeroes; the reset happens at the first update at or after it.
+    The step reached is saved with the model, so that a loaded one does not reset again.
 
     With ``gradient_steps`` the resets are counted in gradient steps instead, over the model's life too (D'Oro et al.
     2022: every 2,560,000). After each such number of them the reset comes before the next one is taken, so that
@@ -67,7 +67,7 @@ class Resets(Part):
             raise ValueError(f"resets must be strictly ascending environment steps, not {self.steps}")
 
     def before_updates(self, learner: Learning) -> None:
-        now = learner.num_transitions
+        now = learner.environment_steps
         if self.period is None:
             due = any(self._reached < step <= now for step in self.steps)
         else:

@@ -28,6 +28,19 @@ class LogScalar(nn.Module):
         return self.log_value.exp()
 
 
+class TaskLogScalar(LogScalar):
+    """
+    A positive number for each task, the exponential of its parameter.
+
+    :param initial: initial value of all, above 0
+    :param n_tasks: how many
+    """
+
+    def __init__(self, initial: float, n_tasks: int):
+        super().__init__(initial)
+        self.log_value = nn.Parameter(torch.full((n_tasks,), math.log(initial)))
+
+
 class BoundedLogScalar(nn.Module):
     """
     Positive number whose logarithm is kept in an interval by a tanh (BRO's published code):

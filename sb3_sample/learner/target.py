@@ -38,7 +38,7 @@ def next_step(
 
     :param learner: the learner
     :param batch: transitions
-    :param alpha: temperature, a scalar
+    :param alpha: temperature, a scalar, or (B, 1) where tasks have their own
     :param noise: standard normal noise of the action, (B, A); drawn if None
     :return: the actor's action in the next state, (B, A), and its entropy bonus, ``-alpha * log pi(a'|s')``, (B, 1)
     """
@@ -114,7 +114,7 @@ def bootstrap(
 
     :param learner: the learner
     :param batch: transitions
-    :param alpha: temperature, a scalar
+    :param alpha: temperature, a scalar, or (B, 1) where tasks have their own
     :param noise: standard normal noise of the action, (B, A); drawn if None
     :param subset: the critics that make the target, (n,); None for all
     :return: (E, B, n_outputs), or (n, B, n_outputs) of a subset; and ``-alpha * log pi(a'|s')``, (B, 1)

@@ -7,6 +7,7 @@ from torch import nn
 
 from sb3_sample.networks.ensemble import Dense, EnsembleLinear
 from sb3_sample.networks.spectral_norm import SpectralEnsembleLinear, SpectralLinear, SpectralNorm
+from sb3_sample.networks.unit_norm import UnitEnsembleLinear, UnitLinear, UnitNorm
 
 #: Gain of every kernel unless a head asks for another one (BRO's and DAC's published code).
 DEFAULT_GAIN = math.sqrt(2)
@@ -38,6 +39,23 @@ def init_orthogonal(layer: Dense, gain: float = DEFAULT_GAIN) -> None:
         nn.init.zeros_(layer.bias)
     if isinstance(layer, SpectralNorm):
         layer.find_direction()
+    if isinstance(layer, UnitNorm):
+        layer.project()
+
+
+@torch.no_grad()
+def init_he_normal(layer: Dense) -> None:
+    """
+    Draw a kernel from a normal distribution of variance 2 / fan-in, truncated at two standard deviations (of which the
+    variance is what is left), and set the bias to zero, in place.
+
+    :param layer: the layer to initialise
+    """
+    # Standard deviation of the standard normal distribution truncated to [-2, 2].
+    std = math.sqrt(2 / layer.in_features) / 0.8796256610342398
+    nn.init.trunc_normal_(layer.weight, 0.0, std, -2 * std, 2 * std)
+    if layer.bias is not None:
+        nn.init.zeros_(layer.bias)
 
 
 def linear(
@@ -47,6 +65,8 @@ def linear(
     bias: bool = True,
     gain: float = DEFAULT_GAIN,
     spectral_norm: bool = False,
+    unit_norm: bool = False,
+    he_normal: bool = False,
 ) -> Dense:
     """
     A dense layer with orthogonal kernels: one, or a stack of independent ones.
@@ -57,12 +77,18 @@ def linear(
     :param bias: whether the layer has a bias
     :param gain: factor on the orthogonal kernel
     :param spectral_norm: whether the kernel is divided by its largest singular value, which undoes the gain
+    :param unit_norm: whether each unit's input weights have length 1, which ``project`` restores; not with the former
+    :param he_normal: whether the kernel is He-normal instead, without the gain
     """
     layer: Dense
     if n_copies is None:
-        layer = (SpectralLinear if spectral_norm else nn.Linear)(in_features, out_features, bias=bias)
+        single = SpectralLinear if spectral_norm else UnitLinear if unit_norm else nn.Linear
+        layer = single(in_features, out_features, bias=bias)
     else:
-        ensemble = SpectralEnsembleLinear if spectral_norm else EnsembleLinear
+        ensemble = SpectralEnsembleLinear if spectral_norm else UnitEnsembleLinear if unit_norm else EnsembleLinear
         layer = ensemble(n_copies, in_features, out_features, bias=bias)
-    init_orthogonal(layer, gain)
+    if he_normal:
+        init_he_normal(layer)
+    else:
+        init_orthogonal(layer, gain)
     return layer

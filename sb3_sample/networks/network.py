@@ -1,12 +1,15 @@
 """Base class of networks, and hidden neurons as a network lists them."""
 
+import inspect
 from abc import abstractmethod
-from typing import ClassVar, NamedTuple
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import nn
 
 from sb3_sample.networks.ensemble import Dense, Norm
+from sb3_sample.networks.initialization import DEFAULT_GAIN, linear
 from sb3_sample.networks.spectral_norm import SpectralNorm
 
 
@@ -45,7 +48,14 @@ class Network(nn.Module):
     #: targets), "target" from the target critics' own pass over the same rows; None: a pass each. Where rows are
     #: stacked, everything else (actors' objectives, rules of pessimism, TD targets' actions) sees the network in
     #: evaluation mode, so that running statistics are those of the stacked rows alone.
-    stacks_rows: ClassVar[str | None] = None
+    stacks_rows: str | None = None
+    #: Whether an actor's own step stacks the current and the next rows too, of which the current ones are learned from.
+    stacks_actor_rows: bool = False
+    #: Whether an actor's running statistics move in every gradient step, also where ``policy_delay`` has it not learn.
+    statistics_every_step: bool = False
+
+    #: Gain of the output layer's kernel, unless its owner asks for another.
+    head_gain: ClassVar[float] = DEFAULT_GAIN
 
     @abstractmethod
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -62,8 +72,22 @@ class Network(nn.Module):
         """
         return []
 
+    def make_head(self, n_outputs: int, n_copies: int | None = None, gain: float | None = None) -> nn.Module:
+        """
+        Make an output layer that reads the network's output.
+
+        :param n_outputs: number of outputs
+        :param n_copies: E for E independent layers, None for one
+        :param gain: of an orthogonal kernel, as its owner asks for; None: the network's ``head_gain``
+        :return: the layer, (B, out_features) to (B, n_outputs), or with an axis E in front
+        """
+        return linear(self.out_features, n_outputs, n_copies, gain=self.head_gain if gain is None else gain)
+
     def project(self) -> None:
-        """Called after every step of the optimizer: bring weights back to where they belong, in place."""
+        """
+        Called after every step of the optimizer: bring weights back to where they belong, in place. Dense layers of
+        unit norm in the head are projected by its owner.
+        """
 
     def refresh(self) -> None:
         """Called after weights were overwritten, as at a shrink and perturb: compute anew what follows from them."""
@@ -78,3 +102,27 @@ class Network(nn.Module):
         """
         layers = [layer for layer in self.modules() if not isinstance(layer, SpectralNorm)]
         return [buffer for layer in layers for buffer in layer.buffers(recurse=False)]
+
+
+def widened(network: type[Network], kwargs: Mapping[str, Any], factor: int) -> dict[str, Any]:
+    """
+    Arguments of a network that is wider.
+
+    :param network: its class, whose width is its argument "width" or "hidden_sizes"
+    :param kwargs: its arguments
+    :param factor: by which every hidden layer is wider
+    :return: the same arguments with other widths
+    :raises ValueError: if it has neither of the two
+    """
+    if factor == 1:
+        return dict(kwargs)
+    defaults = {name: each.default for name, each in inspect.signature(network).parameters.items()}
+    names = [name for name in ("width", "hidden_sizes") if name in {**defaults, **kwargs}]
+    if not names:
+        raise ValueError(
+            f"a network whose width is to be multiplied must have an argument width or hidden_sizes, and "
+            f"{network.__name__} has neither"
+        )
+    (name,) = names
+    size = kwargs.get(name, defaults.get(name))
+    return {**kwargs, name: [factor * width for width in size] if name == "hidden_sizes" else factor * size}

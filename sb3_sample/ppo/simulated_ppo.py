@@ -24,6 +24,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_program, default_of
+from sb3_sample.constructor import Given
 from sb3_sample.faults import TrainingDiverged, check_finite_parameters, diverged, not_finite
 from sb3_sample.kinds import check_value, integer
 from sb3_sample.ppo import arguments
@@ -66,7 +67,7 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
     #: Arguments that mean nothing without simulated samples.
     simulation_arguments: ClassVar[tuple[str, ...]] = ("anneal_until", "warm_up_until")
 
-    def _construct(self, given: dict[str, Any]) -> None:
+    def _construct(self, given: Given) -> None:
         check_program(type(self), given)
         arguments.check_counts(type(self), given)
         is_set_up = given.pop("_init_setup_model")

@@ -26,6 +26,7 @@ from sb3_sample.replay.compact import (
 )
 from sb3_sample.replay.next_observations import ONLY, NextObservations
 from sb3_sample.replay.rows import action_dtype
+from sb3_sample.replay.weighted import FadedDictReplayBuffer, FadedReplay, FadedReplayBuffer
 
 
 class ValidationSplit(CompactReplay):
@@ -254,6 +255,8 @@ PLAIN_BUFFERS = (
     CompactDictReplayBuffer,
     ValidationReplayBuffer,
     ValidationDictReplayBuffer,
+    FadedReplayBuffer,
+    FadedDictReplayBuffer,
     ReplayBuffer,
     DictReplayBuffer,
 )
@@ -309,13 +312,13 @@ class BatchMemory:
 
     def gather(self, buffer: ReplayBuffer, n: int) -> Any:
         """
-        Draw transitions to train on, uniformly with replacement: the same as ``buffer.sample(n)`` would.
+        Draw transitions to train on, with replacement: the same as ``buffer.sample(n)`` would.
 
         :param buffer: a buffer that this memory serves
         :param n: how many
         :return: the transitions, on the buffer's device
         """
-        if isinstance(buffer, ValidationSplit):
+        if isinstance(buffer, (ValidationSplit, FadedReplay)):
             places = buffer.training_places(n)
         else:
             positions = np.random.randint(0, buffer.size(), size=n)

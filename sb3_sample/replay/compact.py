@@ -24,6 +24,10 @@ except ImportError:
     psutil = None
 
 
+#: In files, before the names of what changes in rows that are there already; no column's name has it.
+_CHANGING = "changing/"
+
+
 def _file_name(column: str, key: str) -> str:
     return f"{column}/{key}" if key else column
 
@@ -351,7 +355,27 @@ class CompactReplay(HasColumns):
         size = self.size()
         index = np.flatnonzero(self.slot[:size] != NEXT_ROW)
         numbers = {name: getattr(self, name) for name in ("pos", "full", "buffer_size", "n_envs")}
-        return numbers | {name: array[:size] for name, array in self.columns().items()} | self._apart(index, index)
+        changing = {f"{_CHANGING}{name}": value for name, value in self.changing_state().items()}
+        rows = {name: array[:size] for name, array in self.columns().items()}
+        return numbers | rows | self._apart(index, index) | changing
+
+    def changing_state(self) -> dict[str, Any]:
+        """
+        Collect what changes in rows that are there already.
+
+        :return: numbers and arrays by name; nothing here
+        """
+        return {}
+
+    def load_changing_state(self, state: dict[str, Any]) -> None:
+        """
+        Restore what changes in rows that are there already, after the rows.
+
+        :param state: from :meth:`changing_state` of a buffer of the same sizes
+        :raises ValueError: if it is of another buffer
+        """
+        if state:
+            raise ValueError(f"this buffer's rows do not change, but the saved ones have {sorted(state)}")
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
@@ -368,7 +392,9 @@ class CompactReplay(HasColumns):
         pos, full = state.get("pos"), state.get("full")
         if type(pos) is not int or type(full) is not bool or not 0 <= pos < self.buffer_size:
             raise ValueError(f"no state of a replay buffer: pos={pos!r}, full={full!r}")
-        piece = {name: value for name, value in state.items() if name not in ("pos", "full", "buffer_size", "n_envs")}
+        changing = {name.removeprefix(_CHANGING): state[name] for name in state if name.startswith(_CHANGING)}
+        others = ("pos", "full", "buffer_size", "n_envs")
+        piece = {name: state[name] for name in state if name not in others and not name.startswith(_CHANGING)}
         size = self.buffer_size if full else pos
         newest = (pos - 1) % self.buffer_size
         self._check_rows(piece, size, newest)
@@ -377,6 +403,7 @@ class CompactReplay(HasColumns):
             self._put(np.arange(size), piece, newest)
         self.pos, self.full = pos, full
         self._restored()
+        self.load_changing_state(changing)
 
     def _restored(self) -> None:
         """Called when the rows have been restored."""

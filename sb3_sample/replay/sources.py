@@ -1,5 +1,6 @@
 """Sources of batches: the way from a model's replay buffer, or from a data set, to its learner."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,7 @@ import torch
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_sample.learner.batch import Batch, Extra, for_each
+from sb3_sample.learner.batch import Batch, Extra, Windows, for_each
 from sb3_sample.replay.buffers import BatchMemory, ValidationSplit, latest, samples_as_its_class
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.mixture import mixed
@@ -71,6 +72,13 @@ class DatasetSource:
     def n_held_out(self) -> int:
         """Number of transitions of the validation side."""
         return len(self._held_out)
+
+    def observations(self) -> Iterator[Any]:
+        """
+        :return: those of all transitions, the held-out ones included, some thousand at a time, (n, O)
+        """
+        for rows in np.array_split(np.arange(len(self.dataset)), -(-len(self.dataset) // 10_000)):
+            yield self._taken(rows).observations
 
     def latest(self, n_steps: int) -> Extra | None:
         """
@@ -177,6 +185,42 @@ class ReplaySource:
             return None
         samples, ends = latest(model.replay_buffer, n_steps, model.get_vec_normalize_env())
         return Extra(Batch.of(samples, model.gamma), ends)
+
+
+class WindowSource(ReplaySource):
+    """
+    Source of n-step transitions and of windows, from a model whose buffer holds windows; its ``n_steps`` and
+    ``encoder_horizon`` are those in force when something is drawn.
+
+    :param model: the algorithm
+    """
+
+    def batches(self, n_batches: int, batch_size: int) -> list[Batch]:
+        """
+        Draw the batches of several gradient steps.
+
+        :param n_batches: number of gradient steps
+        :param batch_size: transitions a step
+        :return: the batches, each drawn by the weights of now
+        """
+        model = self._model
+        drawn = (self._window(batch_size, model.n_steps) for _ in range(n_batches))
+        return [windows.n_step(model.gamma) for windows in drawn]
+
+    def windows(self, n_batches: int, batch_size: int) -> Iterator[Windows]:
+        """
+        Draw the batches of several steps of the encoder, each when it is needed.
+
+        :param n_batches: number of steps
+        :param batch_size: windows a step
+        :return: the batches
+        """
+        return (self._window(batch_size, self._model.encoder_horizon) for _ in range(n_batches))
+
+    def _window(self, batch_size: int, length: int) -> Windows:
+        model = self._model
+        found: Windows = model.replay_buffer.windows(batch_size, length, model.get_vec_normalize_env())
+        return found
 
 
 def _n_held_out(model: Any) -> int:

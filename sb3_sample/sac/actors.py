@@ -14,26 +14,27 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, check_value, number
+from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, FINITE, TRUE_OR_FALSE, check_value
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
-from sb3_sample.networks import Network, linear
+from sb3_sample.networks import Network, RunningNorm, project_weights
 from sb3_sample.networks.modes import evaluated
-from sb3_sample.sac.trunks import keep_at_rest, make_trunk
+from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
 
 # The log standard deviation is squashed into this interval by a tanh.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
-INITIAL_STD = number(
-    "lie between e^-10 and e^2", lambda value: value > 0 and LOG_STD_MIN < math.log(value) < LOG_STD_MAX
-)
 #: Where the likelihood of an action on a bound is taken (IQL's published code clips the data there).
 LARGEST_ACTION = 1 - 1e-5
+#: Arguments of a Gaussian actor that say how its standard deviation is bounded.
+LOG_STD_ARGUMENTS = ("log_std_min", "log_std_max", "clip_log_std")
+#: All of its own.
+GAUSSIAN_ARGUMENTS = (*LOG_STD_ARGUMENTS, "initial_std")
 
 
 class Actor(BasePolicy):
     """
     Tanh-Gaussian actor: ``a = tanh(mean + std * noise)``, the log standard deviation squashed by a tanh into
-    [-10, 2] (BRO, section B.1; bounds and squashing as in the published code).
+    [-10, 2] (BRO, section B.1; bounds and squashing as in the published code), or clipped.
 
     :param observation_space: observation space
     :param action_space: action space, a bounded Box; the actor works on [-1, 1]
@@ -42,9 +43,13 @@ class Actor(BasePolicy):
     :param features_extractor: extractor of the observation's features
     :param normalize_images: whether images are divided by 255
     :param shares_encoder: whether the extractor is the critics', whose features are read without gradient
+    :param log_std_min: lower bound of the log standard deviation
+    :param log_std_max: upper bound
+    :param clip_log_std: whether it is clipped to them, without a gradient outside, instead of squashed by a tanh
     :param initial_std: standard deviation before the squashing at the start, about; None: that of the published code,
-        e^-4. A likelihood of given actions starts from a wide one, lest its first gradients be thousands
-    :raises ValueError: if ``initial_std`` is out of range
+        e^-4 between the usual bounds. A likelihood of given actions starts from a wide one, lest its first gradients be
+        thousands
+    :raises ValueError: if an argument is out of range
     """
 
     action_space: spaces.Box
@@ -52,6 +57,8 @@ class Actor(BasePolicy):
     has_entropy: ClassVar[bool] = True
     #: View in evaluation mode, for the actions of TD targets, if the trunk ``stacks_rows``.
     at_rest: Any = None
+    #: The policy's running normalisation of observations, None for none.
+    observation_norm: RunningNorm | None = None
     _encoder: Any
 
     def __init__(
@@ -63,16 +70,25 @@ class Actor(BasePolicy):
         features_extractor: BaseFeaturesExtractor,
         normalize_images: bool = True,
         shares_encoder: bool = False,
+        log_std_min: float = LOG_STD_MIN,
+        log_std_max: float = LOG_STD_MAX,
+        clip_log_std: bool = False,
         initial_std: float | None = None,
     ):
         super().__init__(
-            observation_space,
+            with_plain_sizes(observation_space),
             action_space,
             features_extractor=features_extractor,
             normalize_images=normalize_images,
             squash_output=True,
         )
-        check_value("initial_std", initial_std, INITIAL_STD.or_none())
+        check_value("log_std_min", log_std_min, FINITE)
+        check_value("log_std_max", log_std_max, FINITE)
+        check_value("clip_log_std", clip_log_std, TRUE_OR_FALSE)
+        check_value("initial_std", initial_std, ABOVE_0.or_none())
+        if not log_std_min < log_std_max:
+            raise ValueError(f"log_std_min must lie below log_std_max={log_std_max}, not be {log_std_min}")
+        self.log_std_min, self.log_std_max, self.clip_log_std = log_std_min, log_std_max, clip_log_std
         self.shares_encoder = shares_encoder
         if shares_encoder:
             self.share(features_extractor)
@@ -80,21 +96,35 @@ class Actor(BasePolicy):
         self.features_dim = features_extractor.features_dim
         self.action_dim = get_action_dim(action_space)
         self.trunk = make_trunk("actor_network", network, self.features_dim, network_kwargs)
-        self.mean = linear(self.trunk.out_features, self.action_dim, None)
-        self.log_std = linear(self.trunk.out_features, self.action_dim, None, gain=1.0)
+        self.mean = self.trunk.make_head(self.action_dim)
+        self.log_std = self.trunk.make_head(self.action_dim, gain=1.0)
         if initial_std is not None:
             self._network_args["initial_std"] = initial_std
-            half_range = (LOG_STD_MAX - LOG_STD_MIN) / 2
-            assert self.log_std.bias is not None
-            # Nearly the same for all observations, whatever their size.
-            self.log_std.weight.data.mul_(0.01)
-            nn.init.constant_(self.log_std.bias, math.atanh((math.log(initial_std) - LOG_STD_MIN) / half_range - 1))
+            self._start_from(initial_std)
         #: Stable-Baselines3's distribution of the actions, for its own use: nothing here reads it.
         self.action_dist = SquashedDiagGaussianDistribution(self.action_dim)
         keep_at_rest(self)
 
+    def _start_from(self, initial_std: float) -> None:
+        """Have the head of the log standard deviation start nearly the same for all observations, of any size."""
+        if type(self.log_std) is not nn.Linear:
+            raise ValueError(
+                f"initial_std={initial_std} is set by a plain output layer, and that of actor_network="
+                f"{type(self.trunk).__name__} has a norm of its own: pass actor_kwargs={{'initial_std': None}}"
+            )
+        start, low, high = math.log(initial_std), self.log_std_min, self.log_std_max
+        if not low < start < high:
+            raise ValueError(
+                f"initial_std must lie between e^log_std_min and e^log_std_max, e^{low:g} and e^{high:g}, not be "
+                f"{initial_std}"
+            )
+        self.log_std.weight.data.mul_(0.01)
+        bias = start if self.clip_log_std else math.atanh(2 * (start - low) / (high - low) - 1)
+        nn.init.constant_(self.log_std.bias, bias)
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         own = {"features_extractor": self.features_extractor, "shares_encoder": self.shares_encoder}
+        own |= {name: getattr(self, name) for name in LOG_STD_ARGUMENTS}
         return {**super()._get_constructor_parameters(), **self._network_args, **own}
 
     def share(self, encoder: nn.Module) -> None:
@@ -120,11 +150,21 @@ class Actor(BasePolicy):
         """
         if isinstance(obs, Encoded):
             return obs.features
+        seen: PyTorchObs = obs if self.observation_norm is None else self.observation_norm(obs)
         if self.shares_encoder:
             with torch.no_grad():
-                return self.extract_features(obs, self._encoder)
+                return self.extract_features(seen, self._encoder)
         assert isinstance(self.features_extractor, BaseFeaturesExtractor)
-        return self.extract_features(obs, self.features_extractor)
+        return self.extract_features(seen, self.features_extractor)
+
+    def project(self) -> None:
+        """Called after every step of the optimizer: bring weights back to where they belong, in place."""
+        self.trunk.project()
+        for head in self._heads():
+            project_weights(head)
+
+    def _heads(self) -> tuple[nn.Module, ...]:
+        return self.mean, self.log_std
 
     def statistics(self) -> list[torch.Tensor]:
         """
@@ -140,18 +180,32 @@ class Actor(BasePolicy):
         :return: mean and log standard deviation of the pre-tanh Gaussian, (B, A) each
         """
         h = self.trunk(features)
-        half_range = (LOG_STD_MAX - LOG_STD_MIN) / 2
-        return self.mean(h), LOG_STD_MIN + half_range * (1 + torch.tanh(self.log_std(h)))
+        if self.clip_log_std:
+            return self.mean(h), self.log_std(h).clamp(self.log_std_min, self.log_std_max)
+        half_range = (self.log_std_max - self.log_std_min) / 2
+        return self.mean(h), self.log_std_min + half_range * (1 + torch.tanh(self.log_std(h)))
 
-    def sample(self, obs: PyTorchObs | Encoded, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    def sample(
+        self,
+        obs: PyTorchObs | Encoded,
+        noise: torch.Tensor | None = None,
+        following: PyTorchObs | Encoded | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """
         Sample an action, reparameterised.
 
         :param obs: observations, (B, O), or a dict of them, or their features
         :param noise: standard normal noise, (B, A); drawn if None
+        :param following: further observations, stacked below these in the forward pass, for the sake of batch
+            statistics; None for none
         :return: action in [-1, 1], (B, A), and its log-probability, (B, 1)
         """
-        mean, log_std = self.gaussian(self.features(obs))
+        features = self.features(obs)
+        if following is None:
+            mean, log_std = self.gaussian(features)
+        else:
+            rows = self.gaussian(torch.cat((features, self.features(following))))
+            mean, log_std = (each[: len(features)] for each in rows)
         noise = torch.randn_like(mean) if noise is None else noise
         x = mean + log_std.exp() * noise
         return torch.tanh(x), tanh_gaussian_log_prob(x, noise, log_std)
@@ -296,19 +350,31 @@ class DeterministicActor(Actor):
         """
         raise AttributeError("a deterministic actor (backbone='td3') has no distribution of its actions")
 
+    def _heads(self) -> tuple[nn.Module, ...]:
+        return (self.mean,)
+
     def gaussian(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         mean = self.mean(self.trunk(features))
         return mean, torch.full_like(mean, self.log_exploration_noise)
 
-    def sample(self, obs: PyTorchObs | Encoded, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    def sample(
+        self,
+        obs: PyTorchObs | Encoded,
+        noise: torch.Tensor | None = None,
+        following: PyTorchObs | Encoded | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """
         The action that the actor learns through: no noise, and 0 for the log-probability that it has not.
 
         :param obs: observations, (B, O), or a dict of them
         :param noise: ignored, there is none
+        :param following: further observations, stacked below these in the forward pass; None for none
         :return: action in [-1, 1], (B, A), and zeros, (B, 1)
         """
-        action = torch.tanh(self.mean(self.trunk(self.features(obs))))
+        features = self.features(obs)
+        rows = features if following is None else torch.cat((features, self.features(following)))
+        action = torch.tanh(self.mean(self.trunk(rows)))
+        action = action if following is None else action[: len(features)]
         return action, action.new_zeros(action.shape[0], 1)
 
     def smoothed(self, obs: PyTorchObs, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:

@@ -26,10 +26,11 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_every, check_program, default_of
 from sb3_sample.console import say
+from sb3_sample.constructor import Given
 from sb3_sample.envs.no_environment import NoEnvironment
 from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, not_finite
 from sb3_sample.kinds import check_value, instance, integer
-from sb3_sample.learner.batch import Batch, Noise
+from sb3_sample.learner.batch import SLOTS, Batch, Noise
 from sb3_sample.learner.execution import (
     PAYS_FROM,
     foreign_parts,
@@ -47,10 +48,12 @@ from sb3_sample.replay.columns import has_own_columns
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.sources import DatasetSource, ReplaySource
+from sb3_sample.replay.weighted import PrioritizedReplay
 from sb3_sample.sac import checks
 from sb3_sample.sac.arguments import SACArguments
 from sb3_sample.sac.metrics_log import MetricsLog
 from sb3_sample.sac.model_learner import check_action_space
+from sb3_sample.sac.multi_task import is_multi_task, told_task
 from sb3_sample.sac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.sb3_names import SB3Names
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
@@ -94,7 +97,7 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
-    policy_base = SACPolicy
+    policy_base: ClassVar[type[SACPolicy]] = SACPolicy
     _kept: ClassVar[dict[str, Kept]] = {
         # Saved by its parts.
         "_learner": Kept.NOWHERE,
@@ -113,9 +116,12 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         "action_noise": Kept.EVERYWHERE,
     }
 
-    def _construct(self, given: dict[str, Any]) -> None:
+    def _construct(self, given: Given) -> None:
         check_program(type(self), given)
         checks.check_use_sde(given["use_sde"])
+        if given["policy"] == "MlpPolicy" and is_multi_task(getattr(given["env"], "observation_space", None)):
+            # A vector and the number of a task are no more than that policy is for.
+            given["policy"] = "MultiInputPolicy"
         if given["train_freq"] is not None or given["gradient_steps"] is not None:
             # Stable-Baselines3's two arguments are in force.
             given["replay_ratio"] = None
@@ -144,6 +150,8 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         # The data set of a ``learn_offline`` under way, and what a file names of the prior data.
         self._learns_from: Dataset | None = None
         self._prior_of: dict[str, Any] | None = None
+        #: Gradient steps planned, for ``learning_rate_schedule``; None while they are not known.
+        self.planned_updates: int | None = self.schedule_steps
         # Gradient steps owed but not yet taken, the fraction that a replay ratio leaves over.
         self._updates_owed = 0.0
         self._metrics: dict[str, torch.Tensor] = {}
@@ -203,14 +211,23 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
             # only its own variant needs to have ended.
             self.optimize_memory_usage = False
 
+    def _n_critics(self) -> int:
+        """Number of critics that the arguments ask for."""
+        return self.policy_kwargs.get("n_critics", 2)  # type: ignore[no-any-return]
+
     def _full_policy_kwargs(self) -> dict[str, Any]:
-        return {**self.policy_kwargs, "n_outputs": self._make_head().n_outputs, "backbone": self.backbone}
+        kwargs = {**self.policy_kwargs, "n_outputs": self._make_head().n_outputs, "backbone": self.backbone}
+        if self._width_factor > 1:
+            kwargs["width_factor"] = self._width_factor
+        return {**kwargs, "normalize_observations": True} if self.normalize_observations else kwargs
 
     @classmethod
     def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
         implied: dict[str, Any] = {}
         if "compile" in kwargs:
             implied["compiled"] = None
+        if "schedule_steps" in kwargs:
+            implied["planned_updates"] = kwargs["schedule_steps"]
         if "train_freq" in kwargs or "gradient_steps" in kwargs:
             implied["replay_ratio"] = None
         if "prior_data" in kwargs and kwargs["prior_data"] is None:
@@ -255,12 +272,35 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
 
     # ---------------------------------------------------------------- acting
 
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        Choose actions, as in Stable-Baselines3.
+
+        :param observation: as the environment gives it, one or a batch. Of several tasks ``{"observation": ...,
+            "task": k}``, k being the number of the task, also for a batch
+        :param state: as in Stable-Baselines3, without meaning here
+        :param episode_start: likewise
+        :param deterministic: the mean action instead of a sample
+        :return: actions, and ``state``
+        :raises ValueError: if the observation is not one of the observation space, or there is no such task
+        """
+        if is_multi_task(self.observation_space) and isinstance(observation, dict):
+            observation = told_task(self.observation_space, observation)  # type: ignore[arg-type]
+        return super().predict(observation, state, episode_start, deterministic)
+
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         assert isinstance(self.action_space, spaces.Box)
+        self.learner.on_observations(self._last_obs)
         # What has learned from data acts by it from the beginning.
-        if self.num_transitions < learning_starts and self._n_offline_updates == 0:
+        if self._n_of_warm_up < learning_starts and self._n_offline_updates == 0:
             unscaled = np.array([self.action_space.sample() for _ in range(n_envs)])
             scaled = self.policy.scale_action(unscaled)
         else:
@@ -403,7 +443,14 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
             self._setup_model()
         checks.check_dataset("dataset", dataset, self.observation_space, self.action_space)
         env, source = self.env, self._source
-        self._learns_from, self._source = dataset, DatasetSource(self, dataset)
+        checks.check_offline(self)
+        data = DatasetSource(self, dataset)
+        self._learns_from, self._source = dataset, data
+        norm = self.learner.observation_norm
+        if norm is not None and norm.count < 1:
+            # A model that has acted keeps its statistics.
+            for observations in data.observations():
+                norm.update(observations)
         if env is None:
             self.env = NoEnvironment(self.observation_space, self.action_space)
         try:
@@ -473,21 +520,23 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         self.learner.on_environment_reset()
 
     def _before_turns(self) -> None:
-        """Decide, with ``compile="auto"`` once and for all, whether the coming environment steps pay it back."""
+        """
+        Plan the gradient steps of the first ``learn``, and decide, with ``compile="auto"`` once and for all, whether
+        the coming environment steps pay for compiling.
+        """
+        checks.check_one_reward_scale(self)
+        n_steps = self._total_timesteps - self.num_timesteps
+        if self.learning_rate_schedule is not None and self.planned_updates is None:
+            self.planned_updates = round(self._updates_in(n_steps)) or None
+            if self.planned_updates is None and n_steps > 0:
+                raise ValueError(
+                    f"schedule_steps must be given, as learning_rate_schedule={self.learning_rate_schedule!r} needs to "
+                    "know how many gradient steps are planned, and the arguments do not say it"
+                )
         if self.compiled is not None:
             return
-        n_steps = self._total_timesteps - self.num_timesteps
-        n_steps -= 0 if self._learns_from is not None else max(self.learning_starts - self.num_transitions, 0)
-        if self._learns_from is not None:
-            n_updates: float = n_steps
-        elif self.replay_ratio is not None:
-            n_updates = self.replay_ratio * n_steps
-        else:
-            assert isinstance(self.train_freq, TrainFreq)
-            n_calls = n_steps / (self.n_envs * self.train_freq.frequency)
-            if self.train_freq.unit is TrainFrequencyUnit.EPISODE:
-                n_calls = 0  # How long episodes are is not known.
-            n_updates = n_steps if self.gradient_steps < 0 else self.gradient_steps * n_calls
+        n_of_warm_up = 0 if self._learns_from is not None else max(self.learning_starts - self.num_transitions, 0)
+        n_updates = self._updates_in(n_steps - n_of_warm_up)
         # What keeps the step from being compiled is worth a warning only where it was asked for, but for an old torch,
         # which is easily renewed.
         foreign = foreign_parts(self.learner) if n_updates >= PAYS_FROM else []
@@ -500,6 +549,24 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         if reason is not None and reason == old_torch():
             warn_not_compiled(self.learner, reason)
         self.learner.forget_execution()
+
+    @property
+    def _tasks_together(self) -> int:
+        """Tasks that take a step together; 1 where a single environment has one after the other."""
+        return min(self.n_tasks, self.n_envs)
+
+    def _updates_in(self, n_steps: int) -> float:
+        """Gradient steps in as many environment steps after the warm-up; 0 where that is not known."""
+        if self._learns_from is not None:
+            return n_steps
+        if self.replay_ratio is not None:
+            return self.replay_ratio * n_steps / self._tasks_together
+        assert isinstance(self.train_freq, TrainFreq)
+        if self.gradient_steps < 0:
+            return n_steps
+        if self.train_freq.unit is TrainFrequencyUnit.EPISODE:
+            return 0  # How long episodes are is not known.
+        return self.gradient_steps * n_steps / (self.n_envs * self.train_freq.frequency)
 
     def _after_turns(self) -> None:
         """Say if nothing was learned for want of steps."""
@@ -518,11 +585,22 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
     def _is_warming_up(self) -> bool:
         """Whether there are too few transitions for a gradient step."""
         assert self.replay_buffer is not None
-        if self.num_transitions <= self.learning_starts:
+        if self._n_of_warm_up <= self.learning_starts:
             return True
         # A model that was loaded without its buffer fills it first, acting with what it has learned.
         capacity = self.replay_buffer.buffer_size * self.n_envs
-        return self.replay_buffer.size() * self.n_envs < min(self.learning_starts, capacity)
+        return self._n_in_buffer < min(self.learning_starts, capacity)
+
+    @property
+    def _n_of_warm_up(self) -> int:
+        """What ``learning_starts`` counts: transitions over the model's life."""
+        return self.num_transitions
+
+    @property
+    def _n_in_buffer(self) -> int:
+        """The same in the replay buffer."""
+        assert self.replay_buffer is not None
+        return self.replay_buffer.size() * self.n_envs
 
     def _updates_due(self, n_collected: int) -> int:
         """
@@ -533,9 +611,11 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
             return 0
         if isinstance(self.replay_buffer, ValidationSplit) and self.replay_buffer.n_training == 0:
             return 0
+        if isinstance(self.replay_buffer, PrioritizedReplay) and self.replay_buffer.n_drawable == 0:
+            return 0
         if self.replay_ratio is None:
             return self.gradient_steps if self.gradient_steps >= 0 else n_collected
-        self._updates_owed += self.replay_ratio * n_collected
+        self._updates_owed += self.replay_ratio * n_collected / self._tasks_together
         # The tolerance keeps 10 times 0.1 from falling short of 1 by rounding.
         n_updates = int(self._updates_owed + 1e-6)
         self._updates_owed -= n_updates
@@ -554,14 +634,16 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         batch_size = self.batch_size if batch_size is None else batch_size
         self._take_settings()
         self._set_training_mode(True)
-        self.learner.set_learning_rate(self.lr_schedule(self._current_progress_remaining))
+        if self.learner.schedule is None:
+            self.learner.set_learning_rate(self.lr_schedule(self._current_progress_remaining))
         self.learner.before_updates()
         taken = 0
+        # Each step renews the priorities of which the next one's batch is drawn.
+        at_once = 1 if isinstance(self.replay_buffer, PrioritizedReplay) else MAX_BATCHES_AT_ONCE
         while taken < gradient_steps:
-            n_batches = self.plasticity.before_gradient_steps(
-                self.learner, min(MAX_BATCHES_AT_ONCE, gradient_steps - taken)
-            )
+            n_batches = self.plasticity.before_gradient_steps(self.learner, min(at_once, gradient_steps - taken))
             self.learner.prepared_execution()
+            self._before_batches(batch_size)
             for i, batch in enumerate(self._source.batches(n_batches, batch_size), taken + 1):
                 self._keeps_gradients = self.keep_next_gradients and i == gradient_steps
                 metrics = self._update(batch)
@@ -573,6 +655,13 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
             self._watch.check()
         self._record_metrics()
 
+    def _before_batches(self, batch_size: int) -> None:
+        """
+        Called before batches of gradient steps are drawn.
+
+        :param batch_size: transitions a step
+        """
+
     def _set_training_mode(self, mode: bool) -> None:
         """Dropout and power iterations: on during gradient steps, off whoever acts."""
         self.learner.set_training_mode(mode)
@@ -582,4 +671,8 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
         eager, self._keeps_gradients = self._keeps_gradients, False
         if eager:
             self.keep_next_gradients = False
-        return self.learner.step(batch, noise, self.pessimism_rule.draw(self._source), eager)
+        metrics = self.learner.step(batch, noise, self.pessimism_rule.draw(self._source), eager)
+        errors = self.learner.td_errors
+        if errors is not None and isinstance(self.replay_buffer, PrioritizedReplay):
+            self.replay_buffer.renew(batch.columns[SLOTS], errors)
+        return metrics

@@ -16,6 +16,7 @@ from sb3_sample.kinds import (
     AT_LEAST_0,
     DICT,
     LEARNING_RATE,
+    TRUE_OR_FALSE,
     UNIT,
     Kind,
     instance,
@@ -24,9 +25,12 @@ from sb3_sample.kinds import (
     one_of,
     subclass,
 )
+from sb3_sample.learner.categorical import VALUE_HEADS
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.pessimism import Pessimism
+from sb3_sample.learner.reward_scale import REWARD_SCALES, RewardScale
+from sb3_sample.learner.schedules import SCHEDULES
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.sac.policies import SACPolicy
@@ -103,18 +107,20 @@ class SACArguments(Resumable):
     """temperature: "auto" learns it from 1, "auto_0.1" from that start, a number fixes it"""
     target_update_interval: int | None = argument(default=1, kind=integer(1).or_none("policy_delay"), kw_only=False)
     """gradient steps between two updates of the targets; None: ``policy_delay``"""
-    target_entropy: str | float = argument(default="auto", kw_only=False)
-    """entropy that the learned temperature aims at; "auto" is -|A|/2. As in Stable-Baselines3, a number once the model
-    is made; set anew, it counts from the next ``train`` on"""
+    target_entropy: str | float | Sequence[float] = argument(default="auto", kw_only=False)
+    """entropy that the learned temperature aims at; "auto" is -|A|/2, of all dimensions of the action, also of those
+    that a task has no use for. As in Stable-Baselines3, a number once the model is made; set anew, it counts from the
+    next ``train`` on. With ``task_temperatures`` also a list, one for each task"""
     replay_ratio: float | None = argument(default=2, kind=AT_LEAST_0.or_none(), of_training=True)
     """gradient steps per environment transition after the warm-up, whatever the number of environments; may be below
-    1"""
+    1. Where several tasks take a step together, per transition of each task"""
     n_quantiles: int | None = argument(default=None, kind=integer(1).or_none("scalar critics"))
     """quantiles a critic; None for scalar critics"""
-    value_head: type[ValueHead] | None = argument(
-        default=None, kind=subclass(ValueHead).or_none("scalars or quantiles")
+    value_head: str | type[ValueHead] | None = argument(
+        default=None, kind=one_of(VALUE_HEADS, ValueHead).or_none("scalars or quantiles")
     )
-    """a class of one's own, derived from ``ValueHead``, in the place of those two; with ``n_quantiles=None``"""
+    """"categorical", "hl_gauss", "half_squared" (scalars, half the squared error), or a class derived from
+    ``ValueHead``, in the place of those two; with ``n_quantiles=None``"""
     value_head_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
     """its arguments"""
     pessimism: float | str | type[Pessimism] = argument(default=1.0)
@@ -131,17 +137,37 @@ class SACArguments(Resumable):
     )
     """share of the transitions that is held out of training, in [0, 1); "vpl" learns from them"""
     exploration: str | type[Exploration] = argument(default="actor", kind=one_of(EXPLORATIONS, Exploration))
-    """policy that acts while training: "actor", "oac", "optimistic_actor" (DAC), "optimistic_shift" (BRO), or a class
-    derived from ``Exploration``"""
+    """policy that acts while training: "actor", "held_noise" (FlashSAC), "oac", "optimistic_actor" (DAC),
+    "optimistic_shift" (BRO), or a class derived from ``Exploration``"""
     exploration_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
     """its arguments"""
     backbone: str = argument(default="sac")
     """"sac", or "td3": a deterministic actor, without entropy"""
     policy_delay: int = argument(default=1, kind=integer(1))
     """gradient steps between two of the actors' and of the temperature"""
+    actor_at_once: bool = argument(default=False, kind=TRUE_OR_FALSE)
+    """whether the first of ``policy_delay`` gradient steps is the actors', and not the last (XQC, FlashSAC)"""
+    actor_first: bool = argument(default=False, kind=TRUE_OR_FALSE)
+    """whether actors and temperature learn before the critics in a gradient step, whose target is then of the new
+    actor and temperature (SimbaV2, FlashSAC)"""
+    learning_rate_schedule: str | None = argument(
+        default=None,
+        kind=Kind(f"be one of {list(SCHEDULES)}", lambda value: value in SCHEDULES).or_none("no such schedule"),
+    )
+    """"linear" or "cosine": decay from ``learning_rate``, a number, to ``final_learning_rate`` over the planned
+    gradient steps, each optimizer by the steps that it has taken; the final rate from there on"""
+    final_learning_rate: float = argument(default=0.0, kind=AT_LEAST_0)
+    """rate at the end of the schedule"""
+    schedule_steps: int | None = argument(default=None, kind=integer(1).or_none("those of the first learn"))
+    """planned gradient steps; None: environment steps of the first ``learn``, random ones included, times the replay
+    ratio, which later calls do not change"""
+    warm_up_steps: int = argument(default=0, kind=integer(0))
+    """planned gradient steps that come before the decay, in which the rate rises linearly to ``learning_rate``"""
+    warm_up_learning_rate: float | None = argument(default=0.0, kind=AT_LEAST_0.or_none("learning_rate"))
+    """rate from which it rises; None: ``learning_rate``, which it then keeps"""
     resets: Sequence[int] | int = argument(default=())
-    """environment steps at which all parameters start anew, counted in transitions over the model's life; or one
-    integer for every so many"""
+    """environment steps at which all parameters start anew, counted in transitions over the model's life, of each task
+    where several take a step together; or one integer for every so many"""
     reset_gradient_steps: int | None = argument(default=None, kind=integer(1).or_none("no such resets"))
     """resets after every so many gradient steps of the model's life instead (SR-SAC's original: 2,560,000), in the
     place of a class's own ``resets``; None for none. Not together with ``resets``"""
@@ -163,6 +189,22 @@ class SACArguments(Resumable):
     )
     """classes derived from ``BatchTransform``, or pairs of one and its arguments, which every batch goes through before
     it is learned from"""
+    reward_scale: str | type[RewardScale] | None = argument(
+        default=None, kind=one_of(REWARD_SCALES, RewardScale).or_none("rewards as they are")
+    )
+    """rule by which rewards are divided by a running measure of the return: "simbav2", "xqc", "flashsac", "brc", or a
+    class derived from ``RewardScale``"""
+    reward_scale_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
+    """its arguments"""
+    normalize_observations: bool = argument(default=False, kind=TRUE_OR_FALSE)
+    """whether the networks read observations less their running mean, by their running standard deviation. The
+    statistics are the policy's, and move while training only"""
+    multitask: bool = argument(default=False, kind=TRUE_OR_FALSE)
+    """whether the networks read the task as a one-hot vector and are all twice as wide (BRO, figure 19), where the
+    observations tell one of several (``multi_task_env``). False: as wide as ever, with the one-hot vector; for ``BRC``
+    with an embedding of the task in its place"""
+    task_temperatures: bool = argument(default=False, kind=TRUE_OR_FALSE)
+    """whether each of several tasks has a temperature of its own, which is learned"""
     use_sde: bool = argument(default=False, of_training=True)
     """not supported, refused if True"""
     sde_sample_freq: int = argument(default=-1, kind=integer(-1), of_training=True)

@@ -21,6 +21,8 @@ from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism
 from sb3_sample.replay.buffers import DeviceReplayBuffer, ValidationSplit
 from sb3_sample.replay.columns import has_own_columns
 from sb3_sample.replay.compact import CompactReplay
+from sb3_sample.replay.weighted import FadedReplay, PrioritizedReplay, WindowReplay
+from sb3_sample.sac.multi_task import is_multi_task
 
 
 def check(agent: Any) -> None:
@@ -29,7 +31,7 @@ def check(agent: Any) -> None:
     :raises ValueError: if an argument is out of range or contradicts another
     """
     check_every(agent)
-    n_critics = check_value("n_critics", agent.policy_kwargs.get("n_critics", 2), integer(1))
+    n_critics = check_value("n_critics", agent._n_critics(), integer(1))
     check_target_entropy(agent)
     check_use_sde(agent.use_sde)
     if n_critics == 1 and (isinstance(agent.pessimism, (str, type)) or agent.exploration == "oac"):
@@ -53,7 +55,12 @@ def check(agent: Any) -> None:
             f"n_quantiles={agent.n_quantiles} and value_head={agent.value_head!r} are two value heads: pass "
             "n_quantiles=None"
         )
-    for name in ("n_quantiles", "n_outputs", "backbone"):
+    if agent.reward_scale is None:
+        check_unused(agent, ["reward_scale_kwargs"], "reward_scale=None")
+    check_one_reward_scale(agent)
+    _check_schedule(agent)
+    _check_tasks(agent)
+    for name in ("n_quantiles", "n_outputs", "backbone", "normalize_observations", "width_factor"):
         if name in agent.policy_kwargs:
             raise ValueError(f"{name} is an argument of the algorithm, not of policy_kwargs")
     if agent.backbone == "td3":
@@ -110,6 +117,20 @@ def check_dataset(name: str, dataset: Any, observation_space: Any, action_space:
         )
 
 
+def check_offline(agent: Any) -> None:
+    """
+    Check that an algorithm can learn from a data set alone.
+
+    :param agent: the algorithm
+    :raises ValueError: if it asks for steps of an environment
+    """
+    if agent.reward_scale is not None:
+        raise ValueError(
+            f"reward_scale={agent.reward_scale!r} divides by a measure of returns in an environment, and learn_offline "
+            "takes no steps there: pass reward_scale=None, and rewards of a size that suits the critics"
+        )
+
+
 def check_prior_of(value: Any) -> None:
     """
     Check what a file says of prior data.
@@ -150,10 +171,72 @@ def _check_prior_data(agent: Any) -> None:
             f"prior_share={agent.prior_share} of batch_size={agent.batch_size} leaves no transition of one of the two "
             "sources: pass a larger batch_size or another share"
         )
+    cls = agent.replay_buffer_class
+    if cls is not None and issubclass(cls, PrioritizedReplay):
+        raise ValueError(
+            f"prior_data have no priorities, by which replay_buffer_class={cls.__name__} draws: leave one of them out"
+        )
     if agent.n_steps > 1:
         raise ValueError(
             f"prior_data has transitions of one step, which n_steps={agent.n_steps} would mix with returns of several: "
             "pass n_steps=1"
+        )
+
+
+def check_one_reward_scale(agent: Any) -> None:
+    """
+    Check that rewards are scaled once.
+
+    :param agent: an algorithm
+    :raises ValueError: if its environment scales them too
+    """
+    normalize = agent.get_vec_normalize_env()
+    if agent.reward_scale is not None and normalize is not None and normalize.norm_reward:
+        raise ValueError(
+            f"reward_scale={agent.reward_scale!r} scales rewards, and so does the VecNormalize of env: pass it "
+            "norm_reward=False, or the model reward_scale=None"
+        )
+
+
+def _check_schedule(agent: Any) -> None:
+    """Whether a schedule over planned gradient steps goes with the rate."""
+    if agent.learning_rate_schedule is None:
+        names = ["final_learning_rate", "schedule_steps", "warm_up_steps", "warm_up_learning_rate"]
+        check_unused(agent, names, "learning_rate_schedule=None")
+        return
+    if callable(agent.learning_rate):
+        raise ValueError(
+            f"learning_rate={agent.learning_rate!r} is a schedule, and so is "
+            f"learning_rate_schedule={agent.learning_rate_schedule!r}: pass a number, or learning_rate_schedule=None"
+        )
+    if agent.schedule_steps is not None and agent.schedule_steps <= agent.warm_up_steps:
+        raise ValueError(
+            f"schedule_steps={agent.schedule_steps} must exceed warm_up_steps={agent.warm_up_steps}, which are part of "
+            "them"
+        )
+    if agent.warm_up_steps == 0:
+        check_unused(agent, ["warm_up_learning_rate"], "warm_up_steps=0")
+
+
+def _check_tasks(agent: Any) -> None:
+    """Whether what is said of tasks goes with the observations, and with the temperature."""
+    for name in ("multitask", "task_temperatures"):
+        if getattr(agent, name) and not is_multi_task(agent.observation_space):
+            raise ValueError(
+                f"{name}=True needs observations that tell the task, as those of multi_task_env do, not "
+                f"{agent.observation_space}: leave it out"
+            )
+    if not agent.task_temperatures:
+        return
+    if agent.backbone == "td3":
+        raise ValueError(
+            "task_temperatures=True asks for an entropy, which a deterministic actor (backbone='td3') has not: leave "
+            "it out"
+        )
+    if not (isinstance(agent.ent_coef, str) and agent.ent_coef.startswith("auto")):
+        raise ValueError(
+            f"task_temperatures=True learns a temperature for each task, and ent_coef={agent.ent_coef!r} fixes one for "
+            "all: pass ent_coef='auto' or 'auto_<start>'"
         )
 
 
@@ -173,6 +256,17 @@ def check_target_entropy(agent: Any) -> None:
     if agent.backbone == "td3":
         _check_no_entropy(agent, "target_entropy")
     value = agent.target_entropy
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        n_tasks = agent.n_tasks
+        if not agent.task_temperatures or len(value) != n_tasks:
+            raise ValueError(
+                f"target_entropy must be a number, or 'auto', or with task_temperatures=True one for each of the "
+                f"{n_tasks} tasks, not {value!r} with task_temperatures={agent.task_temperatures}"
+            )
+        for each in value:
+            if not math.isfinite(as_number("target_entropy of a task", each, "a finite one")):
+                raise ValueError(f"target_entropy of a task must be finite, not {each}")
+        return
     if value != "auto" and not math.isfinite(as_number("target_entropy", value, "'auto'")):
         raise ValueError(f"target_entropy must be finite, or 'auto', not {value}")
 
@@ -224,11 +318,11 @@ def _check_pessimism(agent: Any) -> None:
             f"pessimism={agent.pessimism!r} weighs the spread of the targets, and target_subset=1 leaves none"
         )
     if agent.target_subset is not None:
-        n_critics = agent.policy_kwargs.get("n_critics", 2)
+        n_critics = agent._n_critics()
         if not integer(1, n_critics).fits(agent.target_subset):
             raise ValueError(
                 f"target_subset must lie between 1 and the number of critics, {n_critics} "
-                f"(policy_kwargs['n_critics']), or be None for all, not {agent.target_subset!r}"
+                f"(n_critics), or be None for all, not {agent.target_subset!r}"
             )
 
 
@@ -265,6 +359,11 @@ def _check_replay(agent: Any) -> None:
             )
     if agent.validation_proportion > 0:
         cls = agent.replay_buffer_class
+        if cls is not None and issubclass(cls, (FadedReplay, PrioritizedReplay)):
+            raise ValueError(
+                f"validation_proportion={agent.validation_proportion} holds transitions out of uniform draws, which "
+                f"replay_buffer_class={cls.__name__} does not make: leave one of them out"
+            )
         if cls is not None and cls not in (ReplayBuffer, DictReplayBuffer) and not issubclass(cls, CompactReplay):
             raise ValueError(
                 f"validation_proportion={agent.validation_proportion} holds single transitions out, which is known of "
@@ -306,7 +405,7 @@ def _check_device_buffer(agent: Any) -> None:
 
 def _check_n_steps(agent: Any) -> None:
     cls = agent.replay_buffer_class
-    if agent.n_steps > 1 and cls is not None and not issubclass(cls, NStepReplayBuffer):
+    if agent.n_steps > 1 and cls is not None and not issubclass(cls, (NStepReplayBuffer, WindowReplay)):
         raise ValueError(
             f"n_steps={agent.n_steps} needs a buffer that makes n-step returns, NStepReplayBuffer, not "
             f"replay_buffer_class={cls.__name__}: leave replay_buffer_class out"

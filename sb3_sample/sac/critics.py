@@ -16,8 +16,8 @@ from torch import nn
 
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.q_values import QValues
-from sb3_sample.networks import Network, linear
-from sb3_sample.sac.trunks import keep_at_rest, make_trunk
+from sb3_sample.networks import Network, RunningNorm, project_weights
+from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
 
 
 class CriticEnsemble(BaseModel):
@@ -37,6 +37,8 @@ class CriticEnsemble(BaseModel):
     action_space: spaces.Box
     #: View in evaluation mode, for all but the critics' own step, if the trunk ``stacks_rows``.
     at_rest: Any = None
+    #: The policy's running normalisation of observations, None for none.
+    observation_norm: RunningNorm | None = None
 
     def __init__(
         self,
@@ -50,13 +52,16 @@ class CriticEnsemble(BaseModel):
         normalize_images: bool = True,
     ):
         super().__init__(
-            observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
+            with_plain_sizes(observation_space),
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
         )
         self._network_args = {"network": network, "network_kwargs": network_kwargs, "n_outputs": n_outputs}
         self.n_critics = n_critics
         in_features = features_extractor.features_dim + get_action_dim(action_space)
         self.trunk = make_trunk("critic_network", network, in_features, network_kwargs, n_copies=n_critics)
-        self.head = linear(self.trunk.out_features, n_outputs, n_critics)
+        self.head: Any = self.trunk.make_head(n_outputs, n_critics)
         keep_at_rest(self)
 
     def inputs(self, obs: PyTorchObs | Encoded, actions: torch.Tensor) -> torch.Tensor:
@@ -68,7 +73,8 @@ class CriticEnsemble(BaseModel):
         if isinstance(obs, Encoded):
             return torch.cat((obs.features, actions), dim=1)
         assert isinstance(self.features_extractor, BaseFeaturesExtractor)
-        return torch.cat((self.extract_features(obs, self.features_extractor), actions), dim=1)
+        seen: PyTorchObs = obs if self.observation_norm is None else self.observation_norm(obs)
+        return torch.cat((self.extract_features(seen, self.features_extractor), actions), dim=1)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         own = {**self._network_args, "features_extractor": self.features_extractor, "n_critics": self.n_critics}
@@ -114,6 +120,11 @@ class CriticEnsemble(BaseModel):
 
         return [functools.partial(network, index) for index in range(self.n_critics)]
 
+    def project(self) -> None:
+        """Called after every step of the optimizer: bring weights back to where they belong, in place."""
+        self.trunk.project()
+        project_weights(self.head)
+
     def statistics(self) -> list[torch.Tensor]:
         """
         :return: running statistics that the target critics take over: those of features extractor and trunk
@@ -140,6 +151,9 @@ class ValueNetwork(BaseModel):
     :param normalize_images: whether images are divided by 255
     """
 
+    #: The policy's running normalisation of observations, None for none.
+    observation_norm: RunningNorm | None = None
+
     def __init__(
         self,
         observation_space: spaces.Space,
@@ -150,11 +164,14 @@ class ValueNetwork(BaseModel):
         normalize_images: bool = True,
     ):
         super().__init__(
-            observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
+            with_plain_sizes(observation_space),
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
         )
         self._network_args = {"network": network, "network_kwargs": network_kwargs}
         self.trunk = make_trunk("critic_network", network, features_extractor.features_dim, network_kwargs)
-        self.head = linear(self.trunk.out_features, 1, None)
+        self.head: Any = self.trunk.make_head(1)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         own = {**self._network_args, "features_extractor": self.features_extractor}
@@ -166,4 +183,10 @@ class ValueNetwork(BaseModel):
         :return: their value, (B, 1)
         """
         assert isinstance(self.features_extractor, BaseFeaturesExtractor)
-        return self.head(self.trunk(self.extract_features(obs, self.features_extractor)))
+        seen: PyTorchObs = obs if self.observation_norm is None else self.observation_norm(obs)
+        return self.head(self.trunk(self.extract_features(seen, self.features_extractor)))
+
+    def project(self) -> None:
+        """Called after every step of the optimizer: bring weights back to where they belong, in place."""
+        self.trunk.project()
+        project_weights(self.head)

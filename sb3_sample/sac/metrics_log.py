@@ -35,13 +35,31 @@ class MetricsLog:
         self._record_counts()
 
     def _record_counts(self: Any) -> None:
-        self.logger.record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
+        rate = self.learner.scheduled_rate
+        if rate is None:
+            rate = self.lr_schedule(self._current_progress_remaining)
+        self.logger.record("train/learning_rate", rate)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if self.learner.seconds_compiling > 0:
             self.logger.record("time/seconds_compiling", self.learner.seconds_compiling)
         self.logger.record("plasticity/reset", self.plasticity.n_done)
         if isinstance(self.replay_buffer, ValidationSplit):
             self.logger.record("validation/size", self.replay_buffer.n_validation)
+
+    def _record_tasks(self: Any) -> None:
+        """
+        Record each task's mean return and success rate over the episodes of ``ep_info_buffer``, which have the task's
+        id from ``multi_task_env``. Not for the terminal, where 50 tasks would be 100 lines.
+        """
+        episodes: dict[str, list[dict[str, Any]]] = {}
+        for episode in self.ep_info_buffer or ():
+            if self.n_tasks > 1 and "task" in episode:
+                episodes.setdefault(episode["task"], []).append(episode)
+        for task_id, its in sorted(episodes.items()):
+            self.logger.record(f"rollout_return/{task_id}", sum(e["r"] for e in its) / len(its), exclude="stdout")
+            rates = [e["is_success"] for e in its if "is_success" in e]
+            if rates:
+                self.logger.record(f"rollout_success/{task_id}", sum(rates) / len(rates), exclude="stdout")
 
     def dump_logs(self: Any) -> None:
         """
@@ -57,4 +75,5 @@ class MetricsLog:
             if name not in recorded:
                 self.logger.record(name, float(value))
         self._record_counts()
+        self._record_tasks()
         super().dump_logs()  # type: ignore[misc]  # of Stable-Baselines3's algorithm

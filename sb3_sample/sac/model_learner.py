@@ -13,20 +13,25 @@ from torch import nn
 
 from sb3_sample import own_classes
 from sb3_sample.kinds import check_value, chosen, integer
+from sb3_sample.learner.categorical import VALUE_HEADS
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
 from sb3_sample.learner.heads import QuantileHead, ValueHead
 from sb3_sample.learner.learner import Counts, Learner
 from sb3_sample.learner.objectives import Objective
+from sb3_sample.learner.observation_statistics import ObservationStatistics
 from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
 from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.randomness import OwnGenerators
-from sb3_sample.learner.scalars import FixedScalar, LogScalar
+from sb3_sample.learner.reward_scale import REWARD_SCALES, RewardScale
+from sb3_sample.learner.scalars import FixedScalar, LogScalar, TaskLogScalar
+from sb3_sample.learner.schedules import LearningRateSchedule
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.optim import AdamW
 from sb3_sample.sac import checks
 from sb3_sample.sac.actors import BACKBONES, Actor
 from sb3_sample.sac.arguments import transform_choice
 from sb3_sample.sac.critics import CriticEnsemble
+from sb3_sample.sac.multi_task import number_of_tasks
 from sb3_sample.sac.policies import SACPolicy
 
 T = TypeVar("T")
@@ -62,8 +67,10 @@ def _maker(cls: Any) -> Callable[..., Learner]:
 
         ``resets`` and the episodes of "top" count environment steps and do nothing unless ``on_step`` is called;
         ``reset_gradient_steps`` counts what the learner does itself. A learning rate that is a function stays at its
-        first value until ``set_learning_rate``. ``compile="auto"`` compiles nothing, since how many steps will follow
-        is not known.
+        first value until ``set_learning_rate``, and a ``learning_rate_schedule`` does not decay unless
+        ``schedule_steps`` is given, or ``planned_updates`` set. ``compile="auto"`` compiles nothing, since how many
+        steps will follow is not known. Statistics of rewards and observations are those of ``on_step`` and
+        ``on_observations``.
 
         :param observation_space: observation space
         :param action_space: action space, a bounded Box; batches have actions in [-1, 1]
@@ -96,6 +103,7 @@ def _maker(cls: Any) -> Callable[..., Learner]:
         model._setup_lr_schedule()
         counts = Counts()
         counts.compiled = None if model.compile == "auto" else bool(model.compile)
+        counts.planned_updates = model.schedule_steps
         return model._make_learner(counts=counts, generators=generators)  # type: ignore[no-any-return]
 
     learner.__qualname__ = f"{cls.__name__}.learner"
@@ -163,6 +171,10 @@ class HasLearner:
     """value head of the critics"""
     transforms = OfLearner[nn.ModuleList]()
     """batch transforms, in their order"""
+    reward_scaler = OfLearner[RewardScale | None]()
+    """rule by which rewards are scaled; None for none"""
+    observation_statistics = OfLearner[ObservationStatistics | None]()
+    """feeder of the observations' statistics; None without"""
     gradients_are_stale = OfLearner[bool]()
     """whether ``.grad`` holds the gradients of another gradient step than the last"""
     #: The class of the learner.
@@ -186,9 +198,12 @@ class HasLearner:
             redo=None if self.redo_period is None else ReDo(self.redo_period, self.redo_threshold),
             make_transforms=[functools.partial(_make_transform, *each) for each in enumerate(self.batch_transforms)],
             make_objective=self.make_objective,
+            make_reward_scaler=None if self.reward_scale is None else self.make_reward_scaler,
             learning_rate=self.lr_schedule(1),
+            schedule=self._make_schedule(),
             temperature_beta1=self.temperature_beta1,
             target_entropy=self._target_entropy,
+            n_tasks=self.n_tasks,
             device=self.device,
             **{name: getattr(self, name) for name in Learner.SETTINGS},
             **kwargs,
@@ -212,9 +227,21 @@ class HasLearner:
         ]
         return {**kwargs, "batch_transforms": completed}
 
+    @property
+    def n_tasks(self: Any) -> int:
+        """Tasks that the observations tell apart; 1 if they tell none."""
+        return number_of_tasks(self.observation_space)
+
+    @property
+    def _width_factor(self: Any) -> int:
+        """By which networks are wider than described: 2 with ``multitask`` and several tasks."""
+        return 2 if self.multitask and self.n_tasks > 1 else 1
+
     def _make_head(self: Any) -> ValueHead:
-        if (cls := self.value_head) is not None:
-            head = own_classes.make("value_head", cls, cls, ValueHead, kwargs=self.value_head_kwargs or {})
+        if self.value_head is not None:
+            cls = chosen("value_head", self.value_head, VALUE_HEADS, ValueHead)
+            kwargs = self._full_value_head_kwargs()
+            head = own_classes.make("value_head", self.value_head, cls, ValueHead, kwargs=kwargs)
             check_value(f"{cls.__name__}.n_outputs", head.n_outputs, integer(1))
             return head  # type: ignore[no-any-return]
         return ValueHead() if self.n_quantiles is None else QuantileHead(self.n_quantiles)
@@ -226,25 +253,51 @@ class HasLearner:
     def _take_settings(self: Any) -> None:
         """Have the learner take up what was set since the last gradient step."""
         self._take_target_entropy()
-        self.learner.target_entropy = self._target_entropy
+        self.learner.set_target_entropy(self._target_entropy)
         for name in Learner.SETTINGS:
             setattr(self.learner, name, getattr(self, name))
 
     def _take_target_entropy(self: Any) -> None:
-        """Take up what ``target_entropy`` says, which is a number afterwards."""
+        """Take up what ``target_entropy`` says, which is a number afterwards, or a list of them, one a task."""
         checks.check_target_entropy(self)
         if self.target_entropy == "auto":
-            self._target_entropy = -get_action_dim(self.action_space) / 2
+            self._target_entropy = self._auto_target_entropy(get_action_dim(self.action_space))
+        elif isinstance(self.target_entropy, Sequence) and not isinstance(self.target_entropy, str):
+            targets = [float(each) for each in self.target_entropy]
+            self._target_entropy = targets if self.n_tasks > 1 else targets[0]
         else:
             self._target_entropy = float(self.target_entropy)
         if BACKBONES[self.backbone].has_entropy:
             self.target_entropy = self._target_entropy
 
+    def _auto_target_entropy(self: Any, action_dim: int) -> float:
+        """
+        :param action_dim: dimension of the actions
+        :return: what ``target_entropy="auto"`` means
+        """
+        return -action_dim / 2
+
     def _full_exploration_kwargs(self: Any) -> dict[str, Any]:
         """
         :return: the explorer's arguments: the user's and the algorithm's
         """
-        return dict(self.exploration_kwargs or {})
+        kwargs = dict(self.exploration_kwargs or {})
+        if self._width_factor > 1 and self.exploration == "optimistic_shift":
+            return {"width_factor": self._width_factor, **kwargs}
+        return kwargs
+
+    def _full_value_head_kwargs(self: Any) -> dict[str, Any]:
+        """
+        :return: the value head's arguments: the user's and the algorithm's
+        """
+        return dict(self.value_head_kwargs or {})
+
+    def _full_reward_scale_kwargs(self: Any) -> dict[str, Any]:
+        """
+        :return: the arguments of the rule that scales rewards: the user's and the algorithm's
+        """
+        kwargs = dict(self.reward_scale_kwargs or {})
+        return {"n_tasks": self.n_tasks, **kwargs} if self.reward_scale == "brc" else kwargs
 
     def _full_pessimism_kwargs(self: Any) -> dict[str, Any]:
         """
@@ -261,7 +314,8 @@ class HasLearner:
             value = checks.as_number("ent_coef", start, allowed, shown=self.ent_coef)
             if not 0 < value < np.inf:
                 raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
-            return LogScalar(value).to(self.device)
+            by_task = self.task_temperatures and self.n_tasks > 1
+            return (TaskLogScalar(value, self.n_tasks) if by_task else LogScalar(value)).to(self.device)
         value = checks.as_number("ent_coef", self.ent_coef, allowed)
         if not 0 <= value < np.inf:
             raise ValueError(f"ent_coef must be at least 0 and finite, {allowed}, not {self.ent_coef!r}")
@@ -293,6 +347,27 @@ class HasLearner:
         :return: a freshly initialised objective
         """
         return Objective()
+
+    def make_reward_scaler(self: Any, learner: Learner) -> RewardScale:
+        """
+        :param learner: whose it is
+        :return: a rule that scales rewards, without statistics yet
+        """
+        make = chosen("reward_scale", self.reward_scale, REWARD_SCALES, RewardScale)
+        kwargs = self._full_reward_scale_kwargs()
+        return own_classes.make("reward_scale", self.reward_scale, make, RewardScale, learner, kwargs=kwargs)  # type: ignore[no-any-return]
+
+    def _make_schedule(self: Any) -> LearningRateSchedule | None:
+        if self.learning_rate_schedule is None:
+            return None
+        peak, start = self.lr_schedule(1), self.warm_up_learning_rate
+        return LearningRateSchedule(
+            self.learning_rate_schedule,
+            peak,
+            self.final_learning_rate,
+            self.warm_up_steps,
+            peak if start is None else start,
+        )
 
     def _optimizers(self: Any) -> dict[str, torch.optim.Optimizer]:
         """Every optimizer by its path from the algorithm."""

@@ -40,7 +40,8 @@ class BC(SAC):
                 f"backbone={self.backbone!r} of BC follows from deterministic={self.deterministic}: leave it out"
             )
         _check_no_entropy(self)
-        check_unused(self, ("prior_data", "sam_radius", "target_subset", "n_quantiles", "value_head"), "BC")
+        of_values = ("sam_radius", "target_subset", "n_quantiles", "value_head", "actor_first", "reward_scale")
+        check_unused(self, ("prior_data", *of_values), "BC")
         _check_explores_by_actor(self)
         of_critics = ("critic_network", "critic_network_kwargs", "critic_optimizer_kwargs", "n_critics")
         given = sorted({*of_critics, "share_features_extractor"} & self.policy_kwargs.keys())
@@ -109,6 +110,11 @@ class IQL(SAC):
         return FixedScalar(0.0).to(self.device)
 
     def make_objective(self, learner: Learner) -> Objective:
+        if learner.critic.trunk.stacks_rows is not None:
+            raise ValueError(
+                f"critic_network={type(learner.critic.trunk).__name__} sees the actor's next actions in its critics' "
+                "step, of which IQL takes none: choose another critic_network in policy_kwargs"
+            )
         return ImplicitQ(learner, self.expectile, self.inverse_temperature)
 
 
@@ -117,7 +123,7 @@ class TD3BC(SAC):
     TD3+BC (Fujimoto and Gu 2021, https://arxiv.org/abs/2106.06860): TD3 whose actor stays near the batch's actions.
     ``learn`` goes on in an environment, near the replay buffer's.
 
-    The paper normalises observations by the data set's statistics: do so with the data and the environment. Its actor
+    The paper normalises observations by the data set's statistics, as ``normalize_observations=True`` does. Its actor
     follows the first critic, here the mean of the critics.
 
     :raises ValueError: if an argument is out of range or contradicts another
@@ -153,7 +159,7 @@ def _starting_wide(kwargs: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_no_entropy(agent: SAC) -> None:
-    check_unused(agent, ["ent_coef"], f"{type(agent).__name__}, which rewards no entropy")
+    check_unused(agent, ["ent_coef", "task_temperatures"], f"{type(agent).__name__}, which rewards no entropy")
     # A number once a model is made.
     if agent.target_entropy not in ("auto", -get_action_dim(agent.action_space) / 2):
         check_unused(agent, ["target_entropy"], f"{type(agent).__name__}, which rewards no entropy")

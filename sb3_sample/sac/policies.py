@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
     CombinedExtractor,
@@ -21,11 +22,12 @@ from torch import nn
 from sb3_sample.arguments import check_net_arch
 from sb3_sample.kinds import DICT, TRUE_OR_FALSE, check_value, integer
 from sb3_sample.learner.batch import Encoded
-from sb3_sample.networks import Network
+from sb3_sample.networks import Network, RunningNorm
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.optim import AdamW
-from sb3_sample.sac.actors import BACKBONES, Actor, DeterministicActor
+from sb3_sample.sac.actors import BACKBONES, GAUSSIAN_ARGUMENTS, Actor, DeterministicActor
 from sb3_sample.sac.critics import CriticEnsemble, ValueNetwork
+from sb3_sample.sac.multi_task import TaskOneHot, reads_one_hot
 from sb3_sample.sac.trunks import network_args
 
 
@@ -37,9 +39,9 @@ class SACPolicy(BasePolicy):
     :param action_space: action space, a bounded Box
     :param lr_schedule: learning rate schedule; its value at the start is used here
     :param net_arch: widths of the hidden layers as in Stable-Baselines3, a list or ``dict(pi=[...], qf=[...])``;
-        for the network "mlp" only, the same as ``hidden_sizes`` in the network's arguments
-    :param activation_fn: activation of the network "mlp"
-    :param critic_network: trunk of the critics, "mlp", "bronet", "spectral", or a class derived from ``Network``
+        for the networks "mlp", "crossq" and "xqc" only, the same as ``hidden_sizes`` in the network's arguments
+    :param activation_fn: activation of these networks
+    :param critic_network: trunk of the critics by its name in ``NETWORKS``, or a class derived from ``Network``
     :param critic_network_kwargs: its arguments (``hidden_sizes``, ``layer_norm``, ``dropout``, ...; ``width``,
         ``n_blocks``)
     :param actor_network: trunk of the actor, the same
@@ -50,8 +52,8 @@ class SACPolicy(BasePolicy):
     :param features_extractor_kwargs: its arguments
     :param normalize_images: whether images are divided by 255
     :param backbone: "sac" for a tanh-Gaussian actor, "td3" for a deterministic one with a target actor
-    :param actor_kwargs: arguments of the actor: with "td3" ``exploration_noise``, ``target_noise``,
-        ``target_noise_clip``; with "sac" ``initial_std``
+    :param actor_kwargs: arguments of the actor: with "sac" ``log_std_min``, ``log_std_max``, ``clip_log_std``,
+        ``initial_std``, with "td3" ``exploration_noise``, ``target_noise``, ``target_noise_clip``
     :param optimizer_class: optimizer of actor and critics
     :param optimizer_kwargs: its arguments, but for the learning rate
     :param critic_optimizer_kwargs: arguments of the critics' optimizer alone, over ``optimizer_kwargs``
@@ -61,6 +63,9 @@ class SACPolicy(BasePolicy):
         the critics' step (SAC-AE, Yarats et al. 2021; DrQ, Kostrikov et al. 2021; DrQ-v2 reads those from before
         the step). The actors read it in evaluation mode. The target critics have a Polyak average of it, which a
         target actor reads too
+    :param normalize_observations: whether all networks read observations through one running normalisation,
+        ``observation_norm``, whose statistics are in the policy
+    :param width_factor: by which the hidden layers of all trunks are wider than their arguments say
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
@@ -91,6 +96,8 @@ class SACPolicy(BasePolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
         critic_optimizer_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = False,
+        normalize_observations: bool = False,
+        width_factor: int = 1,
     ):
         check_value("share_features_extractor", share_features_extractor, TRUE_OR_FALSE)
         super().__init__(
@@ -105,16 +112,23 @@ class SACPolicy(BasePolicy):
         )
         check_value("n_critics", n_critics, integer(1))
         check_value("n_outputs", n_outputs, integer(1))
+        check_value("normalize_observations", normalize_observations, TRUE_OR_FALSE)
         check_net_arch(net_arch, ("pi", "qf"), both=True)
         pi_arch: list[int] | None = None
         qf_arch: list[int] | None = None
         if net_arch is not None:
             pi_arch, qf_arch = get_actor_critic_arch(net_arch if isinstance(net_arch, dict) else list(net_arch))
-        actor_args = network_args("actor", actor_network, actor_network_kwargs, pi_arch, activation_fn)
-        critic_args = network_args("critic", critic_network, critic_network_kwargs, qf_arch, activation_fn)
+        check_value("width_factor", width_factor, integer(1))
+        further = (activation_fn, width_factor)
+        actor_args = network_args("actor", actor_network, actor_network_kwargs, pi_arch, *further)
+        critic_args = network_args("critic", critic_network, critic_network_kwargs, qf_arch, *further)
+
+        self.observation_norm: RunningNorm | None = None
+        if normalize_observations:
+            self.observation_norm = RunningNorm(_normalized_shape(observation_space))
 
         def critics() -> CriticEnsemble:
-            return CriticEnsemble(
+            made = CriticEnsemble(
                 observation_space,
                 action_space,
                 *critic_args,
@@ -123,14 +137,16 @@ class SACPolicy(BasePolicy):
                 n_outputs=n_outputs,
                 normalize_images=normalize_images,
             )
+            self._share_norm(made)
+            return made
 
         if not isinstance(backbone, str) or backbone not in BACKBONES:
             raise ValueError(f"backbone must be one of {sorted(BACKBONES)}, not {backbone!r}")
         check_value("actor_kwargs", actor_kwargs, DICT)
         check_value("critic_optimizer_kwargs", critic_optimizer_kwargs, DICT)
         actor_kwargs = dict(actor_kwargs or {})
-        of_backbone = {"td3": ("exploration_noise", "target_noise", "target_noise_clip")}
-        allowed = of_backbone.get(backbone, ("initial_std",))
+        of_noise = ("exploration_noise", "target_noise", "target_noise_clip")
+        allowed = of_noise if backbone == "td3" else GAUSSIAN_ARGUMENTS
         for name in actor_kwargs:
             if name not in allowed:
                 raise ValueError(f"actor_kwargs has {name!r}, but backbone={backbone!r} takes {allowed}")
@@ -144,6 +160,7 @@ class SACPolicy(BasePolicy):
         self.actor_target: Actor | None = None
         if isinstance(self.actor, DeterministicActor):
             self.actor_target = copy.deepcopy(self.actor).requires_grad_(False)
+            self._share_norm(self.actor_target)
             self.actor_target.set_training_mode(False)
         if not share_features_extractor:
             self.critic = critics()
@@ -178,7 +195,15 @@ class SACPolicy(BasePolicy):
             optimizer_kwargs=self.optimizer_kwargs,
             critic_optimizer_kwargs=critic_optimizer_kwargs,
             share_features_extractor=share_features_extractor,
+            normalize_observations=normalize_observations,
+            width_factor=width_factor,
         )
+
+    def _share_norm(self, network: Any) -> None:
+        """Have a network read observations through the policy's own normalisation, which is in the policy's state."""
+        if self.observation_norm is not None:
+            # Past nn.Module's own setattr, which would register it.
+            vars(network)["observation_norm"] = self.observation_norm
 
     def make_actor(self) -> Actor:
         """
@@ -187,7 +212,7 @@ class SACPolicy(BasePolicy):
         args, kwargs = self._actor_args
         shared = self.share_features_extractor
         extractor: Any = self.critic.features_extractor if shared else self.make_features_extractor()
-        return self._actor_class(
+        actor = self._actor_class(
             self.observation_space,
             self.action_space,
             *args,
@@ -196,18 +221,22 @@ class SACPolicy(BasePolicy):
             shares_encoder=shared,
             **kwargs,
         )
+        self._share_norm(actor)
+        return actor
 
     def make_value(self) -> ValueNetwork:
         """
         :return: a value network with the critics' settings, a features extractor of its own included
         """
-        return ValueNetwork(
+        value = ValueNetwork(
             self.observation_space,
             self.action_space,
             *self._critic_args,
             features_extractor=self.make_features_extractor(),
             normalize_images=self.normalize_images,
         )
+        self._share_norm(value)
+        return value
 
     def make_optimizer(self, parameters: Any, learning_rate: float, **kwargs: Any) -> torch.optim.Optimizer:
         """
@@ -301,6 +330,15 @@ class SACPolicy(BasePolicy):
         self.training = mode
 
 
+def _normalized_shape(space: spaces.Space) -> tuple[int, ...]:
+    """Shape of observations whose running normalisation makes sense."""
+    if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and not is_image_space(space):
+        return space.shape
+    raise ValueError(
+        f"normalize_observations=True needs observations of a Box of floats, not of {space}: use VecNormalize"
+    )
+
+
 MlpPolicy = SACPolicy
 
 
@@ -313,8 +351,13 @@ class CnnPolicy(SACPolicy):
 
 
 class MultiInputPolicy(SACPolicy):
-    """The same with an extractor for dict observations."""
+    """
+    The same with an extractor for dict observations; ``TaskOneHot`` if they tell the task beside a vector.
 
-    def __init__(self, *args: Any, **kwargs: Any):
-        kwargs.setdefault("features_extractor_class", CombinedExtractor)
-        super().__init__(*args, **kwargs)
+    :param observation_space: observation space
+    """
+
+    def __init__(self, observation_space: spaces.Space, *args: Any, **kwargs: Any):
+        extractor = TaskOneHot if reads_one_hot(observation_space) else CombinedExtractor
+        kwargs.setdefault("features_extractor_class", extractor)
+        super().__init__(observation_space, *args, **kwargs)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from sb3_sample.constructor import argument
+from sb3_sample.constructor import Given, argument
 from sb3_sample.kinds import AT_LEAST_0, DICT, check_value
 from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.networks import CReLU
@@ -63,7 +63,7 @@ class RegularizedSAC(SAC):
     pessimism_kwargs: dict[str, Any] | None = argument(default=None)
     """for "gpl" and "top", arguments of the rule"""
 
-    def _construct(self, given: dict[str, Any]) -> None:
+    def _construct(self, given: Given) -> None:
         critics, kwargs = given["critic_regularization"], given["pessimism_kwargs"]
         if given["pessimism"] is not None:
             raise ValueError("pessimism is what critic_regularization chooses: pass that alone, or use SAC")

@@ -19,7 +19,10 @@ class SB3Names(HasLearner):
 
     @property
     def log_ent_coef(self) -> torch.Tensor | None:
-        """Logarithm of the temperature, a scalar that is learned; None if the temperature is fixed."""
+        """
+        Logarithm of the temperature, a scalar that is learned, or (n_tasks,) with ``task_temperatures``; None if the
+        temperature is fixed.
+        """
         return self.temperature.log_value if isinstance(self.temperature, LogScalar) else None
 
     @log_ent_coef.setter

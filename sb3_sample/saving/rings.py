@@ -152,7 +152,8 @@ class Ring:
         """
         small: dict[str, Any] = {"n_rows": self.n_rows, "size": self.size()}
         if isinstance(self.buffer, CompactReplay):
-            return small
+            changing = self.buffer.changing_state()
+            return {**small, "changing": changing} if changing else small
         own = vars(self.buffer)
         small["numbers"] = {name: value for name, value in own.items() if isinstance(value, (bool, int, float))}
         small["arrays"] = {name: own[name] for name in _SMALL if name in own}
@@ -173,7 +174,11 @@ class Ring:
             raise ValueError(f"of the buffer's rows {size!r:.50} of {n_rows!r:.50} are to be there")
         followed = _Followed(pieces, self.buffer)
         if isinstance(self.buffer, CompactReplay):
+            changing = small.get("changing", {})
+            if not isinstance(changing, dict):
+                raise ValueError(f"what changes in the buffer's rows cannot be {changing!r:.50}")
             self.buffer.restore_rows(followed)
+            self.buffer.load_changing_state(changing)
         else:
             self._restore(small, followed)
         complete = followed.end == n_rows and n_rows - followed.begin >= size

@@ -6,8 +6,9 @@ its statistics, and the figures of the papers' studies.
 from sb3_sample.envs.scores import Score
 from sb3_sample.study.aggregate import aggregate, performance_profiles, probability_of_improvement
 from sb3_sample.study.analysis import correlate, cost, heatmap, marginalize, regress
+from sb3_sample.study.comparison import comparison
 from sb3_sample.study.dry_run import Estimate, estimate
-from sb3_sample.study.plan import Plan, PlanError, Run, read_plan
+from sb3_sample.study.plan import Comparison, Plan, PlanError, Run, read_plan
 from sb3_sample.study.reporting.command import report
 from sb3_sample.study.runs import Outcome, StudyError
 from sb3_sample.study.schedule import Stopped, run
@@ -15,6 +16,7 @@ from sb3_sample.study.states import RunStatus, Status, status
 from sb3_sample.study.table import load, published_curves, published_runs, read, write
 
 __all__ = [
+    "Comparison",
     "Estimate",
     "Outcome",
     "Plan",
@@ -26,6 +28,7 @@ __all__ = [
     "Stopped",
     "StudyError",
     "aggregate",
+    "comparison",
     "correlate",
     "cost",
     "estimate",

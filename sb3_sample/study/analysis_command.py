@@ -24,6 +24,7 @@ from sb3_sample.study.aggregate import (
     performance_profiles,
     probability_of_improvement,
 )
+from sb3_sample.study.comparison import chosen_groups, comparison
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -75,7 +76,12 @@ def _factor(text: str) -> tuple[str, list[str]]:
     return name, names
 
 
-def _add_sources(parser: argparse.ArgumentParser, pictures: bool = False) -> None:
+def add_sources(parser: argparse.ArgumentParser, pictures: bool = False, output: str = "") -> None:
+    """
+    :param parser: gets the runs that a command reads, and its output
+    :param pictures: whether the command draws
+    :param output: help of the output, where it is not a table or a picture
+    """
     parser.add_argument(
         "sources",
         nargs="*",
@@ -92,14 +98,15 @@ def _add_sources(parser: argparse.ArgumentParser, pictures: bool = False) -> Non
         help="published runs besides, every seed of them: BRO, 'BRO Fast'",
     )
     endings = _TABLES + (_PICTURES if pictures else ())
-    parser.add_argument("-o", "--output", type=Path, help=f"file to write ({', '.join(endings)})")
+    parser.add_argument("-o", "--output", type=Path, help=output or f"file to write ({', '.join(endings)})")
     parser.set_defaults(endings=endings)
 
 
-def add_scores(parser: argparse.ArgumentParser, groups: bool = True) -> None:
+def add_scores(parser: argparse.ArgumentParser, groups: bool = True, planned: bool = True) -> None:
     """
     :param parser: of a command that makes scores
     :param groups: whether it takes groups of tasks
+    :param planned: whether these can be those of a study's plan
     """
     parser.add_argument(
         "--score",
@@ -114,7 +121,8 @@ def add_scores(parser: argparse.ArgumentParser, groups: bool = True) -> None:
             "--groups",
             nargs="+",
             metavar="GROUP",
-            help=f"groups of tasks, of {', '.join(GROUPS)} (default: {', '.join(DEFAULT_GROUPS)})",
+            help=f"groups of tasks, of {'the study plan and ' if planned else ''}{', '.join(GROUPS)} (default: "
+            f"{'those of the plan, or ' if planned else ''}{', '.join(DEFAULT_GROUPS)})",
         )
 
 
@@ -163,6 +171,10 @@ def _read(options: argparse.Namespace, *more: str) -> pd.DataFrame:
     if curves:
         parts.append(tables.published_curves(curves))
     return pd.concat(parts, ignore_index=True)
+
+
+def _groups(options: argparse.Namespace, table: pd.DataFrame) -> Any:
+    return chosen_groups(comparison(options.sources).groups, options.groups, table)
 
 
 def _shared(options: argparse.Namespace, *names: str) -> dict[str, Any]:
@@ -235,7 +247,7 @@ def _put(table: pd.DataFrame, output: Path | None, draw: Callable[[], "Figure"] 
 
 
 def _add_table(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser)
+    add_sources(parser)
     parser.add_argument(
         "--curves",
         nargs="+",
@@ -272,7 +284,7 @@ def _run_table(options: argparse.Namespace) -> None:
 
 
 def _add_aggregate(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser)
+    add_sources(parser)
     _add_steps(parser)
     add_scores(parser)
     add_intervals(parser)
@@ -297,28 +309,28 @@ def _run_aggregate(options: argparse.Namespace) -> None:
         if options.improvement and options.common:
             raise ValueError("--common is not of --improvement, which compares each pair on the tasks that both have")
         table = _read(options)
-        shared = _shared(options, *_INTERVALS)
+        groups, shared = _groups(options, table), _shared(options, *_INTERVALS)
         if options.improvement:
-            found = probability_of_improvement(table, options.steps[0], options.groups, **shared)
+            found = probability_of_improvement(table, options.steps[0], groups, **shared)
         elif options.profile:
             found = performance_profiles(
-                table, options.steps[0], options.profile, options.groups, common=options.common, **shared
+                table, options.steps[0], options.profile, groups, common=options.common, **shared
             )
         else:
-            found = aggregate(table, options.steps, options.groups, common=options.common, **shared)
+            found = aggregate(table, options.steps, groups, common=options.common, **shared)
         _put(found, options.output)
 
 
 def _add_marginalize(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser)
+    add_sources(parser)
     parser.add_argument(
         "--factor",
         nargs="+",
         type=_factor,
         dest="factors",
         metavar="[NAME=]ARGUMENT[,...]",
-        help="arguments of which one choice each was made, several that are one choice under a name (default: each "
-        "argument in which the runs of a task differ)",
+        help="arguments of which one choice each was made, several that are one choice under a name (default: the "
+        "plan's factors, or each argument in which the runs of a task differ)",
     )
     parser.add_argument("--order", type=int, default=1, help="how many factors are fixed (default: 1)")
     _add_ends(parser)
@@ -328,13 +340,15 @@ def _add_marginalize(parser: argparse.ArgumentParser) -> None:
 
 def _run_marginalize(options: argparse.Namespace) -> None:
     with refusing("marginalize"):
-        factors = None if options.factors is None else dict(options.factors)
-        shared = _shared(options, "by", "groups", "last", *_INTERVALS)
-        _put(analysis.marginalize(_read(options), factors, options.order, **shared), options.output)
+        table = _read(options)
+        factors = comparison(options.sources).factors if options.factors is None else dict(options.factors)
+        shared = _shared(options, "by", "last", *_INTERVALS)
+        found = analysis.marginalize(table, factors or None, options.order, groups=_groups(options, table), **shared)
+        _put(found, options.output)
 
 
 def _add_correlate(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser, pictures=True)
+    add_sources(parser, pictures=True)
     parser.add_argument(
         "--metrics",
         nargs="+",
@@ -362,34 +376,37 @@ def _run_correlate(options: argparse.Namespace) -> None:
             _put(analysis.regress(table, options.metrics, **shared), options.output)
             return
         found = analysis.correlate(
-            table, options.metrics, by=options.by, groups=options.groups, level=options.level, **shared
+            table, options.metrics, by=options.by, groups=_groups(options, table), level=options.level, **shared
         )
         _put(found, options.output, lambda: _draw_correlations(found, options.by))
 
 
 def _add_heatmap(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser, pictures=True)
+    add_sources(parser, pictures=True)
     parser.add_argument("-x", required=True, metavar="ARGUMENT", help="argument of the columns, as model_size")
     parser.add_argument("-y", required=True, metavar="ARGUMENT", help="argument of the rows, as replay_ratio")
     parser.add_argument(
         "--value", default="score", metavar="METRIC", help="score, or a metric as hours (default: score)"
     )
     parser.add_argument("--step", type=steps_of, help="simulator step (default: the last that all runs reach)")
-    parser.add_argument("--group", default="all", help=f"of tasks, of {', '.join(GROUPS)} (default: all)")
+    parser.add_argument(
+        "--group", default="all", help=f"of tasks, of the study's plan and of {', '.join(GROUPS)} (default: all)"
+    )
     add_scores(parser, groups=False)
 
 
 def _run_heatmap(options: argparse.Namespace) -> None:
     with refusing("heatmap"):
         table = _read(options, *([] if options.value == "score" else [options.value]))
-        shared = _shared(options, "value", "step", "group")
-        found = analysis.heatmap(table, options.x, options.y, **shared)
+        group = comparison(options.sources).groups.get(options.group, options.group)
+        shared = _shared(options, "value", "step")
+        found = analysis.heatmap(table, options.x, options.y, group=group, **shared)
         shown = found.reset_index().rename(columns={options.y: f"{options.y} \\ {options.x}"})
         _put(shown, options.output, lambda: _draw_heatmap(found, options.value))
 
 
 def _add_cost(parser: argparse.ArgumentParser) -> None:
-    _add_sources(parser, pictures=True)
+    add_sources(parser, pictures=True)
     _add_steps(parser)
     add_scores(parser)
     add_intervals(parser)
@@ -398,14 +415,21 @@ def _add_cost(parser: argparse.ArgumentParser) -> None:
 def _run_cost(options: argparse.Namespace) -> None:
     with refusing("cost"):
         shared = _shared(options, "common", *_INTERVALS)
-        found = analysis.cost(_read(options), options.steps, options.groups, **shared)
+        table = _read(options)
+        found = analysis.cost(table, options.steps, _groups(options, table), **shared)
         _put(found, options.output, lambda: _draw_cost(found))
 
 
 # ---------------------------------------------------------------- pictures
 
 
-def _figure(width: float, height: float) -> "Figure":
+def new_figure(width: float, height: float) -> "Figure":
+    """
+    :param width: inches
+    :param height: inches
+    :return: an empty figure
+    :raises ImportError: matplotlib is not installed
+    """
     with needing_matplotlib():
         from matplotlib.figure import Figure
 
@@ -431,7 +455,7 @@ def _cells(values: pd.DataFrame) -> Iterator[tuple[tuple[int, int], float]]:
 
 
 def _draw_heatmap(values: pd.DataFrame, name: str) -> "Figure":
-    figure = _figure(2 + 0.9 * values.shape[1], 1.5 + 0.6 * values.shape[0])
+    figure = new_figure(2 + 0.9 * values.shape[1], 1.5 + 0.6 * values.shape[0])
     axes = figure.add_subplot()
     figure.colorbar(_draw_grid(axes, values, cmap="viridis"), label="IQM of the scores" if name == "score" else name)
     axes.set_xlabel(values.columns.name)
@@ -443,7 +467,7 @@ def _draw_correlations(found: pd.DataFrame, by: list[str]) -> "Figure":
     parts = list(found.groupby(["group", *by], sort=False))
     variables = list(found["x"].unique())
     size = 1.5 + 0.7 * len(variables)
-    figure = _figure((size + 0.5) * len(parts), size)
+    figure = new_figure((size + 0.5) * len(parts), size)
     for axes, (head, part) in zip(figure.subplots(1, len(parts), squeeze=False)[0], parts, strict=True):
         matrix = part.pivot(index="x", columns="y", values="spearman").loc[variables, variables]
         matrix = matrix.rename(index=_last_word, columns=_last_word)
@@ -458,7 +482,7 @@ def _last_word(metric: str) -> str:
 
 def _draw_cost(found: pd.DataFrame) -> "Figure":
     groups = list(found["group"].unique())
-    figure = _figure(4.5 * len(groups), 4)
+    figure = new_figure(4.5 * len(groups), 4)
     for axes, group in zip(figure.subplots(1, len(groups), squeeze=False)[0], groups, strict=True):
         for agent, rows in found[found["group"] == group].dropna(subset="hours").groupby("agent", sort=False):
             lines = axes.plot(rows["hours"], rows["iqm"], marker="o" if len(rows) < 3 else None, label=agent)

@@ -10,11 +10,13 @@ from typing import Any
 
 from sb3_sample.exits import refuse
 from sb3_sample.study import analysis_command
+from sb3_sample.study.cluster import check
+from sb3_sample.study.cores import free_cores
 from sb3_sample.study.dry_run import estimate
 from sb3_sample.study.plan import PlanError, read_plan
 from sb3_sample.study.reporting import command as report_command
 from sb3_sample.study.runs import StudyError
-from sb3_sample.study.schedule import Stopped, free_cores, run
+from sb3_sample.study.schedule import Stopped, run
 from sb3_sample.study.states import RUNNING, STATES, Status, status
 
 #: Seconds between two lines of counts where there is no terminal.
@@ -71,23 +73,42 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--device", default="auto", help="as of train (default: auto)")
     parser.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="a Ray cluster makes the runs: 'local' for one on this machine, 'auto' for the one that this machine is "
+        "in, or its address",
+    )
+    parser.add_argument(
+        "--gpus", type=float, metavar="N", help="GPUs of each run, or its share of one, with --ray (default: none)"
+    )
+    parser.add_argument(
         "--dry-run", action="store_true", help="say how many runs, hours and bytes it takes, and run nothing of it"
     )
 
 
 def _run(options: argparse.Namespace) -> None:
+    try:
+        if options.ray is not None:
+            check(options.ray, options.gpus)
+        elif options.gpus is not None:
+            raise ValueError(f"--gpus is for runs in a Ray cluster: give --ray too, not --gpus {options.gpus:g} alone")
+        if options.ray is not None and options.dry_run:
+            raise ValueError("--dry-run measures this machine: leave --ray out")
+    except (ValueError, ImportError) as error:
+        refuse("study run", error)
     plan = read_plan(options.plan)
     shared: dict[str, Any] = {"workers": options.workers, "threads": options.threads, "device": options.device}
     if options.dry_run:
         print(estimate(plan, options.folder, say=lambda words: print(words, file=sys.stderr), **shared))
         return
     folder = Path("runs") / plan.name if options.folder is None else options.folder
-    if options.workers is None:
+    if options.workers is None and options.ray is None:
         shared["workers"] = max(free_cores() // options.threads, 1)
-    print(f"{len(plan.runs)} runs in {folder}, {shared['workers']} at once", flush=True)
+    at_once = f", {shared['workers']} at once" if shared["workers"] else ""
+    print(f"{len(plan.runs)} runs in {folder}{at_once}", flush=True)
     try:
         with _showing() as show:
-            found = run(plan, folder, retries=options.retries, show=show, **shared)
+            found = run(plan, folder, retries=options.retries, ray=options.ray, gpus=options.gpus, show=show, **shared)
     except KeyboardInterrupt as error:
         raise KeyboardInterrupt(f"interrupted; the same command goes on with {folder}") from error
     except Stopped as error:

@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from sb3_sample.study.cores import free_cores, threads_of_libraries
 from sb3_sample.study.plan import Plan, Run, constructor_arguments, read_plan
 from sb3_sample.study.runs import StudyFolder, checkpointed
-from sb3_sample.study.schedule import free_cores, threads_of_libraries
 from sb3_sample.study.worker import train
 
 #: Seconds for which the step time of an agent on a task is measured.

@@ -29,6 +29,7 @@ from sb3_sample.shallow_yaml import ShallowLoader
 #: Entries of a plan; those after the first four have defaults.
 ENTRIES = (
     "agents", "tasks", "seeds", "steps", "evaluation", "grid", "checkpoint_freq", "env_kwargs", "gym_packages",
+    "groups", "factors",
 )  # fmt: skip
 REQUIRED = ENTRIES[:4]
 #: The published curves' evaluation.
@@ -151,6 +152,18 @@ def _has_default(field: dataclasses.Field[Any]) -> bool:
     return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
 
+class Comparison(NamedTuple):
+    """
+    How the runs of a study are compared, as its plan says.
+
+    :param groups: tasks by the name of their group; empty if the plan has none
+    :param factors: arguments that are one choice together, by the choice's name; empty if the plan has none
+    """
+
+    groups: dict[str, list[str]]
+    factors: dict[str, list[str]]
+
+
 class Plan(NamedTuple):
     """
     A study that is to be made.
@@ -158,11 +171,13 @@ class Plan(NamedTuple):
     :param name: its name
     :param runs: its runs, in their order: the first seed of everything first
     :param text: the file, as it was read; empty for a plan that was made otherwise
+    :param comparison: how its runs are compared
     """
 
     name: str
     runs: tuple[Run, ...]
     text: str = ""
+    comparison: Comparison = Comparison({}, {})
 
 
 def _plain(name: str) -> str:
@@ -274,7 +289,8 @@ class _Reader:
             for task in tasks
             for agent, arguments, point in variants
         )
-        return Plan(self._path.stem, runs, text)
+        comparison = Comparison(self._groups(entries, tasks), self._factors(entries, agents, grid))
+        return Plan(self._path.stem, runs, text, comparison)
 
     # ------------------------------------------------ YAML
 
@@ -436,6 +452,36 @@ class _Reader:
         except (ValueError, TypeError, AssertionError) as error:
             where = f" with {', '.join(f'{k}={v!r}' for k, v in point.items())} of grid" if point else ""
             raise self._fail(agent.node, f"agent {agent.name!r}{where} cannot be made: {error}") from error
+
+    def _groups(self, entries: Mapping[str, _Entry], tasks: list[str]) -> dict[str, list[str]]:
+        if "groups" not in entries:
+            return {}
+        groups = {}
+        for name, (key, node) in self._mapping(entries["groups"].value, "groups").items():
+            groups[name] = self._tasks(node)
+            if others := [task for task in groups[name] if task not in tasks]:
+                raise self._fail(key, f"group {name!r} has {others[0]!r}, which is no task of the plan")
+        return groups
+
+    def _factors(
+        self, entries: Mapping[str, _Entry], agents: list[_Agent], grid: dict[str, list[Any]]
+    ) -> dict[str, list[str]]:
+        if "factors" not in entries:
+            return {}
+        allowed = list(dict.fromkeys(("agent", *grid, *(name for agent in agents for name in agent.arguments))))
+        factors: dict[str, list[str]] = {}
+        for name, (_, node) in self._mapping(entries["factors"].value, "factors").items():
+            factors[name] = []
+            for each in self._list(node, f"factor {name!r}"):
+                argument = self._plain(each)
+                if not isinstance(argument, str) or argument.partition(".")[0] not in allowed:
+                    raise self._fail(
+                        each,
+                        f"factor {name!r} must be of agent and the arguments of the grid and of the agents, not "
+                        f"{argument!r}{_meant(str(argument), allowed)}",
+                    )
+                factors[name].append(argument)
+        return factors
 
     def _tasks(self, node: yaml.Node) -> list[str]:
         found: dict[str, None] = {}

@@ -19,7 +19,7 @@ from sb3_sample.run_logs import EVALUATIONS, read_evaluations
 from sb3_sample.saving import temporary
 from sb3_sample.saving.locks import Lock, take
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
-from sb3_sample.study.plan import Plan, Run
+from sb3_sample.study.plan import Comparison, Plan, Run
 
 #: What is in a study's folder: its runs, what is said of each, the list of them and the plan as it was read.
 RUNS, STATE, LIST, PLAN = "runs", "state", "study.json", "plan.yml"
@@ -106,33 +106,48 @@ class StudyFolder:
         while (lock := take(self.path / STATE / ".lock")) is None:
             time.sleep(0.01)
         with lock:
-            runs = {run.name: run for run in plan.runs}
+            runs, comparison = {run.name: run for run in plan.runs}, plan.comparison
             if (self.path / LIST).exists():
                 known = self.runs()
                 _check_same(self.path, known, plan.runs)
                 if keep:
                     runs = {run.name: run for run in known} | runs
+                    comparison = comparison if any(comparison) else self.comparison()
             listed = [run.as_json() for run in runs.values()]
-            _write(self.path / LIST, json.dumps({"name": plan.name, "runs": listed}, indent=1))
+            content = {"name": plan.name, **comparison._asdict(), "runs": listed}
+            _write(self.path / LIST, json.dumps(content, indent=1))
             if plan.text:
                 _write(self.path / PLAN, plan.text)
+
+    def _list(self) -> Any:
+        path = self.path / LIST
+        try:
+            return parse_json(read_regular(path, MAX_LIST), "it")
+        except FileNotFoundError as error:
+            raise StudyError(f"{self.path} is no folder of sb3-sample study run: it has no {LIST}") from error
+        except (OSError, BadFile) as error:
+            raise StudyError(f"{path} is not what sb3-sample study run has written: {error}") from error
 
     def runs(self) -> list[Run]:
         """
         :return: the runs of the plan that was last run there
         :raises StudyError: there is none, or its list is not what was written
         """
-        path = self.path / LIST
         try:
-            found = parse_json(read_regular(path, MAX_LIST), "it")
-        except FileNotFoundError as error:
-            raise StudyError(f"{self.path} is no folder of sb3-sample study run: it has no {LIST}") from error
-        except (OSError, BadFile) as error:
-            raise StudyError(f"{path} is not what sb3-sample study run has written: {error}") from error
-        try:
-            return [Run.of_json(run) for run in found["runs"]]
+            return [Run.of_json(run) for run in self._list()["runs"]]
         except (ValueError, KeyError, TypeError) as error:
-            raise StudyError(f"{path} is not what sb3-sample study run has written: {error}") from error
+            raise StudyError(f"{self.path / LIST} is not what sb3-sample study run has written: {error}") from error
+
+    def comparison(self) -> Comparison:
+        """
+        :return: how the runs are compared, as the plan says that was last run there
+        :raises StudyError: there is none, or its list is not what was written
+        """
+        content = self._list()
+        found: list[Any] = [content.get(n, {}) if isinstance(content, dict) else None for n in Comparison._fields]
+        if not all(isinstance(each, dict) and all(map(_are_texts, each.values())) for each in found):
+            raise StudyError(f"{self.path / LIST} is not what sb3-sample study run has written: {found!r:.200}")
+        return Comparison(*found)
 
     # ---------------------------------------------------------------- one run
 
@@ -232,6 +247,10 @@ class StudyFolder:
         except (OSError, BadFile):  # none so far, or one is being written
             return Progress(steps, None)
         return Progress(max(steps, int(found["timesteps"][-1])), float(found["results"][-1].mean()))
+
+
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(each, str) for each in value)
 
 
 def checkpointed(folder: Path) -> int:

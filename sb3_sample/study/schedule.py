@@ -1,9 +1,10 @@
 """
 Running a study: which run is made next, by which process, and what becomes of it.
 
-Processes that make runs (:mod:`sb3_sample.study.worker`) stay for runs that differ in their seed alone, so that imports
-are paid for once. The scheduler holds no locks while they work and reads nothing of theirs but their answers: what is
-done, failed and claimed stands in the folder, so that it may be killed at any moment, and others may work beside it.
+Processes of this machine that make runs (:mod:`sb3_sample.study.worker`) stay for runs that differ in their seed alone,
+so that imports are paid for once; in a Ray cluster (:mod:`sb3_sample.study.cluster`) each run has its own. The
+scheduler holds no locks while they work and reads nothing of theirs but their answers: what is done, failed and claimed
+stands in the folder, so that it may be killed at any moment, and others may work beside it.
 """
 
 import contextlib
@@ -18,9 +19,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Protocol
 
 from sb3_sample.kinds import check_value, integer
+from sb3_sample.study import cluster
+from sb3_sample.study.cores import free_cores, threads_of_libraries
 from sb3_sample.study.plan import Plan, Run, read_plan
 from sb3_sample.study.runs import Outcome, StudyFolder, checkpointed
 from sb3_sample.study.states import DONE, FAILED, RUNNING, WAITING, RunStatus, Status
@@ -29,10 +32,6 @@ from sb3_sample.study.states import DONE, FAILED, RUNNING, WAITING, RunStatus, S
 WORKER = (sys.executable, "-c", "from sb3_sample.study.worker import serve; serve()")
 #: Seconds between two looks at what is going on, and at runs that other machines have.
 REFRESH, ELSEWHERE = 2.0, 5.0
-#: Variables that libraries take their number of threads from.
-_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-#: Number of seconds for which idle cores are counted.
-_LOOK = 0.3
 
 
 class Stopped(Exception):
@@ -55,6 +54,8 @@ def run(
     retries: int = 1,
     threads: int = 1,
     device: str = "auto",
+    ray: str | None = None,
+    gpus: float | None = None,
     show: Callable[[Status], None] | None = None,
     worker: Sequence[str] = WORKER,
 ) -> Status:
@@ -64,15 +65,22 @@ def run(
 
     :param plan: a plan or its file
     :param folder: the study's; ``runs/<name of the plan>`` if None
-    :param workers: processes, each with one run at a time; as many as there are free cores for, if None
+    :param workers: processes, each with one run at a time; as many as there are free cores for, if None; in a cluster,
+        as many as its machines have room for
     :param retries: how often a run is tried again that fails
     :param threads: of each process
     :param device: of each run, as ``sb3-sample train --device`` takes it
+    :param ray: a Ray cluster makes the runs: ``"local"`` for one on this machine, ``"auto"`` for the one that this
+        machine is in, else its address; None for processes of this machine without Ray. The folder must be one that all
+        its machines see
+    :param gpus: GPUs of each run, or its share of one, with ``ray`` only
     :param show: gets the status, at the beginning, every two seconds and at the end
-    :param worker: command of a process that makes runs, before the study's folder
+    :param worker: command of a process that makes runs without Ray, before the study's folder
     :return: what became of the runs
     :raises PlanError: the plan cannot be run as it stands; nothing was run
-    :raises StudyError: the folder has runs of other settings; nothing was changed
+    :raises StudyError: the folder has runs of other settings, and nothing was changed; or there is no such cluster, or
+        it has no room for a run
+    :raises ImportError: with ``ray``, that is not installed
     :raises KeyboardInterrupt: after Ctrl-C, when the runs under way have written their checkpoints; a ``Stopped`` after
         SIGTERM and SIGHUP. A second one leaves at once
     :raises OSError: the folder cannot be written to, or has no locks
@@ -80,53 +88,22 @@ def run(
     check_value("retries", retries, integer(0))
     check_value("threads", threads, integer(1))
     check_value("workers", workers, integer(1).or_none())
+    if ray is not None:
+        cluster.check(ray, gpus)
+    elif gpus is not None:
+        raise ValueError(f"gpus is for runs in a Ray cluster: leave it out, or give ray, not gpus={gpus!r} alone")
     if not isinstance(plan, Plan):
         plan = read_plan(plan)
     place = StudyFolder(Path("runs") / plan.name if folder is None else folder)
     place.enter(plan)
-    slots = free_cores() // threads if workers is None else workers
-    scheduler = Scheduler(plan.runs, place, max(slots, 1), retries, threads, device, show or (lambda _: None), worker)
-    with _signals():
-        return scheduler.run()
-
-
-def threads_of_libraries(threads: int) -> dict[str, str]:
-    """
-    :param threads: of a process
-    :return: the variables of its environment that libraries take their number of threads from
-    """
-    return dict.fromkeys(_THREADS, str(threads))
-
-
-def free_cores() -> int:
-    """
-    :return: cores that this process may use and that nobody uses at present, at least 1
-    """
-    usable = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
-    free = float(len(usable))
-    with contextlib.suppress(OSError, ValueError):
-        before = _idle(usable)
-        time.sleep(_LOOK)
-        after = _idle(usable)
-        free = sum((after[core][0] - before[core][0]) / max(after[core][1] - before[core][1], 1) for core in after)
-    with contextlib.suppress(OSError, ValueError):
-        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
-        free = min(free, int(quota) / int(period))  # "max": a ValueError
-    return max(round(free), 1)
-
-
-def _idle(usable: set[int]) -> dict[int, tuple[int, int]]:
-    """By core, the ticks that it was idle and all of them (Linux)."""
-    found = {}
-    for line in Path("/proc/stat").read_text().splitlines():
-        name, *ticks = line.split()
-        core = name.removeprefix("cpu")
-        if name.startswith("cpu") and core.isdigit() and int(core) in usable:
-            numbers = [int(tick) for tick in ticks[:8]]
-            found[int(core)] = (numbers[3] + numbers[4], sum(numbers))
-    if not found:
-        raise ValueError("no cores")
-    return found
+    crew: Crew
+    if ray is None:
+        slots = max(free_cores() // threads, 1) if workers is None else workers
+        crew = Processes([*worker, str(place.path)], slots, threads)
+    else:
+        crew = cluster.Cluster(ray, place.path, workers, threads, gpus)
+    with _signals(), crew:
+        return Scheduler(plan.runs, place, crew, retries, threads, device, show or (lambda _: None)).run()
 
 
 @contextlib.contextmanager
@@ -148,16 +125,96 @@ def _signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-class Worker:
+class Worker(Protocol):
+    """What makes one run at a time: a process of this machine, or a place in a cluster."""
+
+    #: The run that it makes at present.
+    run: Run | None
+    #: Of that run, or of the last one.
+    kind: str
+
+    def give(self, run: Run, options: list[str], threads: int) -> None:
+        """
+        :param run: what it is to make
+        :param options: options of ``sb3-sample train``
+        :param threads: its threads
+        """
+
+    def leave(self) -> None:
+        """Let it end: a training under way is saved first."""
+
+    def kill(self) -> None:
+        """End it at once."""
+
+    def wait(self) -> None:
+        """Wait until it has ended."""
+
+    def why_ended(self) -> str:
+        """
+        :return: how it has ended without an answer, in words
+        """
+
+
+#: Answers of workers: what became of a run, or that it is to be looked at again; None when the worker has ended.
+Events = queue.Queue[tuple[Worker, Any]]
+
+
+class Crew(Protocol):
+    """Where workers come from, for as long as its ``with`` lasts."""
+
+    def __enter__(self) -> Any: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def slots(self) -> int:
+        """
+        :return: workers at once
+        """
+
+    def hire(self, events: Events) -> Worker:
+        """
+        :param events: gets the worker's answers
+        :return: a new one
+        """
+
+
+class Processes(contextlib.nullcontext[None]):
     """
-    A process that makes runs.
+    Workers that are processes of this machine.
+
+    :param command: of each
+    :param slots: how many at once
+    :param threads: of each
+    """
+
+    def __init__(self, command: Sequence[str], slots: int, threads: int):
+        super().__init__()
+        self._command, self._slots, self._threads = command, slots, threads
+
+    def slots(self) -> int:
+        """
+        :return: workers at once
+        """
+        return self._slots
+
+    def hire(self, events: Events) -> "Process":
+        """
+        :param events: gets the worker's answers
+        :return: a new one
+        """
+        return Process(self._command, self._threads, events)
+
+
+class Process:
+    """
+    A process of this machine that makes runs.
 
     :param command: of the process
     :param threads: its threads
     :param events: gets its answers, and None when it has ended, each with the worker
     """
 
-    def __init__(self, command: Sequence[str], threads: int, events: "queue.Queue[tuple[Worker, Any]]"):
+    def __init__(self, command: Sequence[str], threads: int, events: Events):
         # A session of its own: the terminal's Ctrl-C is the scheduler's, which tells its workers.
         self.process = subprocess.Popen(
             command,
@@ -169,10 +226,9 @@ class Worker:
         )
         self.run: Run | None = None
         self.kind = ""
-        self.started = 0.0
         threading.Thread(target=self._listen, args=(self.process.stdout, events), daemon=True).start()
 
-    def _listen(self, answers: IO[str], events: "queue.Queue[tuple[Worker, Any]]") -> None:
+    def _listen(self, answers: IO[str], events: Events) -> None:
         with answers:
             for line in answers:
                 events.put((self, json.loads(line)))
@@ -184,7 +240,7 @@ class Worker:
         :param options: options of ``sb3-sample train``
         :param threads: its threads
         """
-        self.run, self.kind, self.started = run, run.kind, time.monotonic()
+        self.run, self.kind = run, run.kind
         assert self.process.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # it has died: its end is on the way
             print(
@@ -198,6 +254,14 @@ class Worker:
         assert self.process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self.process.stdin.close()
+
+    def kill(self) -> None:
+        """End it at once."""
+        self.process.kill()
+
+    def wait(self) -> None:
+        """Wait until it has ended."""
+        self.process.wait()
 
     def why_ended(self) -> str:
         """
@@ -213,29 +277,27 @@ class Scheduler:
     """
     :param runs: in their order
     :param folder: the study's
-    :param slots: processes at once
+    :param crew: where workers come from
     :param retries: how often a run is tried again that fails
-    :param threads: of each process
+    :param threads: of each run
     :param device: of each run
     :param show: gets the status
-    :param worker: command of a process, before the study's folder
     """
 
     def __init__(
         self,
         runs: Sequence[Run],
         folder: StudyFolder,
-        slots: int,
+        crew: Crew,
         retries: int,
         threads: int,
         device: str,
         show: Callable[[Status], None],
-        worker: Sequence[str],
     ):
-        self._runs, self._folder, self._slots, self._retries = runs, folder, slots, retries
+        self._runs, self._folder, self._crew, self._retries = runs, folder, crew, retries
         self._threads, self._options = threads, ["--num-threads", str(threads), "--device", device]
-        self._show, self._command = show, [*worker, str(folder.path)]
-        self._events: queue.Queue[tuple[Worker, Any]] = queue.Queue()
+        self._show = show
+        self._events: Events = queue.Queue()
         self._workers: list[Worker] = []
         self._pending: deque[Run] = deque()
         #: By run, when it is looked at again that another process has.
@@ -275,15 +337,17 @@ class Scheduler:
             run = self._pending[0]
             idle = [worker for worker in self._workers if worker.run is None]
             fitting = [worker for worker in idle if worker.kind == run.kind]
-            if fitting:
+            slots = self._crew.slots()
+            if fitting and len(self._workers) <= slots:
                 worker = fitting[0]
+            elif len(self._workers) >= slots:
+                if not idle:
+                    return
+                idle[0].leave()
+                self._workers.remove(idle[0])
+                continue
             else:
-                if len(self._workers) >= self._slots:
-                    if not idle:
-                        return
-                    idle[0].leave()
-                    self._workers.remove(idle[0])
-                worker = Worker(self._command, self._threads, self._events)
+                worker = self._crew.hire(self._events)
                 self._workers.append(worker)
             self._pending.popleft()
             worker.give(run, self._options, self._threads)
@@ -370,8 +434,8 @@ class Scheduler:
             worker.leave()
         try:
             for worker in self._workers:
-                worker.process.wait()
+                worker.wait()
         except BaseException:
             for worker in self._workers:
-                worker.process.kill()
+                worker.kill()
             raise

@@ -333,7 +333,7 @@ def _of_settings(settings: dict[str, Any], head: Mapping[str, Any], path: Path) 
     :param path: the file, for messages
     """
     algo, env, seed = (head.get(name) for name in ("algo", "env", "seed"))
-    if not isinstance(algo, str) or not isinstance(env, str) or type(seed) is not int:
+    if not isinstance(algo, str) or not isinstance(env, str) or not (seed is None or type(seed) is int):
         raise BadFile(f"{path} is no record of a run: algo is {algo!r:.50}, env {env!r:.50}, seed {seed!r:.50}")
     arguments = {name: value for name, value in settings.items() if name not in _OF_THE_RUN and value is not None}
     env_kwargs = settings.get("env_kwargs") or {}

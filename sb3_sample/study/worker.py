@@ -26,7 +26,9 @@ from sb3_sample.study.runs import Outcome, StudyFolder, checkpointed, this_proce
 #: Makes a run: the run, its folder, and options of ``sb3-sample train``.
 Train = Callable[[Run, Path, list[str]], None]
 #: What a process ends with that SIGTERM has ended in an orderly way.
-_TERMINATED = 128 + signal.SIGTERM
+TERMINATED = 128 + signal.SIGTERM
+#: Answer of a process that has not made a run to its end: it is to be looked at again.
+TAKEN = {"taken": True}
 
 
 def train(run: Run, folder: Path, options: list[str]) -> None:
@@ -77,7 +79,7 @@ def serve(make: Train = train) -> None:
                 gc.freeze()
             n_made += 1
             outcome = attempt(folder, Run.of_json(order["run"]), order["options"], order["threads"], make)
-            reply = {"taken": True} if outcome is None else outcome._asdict()
+            reply = TAKEN if outcome is None else outcome._asdict()
             print(json.dumps(reply), file=replies, flush=True)
             if outcome is not None and outcome.traceback:
                 return  # what a failed run leaves in the process is not known
@@ -101,7 +103,7 @@ def attempt(folder: StudyFolder, run: Run, options: list[str], threads: int, mak
     :param threads: of this process, for the record
     :param make: makes a run
     :return: what became of it; None if another process has it
-    :raises SystemExit: after SIGTERM, when the run has written its checkpoint
+    :raises SystemExit: after SIGTERM, when the run has written its checkpoint; a ``KeyboardInterrupt`` after SIGINT
     :raises OSError: if the folder cannot be written to, or has no locks
     """
     lock = folder.claim(run)
@@ -119,7 +121,7 @@ def attempt(folder: StudyFolder, run: Run, options: list[str], threads: int, mak
             try:
                 make(run, place, options)
             except BaseException as error:
-                if isinstance(error, SystemExit) and error.code == _TERMINATED:
+                if isinstance(error, KeyboardInterrupt) or (isinstance(error, SystemExit) and error.code == TERMINATED):
                     raise
                 text = traceback.format_exc()
                 print(text, file=sys.stderr)

@@ -10,7 +10,27 @@ from typing import Any, NamedTuple
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
-from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SAC, SRSAC, TOPSAC, VPLSAC, BROFast, RegularizedSAC
+from sb3_sample.sac import (
+    BRC,
+    BRO,
+    BROTD3,
+    DAC,
+    GPLSAC,
+    OAC,
+    OPLSAC,
+    SAC,
+    SRSAC,
+    TOPSAC,
+    VPLSAC,
+    XQC,
+    BROFast,
+    CrossQ,
+    DebiasedRQ,
+    FlashSAC,
+    RegularizedSAC,
+    SimBa,
+    SimbaV2,
+)
 from sb3_sample.saving.untrusted import BadFile
 from sb3_sample.zoo import search
 from sb3_sample.zoo.trials import check_params
@@ -36,10 +56,14 @@ class ZooAlgorithm(NamedTuple):
 #: The algorithms by their names in the zoo (``--algo``, log folders, ``hyperparams/<name>.yml``). "sac" is the zoo's
 #: own, Stable-Baselines3's.
 ALGORITHMS: dict[str, ZooAlgorithm] = {
+    "brc": ZooAlgorithm(BRC, search.BRC_SPACE),
     "bro": ZooAlgorithm(BRO, search.BRO_SPACE),
     "bro_fast": ZooAlgorithm(BROFast, search.BRO_FAST_SPACE),
     "bro_td3": ZooAlgorithm(BROTD3, search.BRO_TD3_SPACE),
+    "crossq": ZooAlgorithm(CrossQ, search.CROSSQ_SPACE),
     "dac": ZooAlgorithm(DAC, search.DAC_SPACE),
+    "dr_q": ZooAlgorithm(DebiasedRQ, search.DR_Q_SPACE),
+    "flash_sac": ZooAlgorithm(FlashSAC, search.FLASH_SPACE),
     "gpl_sac": ZooAlgorithm(GPLSAC, search.GPL_SPACE),
     "mbma_ppo": ZooAlgorithm(MBMAPPO, search.MBMA_SPACE),
     "mbpo_ppo": ZooAlgorithm(MBPOPPO, search.MBPO_SPACE),
@@ -48,9 +72,12 @@ ALGORITHMS: dict[str, ZooAlgorithm] = {
     "qma_ppo": ZooAlgorithm(QMAPPO, search.ON_POLICY_SPACE),
     "regularized_sac": ZooAlgorithm(RegularizedSAC, search.REGULARIZED_SPACE, search.decode_regularized),
     "sac_sample": ZooAlgorithm(SAC, search.SAC_SPACE),
+    "simba": ZooAlgorithm(SimBa, search.SIMBA_SPACE),
+    "simbav2": ZooAlgorithm(SimbaV2, search.SIMBAV2_SPACE),
     "sr_sac": ZooAlgorithm(SRSAC, search.SR_SAC_SPACE),
     "top_sac": ZooAlgorithm(TOPSAC, search.TOP_SPACE),
     "vpl_sac": ZooAlgorithm(VPLSAC, search.VPL_SPACE),
+    "xqc": ZooAlgorithm(XQC, search.XQC_SPACE),
 }
 
 

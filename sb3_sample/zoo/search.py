@@ -111,6 +111,56 @@ OPL_SPACE: Space = {
     "one_minus_td_lambda": _float(0.01, 0.3, log=True),
 }
 VPL_SPACE: Space = {**GPL_SPACE, "validation_proportion": _float(1 / 128, 1 / 4, log=True)}
+#: The successors of BRO, in their published regime. Widths are not searched: they are what a trial's time goes into.
+SIMBA_SPACE: Space = {
+    **OFF_POLICY_SPACE,
+    "n_critics": _int(1, 2),
+    "weight_decay": _float(1e-5, 1e-1, log=True),
+    "replay_ratio": _int(1, 8, log=True),
+}
+SIMBAV2_SPACE: Space = {
+    **OFF_POLICY_SPACE,
+    "n_critics": _int(1, 2),
+    "final_learning_rate": _float(1e-6, 1e-3, log=True),
+    "replay_ratio": _int(1, 8, log=True),
+}
+CROSSQ_SPACE: Space = {
+    # Without target networks.
+    **{name: suggest for name, suggest in OFF_POLICY_SPACE.items() if name != "tau"},
+    "policy_delay": _int(1, 4),
+    "replay_ratio": _int(1, 4),
+}
+XQC_SPACE: Space = {
+    **OFF_POLICY_SPACE,
+    "final_learning_rate": _float(1e-6, 1e-3, log=True),
+    "policy_delay": _int(1, 4),
+    "replay_ratio": _int(1, 8, log=True),
+}
+FLASH_SPACE: Space = {
+    **OFF_POLICY_SPACE,
+    "final_learning_rate": _float(1e-6, 1e-3, log=True),
+    "target_std": _float(0.05, 0.5, log=True),
+    "policy_delay": _int(1, 4),
+    "replay_ratio": _int(1, 4),
+}
+BRC_SPACE: Space = {
+    **OFF_POLICY_SPACE,
+    "pessimism": _float(0.0, 1.0),
+    "weight_decay": _float(1e-5, 1e-2, log=True),
+    "replay_ratio": _int(1, 8, log=True),
+}
+#: Without ``tau``: the targets are copies.
+DR_Q_SPACE: Space = {
+    **{name: suggest for name, suggest in OFF_POLICY_SPACE.items() if name != "tau"},
+    "pessimism": _float(0.0, 1.0),
+    "n_steps": _int(1, 5),
+    "encoder_horizon": _int(1, 8),
+    "target_update_interval": _int(50, 1_000, log=True),
+    "exploration_noise": _float(0.05, 0.5, log=True),
+    "target_noise": _float(0.05, 0.5, log=True),
+    "infonce_weight": _float(0.01, 1.0, log=True),
+    "weight_decay": _float(1e-4, 1e-1, log=True),
+}
 #: PPO with simulated samples. The share of the training in which there are some is not searched: a trial is shorter
 #: than the training that its parameters are for. A trial has to be longer than an iteration, of n_steps times the
 #: environments, since nothing is simulated in the first one.

@@ -16,6 +16,7 @@ from stable_baselines3.td3.policies import TD3Policy
 from sb3_sample import BRO
 from sb3_sample.learner.execution import old_torch
 from sb3_sample.sac import (
+    BRC,
     BROTD3,
     DAC,
     GPLSAC,
@@ -27,8 +28,14 @@ from sb3_sample.sac import (
     TD3BC,
     TOPSAC,
     VPLSAC,
+    XQC,
     BROFast,
+    CrossQ,
+    DebiasedRQ,
+    FlashSAC,
     RegularizedSAC,
+    SimBa,
+    SimbaV2,
 )
 
 #: Of tests whose gradient step is compiled.
@@ -45,6 +52,7 @@ TINY_BRO: dict[str, Any] = dict(
     exploration_kwargs={"network_kwargs": {"width": 8, "n_blocks": 1}},
     device="cpu",
 )
+TINY_RESIDUAL: dict[str, Any] = {f"{who}_network_kwargs": {"width": 8, "n_blocks": 1} for who in ("actor", "critic")}
 TINY_SAC: dict[str, Any] = dict(
     batch_size=8,
     learning_starts=10,
@@ -53,6 +61,17 @@ TINY_SAC: dict[str, Any] = dict(
     policy_kwargs={"net_arch": [8, 8]},
     device="cpu",
 )
+#: FlashSAC's networks, made small.
+TINY_FLASH: dict[str, Any] = {f"{who}_network_kwargs": {"width": 8, "n_blocks": 1} for who in ("critic", "actor")}
+
+
+TINY_DR_Q: dict[str, Any] = dict(
+    policy_kwargs={
+        "net_arch": [8, 8], "encoder_width": 8, "state_embedding": 6, "action_embedding": 4, "pair_embedding": 6,
+        "n_reward_atoms": 5,
+    },
+    target_update_interval=5,
+)  # fmt: skip
 
 
 #: Arguments of every algorithm that are of another kind than it takes: name, value, and what the error says.
@@ -199,6 +218,17 @@ MAKERS: dict[str, Callable[..., Any]] = {
     "OPLSAC": _maker(sac, OPLSAC, pessimism_learning_rate=1e-2, segment_length=4),
     "IQL": _maker(sac, IQL),
     "TD3BC": _maker(sac, TD3BC),
+    "SimBa": _maker(sac, SimBa, policy_kwargs=TINY_RESIDUAL),
+    "SimbaV2": _maker(
+        sac, SimbaV2, n_critics=2, value_head_kwargs={"n_atoms": 11}, policy_kwargs=TINY_RESIDUAL, learning_rate=1e-3
+    ),
+    "BRC": _maker(
+        sac,
+        BRC,
+        critic_width=8,
+        value_head_kwargs={"n_atoms": 21},
+        policy_kwargs={"actor_network_kwargs": {"width": 8, "n_blocks": 1}},
+    ),
     "RegularizedSAC": _maker(
         sac,
         RegularizedSAC,
@@ -207,9 +237,14 @@ MAKERS: dict[str, Callable[..., Any]] = {
         plasticity_regularization=("crelu", "redo", "resets", "sam"),
         redo_period=5,
     ),
+    "DebiasedRQ": _maker(sac, DebiasedRQ, **TINY_DR_Q),
+    "CrossQ": _maker(sac, CrossQ),
+    "CrossQ+WN": _maker(sac, CrossQ, weight_norm=True),
+    "XQC": _maker(sac, XQC),
+    "FlashSAC": _maker(sac, FlashSAC, policy_kwargs=TINY_FLASH),
 }
 #: One of each kind of part, for the slower tests.
-REPRESENTATIVE = ["SAC", "BRO", "BROTD3", "DAC", "VPLSAC", "OPLSAC", "TOPSAC", "RegularizedSAC"]
+REPRESENTATIVE = ["SAC", "BRO", "BROTD3", "DAC", "VPLSAC", "OPLSAC", "TOPSAC", "RegularizedSAC", "DebiasedRQ"]
 
 
 def state(model: SAC) -> dict[str, torch.Tensor]:
@@ -230,6 +265,9 @@ def state(model: SAC) -> dict[str, torch.Tensor]:
 
     for name, value in model.get_parameters().items():
         walk(name, value)
+    if getattr(getattr(model, "learner", None), "schedule", None) is not None:
+        # Each step sets the rates that it takes.
+        flat = {name: value for name, value in flat.items() if not name.endswith("/lr")}
     return flat
 
 

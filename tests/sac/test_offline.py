@@ -13,11 +13,15 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_sample import BC, BRO, IQL, SAC, TD3BC, VPLSAC, Dataset
+from sb3_sample import BC, BRO, IQL, SAC, TD3BC, VPLSAC, Dataset, PrioritizedReplayBuffer, SimBa
 from sb3_sample.learner import losses
-from tests.sac.common import MAKERS, TINY_SAC, differing, sac, state, vec
+from tests.sac.common import MAKERS, TINY_RESIDUAL, TINY_SAC, differing, sac, state, vec
 
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
+
+
+#: Agents that scale rewards by returns in the environment.
+SCALING = ("BRC", "FlashSAC", "SimbaV2", "XQC")
 
 
 def data(n: int = 200, seed: int = 0, **kwargs: Any) -> Dataset:
@@ -211,6 +215,11 @@ def test_td3_bc_moves_its_actor_every_second_step_towards_value_and_data() -> No
         (IQL, {"inverse_temperature": -1}, "inverse_temperature must be at least 0 and finite, not -1"),
         (IQL, {"backbone": "td3"}, "backbone='td3' means nothing with IQL"),
         (IQL, {"pessimism": "gpl"}, "pessimism='gpl' learns from TD errors of the actor"),
+        (BC, {"reward_scale": "xqc"}, "reward_scale='xqc' means nothing with BC"),
+        (BC, {"actor_first": True}, "actor_first=True means nothing with BC"),
+        (IQL, {"policy_kwargs": {"critic_network": "crossq"}}, "critic_network=CrossQ.* of which IQL takes none"),
+        (IQL, {"policy_kwargs": {"actor_network": "xqc"}}, "initial_std=1.0 is set by a plain output layer.*XQC"),
+        (IQL, {"policy_kwargs": {"actor_kwargs": {"initial_std": 9.0}}}, "initial_std must lie between .*, not be 9.0"),
         (IQL, {"sam_radius": 0.1}, "sam_radius=0.1 means nothing with IQL"),
         (IQL, {"policy_kwargs": {"share_features_extractor": True}}, "share_features_extractor=True is not supported"),
         (TD3BC, {"alpha": 0}, "alpha must be above 0 and finite, not 0"),
@@ -247,10 +256,11 @@ def test_files_of_the_agents(cls: type[SAC], tmp_path: Path) -> None:
 # ---------------------------------------------------------------- learn_offline
 
 
-@pytest.mark.parametrize("maker", [*MAKERS, "BC"])
+@pytest.mark.parametrize("maker", [*(name for name in MAKERS if name != "DebiasedRQ"), "BC"])
 def test_every_agent_learns_offline_and_leaves_its_environment_alone(maker: str) -> None:
     env = vec()
-    model: Any = offline(BC, env) if maker == "BC" else MAKERS[maker](env)
+    scaled = {"reward_scale": None} if maker in SCALING else {}
+    model: Any = offline(BC, env) if maker == "BC" else MAKERS[maker](env, **scaled)
     before = state(model)
     assert model.learn_offline(data(), 12, log_interval=None) is model
     toy = env.envs[0].unwrapped
@@ -368,6 +378,57 @@ def test_a_callback_ends_the_training() -> None:
     assert model.num_timesteps == 4
 
 
+@pytest.mark.parametrize("maker", SCALING)
+def test_rewards_scaled_by_returns_of_an_environment_are_refused(maker: str) -> None:
+    with pytest.raises(ValueError, match="reward_scale=.* learn_offline takes no steps there: pass reward_scale=None"):
+        MAKERS[maker]().learn_offline(data(), 1)
+
+
+def test_an_agent_that_learns_from_windows_is_refused() -> None:
+    with pytest.raises(ValueError, match="learn_offline: DebiasedRQ learns from windows of several steps"):
+        MAKERS["DebiasedRQ"]().learn_offline(data(), 1)
+
+
+def test_observations_are_normalised_by_the_data_and_then_by_what_is_acted_on_too() -> None:
+    transitions = data()
+    model = offline(IQL, vec(), normalize_observations=True).learn_offline(transitions, 2)
+    norm, seen = model.policy.observation_norm, transitions.rows(slice(None))["observations"].astype(np.float64)
+    np.testing.assert_allclose(norm.mean, seen.mean(0), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(norm.var, seen.var(0), rtol=1e-4)
+    assert model.objective.value.observation_norm is norm
+    model.learn_offline(transitions, 2)
+    assert norm.count == pytest.approx(200 + 1e-4)
+    model.learn(8)
+    assert 205 < norm.count < 209
+
+
+def test_a_schedule_of_the_learning_rate_counts_the_steps_offline() -> None:
+    model = offline(IQL, learning_rate=1e-3, learning_rate_schedule="linear", final_learning_rate=5e-4)
+    model.learn_offline(data(), 10)
+    assert model.planned_updates == 10
+    assert model.objective.optimizer.param_groups[0]["lr"] == pytest.approx(5.5e-4, abs=6e-5)
+
+
+@pytest.mark.parametrize("cls", [IQL, TD3BC])
+def test_the_actor_first_is_on_the_critics_from_before_the_step(cls: type[SAC]) -> None:
+    model, transitions = offline(cls, vec(), actor_first=True, policy_delay=1), data()
+    model._take_settings()
+    batch = transitions.sample(32)._replace(discounts=model.gamma)
+    actor, critic = copy.deepcopy(model.actor), copy.deepcopy(model.critic)
+    metrics = model._update(batch)
+    assert differing(actor.state_dict(), model.actor.state_dict())
+    if cls is TD3BC:
+        q = critic.q_values(batch.observations, actor(batch.observations)).mean(0)
+        distance = (actor(batch.observations) - batch.actions).square().mean()
+        expected = distance - 2.5 / q.abs().mean() * q.mean()
+        assert metrics["train/actor_loss"].item() == pytest.approx(expected.item(), rel=1e-4)
+
+
+def test_priorities_of_an_objective_with_a_target_of_its_own() -> None:
+    model = offline(IQL, vec(), replay_buffer_class=PrioritizedReplayBuffer).learn(40)
+    assert model.learner.td_errors.shape == (8,) and (model.learner.td_errors > 0).all()
+
+
 class Break(BaseCallback):
     """Raises at a step, as a program that is killed ends there."""
 
@@ -381,11 +442,13 @@ class Break(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize("cls", [BC, IQL, TD3BC, BRO, VPLSAC])
+@pytest.mark.parametrize("cls", [BC, IQL, TD3BC, BRO, VPLSAC, SimBa])
 def test_a_run_that_goes_on_is_the_same_bit_by_bit(cls: type[SAC], tmp_path: Path) -> None:
     kwargs: dict[str, Any] = {"learning_rate": lambda left: 1e-3 * left}
     if cls is BRO:
         kwargs |= {"model_size": (1, 8), "n_quantiles": 5, "policy_kwargs": {}}
+    if cls is SimBa:
+        kwargs["policy_kwargs"] = TINY_RESIDUAL
     if cls is VPLSAC:
         kwargs["validation_proportion"] = 0.25
     whole = offline(cls, **kwargs).learn_offline(data(), 25)

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_sample import IQL, SAC, VPLSAC, Dataset
+from sb3_sample import IQL, SAC, VPLSAC, Dataset, DebiasedRQ, PrioritizedReplayBuffer
 from sb3_sample.learner.learner import Learner
 from tests.sac.common import MAKERS, Toy, differing, sac, state, vec
 
@@ -45,7 +45,7 @@ def batches(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return seen
 
 
-@pytest.mark.parametrize("maker", [name for name in MAKERS if name != "SRSAC"])
+@pytest.mark.parametrize("maker", [name for name in MAKERS if name not in ("SRSAC", "DebiasedRQ")])
 def test_every_agent_has_the_share_of_prior_data_in_every_batch(maker: str, batches: list[Any]) -> None:
     model = MAKERS[maker](prior_data=prior(), prior_share=0.25)
     model.learn(16)
@@ -121,6 +121,11 @@ def test_hindsight_relabels_the_replay_buffers_part_only(batches: list[Any]) -> 
         ({"prior_data": prior(), "prior_share": 0.01}, "prior_share=0.01 of batch_size=8 leaves no transition of one"),
         ({"prior_data": prior(), "n_steps": 3}, "prior_data has transitions of one step, which n_steps=3"),
         ({"prior_data": prior(action_space=spaces.Box(-4, 4, (2,)))}, "prior_data must have actions in the units of"),
+        ({"prior_data": prior(), "cls": DebiasedRQ}, "DebiasedRQ has prior_data=None, not .* windows of several"),
+        (
+            {"prior_data": prior(), "replay_buffer_class": PrioritizedReplayBuffer},
+            "prior_data have no priorities, by which replay_buffer_class=PrioritizedReplayBuffer draws",
+        ),
         ({"prior_data": prior(keys=("a",))}, "prior_data must have observations of the model's shape"),
     ],
 )  # fmt: skip

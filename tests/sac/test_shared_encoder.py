@@ -237,7 +237,7 @@ def check_one(model: SAC) -> None:
         assert not actor.features(observations).requires_grad
 
 
-@pytest.mark.parametrize("maker", REPRESENTATIVE)
+@pytest.mark.parametrize("maker", [name for name in REPRESENTATIVE if name != "DebiasedRQ"])
 def test_saved_loaded_and_going_on(maker: str, tmp_path: Path) -> None:
     model = shared(maker).learn(40)
     model.save(tmp_path / "m")

@@ -42,6 +42,7 @@ from sb3_sample.diagnostics import DiagnosticsCallback
 from sb3_sample.envs import make_env
 from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.replay.compact import CompactReplay
+from sb3_sample.replay.weighted import FadedReplayBuffer, PrioritizedReplayBuffer
 from sb3_sample.saving import training_state, vec_envs
 from sb3_sample.saving.callbacks import walk
 from sb3_sample.saving.folders import Folder
@@ -109,7 +110,8 @@ def model(algorithm: str, folder: str, env: dict[str, Any], **kwargs: Any) -> An
         return cls("MlpPolicy", venv, **arguments)
     if kwargs.pop("her", False):
         kwargs |= {"replay_buffer_class": HerReplayBuffer, "policy": "MultiInputPolicy", "learning_starts": 60}
-    buffers = {"plain": ReplayBuffer, "device": DeviceReplayBuffer}
+    buffers = {"plain": ReplayBuffer, "device": DeviceReplayBuffer, "faded": FadedReplayBuffer,
+               "prioritized": PrioritizedReplayBuffer}  # fmt: skip
     if "buffer" in kwargs:
         kwargs["replay_buffer_class"] = buffers[kwargs.pop("buffer")]
     if kwargs.pop("noise", False):
@@ -314,6 +316,7 @@ def outcome(agent: Any, folder: str, callback: Any = None) -> dict[str, str]:
         note("buffer", {k: v for k, v in own.items() if isinstance(v, (np.ndarray, dict, int, float))})
         if isinstance(buffer, CompactReplay):
             note("buffer/rows", buffer.new_rows(buffer.size()))
+            note("buffer/changing", buffer.changing_state())
         if hasattr(buffer, "_ring"):
             note("buffer/_ring", buffer._ring[np.arange(buffer._first, buffer._last) % len(buffer._ring)])
     for each in callback or []:

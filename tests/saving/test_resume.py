@@ -28,8 +28,8 @@ FAST: dict[str, dict[str, Any]] = {
 }
 SLOW: dict[str, dict[str, Any]] = {
     **{name: {"algorithm": name} for name in (
-        "SAC", "BROFast", "BROTD3", "DAC", "SRSAC", "OAC", "TOPSAC", "GPLSAC", "OPLSAC", "RegularizedSAC", "QMA",
-        "MBPO",
+        "SAC", "BROFast", "BROTD3", "DAC", "SRSAC", "OAC", "TOPSAC", "GPLSAC", "OPLSAC", "RegularizedSAC", "SimBa",
+        "SimbaV2", "BRC", "DebiasedRQ", "CrossQ", "CrossQ+WN", "XQC", "FlashSAC", "QMA", "MBPO",
     )},
     **{f"{name}, workers": {"algorithm": name, "env": WORKERS4} for name in ("BRO", "OPLSAC", "MBMA", "QMA", "MBPO")},
     **{f"{name}, {env}": {"algorithm": name, "env": {"env": env}} for name in ("BRO", "MBMA")
@@ -49,6 +49,11 @@ SLOW: dict[str, dict[str, Any]] = {
     "plain ring": {"algorithm": "SAC", "kwargs": {"buffer": "plain", "buffer_size": 70}, "env": {"n": 2}},
     "ring": {"algorithm": "VPLSAC", "kwargs": {"buffer_size": 70}, "env": {"n": 2}},
     "ring, hindsight": {"algorithm": "SAC", "kwargs": {"her": True, "buffer_size": 70}, "env": {"env": "goal"}},
+    "ring, windows": {"algorithm": "DebiasedRQ", "kwargs": {"buffer_size": 70}, "env": {"n": 2}},
+    "ring, windows, workers": {"algorithm": "DebiasedRQ", "kwargs": {"buffer_size": 70}, "env": WORKERS4},
+    "ring, faded": {"algorithm": "SAC", "kwargs": {"buffer": "faded", "buffer_size": 70}, "env": {"n": 2}},
+    "ring, priorities": {"algorithm": "BRO", "kwargs": {"buffer": "prioritized", "buffer_size": 70}, "env": {"n": 2},
+                         "evaluate": True},
     "noise": {"algorithm": "BROTD3", "kwargs": {"noise": True}, "env": {"n": 2}},
     "episodes": {"algorithm": "SAC", "kwargs": {"train_freq": (1, "episode"), "gradient_steps": -1}},
     "fractions": {"algorithm": "SAC", "kwargs": {"replay_ratio": 0.3, "target_subset": 1}},

@@ -9,6 +9,9 @@ import pytest
 
 from sb3_sample import study
 from sb3_sample.study.analysis_command import COMMANDS, markdown
+from sb3_sample.study.plan import Comparison, Plan
+from sb3_sample.study.plan import Run as Run_
+from sb3_sample.study.runs import StudyFolder
 from tests.study.made_up import made_up, write_run
 from tests.study.test_analysis import CHEETAH, correlated, grid, sized
 
@@ -51,6 +54,37 @@ def test_a_table_of_runs(run: Run, tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(study.load("x.csv"), study.read(["runs"], [*study.table.METRICS, "train/*"]))
     assert "| me | dmc/cheetah-run-v0 | return | 2 |" in run("table", "me=runs")
     assert "| TD7 | dmc/cheetah-run-v0 | return/mean |" in run("table", "--curves", "TD7")
+
+
+def test_groups_and_factors_of_the_plan(run: Run, tmp_path: Path) -> None:
+    runs = [
+        Run_(name, "bro", {"a": a, "b": b}, {"a": a, "b": b}, task, 0, 3_000)
+        for name, task in (("x", CHEETAH), ("x", "dmc/dog-run-v0"))
+        for a in (1, 2)
+        for b in (1, 2)
+    ]
+    comparison = Comparison({"mine": [CHEETAH], "dogs": ["dmc/dog-run-v0", "dmc/dog-walk-v0"]}, {"both": ["a", "b"]})
+    folder = StudyFolder("s")
+    folder.enter(Plan("s", tuple(runs), comparison=comparison))
+    for each in runs:
+        values = [10.0 * each.arguments["a"]] * 3
+        write_run(folder.place(each), each.task, values=values, arguments=each.arguments)
+    out = run("marginalize", "s", "--reps", "5")
+    assert "| group | both |" in out and "| mine | a=1, b=1 | 0.010 |" in out and "| dogs | a=2, b=1 | 0.020 |" in out
+    assert "| all |" not in out
+    out = run("marginalize", "s", "--factor", "a", "--groups", "mine", "dmc", "--reps", "5")
+    assert "| group | a |" in out and "| mine | 1 | 0.010 |" in out and "| dmc | 2 | 0.020 |" in out
+    assert "| dogs |" not in out
+    out = run("aggregate", "s/runs", "--steps", "3k", "--reps", "5")
+    assert "| mine | 3,000 |" in out and "| all | 3,000 |" not in out
+    assert "0.015" in run("heatmap", "s", "-x", "b", "-y", "b", "--group", "mine")
+    assert study.comparison(["s", "label=s/runs"]) == comparison
+    with pytest.raises(SystemExit):
+        run("aggregate", "s", "--steps", "3k", "--groups", "metaword")
+    other = StudyFolder("other")
+    other.enter(Plan("o", tuple(runs), comparison=comparison._replace(groups={"mine": ["dmc/dog-run-v0"]})))
+    with pytest.raises(ValueError, match="groups of the plans must be the same .* not 'mine'"):
+        study.comparison(["s", "other"])
 
 
 def test_aggregates(run: Run) -> None:

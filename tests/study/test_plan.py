@@ -102,8 +102,8 @@ BAD = [
     ("    learning_starts: 500", "    learning_starts: -1", 4, "learning_starts must be an integer of at least 0,"),
     ("0.55M", "0.56M", 5, "agent 'BRO Fast' with replay_ratio=1 of grid .*: model_size must be one of .*'0.55M'"),
     ("    learning_starts: 500", "    learning_starts: .inf", 4, "a number must be finite"),
-    ("sac_sample", "sac_simple", 3, "algo must be one of bro, .*, not 'sac_simple'; did you mean 'sac_sample'"),
-    ("    algo: sac_sample\n", "", 2, "agent 'SAC' needs algo, one of bro, "),
+    ("sac_sample", "sac_simple", 3, "algo must be one of brc, .*, not 'sac_simple'; did you mean 'sac_sample'"),
+    ("    algo: sac_sample\n", "", 2, "agent 'SAC' needs algo, one of brc, "),
     ("BRO Fast:", "SAC:", 5, "'SAC' is there twice: once on line 2"),
     ("BRO Fast:", "sac:", 5, "agents 'SAC' and 'sac' would have the same folder"),
     ("bro_fast\n    model_size: 0.55M", "sac_sample\n    learning_starts: 500", 5, "is agent 'SAC' of line 2"),
@@ -130,6 +130,10 @@ BAD = [
     ("[0, 7]", "\n" + "- " * 5_000, 12, "nests deeper than 50"),
     ("    learning_starts: 500", "    learning_starts: 2020-01-01", 4, "a value must be a number"),
     ("0.55M", "!!python/name:os.system", 7, "a value must be a number"),
+    ("steps: 1e5\n", "steps: 1e5\ngroups: {x: [dmc/dog-run-v0]}\n", 13, "group .x. has .dmc/dog-run-v0., .* no task"),
+    ("steps: 1e5\n", "steps: 1e5\ngroups: {x: [dmc/dig-run-v0]}\n", 13, "'dmc/dig-run-v0' is neither the id"),
+    ("steps: 1e5\n", "steps: 1e5\nfactors: {x: [replay_ration]}\n", 13, "factor .x. must be of agent .*replay_ratio"),
+    ("steps: 1e5\n", "steps: 1e5\nfactors: {x: gamma}\n", 13, "factor 'x' must be a list that is not empty"),
 ]  # fmt: skip
 
 
@@ -170,6 +174,83 @@ def test_a_list_of_somebody_elses_leads_nowhere_else(tmp_path: Path) -> None:
         Run.of_json({**run.as_json(), "steps": "1"})
 
 
-@pytest.mark.parametrize("path", sorted(ROOT.glob("studies/small/*.yml")), ids=lambda path: path.stem)
+def test_groups_and_factors_come_with_the_folder(plan_of, tmp_path: Path) -> None:
+    text = (
+        GOOD.replace("Pendulum-v1, ", "BRO_DMC, ")
+        + "groups: {dmc: [BRO_DMC], two: [dmc/dog-run-v0, dmc/cheetah-run-v0]}\n"
+    )
+    plan = plan_of(
+        text.replace(", dmc/cheetah-run-v0]\nseeds", "]\nseeds") + "factors: {size: [model_size, replay_ratio]}\n"
+    )
+    groups = {"dmc": list(suites.BRO_DMC), "two": ["dmc/dog-run-v0", "dmc/cheetah-run-v0"]}
+    assert plan.comparison == (groups, {"size": ["model_size", "replay_ratio"]})
+    folder = StudyFolder(tmp_path / "study")
+    folder.enter(plan)
+    assert folder.comparison() == plan.comparison
+    # A part of the plan that is run besides says nothing of them.
+    folder.enter(Plan("some", plan.runs[:1]), keep=True)
+    assert folder.comparison() == plan.comparison
+    folder.enter(Plan("some", plan.runs[:1]))
+    assert folder.comparison() == ({}, {})
+
+
+#: Plans with many agents or large critics, each of which is made once to have its arguments checked.
+MANY = {
+    "bro_ablation", "bro_scaling", "bro_scaling_small", "mbma", "mbma_small", "regularization", "regularization_small",
+    "scaling_dmc", "scaling_dmc_small", "scaling_gym", "scaling_gym_small",
+}  # fmt: skip
+#: Runs of the papers' studies: agents, tasks and seeds as the papers state them.
+RUNS = {
+    "bro": 5 * 40 * 10,
+    "bro_scaling": 5 * 5 * 40 * 10,
+    "bro_ablation": 2 * 7 * 10 * 10,
+    "dac": 2 * 6 * 30 * 10,
+    "dac_design": 2 * 8 * 15 * 10,
+    "vpl_sac": 2 * 5 * 20 * 10,
+    "vpl_sac_regret": (1 + 4 + 4) * 4 * 10,
+    "vpl_sac_learning_rate": 3 * 4 * 4 * 10,
+    "vpl_sac_design": 6 * 4 * 10,
+    "regularization": 64 * 2 * 14 * 10,
+    "mbma": 4 * 14 * 15,
+    "mbma_quadruped": 3 * 2 * 8,
+    "mbma_humanoid": 3 * 2 * 8,
+    "scaling_dmc": 4 * 5 * 4 * 7 * 10,
+    "scaling_gym": 4 * 3 * 5 * 4 * 8,
+}
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, marks=[pytest.mark.slow] if path.stem in MANY else [], id=path.stem)
+        for path in sorted(ROOT.glob("studies/*/*.yml"))
+    ],
+)
 def test_the_plans_that_come_with_it_are_good(path: Path) -> None:
-    assert read_plan(path).runs
+    plan = read_plan(path)
+    text = " ".join(plan.text.replace("\n#", " ").split())
+    if path.parent.name == "papers":
+        assert len(plan.runs) == RUNS[path.stem] and f"{len(plan.runs):,} runs of" in text
+        assert f"| {len(plan.runs):,}" in (ROOT / "docs/studies.md").read_text()
+        if path.stem not in ("mbma", "mbma_quadruped", "mbma_humanoid"):  # counted in steps of the simulator
+            assert {run.steps for run in plan.runs} == {500_000 if "half a million" in text else 1_000_000}
+    elif path.stem.endswith("_small"):
+        assert f"{len(plan.runs)} runs of" in text and f"papers/{path.stem.removesuffix('_small')}.yml" in text
+
+
+def test_each_study_of_the_papers_has_a_small_one() -> None:
+    assert {path.stem for path in ROOT.glob("studies/papers/*.yml")} == set(RUNS)
+    assert {path.stem for path in ROOT.glob("studies/small/*_small.yml")} == {f"{name}_small" for name in RUNS}
+
+
+@pytest.mark.parametrize("name", ["vpl_sac_regret", "vpl_sac_regret_small"])
+def test_the_regret_study_is_the_papers(name: str) -> None:
+    plan = read_plan(next(ROOT.glob(f"studies/*/{name}.yml")))
+    agents = {run.agent: (run.algo, run.arguments) for run in plan.runs}
+    high = {"replay_ratio": 16, "resets": 160_000}
+    assert agents["SR-SAC"] == ("sr_sac", high) and len(agents) == 9
+    for proportion in (128, 32, 8, 2):
+        held_out = {**high, "validation_proportion": 1 / proportion}
+        assert agents[f"idle 1-{proportion}"] == ("sr_sac", held_out)
+        assert agents[f"VPL 1-{proportion}"] == ("vpl_sac", held_out)
+    assert {run.task for run in plan.runs} <= set(suites.VPL_ADDITIONAL)

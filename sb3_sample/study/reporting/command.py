@@ -158,7 +158,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="average each agent over all its tasks, not over those that every agent has reached the step on",
     )
-    add_scores(parser)
+    add_scores(parser, planned=False)
     add_intervals(parser)
 
 

@@ -1,0 +1,281 @@
+"""Rewards divided by a running measure of the return's size: the published rules."""
+
+from abc import abstractmethod
+from typing import Any
+
+import numpy as np
+import torch
+
+from sb3_sample.kinds import ABOVE_0, check_value, integer
+from sb3_sample.learner.batch import Batch
+from sb3_sample.learner.parts import Learning
+from sb3_sample.learner.transforms import BatchTransform
+from sb3_sample.networks.normalization import RunningMoments
+
+
+class RewardScale(BatchTransform):
+    """
+    Base class of the rules that divide the rewards of every batch; nothing is subtracted. The division is in the
+    precision of the divisor, and its result is rounded once. At a reset of the networks the statistics stay, as the
+    replay does.
+
+    :param learner: the learner
+    """
+
+    @abstractmethod
+    def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
+        """
+        Look up the divisor.
+
+        :param task: tasks of transitions by their numbers, (B, 1); None where there is one
+        :return: the divisor of their rewards, (B, 1) or a scalar
+        """
+        raise NotImplementedError
+
+    def transform(self, batch: Batch, noise: torch.Tensor | None) -> Batch:
+        rewards, divisor = batch.rewards, self.divisor(task_of(batch))
+        return batch._replace(rewards=(rewards.to(divisor.dtype) / divisor).to(rewards.dtype))
+
+
+def task_of(batch: Batch) -> torch.Tensor | None:
+    """
+    Look up the tasks of transitions: the column "task", or that of dict observations.
+
+    :param batch: transitions
+    :return: numbers of tasks, (B, 1); None if they tell none
+    """
+    dicts = batch.observations if isinstance(batch.observations, dict) else {}
+    task = batch.columns.get("task", dicts.get("task"))
+    return None if task is None else task.long().reshape(-1, 1)
+
+
+class ReturnScale(RewardScale):
+    """
+    Base class of the rules by the return so far, ``G <- gamma * (1 - done) * G + r`` of each environment, where
+    ``done`` is a termination or truncation by this very step: the last reward of an episode begins the next one's
+    return, as in the published code. Statistics are of G over steps and environments.
+
+    :param learner: the learner
+    """
+
+    largest: torch.Tensor
+
+    def __init__(self, learner: Learning, count: float, dtype: torch.dtype):
+        super().__init__(learner)
+        self.moments = RunningMoments((), count, dtype)
+        self.register_buffer("largest", torch.zeros((), dtype=dtype))
+        # G of each environment.
+        self._returns: list[float] = []
+
+    def on_step(self, learner: Learning, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        self.feed(rewards, dones, learner.gamma)
+
+    def on_environment_reset(self, learner: Learning) -> None:
+        self._returns = []
+
+    def feed(self, rewards: np.ndarray, dones: np.ndarray, gamma: float) -> None:
+        """
+        Take one step of all environments into the statistics.
+
+        :param rewards: (n_envs,)
+        :param dones: whether each environment's episode ended with this step, (n_envs,)
+        :param gamma: discount factor
+        """
+        rewards, ends = np.asarray(rewards, np.float64), np.asarray(dones, bool)
+        before = np.array(self._returns) if len(self._returns) == len(rewards) else np.zeros(len(rewards))
+        returns = self._discounts(ends, gamma) * before + rewards
+        self._returns = returns.tolist()
+        values = torch.as_tensor(returns, dtype=self.largest.dtype, device=self.largest.device)
+        self._update(values)
+        self.largest.copy_(torch.maximum(self.largest, values.abs().max()))
+
+    def _discounts(self, ends: np.ndarray, gamma: float) -> np.ndarray:
+        return gamma * (1.0 - ends)
+
+    def _update(self, returns: torch.Tensor) -> None:
+        self.moments.update(returns)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        return {"returns": list(self._returns)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self._returns = list(state["returns"])
+
+
+class StdScale(ReturnScale):
+    """
+    XQC's rule (Palenicek et al. 2026): the divisor is the standard deviation of G plus ``eps``, from population
+    statistics in float64 without start values. Before the first step the rewards are as they are.
+
+    :param learner: the learner
+    :param eps: added to the standard deviation
+    """
+
+    def __init__(self, learner: Learning, eps: float = 1e-8):
+        super().__init__(learner, 0.0, torch.float64)
+        check_value("eps", eps, ABOVE_0)
+        self.eps = eps
+
+    def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
+        return self.moments.var.sqrt() + self.eps
+
+
+class StdOrMaxScale(ReturnScale):
+    """
+    SimbaV2's rule (Lee et al. 2025): the divisor is the standard deviation of G, or the largest ``|G|`` so far divided
+    by ``max_return``, whichever is larger. Statistics in float64; the start values (variance 1) count as 1e-4 samples.
+
+    A step is taken in when the next actions are chosen, so that a batch drawn after it does not see it yet.
+
+    :param learner: the learner
+    :param max_return: bound of the scaled return; None: the last atom of a categorical head, 5 without one
+    """
+
+    def __init__(self, learner: Learning, max_return: float | None = None):
+        super().__init__(learner, 1e-4, torch.float64)
+        self.max_return = _bound(learner, max_return, 5.0)
+        # The latest step's rewards and ends, while they wait.
+        self._waiting: tuple[list[float], list[bool]] | None = None
+
+    def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
+        return torch.maximum((self.moments.var + 1e-8).sqrt(), self.largest / self.max_return)
+
+    def on_step(self, learner: Learning, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        self._waiting = (np.asarray(rewards, np.float64).tolist(), np.asarray(dones, bool).tolist())
+
+    def on_observations(self, learner: Learning, observations: Any) -> None:
+        if self._waiting is not None:
+            rewards, ends = self._waiting
+            self.feed(np.array(rewards), np.array(ends), learner.gamma)
+        self._waiting = None
+
+    def on_environment_reset(self, learner: Learning) -> None:
+        super().on_environment_reset(learner)
+        self._waiting = None
+
+    def get_extra_state(self) -> dict[str, Any]:
+        return {**super().get_extra_state(), "waiting": None if self._waiting is None else list(self._waiting)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        super().set_extra_state(state)
+        self._waiting = None if state["waiting"] is None else tuple(state["waiting"])
+
+
+class Float32Scale(ReturnScale):
+    """
+    FlashSAC's rule: SimbaV2's with statistics in float32, without start values, and 1e-4 added to the count where it
+    weighs the old variance (1 at the start). G is in float64, its discount in float32. A step is taken in at once.
+
+    :param learner: the learner
+    :param max_return: bound of the scaled return; None: the last atom of a categorical head, 5 without one
+    """
+
+    def __init__(self, learner: Learning, max_return: float | None = None):
+        super().__init__(learner, 0.0, torch.float32)
+        self.max_return = _bound(learner, max_return, 5.0)
+
+    def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
+        return torch.maximum((self.moments.var + 1e-8).sqrt(), self.largest / self.max_return)
+
+    def _discounts(self, ends: np.ndarray, gamma: float) -> np.ndarray:
+        return (np.float32(gamma) * (1 - ends.astype(np.float32))).astype(np.float64)
+
+    def _update(self, returns: torch.Tensor) -> None:
+        self.moments.update(returns, more_count=1e-4)
+
+
+class TaskScale(RewardScale):
+    """
+    BRC's rule (Nauman et al. 2025), by task. The returns of finished episodes, ``G_t = r_t + gamma * G_{t+1}``, are
+    formed backwards; after the last reward of a truncated one (also if it terminated) stands ``mean reward / (1 -
+    gamma)``. With the largest and smallest return of a task ever seen (in float32) the divisor is::
+
+        (max(largest, |smallest|) - alpha * target_entropy / (2 * (1 - gamma))) / max_return
+
+    the temperature alpha being read before the gradient steps that follow an environment step. It is infinite, and the
+    rewards are 0, until the task has finished an episode.
+
+    The task of an environment's step is that of the dict observation that was acted on, key "task", or its info's
+    "task"; that of a transition the same key, or the batch's column "task". Without either it is 0.
+
+    :param learner: the learner
+    :param n_tasks: number of tasks
+    :param max_return: bound of the scaled return; None: the last atom of a categorical head, 10 without one
+    """
+
+    smallest: torch.Tensor
+    largest: torch.Tensor
+    divisors: torch.Tensor
+
+    def __init__(self, learner: Learning, n_tasks: int = 1, max_return: float | None = None):
+        super().__init__(learner)
+        check_value("n_tasks", n_tasks, integer(1))
+        self.max_return = _bound(learner, max_return, 10.0)
+        self.register_buffer("smallest", torch.full((n_tasks,), torch.inf))
+        self.register_buffer("largest", torch.full((n_tasks,), -torch.inf))
+        self.register_buffer("divisors", torch.full((n_tasks,), torch.inf, dtype=torch.float64))
+        # Rewards of each environment's episode so far, and the tasks that their observations told.
+        self._episodes: list[list[float]] = []
+        self._tasks: list[int] = []
+
+    def on_observations(self, learner: Learning, observations: Any) -> None:
+        told = observations.get("task") if isinstance(observations, dict) else None
+        self._tasks = [] if told is None else [int(task) for task in np.asarray(told).reshape(-1)]
+
+    def on_step(self, learner: Learning, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        if len(self._episodes) != len(dones):
+            self._episodes = [[] for _ in dones]
+        for i, (episode, reward, done, info) in enumerate(zip(self._episodes, rewards, dones, infos, strict=True)):
+            episode.append(float(reward))
+            if done:
+                task = self._tasks[i] if self._tasks else int(info.get("task", 0))
+                self._take(episode, bool(info.get("TimeLimit.truncated", False)), task, learner.gamma)
+                episode.clear()
+
+    def _take(self, rewards: list[float], truncated: bool, task: int, gamma: float) -> None:
+        """Take in a finished episode."""
+        n_tasks = len(self.largest)
+        if not 0 <= task < n_tasks:
+            raise ValueError(f"the task of an environment must lie in [0, {n_tasks - 1}], by n_tasks, not be {task}")
+        following = sum(rewards) / len(rewards) / (1 - gamma) if truncated else 0.0
+        returns = []
+        for reward in reversed(rewards):
+            following = reward + gamma * following
+            returns.append(following)
+        self.largest[task].clamp_(min=max(returns))
+        self.smallest[task].clamp_(max=min(returns))
+
+    def on_environment_reset(self, learner: Learning) -> None:
+        self._episodes = []
+
+    def before_updates(self, learner: Learning) -> None:
+        with torch.no_grad():
+            alpha = learner.temperature().double()
+        size = torch.maximum(self.largest, self.smallest.abs()).double()
+        entropy = alpha * learner.target_entropy / (2 * (1 - learner.gamma))
+        self.divisors.copy_((size - entropy) / self.max_return)
+
+    def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
+        return self.divisors[0] if task is None else self.divisors[task]
+
+    def get_extra_state(self) -> dict[str, Any]:
+        return {"episodes": [list(episode) for episode in self._episodes]}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self._episodes = [list(episode) for episode in state["episodes"]]
+
+
+def _bound(learner: Learning, max_return: float | None, otherwise: float) -> float:
+    """Bound of the scaled return: the last atom of a categorical head unless it is given, a number without atoms."""
+    if max_return is None:
+        return float(getattr(learner.head, "v_max", otherwise))
+    return float(check_value("max_return", max_return, ABOVE_0))
+
+
+#: Rules by the name that ``reward_scale`` takes, that of the method which has published it.
+REWARD_SCALES: dict[str, type[RewardScale]] = {
+    "brc": TaskScale,
+    "flashsac": Float32Scale,
+    "simbav2": StdOrMaxScale,
+    "xqc": StdScale,
+}

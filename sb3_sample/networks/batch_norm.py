@@ -1,0 +1,136 @@
+"""Batch norm of one network or of a stack of independent ones, and batch renormalisation."""
+
+import torch
+from torch import nn
+
+from sb3_sample.kinds import ABOVE_0, Kind, check_value, is_number
+
+#: What an argument may be that is a share of the new batch in a running mean.
+MOMENTUM = Kind("lie in (0, 1]", lambda value: is_number(value) and 0 < value <= 1)
+
+
+class BatchNorm(nn.Module):
+    """
+    Batch norm over the rows: ``(x - mean) / sqrt(var + eps) * weight + bias``, in training mode with the moments of the
+    batch, through which the gradient goes, in evaluation mode with running ones. A training pass moves those:
+    ``running += momentum * (of the batch - running)``. Each copy of a stack has its own.
+
+    :param n_features: number of features
+    :param n_copies: E for E independent ones, None for one
+    :param eps: added to the variance
+    :param momentum: share of the batch in the running moments, in (0, 1]
+    :param unbiased: whether the batch is normalised by the unbiased variance (over n - 1 of n rows) and not by that
+        over n
+    :param running_unbiased: whether the unbiased variance enters the running one; None: as ``unbiased``
+    """
+
+    running_mean: torch.Tensor
+    running_var: torch.Tensor
+
+    def __init__(
+        self,
+        n_features: int,
+        n_copies: int | None = None,
+        eps: float = 1e-3,
+        momentum: float = 0.01,
+        unbiased: bool = False,
+        running_unbiased: bool | None = None,
+    ):
+        super().__init__()
+        check_value("eps", eps, ABOVE_0)
+        check_value("momentum", momentum, MOMENTUM)
+        self.n_features, self.n_copies, self.eps, self.momentum = n_features, n_copies, eps, momentum
+        self.unbiased = unbiased
+        self.running_unbiased = unbiased if running_unbiased is None else running_unbiased
+        shape = (n_features,) if n_copies is None else (n_copies, 1, n_features)
+        self.weight: torch.Tensor = nn.Parameter(torch.ones(shape))
+        self.bias: torch.Tensor = nn.Parameter(torch.zeros(shape))
+        self.register_buffer("running_mean", torch.zeros(shape))
+        self.register_buffer("running_var", torch.ones(shape))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """
+        :param x: input, (B, features), or (E, B, features) if there are copies; (B, features) is shared by them
+        :return: output, (B, features), or (E, B, features) if there are copies
+        :raises ValueError: in training mode, if there is one row
+        """
+        if self.training:
+            mean, var = self._of_batch(x)
+        else:
+            mean, var = self.running_mean, self.running_var
+        return torch.addcmul(self.bias, x - mean, self.weight * (var + self.eps).rsqrt())
+
+    def _of_batch(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean and variance to normalise a batch with; moves the running ones."""
+        mean, var = self._moments(x)
+        self._follow(mean, var, x.shape[-2])
+        return mean, var
+
+    def _moments(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        if x.shape[-2] < 2:
+            raise ValueError(
+                "batch norm needs at least 2 rows in training mode, whose mean and variance it takes, not "
+                f"{x.shape[-2]}: pass larger batches"
+            )
+        var, mean = torch.var_mean(x, dim=-2, correction=int(self.unbiased), keepdim=self.n_copies is not None)
+        return mean, var
+
+    @torch.no_grad()
+    def _follow(self, mean: torch.Tensor, var: torch.Tensor, n: int) -> None:
+        if self.running_unbiased and not self.unbiased:
+            var = var * (n / (n - 1))
+        elif self.unbiased and not self.running_unbiased:
+            var = var * ((n - 1) / n)
+        self.running_mean.lerp_(mean.detach(), self.momentum)
+        self.running_var.lerp_(var.detach(), self.momentum)
+
+    def extra_repr(self) -> str:
+        return f"n_features={self.n_features}, n_copies={self.n_copies}, eps={self.eps}, momentum={self.momentum}"
+
+
+class BatchRenorm(BatchNorm):
+    """
+    Batch renormalisation (Ioffe 2017) as CrossQ has it: after ``warm_up`` training passes, in which it is batch norm,
+    the batch is normalised so that the result is that of the running moments, as far as these lie within a factor of 3
+    of the batch's standard deviation and 5 standard deviations of its mean. The correction is constant to the gradient.
+
+    :param n_features: number of features
+    :param n_copies: E for E independent ones, None for one
+    :param eps: added to the variance
+    :param momentum: share of the batch in the running moments, in (0, 1]
+    :param unbiased: whether variances are unbiased
+    :param warm_up: training passes before
+    """
+
+    #: Bounds of the ratio of standard deviations (and its inverse), and of the distance of means.
+    MAX_RATIO, MAX_DISTANCE = 3.0, 5.0
+    n_passes: torch.Tensor
+
+    def __init__(
+        self,
+        n_features: int,
+        n_copies: int | None = None,
+        eps: float = 1e-3,
+        momentum: float = 0.01,
+        unbiased: bool = False,
+        warm_up: int = 100_000,
+    ):
+        super().__init__(n_features, n_copies, eps, momentum, unbiased)
+        self.warm_up = warm_up
+        #: Training passes so far.
+        self.register_buffer("n_passes", torch.zeros((), dtype=torch.long))
+
+    def _of_batch(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        mean, var = self._moments(x)
+        with torch.no_grad():
+            running_std, is_warm = (self.running_var + self.eps).sqrt(), self.n_passes > self.warm_up
+            ratio = ((var + self.eps).sqrt() / running_std).clamp(1 / self.MAX_RATIO, self.MAX_RATIO)
+            ratio = torch.where(is_warm, ratio, 1.0)
+            distance = ((mean - self.running_mean) / running_std).clamp(-self.MAX_DISTANCE, self.MAX_DISTANCE)
+            distance = torch.where(is_warm, distance, 0.0)
+            self.n_passes.add_(1)
+        self._follow(mean, var, x.shape[-2])
+        # Where a feature is the same in all rows, as of a silent neuron, the root would have an infinite gradient.
+        is_flat = var == 0
+        std = torch.where(is_flat, 0.0, torch.where(is_flat, 1.0, var).sqrt())
+        return mean - distance * std / ratio, var / ratio.square()

@@ -1,0 +1,88 @@
+"""BRC, for one task and for several."""
+
+from typing import Any, ClassVar
+
+from sb3_sample.constructor import argument
+from sb3_sample.kinds import AT_LEAST_0, integer
+from sb3_sample.learner.categorical import VALUE_HEADS, CategoricalHead
+from sb3_sample.learner.heads import ValueHead
+from sb3_sample.learner.pessimism import Pessimism
+from sb3_sample.learner.reward_scale import RewardScale
+from sb3_sample.sac.algorithm import SAC
+from sb3_sample.sac.multi_task import TaskEmbedding
+
+
+class BRC(SAC):
+    """
+    BRC: bigger, regularized, categorical (Nauman et al. 2025, https://arxiv.org/abs/2505.23150).
+
+    BroNet critics, far wider than BRO's, as classifiers over 101 atoms in [-10, 10]; the mean of their probabilities in
+    target and actor; rewards divided by a measure of the returns of finished episodes; weight decay; no resets and no
+    optimism.
+
+    With observations that tell one of several tasks (``multi_task_env``), critics and actor read a learned embedding of
+    the task beside the observation, and rewards are scaled by task. The embeddings are the critics', which learn them;
+    the actor reads them without gradient. Target entropy and temperature are one for all tasks, unless
+    ``task_temperatures``. The published batch is then 1,024. With ``multitask=True`` the task is a one-hot vector, as
+    in BRO, instead of an embedding.
+
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    learning_starts: int = argument(default=5_000, kw_only=False)
+    """transitions with uniformly random actions before the first gradient step, counted over the model's life"""
+    ent_coef: str | float = argument(default="auto_0.1", kw_only=False)
+    """temperature: "auto_0.1" learns it from that start, a number fixes it"""
+    critic_width: int | None = argument(default=4096, kind=integer(1).or_none("what policy_kwargs say"))
+    """width of the critics; None if ``policy_kwargs`` describe them"""
+    value_head: str | type[ValueHead] | None = argument(default="categorical")
+    """"categorical" or "hl_gauss", from -10 to 10 unless ``value_head_kwargs`` say otherwise, or a class derived from
+    ``ValueHead``; None: scalar critics, or ``n_quantiles``"""
+    pessimism: float | str | type[Pessimism] = argument(default=0.0)
+    """weight of the critics' spread that is subtracted from their mean, at least 0; or a rule, as in ``SAC``"""
+    reward_scale: str | type[RewardScale] | None = argument(default="brc")
+    """rule by which rewards are divided by a running measure of the return; None for none"""
+    weight_decay: float = argument(default=1e-4, kind=AT_LEAST_0)
+    """decoupled weight decay of critics, embeddings and actor"""
+    embedding_size: int = argument(default=32, kind=integer(1))
+    """size of a task's embedding, where there are tasks"""
+
+    temperature_beta1: ClassVar[float] = 0.5
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        described = sorted({"critic_network", "critic_network_kwargs"} & self.policy_kwargs.keys())
+        if described and self.critic_width is not None:
+            raise ValueError(
+                f"policy_kwargs describe the critics ({', '.join(described)}), and so does "
+                f"critic_width={self.critic_width!r}: pass critic_width=None"
+            )
+        if "weight_decay" in (self.policy_kwargs.get("optimizer_kwargs") or {}):
+            raise ValueError("weight_decay is an argument of the algorithm, not of policy_kwargs['optimizer_kwargs']")
+
+    def _full_value_head_kwargs(self) -> dict[str, Any]:
+        kwargs: dict[str, Any] = super()._full_value_head_kwargs()
+        cls = VALUE_HEADS.get(self.value_head) if isinstance(self.value_head, str) else None
+        is_categorical = cls is not None and issubclass(cls, CategoricalHead)
+        return {"v_min": -10.0, "v_max": 10.0, **kwargs} if is_categorical else kwargs
+
+    def _full_policy_kwargs(self) -> dict[str, Any]:
+        kwargs: dict[str, Any] = {
+            "critic_network": "bronet",
+            "actor_network": "bronet",
+            **super()._full_policy_kwargs(),
+        }
+        if kwargs["actor_network"] == "bronet":
+            kwargs["actor_network_kwargs"] = {
+                "width": 256,
+                "n_blocks": 1,
+                **(kwargs.get("actor_network_kwargs") or {}),
+            }
+        if self.critic_width is not None:
+            kwargs["critic_network_kwargs"] = {"width": self.critic_width, "n_blocks": 2}
+        if self.n_tasks > 1 and not self.multitask and "features_extractor_class" not in kwargs:
+            kwargs["features_extractor_class"] = TaskEmbedding
+            kwargs["features_extractor_kwargs"] = {"size": self.embedding_size}
+            kwargs["share_features_extractor"] = True
+        kwargs["optimizer_kwargs"] = {**(kwargs.get("optimizer_kwargs") or {}), "weight_decay": self.weight_decay}
+        return kwargs

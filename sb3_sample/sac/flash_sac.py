@@ -1,0 +1,92 @@
+"""FlashSAC."""
+
+import math
+from typing import Any
+
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_sample.constructor import argument
+from sb3_sample.kinds import ABOVE_0
+from sb3_sample.learner.categorical import VALUE_HEADS, CategoricalHead
+from sb3_sample.learner.exploration import Exploration
+from sb3_sample.learner.heads import ValueHead
+from sb3_sample.learner.reward_scale import RewardScale
+from sb3_sample.sac.algorithm import SAC
+
+#: Width and blocks of the published networks.
+_SIZES: dict[str, dict[str, Any]] = {
+    "critic": {"width": 256, "n_blocks": 2},
+    "actor": {"width": 128, "n_blocks": 2},
+}
+
+
+class FlashSAC(SAC):
+    """
+    FlashSAC (Holiday Robot 2026, https://arxiv.org/abs/2604.04539), with the settings of its runs on simulators of a
+    CPU.
+
+    Residual networks with batch norm whose weights, scales and shifts keep their norms ("flash"), critics as
+    classifiers over 101 atoms in [-5, 5], rewards divided by a running measure of the return, noise that is held for
+    some steps while exploring, and a learning rate that falls by a cosine to a half over the planned gradient steps.
+    Critics, their targets and the actor see current and next states in one forward pass, so that batch statistics are
+    those of both. Actor and temperature learn in the first of every two gradient steps, before the critics.
+
+    Defaults are those of the published runs on DeepMind Control, with one environment step an action.
+
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    learning_rate: float | Schedule = argument(default=3e-4, kw_only=False)
+    """of actor, critics and temperature at the start; a function of the remaining progress (from 1 to 0) goes with
+    ``learning_rate_schedule=None`` only"""
+    batch_size: int = argument(default=512, kw_only=False)
+    """transitions a gradient step"""
+    tau: float = argument(default=0.01, kw_only=False)
+    """weight of the new critics in the Polyak average of the targets, in (0, 1]"""
+    ent_coef: str | float = argument(default="auto_0.01", kw_only=False)
+    """temperature: "auto_0.01" learns it from that start, a number fixes it"""
+    target_entropy: str | float = argument(default="auto", kw_only=False)
+    """entropy that the learned temperature aims at; "auto" is that of a Gaussian with the standard deviation
+    ``target_std``"""
+    target_std: float = argument(default=0.15, kind=ABOVE_0)
+    """standard deviation of each action dimension whose entropy ``target_entropy="auto"`` is"""
+    replay_ratio: float | None = argument(default=1)
+    """gradient steps per environment transition after the warm-up, whatever the number of environments; may be below
+    1"""
+    value_head: str | type[ValueHead] | None = argument(default="categorical")
+    """"categorical" or "hl_gauss", from -5 to 5 and with the mean of the critics' losses unless ``value_head_kwargs``
+    say otherwise, "half_squared", or a class derived from ``ValueHead``; None: scalar critics, or ``n_quantiles``"""
+    exploration: str | type[Exploration] = argument(default="held_noise")
+    """policy that acts while training: "held_noise", or another of ``SAC``'s"""
+    policy_delay: int = argument(default=2)
+    """gradient steps between two of the actors' and of the temperature"""
+    actor_at_once: bool = argument(default=True)
+    """whether the first of ``policy_delay`` gradient steps is the actors', and not the last"""
+    actor_first: bool = argument(default=True)
+    """whether actors and temperature learn before the critics in a gradient step"""
+    learning_rate_schedule: str | None = argument(default="cosine")
+    """"linear" or "cosine": decay to ``final_learning_rate`` over the planned gradient steps; None for none"""
+    final_learning_rate: float = argument(default=1.5e-4)
+    """rate at the end of the schedule"""
+    warm_up_steps: int = argument(default=1)
+    """planned gradient steps that come before the decay, in which the rate rises linearly to ``learning_rate``"""
+    warm_up_learning_rate: float | None = argument(default=None)
+    """rate from which it rises; None: ``learning_rate``, which it then keeps"""
+    reward_scale: str | type[RewardScale] | None = argument(default="flashsac")
+    """rule by which rewards are divided by a running measure of the return; None for none"""
+
+    def _auto_target_entropy(self, action_dim: int) -> float:
+        return action_dim * math.log(2 * math.pi * math.e * self.target_std**2) / 2
+
+    def _full_value_head_kwargs(self) -> dict[str, Any]:
+        kwargs: dict[str, Any] = super()._full_value_head_kwargs()
+        cls = VALUE_HEADS.get(self.value_head) if isinstance(self.value_head, str) else None
+        return {"average_critics": True, **kwargs} if cls is not None and issubclass(cls, CategoricalHead) else kwargs
+
+    def _full_policy_kwargs(self) -> dict[str, Any]:
+        kwargs: dict[str, Any] = super()._full_policy_kwargs()
+        for who, size in _SIZES.items():
+            kwargs.setdefault(f"{who}_network", "flash")
+            if kwargs[f"{who}_network"] == "flash":
+                kwargs[f"{who}_network_kwargs"] = {**size, **(kwargs.get(f"{who}_network_kwargs") or {})}
+        return kwargs

@@ -1,0 +1,106 @@
+"""Tasks in the observations of the off-policy family: how networks read them, and how ``predict`` is told one."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+
+def is_multi_task(space: spaces.Space | None) -> bool:
+    """
+    :param space: of observations
+    :return: whether they tell the task: a Dict of "observation", a Box, and "task", a Discrete
+    """
+    if not isinstance(space, spaces.Dict) or space.spaces.keys() != {"observation", "task"}:
+        return False
+    return isinstance(space["observation"], spaces.Box) and isinstance(space["task"], spaces.Discrete)
+
+
+def number_of_tasks(space: spaces.Space | None) -> int:
+    """
+    :param space: of observations
+    :return: how many tasks they tell apart; 1 if they tell none
+    """
+    return int(space["task"].n) if is_multi_task(space) else 1  # type: ignore[index]
+
+
+def reads_one_hot(space: spaces.Space) -> bool:
+    """
+    :param space: of observations
+    :return: whether :class:`TaskOneHot` reads them: they tell the task, and are no images
+    """
+    return is_multi_task(space) and not is_image_space(space["observation"])  # type: ignore[index]
+
+
+class TaskOneHot(BaseFeaturesExtractor):
+    """
+    Observation and the one-hot vector of its task (BRO, figure 19); the observation alone where there is one task.
+
+    :param observation_space: a Dict of "observation", a Box, and "task", a Discrete
+    """
+
+    def __init__(self, observation_space: spaces.Dict):
+        self.n_tasks = number_of_tasks(observation_space)
+        size = get_flattened_obs_dim(observation_space["observation"])
+        super().__init__(observation_space, size + (self.n_tasks if self.n_tasks > 1 else 0))
+
+    def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
+        """
+        :param observations: "observation", (B, ...), and "task", one-hot, (B, n_tasks)
+        :return: (B, O + n_tasks), or (B, O) for one task
+        """
+        vectors = observations["observation"].flatten(1)
+        return torch.cat((vectors, observations["task"].flatten(1)), dim=1) if self.n_tasks > 1 else vectors
+
+
+class TaskEmbedding(BaseFeaturesExtractor):
+    """
+    Observation and the embedding of its task, a learned vector divided by its length (BRC).
+
+    :param observation_space: a Dict of "observation", a Box, and "task", a Discrete
+    :param size: of an embedding
+    """
+
+    def __init__(self, observation_space: spaces.Dict, size: int = 32):
+        task = observation_space["task"]
+        assert isinstance(task, spaces.Discrete)
+        super().__init__(observation_space, get_flattened_obs_dim(observation_space["observation"]) + size)
+        #: A row for each task, whose length is learned as well and without effect on the embedding.
+        self.table = nn.Parameter(torch.randn(int(task.n), size) / size**0.5)
+
+    def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
+        """
+        :param observations: "observation", (B, ...), and "task", one-hot, (B, n_tasks)
+        :return: (B, O + size)
+        """
+        rows = observations["task"].flatten(1) @ self.table
+        lengths = torch.linalg.vector_norm(rows, dim=1, keepdim=True)
+        return torch.cat((observations["observation"].flatten(1), rows / lengths), dim=1)
+
+
+def told_task(space: spaces.Dict, observation: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Check the task that ``predict`` is told, and repeat a single one for each row of a batch.
+
+    :param space: of observations that tell the task
+    :param observation: "observation", (O,) or (B, O), and "task", a number, or (B,) of them
+    :return: the same with a task for each observation
+    :raises ValueError: if it has other entries, or a task is no number of one
+    """
+    if observation.keys() != {"observation", "task"}:
+        raise ValueError(f"observation must have the entries 'observation' and 'task', not {sorted(observation)}")
+    task, n_tasks = np.asarray(observation["task"]), number_of_tasks(space)
+    if task.dtype.kind not in "iu" or ((task < 0) | (task >= n_tasks)).any():
+        raise ValueError(
+            f"the task of an observation must be its number, an integer from 0 to {n_tasks - 1}, not "
+            f"{observation['task']!r}"
+        )
+    vectors = np.asarray(observation["observation"])
+    if vectors.ndim > len(space["observation"].shape) and task.size == 1:  # type: ignore[arg-type]
+        task = np.full(len(vectors), task.item())
+    return {"observation": vectors, "task": task}

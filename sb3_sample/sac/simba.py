@@ -1,0 +1,126 @@
+"""SimBa and SimbaV2."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_sample.constructor import argument
+from sb3_sample.kinds import AT_LEAST_0, integer
+from sb3_sample.learner.heads import ValueHead
+from sb3_sample.learner.reward_scale import RewardScale
+from sb3_sample.sac.algorithm import SAC
+
+
+class SimBa(SAC):
+    """
+    SimBa: soft actor-critic with a simplicity bias of its networks (Lee et al. 2024, https://arxiv.org/abs/2410.09754).
+
+    Observations less their running mean by their running standard deviation, residual networks with layer norms and
+    inverted bottlenecks ("simba"), weight decay, and little else. Defaults are those of the published runs on
+    DeepMind Control, with two environment steps an action (``action_repeat=2`` of the environment): one critic, since
+    the episodes do not terminate; where they do (Gymnasium's MuJoCo, HumanoidBench), two with their minimum,
+    ``n_critics=2``. docs/simba.md says what was taken from where.
+
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    learning_rate: float | Schedule = argument(default=1e-4, kw_only=False)
+    """of actor, critics and temperature; a number or a function of the remaining progress (from 1 to 0)"""
+    learning_starts: int = argument(default=5_000, kw_only=False)
+    """transitions with uniformly random actions before the first gradient step, counted over the model's life"""
+    ent_coef: str | float = argument(default="auto_0.01", kw_only=False)
+    """temperature: "auto_0.01" learns it from that start, a number fixes it"""
+    n_critics: int = argument(default=1, kind=integer(1))
+    """number of critics; 2 where episodes terminate"""
+    weight_decay: float = argument(default=1e-2, kind=AT_LEAST_0)
+    """decoupled weight decay of critics and actor"""
+    normalize_observations: bool = argument(default=True)
+    """whether the networks read observations less their running mean, by their running standard deviation. The
+    statistics are the policy's, and move while training only"""
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        _check_n_critics(self)
+        if "weight_decay" in (self.policy_kwargs.get("optimizer_kwargs") or {}):
+            raise ValueError("weight_decay is an argument of the algorithm, not of policy_kwargs['optimizer_kwargs']")
+
+    def _n_critics(self) -> int:
+        return self.n_critics
+
+    def _full_policy_kwargs(self) -> dict[str, Any]:
+        kwargs = _with_networks(super()._full_policy_kwargs(), "simba", self.n_critics)
+        kwargs["optimizer_kwargs"] = {**(kwargs.get("optimizer_kwargs") or {}), "weight_decay": self.weight_decay}
+        return kwargs
+
+
+class SimbaV2(SAC):
+    """
+    SimbaV2: hyperspherical normalisation (Lee et al. 2025, https://arxiv.org/abs/2502.15280).
+
+    Networks whose weights have unit norm and whose features lie on a sphere ("simbav2"), critics as classifiers over
+    101 atoms in [-5, 5], rewards divided by a running measure of the return, normalised observations, and a learning
+    rate that falls linearly to a half over the planned gradient steps. Actor and temperature learn before the critics.
+
+    Defaults are those of the published runs on DeepMind Control, with two environment steps an action
+    (``action_repeat=2`` of the environment): one critic, since the episodes do not terminate. Where they do
+    (Gymnasium's MuJoCo, HumanoidBench), there are two, with the distribution of the smaller one, ``n_critics=2``; and
+    ``gamma`` is 1 - 5 / T within [0.95, 0.995], T being the episode's length in actions.
+
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    learning_rate: float | Schedule = argument(default=1e-4, kw_only=False)
+    """of actor, critics and temperature at the start; a function of the remaining progress (from 1 to 0) goes with
+    ``learning_rate_schedule=None`` only"""
+    learning_starts: int = argument(default=5_000, kw_only=False)
+    """transitions with uniformly random actions before the first gradient step, counted over the model's life"""
+    ent_coef: str | float = argument(default="auto_0.01", kw_only=False)
+    """temperature: "auto_0.01" learns it from that start, a number fixes it"""
+    n_critics: int = argument(default=1, kind=integer(1))
+    """number of critics; 2 where episodes terminate"""
+    value_head: str | type[ValueHead] | None = argument(default="categorical")
+    """"categorical", "hl_gauss", or a class derived from ``ValueHead``; None: scalar critics, or ``n_quantiles``"""
+    actor_first: bool = argument(default=True)
+    """whether actors and temperature learn before the critics in a gradient step"""
+    learning_rate_schedule: str | None = argument(default="linear")
+    """"linear" or "cosine": decay to ``final_learning_rate`` over the planned gradient steps; None for none"""
+    final_learning_rate: float = argument(default=5e-5)
+    """rate at the end of the schedule"""
+    reward_scale: str | type[RewardScale] | None = argument(default="simbav2")
+    """rule by which rewards are divided by a running measure of the return; None for none"""
+    normalize_observations: bool = argument(default=True)
+    """whether the networks read observations less their running mean, by their running standard deviation. The
+    statistics are the policy's, and move while training only"""
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        _check_n_critics(self)
+
+    def _n_critics(self) -> int:
+        return self.n_critics
+
+    def _full_policy_kwargs(self) -> dict[str, Any]:
+        return _with_networks(super()._full_policy_kwargs(), "simbav2", self.n_critics)
+
+
+def _check_n_critics(agent: Any) -> None:
+    if "n_critics" in agent.policy_kwargs:
+        raise ValueError("n_critics is an argument of the algorithm, not of policy_kwargs")
+
+
+#: Width and blocks of the published networks.
+_SIZES: Sequence[tuple[str, dict[str, Any]]] = (
+    ("critic_network", {"width": 512, "n_blocks": 2}),
+    ("actor_network", {"width": 128, "n_blocks": 1}),
+)
+
+
+def _with_networks(kwargs: dict[str, Any], network: str, n_critics: int) -> dict[str, Any]:
+    """Arguments of the policy with networks of the published sizes where the user's say nothing else."""
+    kwargs["n_critics"] = n_critics
+    for who, size in _SIZES:
+        kwargs.setdefault(who, network)
+        if kwargs[who] == network:
+            kwargs[f"{who}_kwargs"] = {**size, **(kwargs.get(f"{who}_kwargs") or {})}
+    return kwargs

@@ -1,0 +1,256 @@
+"""
+Runs of a study as tasks of a Ray cluster: a run is a task with its cores or its share of a GPU, in a process of its
+own, on whichever machine has room. Its folder, which all machines see, is its checkpoint, and its lock is held by the
+process that makes it, as without Ray.
+"""
+
+import contextlib
+import importlib.util
+import math
+import os
+import queue
+import signal
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from sb3_sample.extras import install
+from sb3_sample.kinds import check_value, number
+from sb3_sample.study.cores import free_cores, threads_of_libraries
+from sb3_sample.study.plan import Run
+from sb3_sample.study.runs import LIST, StudyError, StudyFolder
+from sb3_sample.study.worker import TAKEN, TERMINATED, attempt
+
+#: Seconds between two looks at how many machines there are.
+LOOK_EVERY = 2.0
+#: Bytes of a local cluster's object store: tasks pass a few kilobytes.
+OBJECT_STORE = 100_000_000
+#: Values of ``ray=`` beside an address.
+LOCAL, AUTO = "local", "auto"
+#: GPUs of a run.
+GPUS = number("be above 0, and whole above 1", lambda share: 0 < share <= 1 or (share > 1 and share == int(share)))
+
+
+def check(address: str, gpus: float | None) -> None:
+    """
+    :param address: of a cluster, as :class:`Cluster` takes it
+    :param gpus: of a run
+    :raises ValueError: an argument is out of range
+    :raises ImportError: Ray is not installed
+    """
+    if not isinstance(address, str) or not address:
+        raise ValueError(f"ray must be {LOCAL!r}, {AUTO!r} or a cluster's address, not {address!r}")
+    check_value("gpus", gpus, GPUS.or_none())
+    if importlib.util.find_spec("ray") is None:
+        raise ImportError(f"ray={address!r} needs Ray. Install it with: {install('cluster')}")
+
+
+class Cluster:
+    """
+    A Ray cluster for the runs of a study. One that was started or connected to here is left at the end of the ``with``.
+
+    :param address: ``"local"`` for one on this machine; ``"auto"`` for the one that this machine is in; else the
+        address of one, as ``ray.init`` takes it
+    :param folder: the study's, which all machines of the cluster have under the same path
+    :param workers: runs at once; as many as the machines of the cluster have room for at the moment, if None
+    :param threads: cores of a run
+    :param gpus: GPUs of a run, or its share of one; None for none
+    """
+
+    def __init__(self, address: str, folder: Path, workers: int | None, threads: int, gpus: float | None):
+        self._address, self._folder, self._workers = address, folder.absolute(), workers
+        self._threads, self._gpus = threads, gpus
+        self._room, self._looked = 0, -math.inf
+        self._entered = False
+
+    def __enter__(self) -> "Cluster":
+        """
+        :raises StudyError: there is no such cluster, or it has no room for a run
+        """
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        with _keeping_sigterm():
+            import ray
+
+            if not ray.is_initialized():
+                try:
+                    ray.init(**self._options())
+                except (ConnectionError, ValueError, RuntimeError) as error:
+                    raise StudyError(f"ray={self._address!r} cannot be connected to: {error}") from error
+                self._entered = True
+        self._task = ray.remote(
+            num_cpus=self._threads,
+            num_gpus=self._gpus or 0,
+            # A process for each run, with its own imports and threads; what to do when it dies is the scheduler's.
+            max_calls=1,
+            max_retries=0,
+            runtime_env={"env_vars": threads_of_libraries(self._threads)},
+        )(make)
+        if not self.slots():
+            wanted = _words(CPU=self._threads, GPU=self._gpus or 0)
+            there = "; ".join(_words(**each) for each in _machines()) or "no machine"
+            self.__exit__()
+            raise StudyError(
+                f"ray={self._address!r} has no room for a run with {wanted}: it has {there}. A cluster that grows when "
+                "it is asked to needs workers=, the number of runs at once"
+            )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._entered:
+            import ray
+
+            ray.shutdown()
+
+    def _options(self) -> dict[str, Any]:
+        if self._address != LOCAL:
+            return {"address": self._address, "log_to_driver": False}
+        return {
+            "address": LOCAL,
+            "num_cpus": self._threads * (self._workers or max(free_cores() // self._threads, 1)),
+            "object_store_memory": OBJECT_STORE,
+            "include_dashboard": False,
+            "log_to_driver": False,
+        }
+
+    def slots(self) -> int:
+        """
+        :return: runs at once
+        """
+        if self._workers is not None:
+            return self._workers
+        if (now := time.monotonic()) - self._looked > LOOK_EVERY:
+            self._looked = now
+            gpus = self._gpus
+            self._room = sum(
+                int(min(each["CPU"] / self._threads, math.inf if gpus is None else each["GPU"] / gpus))
+                for each in _machines()
+            )
+        return self._room
+
+    def hire(self, events: "queue.Queue[tuple[Any, Any]]") -> "Slot":
+        """
+        :param events: gets the answers
+        :return: a place for one run at a time
+        """
+        return Slot(self._task, str(self._folder), events)
+
+
+class Slot:
+    """
+    A place for one run at a time in a cluster, as a worker is one on this machine.
+
+    :param task: makes a run, as Ray's remote function
+    :param folder: the study's
+    :param events: gets the answers, and None when a process has ended without one, each with the slot
+    """
+
+    def __init__(self, task: Any, folder: str, events: "queue.Queue[tuple[Any, Any]]"):
+        self.run: Run | None = None
+        self.kind = ""
+        self._task, self._folder, self._events = task, folder, events
+        self._order: Any = None
+        self._listener: threading.Thread | None = None
+        self._why = ""
+
+    def give(self, run: Run, options: list[str], threads: int) -> None:
+        """
+        :param run: what is to be made
+        :param options: options of ``sb3-sample train``
+        :param threads: of the run
+        """
+        self.run, self.kind = run, run.kind
+        self._order = self._task.remote(self._folder, run.as_json(), options, threads)
+        self._listener = threading.Thread(target=self._listen, args=(self._order,), daemon=True)
+        self._listener.start()
+
+    def _listen(self, order: Any) -> None:
+        import ray
+
+        answer = None
+        try:
+            answer = ray.get(order)
+        except ray.exceptions.NodeDiedError:
+            answer = TAKEN  # the run is none the worse: it goes on elsewhere, when its lock is free
+        except Exception as error:
+            self._why = f"the process that made the run has ended: {error}"
+        self._events.put((self, answer))
+
+    def leave(self) -> None:
+        """Have a run under way end: a training is saved first."""
+        self._cancel(force=False)
+
+    def kill(self) -> None:
+        """Have a run under way end at once."""
+        self._cancel(force=True)
+
+    def _cancel(self, force: bool) -> None:
+        import ray
+
+        if self.run is not None:
+            ray.cancel(self._order, force=force)
+
+    def wait(self) -> None:
+        """Wait until the run under way has ended, if there is one."""
+        if self._listener is not None:
+            self._listener.join()
+
+    def why_ended(self) -> str:
+        """
+        :return: why there was no answer, in words
+        """
+        return self._why
+
+
+def make(folder: str, run: dict[str, Any], options: list[str], threads: int) -> dict[str, Any]:
+    """
+    Make a run, in a process of the cluster. After Ray's cancel and SIGTERM a training finishes its turn and saves.
+
+    :param folder: the study's
+    :param run: the run, as JSON
+    :param options: options of ``sb3-sample train``
+    :param threads: of the process
+    :return: what became of it, or that it is to be looked at again
+    :raises FileNotFoundError: this machine does not see the folder
+    """
+    if not (Path(folder) / LIST).is_file():
+        raise FileNotFoundError(
+            f"{socket.gethostname()} does not see {folder}: the study's folder must be one that all machines of the "
+            "cluster have under the same path"
+        )
+    outcome = None
+    # In the place of Ray's, which an attempt would take for a failure of the run's.
+    signal.signal(signal.SIGTERM, _terminate)
+    with contextlib.suppress(KeyboardInterrupt, SystemExit):
+        outcome = attempt(StudyFolder(folder), Run.of_json(run), options, threads)
+    return TAKEN if outcome is None else outcome._asdict()
+
+
+def _terminate(number: int, frame: Any) -> None:
+    raise SystemExit(TERMINATED)
+
+
+def _machines() -> list[dict[str, float]]:
+    """Cores and GPUs of the cluster's machines."""
+    import ray
+
+    return [{name: each["Resources"].get(name, 0) for name in ("CPU", "GPU")} for each in ray.nodes() if each["Alive"]]
+
+
+def _words(CPU: float, GPU: float) -> str:
+    return f"{CPU:g} cores" + (f" and {GPU:g} GPUs" if GPU else "")
+
+
+@contextlib.contextmanager
+def _keeping_sigterm() -> Iterator[None]:
+    """Ray's import and its start set a handler of SIGTERM, in the place of the scheduler's."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

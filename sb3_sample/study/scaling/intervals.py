@@ -1,0 +1,62 @@
+"""Intervals by the bootstrap over seeds."""
+
+import numpy as np
+from scipy.stats import norm, t
+
+from sb3_sample.study.aggregate import check_samples
+
+#: Seeds below which the percentiles' distances are multiplied.
+FEW = 5
+
+
+def draw(rng: np.random.Generator, reps: int, n: int) -> np.ndarray:
+    """
+    :param rng: generator
+    :param reps: samples
+    :param n: seeds
+    :return: numbers of the seeds of each sample, (reps, n)
+    """
+    return rng.integers(0, n, (reps, n))
+
+
+def interval(
+    point: np.ndarray | float, reps: np.ndarray, n: int | None, confidence: float = 0.95
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Percentiles of bootstrap samples, widened for few seeds: a bootstrap sample of n seeds has a variance that is too
+    small by (n - 1) / n, and n seeds know their own no better than Student's t says (the expanded percentile interval
+    of Hesterberg 2015, "What teachers should know about the bootstrap", section 5.3).
+
+    Samples of three or four seeds do not reach as far out as that: there the distances of the plain percentiles from
+    the number are multiplied, by logarithms where all are positive.
+
+    BCa intervals, whose correction of a bias is itself estimated, cover less here (``benchmarks/scaling_coverage.py``).
+
+    :param point: (...) of all seeds
+    :param reps: (R, ...)
+    :param n: seeds of a configuration, at least 2; None for plain percentiles
+    :param confidence: of the interval
+    :return: lower and upper ends, (...); NaN where fewer than half of the samples have a value
+    """
+    check_samples(len(reps), confidence)
+    level = (1 - confidence) / 2
+    factor = 1.0
+    if n is not None:
+        wide = float(t.ppf(level, n - 1) * np.sqrt(n / (n - 1)))
+        if n < FEW:
+            factor = wide / float(norm.ppf(level))
+        else:
+            level = float(norm.cdf(wide))
+    there = np.isfinite(reps)
+    enough = (2 * there.sum(axis=0) >= len(reps)) & np.isfinite(point)
+    # Where there are not enough, zeros in their place: no warnings of what is not shown.
+    center, known = np.where(enough, point, 0.0), np.where(enough, np.where(there, reps, np.nan), 0.0)
+    ends = np.nanquantile(known, [level, 1 - level], axis=0)
+    if factor != 1:
+        positive = (center > 0) & (ends > 0).all(axis=0)
+        with np.errstate(all="ignore"):
+            logs = center * (ends / center) ** factor
+        ends = np.where(positive, logs, center + factor * (ends - center))
+        ends = np.stack([np.minimum(ends[0], center), np.maximum(ends[1], center)])
+    low, high = (np.where(enough, end, np.nan)[()] for end in ends)
+    return low, high

@@ -1,0 +1,412 @@
+"""Laws of a table of runs: their numbers with intervals, and what they predict."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from sb3_sample.study.scaling.budget import BudgetLaw, ComputeLaw, fit_budget
+from sb3_sample.study.scaling.intervals import interval
+from sb3_sample.study.scaling.laws import DataLaw, HyperparameterLaw
+
+#: Largest budgets that are held out of the budget's law (appendix D).
+HELD_OUT = 2
+#: How far beyond the replay ratios of the runs a prediction may go; the paper's own checks go four times as far.
+BEYOND = 4.0
+#: Batch sizes are multiples of this, at least this.
+MULTIPLE = 16
+
+
+class Estimate(NamedTuple):
+    """
+    A number with its interval.
+
+    :param value: of all seeds
+    :param low: lower end; NaN where there is none
+    :param high: upper end
+    """
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+
+    def __str__(self) -> str:
+        if math.isnan(self.low):
+            return f"{self.value:.4g}"
+        return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]"
+
+
+#: Numbers of all seeds (1,), and of the bootstrap samples (R,).
+Stages = Sequence[np.ndarray]
+
+
+@dataclasses.dataclass
+class Hyperparameter:
+    """
+    The law of batch size or learning rate.
+
+    :param values: what was chosen: task, replay_ratio, name, value, std, decided, edge
+    :param tasks: of the law
+    :param slopes: (1,), (R,)
+    :param intercepts: the same with an axis of tasks
+    """
+
+    values: pd.DataFrame
+    tasks: list[str]
+    slopes: list[np.ndarray]
+    intercepts: list[np.ndarray]
+
+    def law(self) -> HyperparameterLaw:
+        """
+        :return: the law of all seeds
+        """
+        intercepts = map(float, self.intercepts[0][0])
+        return HyperparameterLaw(float(self.slopes[0][0]), dict(zip(self.tasks, intercepts, strict=True)))
+
+    def at(self, replay_ratio: Any, task: str | None = None) -> list[np.ndarray]:
+        """
+        :param replay_ratio: a number, or one a sample for each stage
+        :param task: whose; the mean over all if None
+        :return: values
+        """
+        ratios = replay_ratio if isinstance(replay_ratio, list) else [replay_ratio] * len(self.slopes)
+        found = []
+        for slopes, intercepts, ratio in zip(self.slopes, self.intercepts, ratios, strict=True):
+            own = intercepts.mean(axis=1) if task is None else intercepts[:, self.tasks.index(task)]
+            found.append(own * ratio**slopes)
+        return found
+
+
+@dataclasses.dataclass
+class Level:
+    """
+    The data law of a level.
+
+    :param level: of the return, of 0 to 1000
+    :param tasks: that it is over
+    :param left_out: tasks that reach the level at too few replay ratios
+    :param points: (S,) mean environment steps by replay ratio
+    :param censored: (S,) where a task does not reach the level, so that its mean is a lower bound
+    :param factors: by which the mean is the steps of a task, (tasks,)
+    :param laws: of (1,), (R,)
+    """
+
+    level: float
+    tasks: list[str]
+    left_out: list[str]
+    points: np.ndarray
+    censored: np.ndarray
+    factors: np.ndarray
+    laws: list[DataLaw]
+
+    def law(self) -> DataLaw:
+        """
+        :return: the law of all seeds
+        """
+        return DataLaw(*(float(each[0]) for each in self.laws[0]))
+
+
+class Prediction(NamedTuple):
+    """
+    Settings, and what they take.
+
+    :param replay_ratio: gradient steps an environment step
+    :param batch_size: rows, a multiple of 16; None where it was not swept
+    :param learning_rate: to three digits; None where it was not swept
+    :param steps: environment steps to the level, as the mean over the tasks or of one
+    :param compute: FLOPs; None without the size of the critics
+    :param level: of the return; None for a budget between levels
+    :param limits: what the prediction rests on, and what not
+    """
+
+    replay_ratio: Estimate
+    batch_size: Estimate | None
+    learning_rate: Estimate | None
+    steps: Estimate | None
+    compute: Estimate | None
+    level: float | None
+    limits: list[str]
+
+    def params(self) -> str:
+        """
+        :return: arguments of ``sb3-sample train``, after ``-params``
+        """
+        words = [f"replay_ratio:{self.replay_ratio.value:.4g}"]
+        if self.batch_size is not None:
+            words.append(f"batch_size:{rounded_batch_size(self.batch_size.value)}")
+        if self.learning_rate is not None:
+            words.append(f"learning_rate:{self.learning_rate.value:.3g}")
+        return " ".join(words)
+
+
+def rounded_batch_size(value: float) -> int:
+    """
+    :param value: of a law
+    :return: the nearest multiple of 16, at least 16, as in the paper's tables 6 and 8
+    """
+    return max(MULTIPLE, MULTIPLE * round(value / MULTIPLE))
+
+
+@dataclasses.dataclass
+class Laws:
+    """
+    All laws of a table of runs.
+
+    :param tasks: of the runs
+    :param replay_ratios: of the runs, ascending
+    :param seeds: fewest of a configuration
+    :param hyperparameters: laws by name, "batch_size" and "learning_rate" as far as they were swept
+    :param levels: data laws, ascending
+    :param critic_params: parameters of the critics; None if they are not known
+    :param delta: FLOPs that an environment step is worth
+    :param batch_size: where all runs of the data laws have one
+    :param learning_rate: where all runs of the data laws have one
+    :param loss: of the data laws
+    :param choice_level: at which batch sizes and learning rates were chosen
+    :param notes: limits of all this, in words
+    """
+
+    tasks: list[str]
+    replay_ratios: list[float]
+    seeds: int
+    hyperparameters: dict[str, Hyperparameter]
+    levels: list[Level]
+    critic_params: float | None
+    delta: float
+    batch_size: float | None
+    learning_rate: float | None
+    loss: str
+    choice_level: float
+    notes: list[str]
+
+    # ------------------------------------------------ numbers
+
+    @property
+    def has_compute(self) -> bool:
+        """Whether size and batch size are known."""
+        return self.critic_params is not None and ("batch_size" in self.hyperparameters or self.batch_size is not None)
+
+    def interval(self, stages: Stages) -> Estimate:
+        """
+        :param stages: (1,), (R,)
+        :return: the number with its 95% interval
+        """
+        value = float(stages[0][0])
+        if self.seeds < 2:
+            return Estimate(value)
+        low, high = interval(stages[0][0], stages[1], self.seeds)
+        return Estimate(value, float(low), float(high))
+
+    def level(self, level: float | None = None) -> Level:
+        """
+        :param level: one of the fit; the largest if None
+        :return: its law
+        """
+        if level is None:
+            return self.levels[-1]
+        for each in self.levels:
+            if abs(each.level - level) <= 0.5:
+                return each
+        raise ValueError(
+            f"level must be one of the fit, {', '.join(f'{x.level:g}' for x in self.levels)}, not {level!r}"
+        )
+
+    def compute_laws(self, level: float | None = None, task: str | None = None) -> list[ComputeLaw]:
+        """
+        :param level: of the fit; the largest if None
+        :param task: one of the level's; the mean over the tasks if None
+        :return: laws of (1,), (R,)
+        """
+        if not self.has_compute:
+            raise ValueError("compute needs the size of the critics and the batch size, which these laws do not have")
+        found = []
+        for i, data in enumerate(self._data(self.level(level), task)):
+            if "batch_size" in self.hyperparameters:
+                law = self.hyperparameters["batch_size"]
+                own = (
+                    law.intercepts[i].mean(axis=1)
+                    if task not in law.tasks
+                    else law.intercepts[i][:, law.tasks.index(task)]
+                )
+                batch, slope = own, law.slopes[i]
+            else:
+                batch, slope = np.full(data.d_min.shape, self.batch_size), np.zeros(data.d_min.shape)
+            found.append(ComputeLaw(data, batch, slope, float(self.critic_params or 0)))
+        return found
+
+    def _data(self, level: Level, task: str | None) -> list[DataLaw]:
+        if task is None:
+            return level.laws
+        if task not in level.tasks:
+            raise ValueError(f"task must be one of level {level.level:g}, {', '.join(level.tasks)}, not {task!r}")
+        factor = float(level.factors[level.tasks.index(task)])
+        return [DataLaw(law.d_min * factor, law.beta, law.alpha) for law in level.laws]
+
+    def budgets(self) -> pd.DataFrame:
+        """
+        :return: of each level the replay ratio of the least C + δ D and this budget, each with its interval, and
+            whether the replay ratio is within those of the runs
+        """
+        rows = []
+        for level in self.levels:
+            points = [law.best(self.delta) for law in self.compute_laws(level.level)]
+            ratio = self.interval([np.atleast_1d(point.replay_ratio) for point in points])
+            budget = self.interval([np.atleast_1d(point.compute + self.delta * point.steps) for point in points])
+            rows.append(
+                {
+                    "level": level.level, "replay_ratio": ratio.value, "replay_ratio_low": ratio.low,
+                    "replay_ratio_high": ratio.high, "budget": budget.value, "budget_low": budget.low,
+                    "budget_high": budget.high,
+                    "within": self.replay_ratios[0] <= ratio.value <= self.replay_ratios[-1],
+                }
+            )  # fmt: skip
+        return pd.DataFrame(rows)
+
+    def budget_laws(self) -> list[BudgetLaw]:
+        """
+        :return: laws of all but the two largest budgets, of (1,), (R,)
+        :raises ValueError: there are fewer than four levels, or no compute
+        """
+        if len(self.levels) < HELD_OUT + 2:
+            raise ValueError(
+                f"levels must be at least {HELD_OUT + 2} for a law of the budget, of which the two largest are held "
+                f"out; there are {len(self.levels)}"
+            )
+        points = [[law.best(self.delta) for law in self.compute_laws(level.level)] for level in self.levels]
+        found = []
+        for stage in zip(*points, strict=True):
+            ratios = np.stack([np.atleast_1d(point.replay_ratio) for point in stage], axis=-1)
+            budgets = np.stack([np.atleast_1d(p.compute + self.delta * p.steps) for p in stage], axis=-1)
+            found.append(fit_budget(budgets[..., :-HELD_OUT], ratios[..., :-HELD_OUT]))
+        return found
+
+    # ------------------------------------------------ answers
+
+    def predict(
+        self,
+        *,
+        replay_ratio: float | None = None,
+        compute: float | None = None,
+        data: float | None = None,
+        budget: float | None = None,
+        level: float | None = None,
+        task: str | None = None,
+    ) -> Prediction:
+        """
+        Settings for a replay ratio, for the fewest steps under a limit of compute, for the least compute under a limit
+        of steps, or for a budget C + δ D.
+
+        :param replay_ratio: gradient steps an environment step
+        :param compute: FLOPs
+        :param data: environment steps
+        :param budget: FLOPs and, by δ, steps
+        :param level: of the return, one of the fit; the largest if None. Not of a budget, which says how far one gets
+        :param task: whose; the mean over the tasks if None
+        :return: the settings
+        :raises ValueError: not exactly one is given, there is no answer, or it lies more than four times beyond the
+            replay ratios of the runs
+        """
+        given = {"replay_ratio": replay_ratio, "compute": compute, "data": data, "budget": budget}
+        asked = {name: value for name, value in given.items() if value is not None}
+        if len(asked) != 1:
+            raise ValueError(f"exactly one of {', '.join(given)} must be given, not {', '.join(asked) or 'none'}")
+        ((name, value),) = asked.items()
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be a positive number, not {value!r}")
+        if name == "budget":
+            if level is not None:
+                raise ValueError("level is not for a budget, which says by itself how far one gets")
+            return self._at_budget(value, task)
+        of = self.level(level)
+        if name == "replay_ratio":
+            self._check_reach(value)
+            return self._at([np.full(len(law.d_min), value) for law in of.laws], of, task)
+        laws = self.compute_laws(of.level, task)
+        answer: Callable[[ComputeLaw], Any] = (
+            (lambda law: law.most_data_efficient(value)) if name == "compute" else (lambda law: law.cheapest(value))
+        )
+        answer(_first(laws[0]))  # raises where there is none
+        ratios = [np.atleast_1d(answer(law).replay_ratio) for law in laws]
+        self._check_reach(float(ratios[0][0]))
+        return self._at(ratios, of, task)
+
+    def _check_reach(self, ratio: float) -> None:
+        low, high = self.replay_ratios[0] / BEYOND, self.replay_ratios[-1] * BEYOND
+        if not low <= ratio <= high:
+            raise ValueError(
+                f"the answer would be a replay ratio of {ratio:.4g}, and runs at {self.replay_ratios[0]:g} to "
+                f"{self.replay_ratios[-1]:g} warrant {low:g} to {high:g} at most: make runs nearer to it"
+            )
+
+    def _at_budget(self, budget: float, task: str | None) -> Prediction:
+        laws = self.budget_laws()
+        ratios = [np.atleast_1d(law.replay_ratio(budget)) for law in laws]
+        ratio = float(ratios[0][0])
+        self._check_reach(ratio)
+        table = self.budgets()
+        limits = self._limits(ratio, task)
+        inside = table["budget"].min() <= budget <= table["budget"].max()
+        if not inside:
+            limits.append(
+                f"the budget is outside of those of the levels, {table['budget'].min():.3g} to "
+                f"{table['budget'].max():.3g} FLOPs: the level is not known"
+            )
+        reached = float(table.loc[table["budget"] <= budget, "level"].max()) if inside else None
+        costs = self.compute_laws(self.levels[0].level)
+        steps = [
+            budget / (10 * law.critic_params * law.batch_size * each ** (1 + law.slope) + self.delta)
+            for law, each in zip(costs, ratios, strict=True)
+        ]
+        compute = [budget - self.delta * each for each in steps]
+        batch, rate = (self._hyperparameter(name, ratios, task) for name in ("batch_size", "learning_rate"))
+        return Prediction(
+            self.interval(ratios), batch, rate, self.interval(steps), self.interval(compute), reached, limits
+        )
+
+    def _at(self, ratios: list[np.ndarray], level: Level, task: str | None) -> Prediction:
+        data = self._data(level, task)
+        steps = [law.d_min * (1 + (law.beta / ratio) ** law.alpha) for law, ratio in zip(data, ratios, strict=True)]
+        compute = None
+        if self.has_compute:
+            laws = self.compute_laws(level.level, task)
+            compute = self.interval([law.at(r).compute for law, r in zip(laws, ratios, strict=True)])
+        ratio = float(ratios[0][0])
+        limits = self._limits(ratio, task) + level.law().doubts(self.replay_ratios)
+        if level.left_out:
+            limits.append(f"tasks that do not reach {level.level:g} are not in it: {', '.join(level.left_out)}")
+        exact = all(np.ptp(each) == 0 for each in ratios if len(each))
+        batch, rate = (self._hyperparameter(name, ratios, task) for name in ("batch_size", "learning_rate"))
+        return Prediction(
+            Estimate(ratio) if exact else self.interval(ratios),
+            batch, rate, self.interval(steps), compute, level.level, limits,
+        )  # fmt: skip
+
+    def _hyperparameter(self, name: str, ratios: list[np.ndarray], task: str | None) -> Estimate | None:
+        if name in self.hyperparameters:
+            law = self.hyperparameters[name]
+            return self.interval(law.at(ratios, task if task in law.tasks else None))
+        fixed = self.batch_size if name == "batch_size" else self.learning_rate
+        return None if fixed is None else Estimate(fixed)
+
+    def _limits(self, ratio: float, task: str | None) -> list[str]:
+        limits = []
+        if not self.replay_ratios[0] <= ratio <= self.replay_ratios[-1]:
+            limits.append(
+                f"extrapolated: the runs have replay ratios of {self.replay_ratios[0]:g} to {self.replay_ratios[-1]:g}"
+            )
+        for name, law in self.hyperparameters.items():
+            if task is not None and task not in law.tasks:
+                limits.append(f"{name} is the mean over the tasks: none could be chosen on {task}")
+        for name in ("batch_size", "learning_rate"):
+            if name not in self.hyperparameters:
+                fixed = self.batch_size if name == "batch_size" else self.learning_rate
+                limits.append(f"{name} was not swept" + ("" if fixed is None else ": it is that of the runs"))
+        return limits
+
+
+def _first(law: ComputeLaw) -> ComputeLaw:
+    data = DataLaw(*(float(each[0]) for each in law.data))
+    return ComputeLaw(data, float(law.batch_size[0]), float(law.slope[0]), law.critic_params)

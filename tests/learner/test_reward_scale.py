@@ -1,0 +1,223 @@
+"""Rewards scaled by the running return, and normalised observations: by hand, saved, and in training."""
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sb3_sample.learner.batch import Batch
+from sb3_sample.learner.reward_scale import REWARD_SCALES
+from sb3_sample.sac import DAC, SAC
+from tests.sac.common import MAKERS, differing, random_batch, sac, state, vec
+
+RULES = sorted(REWARD_SCALES)
+
+
+def learner(**kwargs: Any) -> Any:
+    """What a rule knows of a learner."""
+    return SimpleNamespace(gamma=0.9, head=None, temperature=lambda: torch.tensor(0.5), target_entropy=-2.0, **kwargs)
+
+
+def told(rule: str, rewards: list[float], ends: list[int], **kwargs: Any) -> tuple[Any, Any]:
+    """A rule that was told of some steps of one environment."""
+    of = learner()
+    scale: Any = REWARD_SCALES[rule](of, **kwargs)
+    for reward, end in zip(rewards, ends, strict=True):
+        scale.on_step(of, np.array([reward]), np.array([bool(end)]), [{"TimeLimit.truncated": end == 2}])
+        scale.on_observations(of, np.zeros((1, 3)))
+    scale.before_updates(of)
+    return scale, of
+
+
+REWARDS, ENDS = [1.0, -2.0, 4.0, 3.0], [0, 0, 1, 0]
+#: G: the last reward of the episode already begins the next one.
+RETURNS = [1.0, 0.9 - 2.0, 4.0, 0.9 * 4.0 + 3.0]
+
+
+def test_xqc_by_hand() -> None:
+    scale, _ = told("xqc", REWARDS, ENDS)
+    assert scale.divisor(None).item() == pytest.approx(np.std(RETURNS) + 1e-8, rel=1e-12)
+
+
+def test_simbav2_by_hand() -> None:
+    scale, _ = told("simbav2", REWARDS, ENDS, max_return=100.0)
+    mean, var, count = 0.0, 1.0, 1e-4
+    for g in RETURNS:
+        delta, total = g - mean, count + 1
+        mean, var, count = mean + delta / total, (var * count + delta**2 * count / total) / total, total
+    assert scale.divisor(None).item() == pytest.approx(math.sqrt(var + 1e-8), rel=1e-12)
+    scale, _ = told("simbav2", REWARDS, ENDS)
+    assert scale.divisor(None).item() == pytest.approx(max(math.sqrt(var + 1e-8), 6.6 / 5), rel=1e-12)
+
+
+def test_simbav2_waits_for_the_next_actions() -> None:
+    scale, of = told("simbav2", REWARDS, ENDS)
+    before = scale.divisor(None).item()
+    scale.on_step(of, np.array([1e3]), np.array([False]), [{}])
+    assert scale.divisor(None).item() == before
+    scale.on_observations(of, None)
+    assert scale.divisor(None).item() > 100
+
+
+def test_flashsac_by_hand() -> None:
+    scale, _ = told("flashsac", REWARDS, ENDS, max_return=100.0)
+    mean, var, count = 0.0, 1.0, 0
+    for g in RETURNS:
+        delta, total = g - mean, count + 1
+        mean, var = mean + delta / total, (var * (count + 1e-4) + delta**2 * count / total) / total
+        count = total
+    assert scale.divisor(None).item() == pytest.approx(math.sqrt(var + 1e-8), rel=1e-5)
+    assert scale.divisor(None).dtype == torch.float32
+
+
+def test_brc_by_hand() -> None:
+    scale, _ = told("brc", [1.0, 2.0, 4.0], [0, 0, 1])
+    # Returns 4, 2 + 3.6, 1 + 5.04; the temperature is 0.5, the target entropy -2, 1 - gamma 0.1.
+    expected = (1 + 0.9 * (2 + 0.9 * 4) + 0.5 * 2 / (2 * 0.1)) / 10
+    assert scale.divisor(None).item() == pytest.approx(expected, rel=1e-6)
+    # A tail that was cut off goes on at the episode's mean reward.
+    scale, _ = told("brc", [-1.0, -3.0], [0, 2])
+    returns = [-3 + 0.9 * -2 / 0.1, -1 + 0.9 * (-3 + 0.9 * -2 / 0.1)]
+    assert scale.divisor(None).item() == pytest.approx((max(map(abs, returns)) + 5) / 10, rel=1e-6)
+    # Before an episode is over, rewards are 0.
+    scale, _ = told("brc", [1.0, 2.0], [0, 0])
+    assert scale.divisor(None).item() == math.inf
+
+
+def test_brc_by_task() -> None:
+    of = learner()
+    scale: Any = REWARD_SCALES["brc"](of, n_tasks=3)
+    ends = np.array([True, True])
+    scale.on_step(of, np.array([1.0, 5.0]), ends, [{"task": 2}, {"task": 0}])
+    scale.before_updates(of)
+    o = torch.zeros(4, 1)
+    rewards = torch.full((4, 1), 3.0)
+    tasks = torch.tensor([[0], [1], [2], [2]])
+    found = scale.transform(Batch(o, o, o, o, rewards, 0.9, {"task": tasks}), None).rewards
+    expected = [3 / ((5 + 5) / 10), 0.0, 3 / ((1 + 5) / 10), 3 / ((1 + 5) / 10)]
+    assert found.flatten().tolist() == pytest.approx(expected, rel=1e-6)
+    with pytest.raises(ValueError, match=r"the task of an environment must lie in \[0, 2\], by n_tasks, not be 3"):
+        scale.on_step(of, np.array([1.0, 5.0]), ends, [{"task": 3}, {"task": 0}])
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_trains_saves_and_goes_on(rule: str, tmp_path: Path) -> None:
+    model = sac(reward_scale=rule, normalize_observations=True, env=vec(2)).learn(30)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = SAC.load(tmp_path / "model", env=vec(2))
+    assert not differing(state(model), state(loaded))
+    assert loaded.reward_scaler.get_extra_state() == model.reward_scaler.get_extra_state()
+    assert loaded.reward_scaler.divisor(None) == model.reward_scaler.divisor(None)
+    # With another number of environments the returns so far begin anew.
+    SAC.load(tmp_path / "model", env=vec(3)).learn(12)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_resumes(rule: str, tmp_path: Path) -> None:
+    def run(folder: Path, n: int, stop: int | None = None) -> Any:
+        model = sac(reward_scale=rule, normalize_observations=True, reset_gradient_steps=25)
+        stopped = (lambda _l, _g: model.num_timesteps < stop) if stop else None
+        return model.learn(n, callback=stopped, checkpoint=folder, checkpoint_freq=10)
+
+    whole = run(tmp_path / "a", 60)
+    run(tmp_path / "b", 60, stop=35)
+    assert not differing(state(whole), state(run(tmp_path / "b", 60)))
+
+
+def test_the_bound_is_the_heads() -> None:
+    model = sac(reward_scale="simbav2", value_head="categorical", value_head_kwargs={"v_max": 7.0})
+    assert model.reward_scaler.max_return == 7.0
+    assert sac(reward_scale="simbav2").reward_scaler.max_return == 5.0
+    assert sac(reward_scale="brc").reward_scaler.max_return == 10.0
+    assert sac(reward_scale="brc", reward_scale_kwargs={"max_return": 3}).reward_scaler.max_return == 3.0
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "words"),
+    [
+        ({"reward_scale": "std"}, r"reward_scale must be one of \['brc', 'flashsac', 'simbav2', 'xqc'\], .* not 'std'"),
+        ({"reward_scale_kwargs": {"eps": 1e-8}}, "reward_scale_kwargs=.* means nothing with reward_scale=None"),
+        ({"reward_scale": "xqc", "reward_scale_kwargs": {"max_return": 1}}, "reward_scale_kwargs has 'max_return'"),
+        ({"reward_scale": "brc", "reward_scale_kwargs": {"n_tasks": 0}}, "n_tasks must be an integer of at least 1"),
+        ({"reward_scale": "simbav2", "reward_scale_kwargs": {"max_return": 0}}, "max_return must be above 0"),
+        ({"policy_kwargs": {"normalize_observations": True}}, "is an argument of the algorithm, not of policy_kwargs"),
+    ],
+)
+def test_refused(kwargs: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        sac(**kwargs)
+
+
+# ---------------------------------------------------------------- observations
+
+
+def test_which_observations_count() -> None:
+    """Those that are acted on: not the first, nor the last of an episode; the latest step is not seen yet."""
+    model = sac(normalize_observations=True, learning_starts=100).learn(10)
+    # The toy counts its steps, of which an episode has 7: 0 to 6, then 0 to 2; the first is not among them.
+    seen = np.array([1, 2, 3, 4, 5, 6, 0, 1, 2], dtype=float)
+    norm = model.policy.observation_norm
+    count = 1e-4 + len(seen)
+    mean = seen.sum() / count
+    assert norm.count.item() == pytest.approx(count)
+    assert norm.mean.tolist() == pytest.approx([mean] * 3)
+    second = (1e-4 * 1.0 + (seen**2).sum()) / count
+    assert norm.var.tolist() == pytest.approx([second - mean**2] * 3)
+    before = norm.mean.clone()
+    model.predict(np.full(3, 50.0))
+    assert torch.equal(norm.mean, before)
+    model.learn(3, reset_num_timesteps=False)
+    assert norm.count.item() == pytest.approx(count + 3)
+    # A new run begins with an observation that does not count.
+    model.learn(3)
+    assert norm.count.item() == pytest.approx(count + 5)
+
+
+def test_every_network_reads_them() -> None:
+    """Networks on raw observations with statistics are those without on normalised ones."""
+    model, plain = sac(normalize_observations=True), sac()
+    norm = model.policy.observation_norm
+    norm.update(torch.tensor([[1.0, -3.0, 0.5], [2.0, 5.0, 0.5]]))
+    weights = {name: value for name, value in model.policy.state_dict().items() if "observation_norm" not in name}
+    plain.policy.load_state_dict(weights)
+    batch = random_batch(model)
+    seen = batch._replace(observations=norm(batch.observations), next_observations=norm(batch.next_observations))
+    torch.manual_seed(0)
+    ours = model._update(batch)
+    torch.manual_seed(0)
+    theirs = plain._update(seen)
+    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    o = batch.observations.numpy()
+    assert np.array_equal(
+        model.predict(o, deterministic=True)[0], plain.predict(norm(batch.observations).numpy(), deterministic=True)[0]
+    )
+
+
+@pytest.mark.parametrize("maker", ["SAC", "BRO", "BROTD3", "DAC", "VPLSAC"])
+def test_statistics_stay_at_a_reset(maker: str, tmp_path: Path) -> None:
+    model = MAKERS[maker](normalize_observations=True, resets=25).learn(24)
+    norm = model.policy.observation_norm
+    before = norm.count.item()
+    model.reinitialize()
+    assert norm.count.item() == before > 20
+    model.learn(20, reset_num_timesteps=False)
+    for network in (model.actor, model.critic, model.critic_target, model.policy.actor_target):
+        assert network is None or network.observation_norm is norm
+    if isinstance(model, DAC):
+        assert model.explorer.actor.observation_norm is norm
+    names = [name for name in model.policy.state_dict() if "observation_norm" in name]
+    assert names == ["observation_norm.mean", "observation_norm.var", "observation_norm.count"]
+    model.save(tmp_path / "model")
+    assert not differing(state(model), state(type(model).load(tmp_path / "model")))
+
+
+def test_spaces_that_are_not_normalised() -> None:
+    from gymnasium import spaces
+
+    with pytest.raises(ValueError, match="normalize_observations=True needs observations of a Box of floats, not of"):
+        sac(vec(obs_space=spaces.Discrete(8)), normalize_observations=True)

@@ -1,0 +1,144 @@
+"""Learning rates over the planned gradient steps: by hand, in training, resumed and continued."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from stable_baselines3.common.logger import configure
+
+from sb3_sample.learner.schedules import LearningRateSchedule
+from sb3_sample.sac import SAC
+from tests.sac.common import COMPILES, bro, differing, random_batch, sac, state, vec
+
+
+def test_linear_by_hand() -> None:
+    schedule = LearningRateSchedule("linear", 1e-4, 5e-5)
+    found = [schedule.rate(n, 4) for n in (0, 1, 2, 4, 5, 100)]
+    assert found == pytest.approx([1e-4, 8.75e-5, 7.5e-5, 5e-5, 5e-5, 5e-5])
+    assert schedule.rate(7, None) == 1e-4
+
+
+def test_cosine_by_hand() -> None:
+    schedule = LearningRateSchedule("cosine", 3e-4, 1e-4, warm_up=2, start=1e-4)
+    found = [schedule.rate(n, 10) for n in (0, 1, 2, 4, 6, 10, 11)]
+    quarter = 1e-4 + 2e-4 * (1 + math.cos(math.pi / 4)) / 2
+    assert found == pytest.approx([1e-4, 2e-4, 3e-4, quarter, 2e-4, 1e-4, 1e-4])
+
+
+def rates(model: Any) -> dict[str, float]:
+    return {name: optimizer.param_groups[0]["lr"] for name, optimizer in model.learner.optimizers().items()}
+
+
+def test_each_optimizer_goes_by_its_own_steps() -> None:
+    model = bro(
+        learning_rate=1e-3, learning_rate_schedule="linear", final_learning_rate=0.0, schedule_steps=10, policy_delay=2
+    )
+    batch, own = random_batch(model), model.explorer.scalar_optimizer.param_groups[0]["lr"]
+    for k in range(6):
+        model._update(batch)
+        found = rates(model)
+        assert found["critic.optimizer"] == pytest.approx(1e-3 * (1 - k / 10))
+        for name in ("actor.optimizer", "temperature_optimizer", "explorer.actor_optimizer"):
+            assert found[name] == pytest.approx(1e-3 * (1 - k // 2 / 10)), (name, k)
+    assert found["explorer.scalar_optimizer"] == own
+
+
+def test_planned_are_the_first_learns(tmp_path: Path) -> None:
+    """Its environment steps times the replay ratio, the random ones included; later calls and files keep that."""
+    model = sac(learning_rate_schedule="linear", replay_ratio=2, learning_starts=10)
+    model.learn(40)
+    assert model.planned_updates == 80 and model._n_updates == 60
+    assert model.learner.scheduled_rate == pytest.approx(3e-4 * (1 - 60 / 80))
+    model.learn(5, reset_num_timesteps=False)
+    assert model.learner.planned_updates == 80 and model.learner.scheduled_rate == pytest.approx(3e-4 * 10 / 80)
+    model.save(tmp_path / "model")
+    loaded = SAC.load(tmp_path / "model", env=vec())
+    assert loaded.planned_updates == 80
+    loaded.learn(60)
+    assert loaded.planned_updates == 80 and loaded.learner.scheduled_rate == 0
+    assert SAC.load(tmp_path / "model", schedule_steps=200).learner.planned_updates == 200
+    assert sac(learning_rate_schedule="cosine", schedule_steps=7).learn(40).planned_updates == 7
+
+
+def test_stable_baselines3s_arguments() -> None:
+    model = sac(learning_rate_schedule="linear", train_freq=2, gradient_steps=3, env=vec(2)).learn(40)
+    assert model.planned_updates == 30
+    model = sac(learning_rate_schedule="linear", train_freq=(1, "episode"), gradient_steps=-1).learn(40)
+    assert model.planned_updates == 40
+    model = sac(learning_rate_schedule="linear", train_freq=(1, "episode"), gradient_steps=5)
+    with pytest.raises(ValueError, match="schedule_steps must be given"):
+        model.learn(40)
+
+
+def test_resumed(tmp_path: Path) -> None:
+    def run(folder: Path, stop: int | None = None) -> Any:
+        model = sac(learning_rate_schedule="cosine", final_learning_rate=1e-5, warm_up_steps=5)
+        stopped = (lambda _l, _g: model.num_timesteps < stop) if stop else None
+        return model.learn(60, callback=stopped, checkpoint=folder, checkpoint_freq=10)
+
+    whole = run(tmp_path / "a")
+    run(tmp_path / "b", stop=35)
+    resumed = run(tmp_path / "b")
+    assert resumed.planned_updates == whole.planned_updates == 60
+    assert not differing(state(whole), state(resumed))
+
+
+@COMPILES
+def test_compiled_and_logged(tmp_path: Path) -> None:
+    """A compiled step reads the rates of every step, and is compiled once."""
+    models = [sac(learning_rate_schedule="linear", schedule_steps=20, compile=compile) for compile in (False, True)]
+    ends = []
+    for model in models:
+        torch.manual_seed(0)
+        for k in range(20):
+            model._update(random_batch(model, seed=k))
+        ends.append({name: value for name, value in state(model).items() if "optimizer" not in name})
+    assert models[1].learner._execution.compiled
+    for name, value in ends[0].items():
+        assert torch.allclose(value, ends[1][name], atol=3e-5), name
+    models[1]._update(random_batch(models[1]))
+    moved = [name for name in differing(ends[1], state(models[1])) if name.startswith("policy/actor.")]
+    assert not moved, "the rate at the end is 0"
+    models[1].set_logger(configure(str(tmp_path), ["csv"]))
+    models[1]._record_counts()
+    assert models[1].logger.name_to_value["train/learning_rate"] == 0
+
+
+def test_a_learner_alone() -> None:
+    model = sac()
+    spaces = model.observation_space, model.action_space
+    learner = SAC.learner(*spaces, learning_rate_schedule="linear", learning_rate=1.0)
+    assert learner.planned_updates is None and learner.scheduled_rate == 1.0
+    learner.planned_updates = 4
+    learner._counts._n_updates = 2
+    other = SAC.learner(*spaces, learning_rate_schedule="linear", learning_rate=1.0)
+    other.load_state_dict(learner.state_dict())
+    assert other.scheduled_rate == 0.5
+    assert SAC.learner(*spaces, learning_rate_schedule="linear", schedule_steps=9).planned_updates == 9
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "words"),
+    [
+        ({"learning_rate_schedule": "exponential"}, r"learning_rate_schedule must be one of \['linear', 'cosine'\]"),
+        ({"final_learning_rate": 1e-5}, "final_learning_rate=1e-05 means nothing with learning_rate_schedule=None"),
+        ({"schedule_steps": 5}, "schedule_steps=5 means nothing with learning_rate_schedule=None"),
+        (
+            {"learning_rate_schedule": "linear", "learning_rate": lambda p: p},
+            "learning_rate=.* is a schedule, and so is learning_rate_schedule='linear'",
+        ),
+        (
+            {"learning_rate_schedule": "linear", "schedule_steps": 5, "warm_up_steps": 5},
+            "schedule_steps=5 must exceed warm_up_steps=5",
+        ),
+        (
+            {"learning_rate_schedule": "linear", "warm_up_learning_rate": 1e-3},
+            "warm_up_learning_rate=0.001 means nothing with warm_up_steps=0",
+        ),
+    ],
+)
+def test_refused(kwargs: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        sac(**kwargs)

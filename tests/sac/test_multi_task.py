@@ -1,0 +1,460 @@
+"""Agents of several tasks: what networks read, pace, temperatures by task, files, logs, evaluation by task."""
+
+import importlib.util
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import ConvertCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.her import HerReplayBuffer
+
+from sb3_sample import DiagnosticsCallback, MultiTaskEvalCallback, evaluate_tasks, multi_task_env, study
+from sb3_sample.learner.batch import Noise
+from sb3_sample.learner.scalars import TaskLogScalar
+from sb3_sample.learner.target import next_step
+from sb3_sample.networks import MLP, BroNet, Network, widened
+from sb3_sample.sac import BRC, BRO
+from sb3_sample.sac.multi_task import TaskEmbedding, TaskOneHot
+from tests.sac.common import COMPILES, MAKERS, bro, differing, sac, state, vec
+
+ROOT = Path(__file__).parents[2]
+PENDULUM, CAR = "Pendulum-v1", "MountainCarContinuous-v0"
+#: Of episodes of eight steps.
+SHORT = {"max_episode_steps": 8}
+
+
+def tasks(*ids: str, seed: int = 0) -> Any:
+    return multi_task_env(ids or (PENDULUM, CAR), seed=seed, env_kwargs=SHORT)
+
+
+def make(name: str, env: Any = None, policy: str = "MultiInputPolicy", **kwargs: Any) -> Any:
+    return MAKERS[name](tasks() if env is None else env, policy=policy, **kwargs)
+
+
+def told(task: Any, n: int | None = None) -> dict[str, Any]:
+    shape = (3,) if n is None else (n, 3)
+    return {"observation": np.linspace(-1, 1, 3 * (n or 1), dtype=np.float32).reshape(shape), "task": task}
+
+
+# ---------------------------------------------------------------- one task
+
+
+@pytest.mark.parametrize("policy", ["MlpPolicy", "MultiInputPolicy"])
+@pytest.mark.parametrize("name", ["BRC", "BRO", "SAC"])
+def test_one_task_is_single_task_bit_by_bit(name: str, policy: str) -> None:
+    """Nothing is appended and nothing widened, whatever is asked of several tasks."""
+    asked: dict[str, Any] = {"task_temperatures": True, "target_entropy": [-0.5]}
+    asked |= {} if name == "BRC" else {"multitask": True}
+    multi = make(name, tasks(PENDULUM), policy, **asked).learn(40)
+    single = make(name, make_vec_env(PENDULUM, seed=0, env_kwargs=SHORT), "MlpPolicy").learn(40)
+    assert multi._n_updates == single._n_updates == 30
+    assert len(state(single)) > 30 and not differing(state(multi), state(single))
+    single_action, _ = single.predict(told(0)["observation"], deterministic=True)
+    assert np.array_equal(multi.predict(told(0), deterministic=True)[0], single_action)
+
+
+# ---------------------------------------------------------------- what networks read
+
+
+def test_the_multitask_bro_reads_the_one_hot_vector_and_is_twice_as_wide() -> None:
+    model = BRO(
+        "MultiInputPolicy", tasks(), model_size=(1, 8), n_quantiles=5, multitask=True, buffer_size=100, device="cpu"
+    )
+    plain = BRO("MultiInputPolicy", tasks(), model_size=(1, 8), n_quantiles=5, buffer_size=100, device="cpu")
+    for each, width, of_actors in ((model, 16, 512), (plain, 8, 256)):
+        assert isinstance(each.critic.features_extractor, TaskOneHot)
+        for trunk, size in (
+            (each.critic.trunk, width),
+            (each.critic_target.trunk, width),
+            (each.actor.trunk, of_actors),
+            (each.explorer.trunk, of_actors),
+        ):
+            assert isinstance(trunk, BroNet) and trunk.out_features == size and len(trunk.blocks) == 1
+        # Observation of 3 and two tasks; beside the action, or the actor's mean, of 1.
+        assert each.actor.trunk.dense.in_features == 5
+        assert each.critic.trunk.dense.in_features == each.explorer.trunk.dense.in_features == 6
+    observations, _ = model.policy.obs_to_tensor(told(np.array([0, 1]), 2))
+    features = model.actor.features(observations)
+    assert features[:, :3].numpy().tolist() == told(0, 2)["observation"].tolist()
+    assert features[:, 3:].tolist() == [[1, 0], [0, 1]]
+
+
+def test_every_algorithm_can_be_widened() -> None:
+    """The actors of MLPs and of TD3, the optimistic actor of DAC; a network without a width says so."""
+    for name, trunks in (("SAC", "actor critic"), ("DAC", "actor critic"), ("BROTD3", "actor critic")):
+        model = make(name, multitask=True)
+        for trunk in trunks.split():
+            assert getattr(model, trunk).trunk.out_features == 16
+    assert make("DAC", multitask=True).explorer.actor.trunk.out_features == 16
+    assert make("BROTD3", multitask=True).policy.actor_target.trunk.out_features == 16
+    model = make("BRC", multitask=True)
+    assert isinstance(model.critic.features_extractor, TaskOneHot) and model.critic.trunk.out_features == 16
+    assert isinstance(make("BRC").critic.features_extractor, TaskEmbedding)
+    assert widened(MLP, {}, 2) == {"hidden_sizes": [512, 512]} and widened(MLP, {}, 1) == {}
+
+    class Fixed(Network):
+        def __init__(self, in_features: int, n_copies: int | None = None):
+            super().__init__()
+
+    with pytest.raises(ValueError, match="argument width or hidden_sizes, and Fixed has neither"):
+        widened(Fixed, {}, 2)
+
+
+# ---------------------------------------------------------------- pace
+
+
+def test_replay_ratio_and_resets_count_the_steps_of_each_task() -> None:
+    model = make("SAC", tasks(PENDULUM, CAR, seed=0), replay_ratio=2, learning_starts=10, resets=(15,))
+    model.learn(48)
+    # 24 steps of each task, of which six (more than ten transitions) come before the first gradient steps.
+    assert model.num_transitions == 48 and model._n_updates == 2 * (24 - 5)
+    assert model.plasticity.n_done == 1 and model.plasticity._reached == 24
+    # A single environment that has one task after the other takes a step of one task at a time.
+    space = spaces.Dict({"observation": spaces.Box(-10, 10, (3,), np.float32), "task": spaces.Discrete(2)})
+    model = make("SAC", vec(obs_space=space), replay_ratio=2, learning_starts=10)
+    model.learn(24)
+    assert model._n_updates == 2 * (24 - 10)
+
+
+# ---------------------------------------------------------------- temperatures
+
+
+def batch_of(model: Any, n: int = 6, seed: int = 0) -> Any:
+    """A random batch whose tasks are 0 and 1, unequally often."""
+    generator = torch.Generator().manual_seed(seed)
+    random = {name: torch.randn(n, 3, generator=generator) for name in ("observations", "next_observations")}
+    task = torch.tensor([[0], [1], [1], [0], [1], [1]])
+    model.learn(30)
+    batch = next(iter(model._source.batches(1, n)))
+    return batch._replace(**{name: {"observation": value, "task": task} for name, value in random.items()})
+
+
+@pytest.mark.parametrize("target_entropy", ["auto", [-0.25, -2.0]])
+def test_temperatures_by_task_by_hand(target_entropy: Any) -> None:
+    model = make("SAC", task_temperatures=True, ent_coef="auto_0.5", target_entropy=target_entropy)
+    batch = batch_of(model)
+    learner, temperature = model.learner, model.temperature
+    assert isinstance(temperature, TaskLogScalar) and model.log_ent_coef is temperature.log_value
+    with torch.no_grad():
+        temperature.log_value.copy_(torch.tensor([math.log(0.2), math.log(3.0)]))
+    alphas = torch.tensor([[0.2], [3.0]])[batch.observations["task"][:, 0]]
+    targets = torch.tensor([-0.5, -0.5] if target_entropy == "auto" else target_entropy)
+    targets = targets[batch.observations["task"]]
+    torch.testing.assert_close(learner.temperature_of(batch), alphas)
+    noise = torch.randn(6, 1, generator=torch.Generator().manual_seed(1))
+
+    # The TD target's bonus.
+    action, bonus = next_step(learner, batch, learner.temperature_of(batch), noise)
+    same_action, log_prob = learner.next_actions(batch.next_observations, noise)
+    assert torch.equal(action, same_action)
+    torch.testing.assert_close(bonus, -alphas * log_prob)
+
+    # The loss, and its gradient, which is each task's own.
+    _, log_prob = model.actor.sample(batch.observations, noise)
+    excess = -log_prob.detach() - targets
+    metrics = learner.step(batch, Noise(noise, noise, noise), eager=True)
+    assert metrics["train/ent_coef_loss"].item() == pytest.approx((alphas * excess).mean().item(), rel=1e-5)
+    assert metrics["train/ent_coef"].item() == pytest.approx(alphas.mean().item(), rel=1e-5)
+    of_task = [(alphas * excess)[batch.observations["task"] == k].sum() / 6 for k in range(2)]
+    torch.testing.assert_close(temperature.log_value.grad, torch.stack(of_task), rtol=1e-5, atol=1e-7)
+
+
+def test_the_actors_loss_weighs_each_tasks_entropy() -> None:
+    model = make("SAC", task_temperatures=True)
+    batch = batch_of(model)
+    with torch.no_grad():
+        model.temperature.log_value.copy_(torch.tensor([math.log(0.2), math.log(3.0)]))
+    noise = torch.randn(6, 1, generator=torch.Generator().manual_seed(1))
+    # With the critics after their step, and the actor and temperatures before theirs.
+    model.policy_delay = model.learner.policy_delay = 10**9
+    model.learner.step(batch, Noise(noise, noise, noise), eager=True)
+    actions, log_prob = model.actor.sample(batch.observations, noise)
+    value = model.critic.q_values(batch.observations, actions).amin(dim=0)
+    alphas = torch.tensor([[0.2], [3.0]])[batch.observations["task"][:, 0]]
+    expected = (alphas * log_prob).mean().item() - value.mean().item()
+    rate = model.critic.optimizer.param_groups[0]
+    rate["lr"] = 0.0
+    model.learner.policy_delay = 1
+    metrics = model.learner.step(batch, Noise(noise, noise, noise), eager=True)
+    assert metrics["train/actor_loss"].item() == pytest.approx(expected, rel=1e-5)
+    # As published, there is one temperature for both.
+    assert make("SAC").temperature().shape == () and model.temperature().shape == (2,)
+
+
+def test_rewards_are_divided_by_each_tasks_temperature_and_target() -> None:
+    model = make("BRC", task_temperatures=True, target_entropy=[-1.0, -3.0]).learn(30)
+    scaler = model.reward_scaler
+    with torch.no_grad():
+        model.temperature.log_value.copy_(torch.tensor([math.log(0.2), math.log(3.0)]))
+    scaler.before_updates(model.learner)
+    size = torch.maximum(scaler.largest, scaler.smallest.abs()).double()
+    assert size.isfinite().all()
+    expected = (size - torch.tensor([0.2, 3.0]) * torch.tensor([-1.0, -3.0]) / (2 * 0.01)) / 10
+    torch.testing.assert_close(scaler.divisors, expected, rtol=1e-5, atol=0)
+
+
+@pytest.mark.slow
+@COMPILES
+def test_compiled_as_eager() -> None:
+    found = []
+    for compile in (False, True):
+        model = make("BRC", task_temperatures=True, target_entropy=[-1.0, -0.5], compile=compile).learn(40)
+        found.append(state(model))
+    assert found[0].keys() == found[1].keys()
+    for name, value in found[0].items():
+        torch.testing.assert_close(found[1][name], value, rtol=1e-3, atol=1e-4)
+
+
+# ---------------------------------------------------------------- predict
+
+
+def test_predict_is_told_the_task() -> None:
+    model = make("BRC")
+    actions = [model.predict(told(task), deterministic=True)[0] for task in (0, 1)]
+    assert actions[0].shape == (1,) and not np.array_equal(*actions)
+    batch, _ = model.predict(told(1, 4), deterministic=True)
+    each, _ = model.predict(told(np.array([1, 1, 1, 1]), 4), deterministic=True)
+    assert batch.shape == (4, 1) and np.array_equal(batch, each)
+    one_of_batch, _ = model.predict(told(np.array([1]), 1), deterministic=True)
+    assert one_of_batch.shape == (1, 1)
+    for task in (2, -1, 1.0, "car"):
+        with pytest.raises(ValueError, match="task of an observation must be its number, an integer from 0 to 1, not"):
+            model.predict(told(task))
+    with pytest.raises(ValueError, match=r"entries 'observation' and 'task', not \['observation'\]"):
+        model.predict({"observation": told(0)["observation"]})
+
+
+# ---------------------------------------------------------------- files
+
+
+def test_one_model_is_saved_and_loaded(tmp_path: Path) -> None:
+    model = make("BRC", task_temperatures=True, target_entropy=[-1.0, -0.5]).learn(40)
+    model.save(tmp_path / "model")
+    loaded = BRC.load(tmp_path / "model", env=tasks())
+    assert not differing(state(model), state(loaded)) and loaded.target_entropy == [-1.0, -0.5]
+    assert loaded.learner.target_entropy.tolist() == [-1.0, -0.5]
+    loaded.learn(20)
+    alone = BRC.load(tmp_path / "model")
+    for task in (0, 1):
+        expected, _ = model.predict(told(task), deterministic=True)
+        assert np.array_equal(alone.predict(told(task), deterministic=True)[0], expected)
+    bro(tasks(), policy="MultiInputPolicy", multitask=True).learn(30).save(tmp_path / "bro")
+    assert BRO.load(tmp_path / "bro").critic.trunk.out_features == 16
+
+
+@pytest.mark.parametrize("name", ["BRC", "BRO", "VPLSAC"])
+def test_goes_on_bit_by_bit(name: str, tmp_path: Path) -> None:
+    arguments: dict[str, Any] = {"task_temperatures": True, "multitask": name == "BRO"}
+
+    def run(folder: Path, stop: int = 10**9) -> Any:
+        model = make(name, tasks(seed=3), **arguments)
+        evaluation = MultiTaskEvalCallback(
+            tasks(seed=9), eval_freq=8, n_eval_episodes=2, log_path=folder / "log", verbose=0
+        )
+        stopping = ConvertCallback(lambda *_: model.num_timesteps < stop)
+        model.learn(64, callback=[evaluation, stopping], checkpoint=folder, checkpoint_freq=16)
+        return model, evaluation
+
+    whole, evaluation = run(tmp_path / "a")
+    run(tmp_path / "b", stop=44)
+    again, evaluation_again = run(tmp_path / "b")
+    assert whole._n_updates == again._n_updates > 20 and not differing(state(whole), state(again))
+    assert evaluation.evaluations_timesteps == evaluation_again.evaluations_timesteps == [0, 8, 16, 24, 32]
+    assert evaluation.evaluations_results == evaluation_again.evaluations_results
+    first, second = (study.read(tmp_path / run / "log") for run in "ab")
+    assert first.equals(second) and set(first["task"]) == {PENDULUM, CAR}
+
+
+def test_exported(tmp_path: Path) -> None:
+    pytest.importorskip("onnxscript")
+    runtime = pytest.importorskip("onnxruntime")
+    model = make("BRC").learn(30)
+    onnx, _ = model.export(tmp_path / "policy")
+    inputs = {"observation": told(0, 4)["observation"], "task": np.array([0, 1, 0, 1])}
+    (found,) = runtime.InferenceSession(onnx).run(None, inputs)
+    np.testing.assert_allclose(found, model.predict(inputs, deterministic=True)[0], rtol=1e-4, atol=1e-5)
+
+
+# ---------------------------------------------------------------- logs and evaluation
+
+
+def test_the_log_has_each_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = make("SAC")
+    model.set_logger(configure(str(tmp_path), ["json", "stdout"]))
+    model.learn(64)
+    lines = [json.loads(line) for line in (tmp_path / "progress.json").read_text().splitlines()]
+    returns = {name: value for name, value in lines[-1].items() if name.startswith("rollout_return/")}
+    assert returns.keys() == {f"rollout_return/{PENDULUM}", f"rollout_return/{CAR}"}
+    for task_id in (PENDULUM, CAR):
+        its = [each["r"] for each in model.ep_info_buffer if each["task"] == task_id]
+        assert len(its) == 4 and returns[f"rollout_return/{task_id}"] == pytest.approx(np.mean(its))
+    assert "rollout_return" not in capsys.readouterr().out
+
+
+class ByTask:
+    """Successful where the action has the sign of the task."""
+
+    def predict(self, observation: Any, **_: Any) -> Any:
+        return np.where(observation["task"] == 1, 1.0, -1.0)[:, None], None
+
+
+def test_evaluation_by_task() -> None:
+    env = tasks(seed=5)
+    found = evaluate_tasks(ByTask(), env, n_eval_episodes=3)
+    assert list(found) == [PENDULUM, CAR]
+    assert all(each.lengths == [8] * 3 and each.successes == [] for each in found.values())
+    assert found[CAR].success_rate is None
+    # A force of 1 costs 0.1 a step.
+    assert found[CAR].returns == pytest.approx([-0.8] * 3)
+    alone: Any = make_vec_env(PENDULUM, seed=5, env_kwargs=SHORT)
+    alone.reset()
+    returns = [sum(alone.step(np.array([[-2.0]]))[1][0] for _ in range(8)) for _ in range(3)]
+    assert found[PENDULUM].returns == pytest.approx(returns, rel=1e-4)
+    assert found[PENDULUM].mean_return == pytest.approx(np.mean(returns), rel=1e-4)
+
+
+def test_callback_logs_and_writes_what_a_study_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = make("BRC", seed=4)
+    model.set_logger(configure(str(tmp_path / "logger"), ["json"]))
+    callback = MultiTaskEvalCallback(
+        tasks(seed=9),
+        eval_freq=10,
+        n_eval_episodes=2,
+        log_path=tmp_path / "runs",
+        best_model_save_path=tmp_path / "best",
+    )
+    model.learn(48, callback=callback)
+    table = study.read(tmp_path / "runs")
+    assert set(table["agent"]) == {"BRC"} and set(table["arguments"]) == {'{"n_tasks": 2}'}
+    assert set(table["seed"]) == {4} and set(table["metric"]) == {"return"}
+    for number, task_id in enumerate((PENDULUM, CAR)):
+        its = table[table["task"] == task_id]
+        # Steps of this task.
+        assert its["step"].tolist() == [0, 10, 20]
+        expected = [np.mean(each[number]) for each in callback.evaluations_results]
+        assert its["value"].tolist() == pytest.approx(expected)
+        assert callback.last_results[task_id].mean_return == pytest.approx(expected[-1])
+    lines = [json.loads(line) for line in (tmp_path / "logger" / "progress.json").read_text().splitlines()]
+    evaluated = [line for line in lines if f"eval_return/{CAR}" in line]
+    assert [line["time/total_timesteps"] for line in evaluated] == [0, 20, 40]
+    assert evaluated[-1][f"eval_return/{CAR}"] == pytest.approx(expected[-1])
+    assert evaluated[-1]["eval/mean_reward"] == pytest.approx(callback.last_mean_reward)
+    assert (tmp_path / "best" / "best_model.zip").exists()
+    assert f"{PENDULUM}: return " in capsys.readouterr().out
+
+
+def test_runs_without_a_seed_are_numbered(tmp_path: Path) -> None:
+    for name in "ab":
+        callback = MultiTaskEvalCallback(tasks(seed=9), n_eval_episodes=1, log_path=tmp_path / name, verbose=0)
+        make("SAC", seed=None).learn(4, callback=callback)
+    assert sorted(set(study.read([tmp_path / "a", tmp_path / "b"])["seed"])) == [0, 1]
+
+
+def test_successes_are_of_each_task(tmp_path: Path) -> None:
+    pytest.importorskip("metaworld")
+    ids = ("metaworld/reach-v3", "metaworld/push-v3")
+    env = multi_task_env(ids, seed=0, env_kwargs={"max_episode_steps": 4})
+    found = evaluate_tasks(_Zeros(), env, n_eval_episodes=2)
+    assert [each.successes for each in found.values()] == [[False] * 2] * 2
+    assert found[ids[0]].success_rate == 0.0
+    callback = MultiTaskEvalCallback(env, n_eval_episodes=2, log_path=tmp_path, verbose=0)
+    training = multi_task_env(ids, seed=1, env_kwargs={"max_episode_steps": 4})
+    make("SAC", training).learn(8, callback=callback)
+    assert set(study.read(tmp_path)["metric"]) == {"return", "success_rate"}
+
+
+class _Zeros:
+    def predict(self, observation: Any, **_: Any) -> Any:
+        return np.zeros((len(observation["task"]), 4)), None
+
+
+# ---------------------------------------------------------------- what goes together, and what does not
+
+
+def test_validation_goes_with_tasks() -> None:
+    model = make("VPLSAC").learn(60)
+    assert model._n_updates > 10 and model.replay_buffer.n_validation > 0
+
+
+@pytest.mark.parametrize(
+    ("name", "kwargs", "words"),
+    [
+        ("SAC", {"env": vec(), "policy": "MlpPolicy", "multitask": True}, "multitask=True needs .* multi_task_env do"),
+        ("SAC", {"env": vec(), "policy": "MlpPolicy", "task_temperatures": True}, "task_temperatures=True needs"),
+        ("SAC", {"multitask": 2}, "multitask must be True or False, not 2"),
+        ("SAC", {"task_temperatures": True, "ent_coef": 0.1}, "task_temperatures=True learns .* ent_coef=0.1 fixes"),
+        ("BROTD3", {"task_temperatures": True}, "task_temperatures=True .*backbone='td3'"),
+        ("SAC", {"target_entropy": [-1.0, -2.0]}, "with task_temperatures=True one for each of the 2 tasks, not"),
+        ("SAC", {"target_entropy": [-1.0], "task_temperatures": True}, "one for each of the 2 tasks, not"),
+        ("SAC", {"target_entropy": [-1.0, math.inf], "task_temperatures": True}, "a task must be finite, not inf"),
+        ("SAC", {"target_entropy": [-1.0, "x"], "task_temperatures": True}, "target_entropy of a task must be a num"),
+        ("SAC", {"replay_buffer_class": HerReplayBuffer}, "replay_buffer_class=HerReplayBuffer needs .*desired_goal"),
+        ("SAC", {"policy_kwargs": {"width_factor": 2}}, "width_factor is an argument of the algorithm"),
+        ("SAC", {"policy": "CnnPolicy"}, "CnnPolicy"),
+        ("SAC", {"n_steps": 3}, "n_steps=3 is not supported with Dict"),
+        ("SimBa", {}, "normalize_observations=True needs observations of a Box of floats, not of Dict"),
+    ],
+)
+def test_refused(name: str, kwargs: dict[str, Any], words: str) -> None:
+    with pytest.raises((ValueError, AssertionError), match=words):
+        make(name, **kwargs)
+
+
+def test_callbacks_of_one_task_and_of_another_are_refused() -> None:
+    with pytest.raises(ValueError, match="eval_env must be of multi_task_env, whose environments have a task_id"):
+        MultiTaskEvalCallback(make_vec_env(PENDULUM))
+    with pytest.raises(ValueError, match="env must be of multi_task_env"):
+        evaluate_tasks(ByTask(), DummyVecEnv([lambda: vec().envs[0]]))
+    with pytest.raises(ValueError, match="eval_freq must be an integer of at least 1, not 0"):
+        MultiTaskEvalCallback(tasks(), eval_freq=0)
+    with pytest.raises(ValueError, match="n_eval_episodes must be an integer of at least 1, not 0"):
+        evaluate_tasks(ByTask(), tasks(), n_eval_episodes=0)
+    with pytest.raises(ValueError, match="eval_env has the observation_space"):
+        sac(tasks(), policy="MultiInputPolicy").learn(2, callback=MultiTaskEvalCallback(tasks(PENDULUM)))
+    with pytest.raises(ValueError, match="DiagnosticsCallback measures models of one task, and this one has 2"):
+        sac(tasks(), policy="MultiInputPolicy").learn(2, callback=DiagnosticsCallback(vec()))
+
+
+# ---------------------------------------------------------------- the page and the program
+
+
+def test_the_pages_program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The code of docs/multi_task.md, with small numbers in the place of its own."""
+    pytest.importorskip("metaworld")
+    page = (ROOT / "docs" / "multi_task.md").read_text()
+    code = page.partition("```python\n")[2].partition("```")[0]
+    for theirs, ours in (
+        ("critic_width=512, batch_size=1024", "critic_width=8, batch_size=8, learning_starts=10, device='cpu'"),
+        ("100_000", "60"),
+        ("eval_freq=5_000", "eval_freq=4, n_eval_episodes=1, verbose=0"),
+        ('"MT10", seed', '"MT10", env_kwargs={"max_episode_steps": 2}, seed'),
+    ):
+        assert theirs in code
+        code = code.replace(theirs, ours)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(code, names)
+    assert names["model"]._n_updates > 0 and names["action"].shape == (4,)
+    assert study.read("runs/mt10")["task"].nunique() == 10
+
+
+def test_the_example(tmp_path: Path) -> None:
+    spec = importlib.util.spec_from_file_location("multi_task", ROOT / "examples" / "multi_task.py")
+    assert spec is not None and spec.loader is not None
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    given = f"--steps 20 --eval-every 10 --episodes 1 --critic-width 8 --batch-size 8 --folder {tmp_path} --tasks"
+    example.main([*given.split(), PENDULUM, CAR, "--random-steps", "5", "--max-episode-steps", "5"])
+    table = study.read(tmp_path / "seed_0" / "tasks", ["return"])
+    assert sorted(set(table["task"])) == [CAR, PENDULUM] and sorted(set(table["step"])) == [0, 10, 20]
+    model = BRC.load(tmp_path / "seed_0" / "final_model")
+    # Two for each step of both tasks after the random ones.
+    assert model._n_updates == 2 * 15 and model.learning_starts == 10
