@@ -10,38 +10,16 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
 
-import sb3_sample.envs  # noqa: F401  # registers the ids
+import sb3_sample
 from sb3_sample.exits import refuse
-from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.recording import record
-from sb3_sample.sac import (
-    BC,
-    BRO,
-    BROTD3,
-    DAC,
-    GPLSAC,
-    IQL,
-    OAC,
-    OPLSAC,
-    SAC,
-    SRSAC,
-    TD3BC,
-    TOPSAC,
-    VPLSAC,
-    BROFast,
-    RegularizedSAC,
-)
 from sb3_sample.saving.classes import path_of
 from sb3_sample.saving.container import PickledFile
 from sb3_sample.saving.model import class_of
 
-#: The algorithms whose models are recorded.
-_ALGORITHMS: tuple[Any, ...] = (
-    BC, BRO, BROTD3, DAC, GPLSAC, IQL, OAC, OPLSAC, SAC, SRSAC, TD3BC, TOPSAC, VPLSAC, BROFast, RegularizedSAC,
-    MBMAPPO, MBPOPPO, QMAPPO,
-)  # fmt: skip
 _SOURCE = "a folder or an id of Minari's, or an HDF5 file in D4RL's layout (.hdf5, .h5)"
 
 
@@ -102,7 +80,8 @@ def _run(args: argparse.Namespace) -> None:
 
 def _recorded(args: argparse.Namespace) -> Dataset:
     name = class_of(args.model)
-    cls = next((each for each in _ALGORITHMS if path_of(each) == name), None)
+    classes = [each for each in vars(sb3_sample).values() if isinstance(each, type) and issubclass(each, BaseAlgorithm)]
+    cls: Any = next((each for each in classes if path_of(each) == name), None)
     if cls is None:
         raise ValueError(f"model {args.model} is of {name}, none of this package's algorithms")
     model = cls.load(args.model, device="cpu")

@@ -364,6 +364,7 @@ def collect(root: Path, results: Path) -> None:
     import pandas as pd
 
     from sb3_sample import study
+    from sb3_sample.saving.training_state import processor
 
     for name in dict.fromkeys(name for name, _ in queue()):
         records = recorded(results, name)
@@ -389,17 +390,6 @@ def collect(root: Path, results: Path) -> None:
             results.mkdir(parents=True, exist_ok=True)
             study.write(pd.concat(tables, ignore_index=True), path)
             (results / f"{name}.json").write_text(json.dumps(records, indent=1) + "\n")
-
-
-def processor() -> str:
-    """
-    :return: model of this machine's processor
-    """
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
 
 
 def run(folder: str, name: str) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from sb3_sample import Dataset
 from sb3_sample.cli import main
-from tests.sac.common import sac
+from tests.sac.common import MAKERS, sac
 
 pytest.importorskip("minari", reason="needs the extra [offline]")
 
@@ -28,6 +28,14 @@ def test_record_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert facts["mean_return"] == pytest.approx(float(rows["rewards"].astype(float).sum()) / 2)
     main(["dataset", "info", str(tmp_path / "set")])
     assert "mean length            200.0" in capsys.readouterr().out
+
+
+def test_models_of_all_algorithms_are_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for maker in "CrossQ", "DebiasedRQ":
+        MAKERS[maker](env="Pendulum-v1").save(tmp_path / maker)
+        main(["dataset", "record", str(tmp_path / f"{maker}.zip"), str(tmp_path / f"{maker}-data"), "--env",
+              "Pendulum-v1", "--episodes", "1"])  # fmt: skip
+        assert "200 transitions of 1 episodes written to" in capsys.readouterr().out
 
 
 def test_convert(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -87,6 +87,9 @@ def why_not_compiled(learner: Any) -> str | None:
     if old is not None:
         return old
     if learner.device.type == "cpu":
+        moved = [p for each in learner.optimizers().values() for group in each.param_groups for p in group["params"]]
+        if any(p.dim() == 0 and p.dtype is torch.float64 for p in moved):
+            return "torch's compiled code loses changes of float64 numbers without axes on a CPU"
         from torch._inductor.cpp_builder import get_cpp_compiler
         from torch._inductor.exc import InvalidCxxCompiler
 

@@ -495,7 +495,7 @@ class Learner:
 
     @contextmanager
     def _updating(self) -> Iterator[None]:
-        """What :meth:`update` does around a gradient step."""
+        """Count, transform, draw and check around a gradient step, for :meth:`update`."""
         with self._random():
             if self._heard:
                 self.before_updates()

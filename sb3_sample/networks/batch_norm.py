@@ -5,7 +5,7 @@ from torch import nn
 
 from sb3_sample.kinds import ABOVE_0, Kind, check_value, is_number
 
-#: What an argument may be that is a share of the new batch in a running mean.
+#: Kind of an argument that is the share of the new batch in a running mean.
 MOMENTUM = Kind("lie in (0, 1]", lambda value: is_number(value) and 0 < value <= 1)
 
 

@@ -6,8 +6,8 @@ from torch import nn
 from sb3_sample.networks.batch_norm import BatchNorm
 from sb3_sample.networks.ensemble import Dense
 from sb3_sample.networks.initialization import linear
-from sb3_sample.networks.network import HiddenUnits, Network
-from sb3_sample.networks.unit_norm import UnitNorm, project_weights
+from sb3_sample.networks.unit_norm import UnitNorm
+from sb3_sample.networks.unit_norm_blocks import UnitNormBlocks
 
 
 class UnitBatchNorm(UnitNorm, BatchNorm):
@@ -72,17 +72,17 @@ class FlashBlock(nn.Module):
         super().__init__()
         self.dense1 = _dense(width, expansion * width, n_copies)
         self.norm1 = _norm(expansion * width, n_copies)
-        self.activation1 = nn.ReLU()
+        self.activation = nn.ReLU()
         self.dense2 = _dense(expansion * width, width, n_copies)
         self.norm2 = _norm(width, n_copies)
         self.activation2 = nn.ReLU()
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        h = self.activation1(self.norm1(self.dense1(x)))
+        h = self.activation(self.norm1(self.dense1(x)))
         return x + self.activation2(self.norm2(self.dense2(h)))
 
 
-class FlashNet(Network):
+class FlashNet(UnitNormBlocks):
     """
     FlashSAC's trunk (Holiday Robot 2026): batch norm of the input, a dense layer, residual blocks with inverted
     bottlenecks and batch norm, and an RMS norm. No biases but the head's. The units of all dense layers, of the head
@@ -133,19 +133,3 @@ class FlashNet(Network):
 
     def make_head(self, n_outputs: int, n_copies: int | None = None, gain: float | None = None) -> nn.Module:
         return _dense(self.out_features, n_outputs, n_copies, bias=True)
-
-    def project(self) -> None:
-        project_weights(self)
-
-    def hidden_units(self, head: Dense | None) -> list[HiddenUnits]:
-        """
-        The neurons are listed to be looked at, not to be recycled: fresh weights of ReDo's have another length.
-
-        :param head: the layer that reads the network's output; it plays no part here
-        :return: the hidden layer of each block
-        """
-        units = []
-        for k, block in enumerate(self.blocks):
-            assert isinstance(block, FlashBlock)
-            units.append(HiddenUnits(f"blocks.{k}.dense1", block.dense1, None, block.activation1, None))
-        return units

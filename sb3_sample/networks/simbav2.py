@@ -8,8 +8,7 @@ from torch import nn
 
 from sb3_sample.networks.ensemble import Dense
 from sb3_sample.networks.initialization import linear
-from sb3_sample.networks.network import HiddenUnits, Network
-from sb3_sample.networks.unit_norm import project_weights
+from sb3_sample.networks.unit_norm_blocks import UnitNormBlocks
 
 
 def on_sphere(x: torch.Tensor) -> torch.Tensor:
@@ -92,7 +91,7 @@ class HyperHead(nn.Module):
         return self.dense2(self.scaler(self.dense1(x)))
 
 
-class SimbaV2Net(Network):
+class SimbaV2Net(UnitNormBlocks):
     """
     SimbaV2's trunk: the input with a constant appended, on the sphere; a dense layer and a scaler, on the sphere;
     blocks that move on it. The units of every dense layer have input weights of length 1, which :meth:`project`
@@ -140,19 +139,3 @@ class SimbaV2Net(Network):
 
     def make_head(self, n_outputs: int, n_copies: int | None = None, gain: float | None = None) -> nn.Module:
         return HyperHead(self.out_features, n_outputs, n_copies)
-
-    def project(self) -> None:
-        project_weights(self)
-
-    def hidden_units(self, head: Dense | None) -> list[HiddenUnits]:
-        """
-        The neurons are listed to be looked at, not to be recycled: fresh weights of ReDo's have another length.
-
-        :param head: the layer that reads the network's output; it plays no part here
-        :return: the hidden layer of each block
-        """
-        units = []
-        for k, block in enumerate(self.blocks):
-            assert isinstance(block, HyperBlock)
-            units.append(HiddenUnits(f"blocks.{k}.dense1", block.dense1, None, block.activation, None))
-        return units

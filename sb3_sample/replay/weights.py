@@ -182,7 +182,7 @@ class DrawWeights:
         ordinal, priority, ready = arrays
         fits = 0 <= n_stored <= n_taken < 2**62 and n == min(n_taken, self.n_slots) and 0 <= size <= n
         fits = fits and 0 < most < math.inf and bool((ordinal >= -1).all() and (ordinal < n_stored).all())
-        # What is older than all slots is in no row any more.
+        # Slots older than all of the buffer are in no row any more.
         fits = fits and bool((ordinal[ready] >= max(n_stored - self.n_slots, 0)).all())
         if not fits or not (np.isfinite(priority).all() and (priority >= 0).all()) or ready[size:].any():
             raise ValueError("the weights of the replay buffer are not those of a replay buffer of this size")

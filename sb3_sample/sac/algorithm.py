@@ -20,24 +20,16 @@ from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_every, check_program, default_of
-from sb3_sample.console import say
 from sb3_sample.constructor import Given
 from sb3_sample.envs.no_environment import NoEnvironment
 from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, not_finite
 from sb3_sample.kinds import check_value, instance, integer
 from sb3_sample.learner.batch import SLOTS, Batch, Noise
-from sb3_sample.learner.execution import (
-    PAYS_FROM,
-    foreign_parts,
-    old_torch,
-    warn_not_compiled,
-    why_not_compiled,
-)
 from sb3_sample.replay.buffers import (
     ValidationDictReplayBuffer,
     ValidationReplayBuffer,
@@ -56,6 +48,7 @@ from sb3_sample.sac.model_learner import check_action_space
 from sb3_sample.sac.multi_task import is_multi_task, told_task
 from sb3_sample.sac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.sb3_names import SB3Names
+from sb3_sample.sac.update_schedule import UpdateSchedule
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
 from sb3_sample.saving.encoding import Lenient
 from sb3_sample.saving.kept import Kept
@@ -78,7 +71,7 @@ class GradientStepBar(ProgressBarCallback):
         return True
 
 
-class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]  # actor
+class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]  # actor
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
     SAC that the DAC, VPL and BRO papers and the regularization study (https://arxiv.org/abs/2403.00514) compare with:
@@ -518,108 +511,6 @@ class SAC(SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffP
 
     def _on_environment_reset(self) -> None:
         self.learner.on_environment_reset()
-
-    def _before_turns(self) -> None:
-        """
-        Plan the gradient steps of the first ``learn``, and decide, with ``compile="auto"`` once and for all, whether
-        the coming environment steps pay for compiling.
-        """
-        checks.check_one_reward_scale(self)
-        n_steps = self._total_timesteps - self.num_timesteps
-        if self.learning_rate_schedule is not None and self.planned_updates is None:
-            self.planned_updates = round(self._updates_in(n_steps)) or None
-            if self.planned_updates is None and n_steps > 0:
-                raise ValueError(
-                    f"schedule_steps must be given, as learning_rate_schedule={self.learning_rate_schedule!r} needs to "
-                    "know how many gradient steps are planned, and the arguments do not say it"
-                )
-        if self.compiled is not None:
-            return
-        n_of_warm_up = 0 if self._learns_from is not None else max(self.learning_starts - self.num_transitions, 0)
-        n_updates = self._updates_in(n_steps - n_of_warm_up)
-        # What keeps the step from being compiled is worth a warning only where it was asked for, but for an old torch,
-        # which is easily renewed.
-        foreign = foreign_parts(self.learner) if n_updates >= PAYS_FROM else []
-        if foreign and self.verbose >= 1:
-            verb = "does" if len(foreign) == 1 else "do"
-            say(f"The gradient step is not compiled: {', '.join(foreign)} {verb} not declare compilable = True")
-        pays = n_updates >= PAYS_FROM and not foreign
-        reason = why_not_compiled(self.learner) if pays else None
-        self.compiled = pays and reason is None
-        if reason is not None and reason == old_torch():
-            warn_not_compiled(self.learner, reason)
-        self.learner.forget_execution()
-
-    @property
-    def _tasks_together(self) -> int:
-        """Tasks that take a step together; 1 where a single environment has one after the other."""
-        return min(self.n_tasks, self.n_envs)
-
-    def _updates_in(self, n_steps: int) -> float:
-        """Gradient steps in as many environment steps after the warm-up; 0 where that is not known."""
-        if self._learns_from is not None:
-            return n_steps
-        if self.replay_ratio is not None:
-            return self.replay_ratio * n_steps / self._tasks_together
-        assert isinstance(self.train_freq, TrainFreq)
-        if self.gradient_steps < 0:
-            return n_steps
-        if self.train_freq.unit is TrainFrequencyUnit.EPISODE:
-            return 0  # How long episodes are is not known.
-        return self.gradient_steps * n_steps / (self.n_envs * self.train_freq.frequency)
-
-    def _after_turns(self) -> None:
-        """Say if nothing was learned for want of steps."""
-        wanted = self.gradient_steps if self.replay_ratio is None else self.replay_ratio
-        if self._n_updates > 0 or self.num_transitions == 0 or wanted == 0 or not self._is_warming_up():
-            return
-        assert self.replay_buffer is not None
-        warnings.warn(
-            f"learn ended without a single gradient step: learning_starts={self.learning_starts} transitions come "
-            f"before the first, and the replay buffer has {self.replay_buffer.size() * self.n_envs} of the "
-            f"{self.num_transitions} of this model's life. Train for more than {self.learning_starts} steps, or pass a "
-            "smaller learning_starts= to the constructor or to load (Stable-Baselines3's SAC has 100)",
-            stacklevel=4,
-        )
-
-    def _is_warming_up(self) -> bool:
-        """Whether there are too few transitions for a gradient step."""
-        assert self.replay_buffer is not None
-        if self._n_of_warm_up <= self.learning_starts:
-            return True
-        # A model that was loaded without its buffer fills it first, acting with what it has learned.
-        capacity = self.replay_buffer.buffer_size * self.n_envs
-        return self._n_in_buffer < min(self.learning_starts, capacity)
-
-    @property
-    def _n_of_warm_up(self) -> int:
-        """What ``learning_starts`` counts: transitions over the model's life."""
-        return self.num_transitions
-
-    @property
-    def _n_in_buffer(self) -> int:
-        """The same in the replay buffer."""
-        assert self.replay_buffer is not None
-        return self.replay_buffer.size() * self.n_envs
-
-    def _updates_due(self, n_collected: int) -> int:
-        """
-        :param n_collected: transitions just collected
-        :return: gradient steps to take now
-        """
-        if self._is_warming_up():
-            return 0
-        if isinstance(self.replay_buffer, ValidationSplit) and self.replay_buffer.n_training == 0:
-            return 0
-        if isinstance(self.replay_buffer, PrioritizedReplay) and self.replay_buffer.n_drawable == 0:
-            return 0
-        if self.replay_ratio is None:
-            return self.gradient_steps if self.gradient_steps >= 0 else n_collected
-        self._updates_owed += self.replay_ratio * n_collected / self._tasks_together
-        # The tolerance keeps 10 times 0.1 from falling short of 1 by rounding.
-        n_updates = int(self._updates_owed + 1e-6)
-        self._updates_owed -= n_updates
-        return n_updates
 
     def train(self, gradient_steps: int, batch_size: int | None = None) -> None:
         """

@@ -8,8 +8,10 @@ from sb3_sample.learner.categorical import VALUE_HEADS, CategoricalHead
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.learner.reward_scale import RewardScale
+from sb3_sample.sac import checks
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.multi_task import TaskEmbedding
+from sb3_sample.sac.policy_kwargs import with_weight_decay
 
 
 class BRC(SAC):
@@ -51,14 +53,8 @@ class BRC(SAC):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        described = sorted({"critic_network", "critic_network_kwargs"} & self.policy_kwargs.keys())
-        if described and self.critic_width is not None:
-            raise ValueError(
-                f"policy_kwargs describe the critics ({', '.join(described)}), and so does "
-                f"critic_width={self.critic_width!r}: pass critic_width=None"
-            )
-        if "weight_decay" in (self.policy_kwargs.get("optimizer_kwargs") or {}):
-            raise ValueError("weight_decay is an argument of the algorithm, not of policy_kwargs['optimizer_kwargs']")
+        checks.check_critics_described_once(self, "critic_width")
+        checks.check_weight_decay(self)
 
     def _full_value_head_kwargs(self) -> dict[str, Any]:
         kwargs: dict[str, Any] = super()._full_value_head_kwargs()
@@ -84,5 +80,4 @@ class BRC(SAC):
             kwargs["features_extractor_class"] = TaskEmbedding
             kwargs["features_extractor_kwargs"] = {"size": self.embedding_size}
             kwargs["share_features_extractor"] = True
-        kwargs["optimizer_kwargs"] = {**(kwargs.get("optimizer_kwargs") or {}), "weight_decay": self.weight_decay}
-        return kwargs
+        return with_weight_decay(kwargs, self.weight_decay)

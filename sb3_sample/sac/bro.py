@@ -12,6 +12,7 @@ from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.sac import checks
 from sb3_sample.sac.algorithm import SAC
+from sb3_sample.sac.policy_kwargs import with_weight_decay
 
 #: Critic sizes by their names in BRO, table 7 (parameters of all networks): residual blocks and width.
 MODEL_SIZES: dict[str, tuple[int, int]] = {
@@ -98,14 +99,8 @@ class BRO(SAC):
             checks.check_once("exploration_kwargs", self.exploration_kwargs, same)
         else:
             check_unused(self, OPTIMISTIC_SHIFT_SETTINGS, f"exploration={self.exploration!r}")
-        described = sorted({"critic_network", "critic_network_kwargs"} & self.policy_kwargs.keys())
-        if described and self.model_size is not None:
-            raise ValueError(
-                f"policy_kwargs describe the critics ({', '.join(described)}), and so does "
-                f"model_size={self.model_size!r}: pass model_size=None"
-            )
-        if "weight_decay" in (self.policy_kwargs.get("optimizer_kwargs") or {}):
-            raise ValueError("weight_decay is an argument of the algorithm, not of policy_kwargs['optimizer_kwargs']")
+        checks.check_critics_described_once(self, "model_size")
+        checks.check_weight_decay(self)
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         kwargs: dict[str, Any] = {
@@ -119,8 +114,7 @@ class BRO(SAC):
             kwargs["critic_network_kwargs"] = dict(
                 zip(("n_blocks", "width"), _model_size(self.model_size), strict=True)
             )
-        kwargs["optimizer_kwargs"] = {**(kwargs.get("optimizer_kwargs") or {}), "weight_decay": self.weight_decay}
-        return kwargs
+        return with_weight_decay(kwargs, self.weight_decay)
 
     def _full_exploration_kwargs(self) -> dict[str, Any]:
         kwargs = super()._full_exploration_kwargs()

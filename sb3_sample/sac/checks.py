@@ -60,7 +60,9 @@ def check(agent: Any) -> None:
     check_one_reward_scale(agent)
     _check_schedule(agent)
     _check_tasks(agent)
-    for name in ("n_quantiles", "n_outputs", "backbone", "normalize_observations", "width_factor"):
+    of_policy = ["n_quantiles", "n_outputs", "backbone", "normalize_observations", "width_factor"]
+    of_policy += ["n_critics"] if "n_critics" in type(agent).constructor_arguments else []
+    for name in of_policy:
         if name in agent.policy_kwargs:
             raise ValueError(f"{name} is an argument of the algorithm, not of policy_kwargs")
     if agent.backbone == "td3":
@@ -451,6 +453,42 @@ def check_rule(agent: Any) -> None:
             )
         if agent.action_noise is not None:
             raise ValueError("the segments of pessimism='opl' must be on-policy: leave action_noise out")
+
+
+def check_weight_decay(agent: Any) -> None:
+    """
+    :param agent: an algorithm with an argument ``weight_decay`` for all networks
+    :raises ValueError: if the policy's arguments have one too
+    """
+    if "weight_decay" in (agent.policy_kwargs.get("optimizer_kwargs") or {}):
+        raise ValueError("weight_decay is an argument of the algorithm, not of policy_kwargs['optimizer_kwargs']")
+
+
+def check_critics_described_once(agent: Any, name: str) -> None:
+    """
+    :param agent: an algorithm
+    :param name: its argument that describes the critics, unless it is None
+    :raises ValueError: if the policy's arguments describe them too
+    """
+    described = sorted({"critic_network", "critic_network_kwargs"} & agent.policy_kwargs.keys())
+    value = getattr(agent, name)
+    if described and value is not None:
+        raise ValueError(
+            f"policy_kwargs describe the critics ({', '.join(described)}), and so does {name}={value!r}: pass "
+            f"{name}=None"
+        )
+
+
+def check_batch_size(agent: Any) -> None:
+    """
+    :param agent: an algorithm whose actor takes the mean and variance of a batch
+    :raises ValueError: if a batch has one transition
+    """
+    if agent.batch_size < 2:
+        raise ValueError(
+            f"batch_size must be at least 2 with batch norm, which takes mean and variance of the batch, not "
+            f"{agent.batch_size}"
+        )
 
 
 def check_once(kwargs_name: str, kwargs: dict[str, Any] | None, arguments: dict[str, str]) -> None:

@@ -9,8 +9,9 @@ from sb3_sample.constructor import Given, argument
 from sb3_sample.kinds import AT_LEAST_0, TRUE_OR_FALSE
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.optim import AdamW
+from sb3_sample.sac import checks
 from sb3_sample.sac.algorithm import SAC
-from sb3_sample.sac.batch_normed import check_batch_size, with_networks
+from sb3_sample.sac.policy_kwargs import with_hidden_sizes, with_weight_decay
 
 
 class CrossQ(SAC):
@@ -74,9 +75,8 @@ class CrossQ(SAC):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_batch_size(self)
-        if "weight_decay" in (self.policy_kwargs.get("optimizer_kwargs") or {}):
-            raise ValueError("weight_decay is an argument of the algorithm, not of policy_kwargs['optimizer_kwargs']")
+        checks.check_batch_size(self)
+        checks.check_weight_decay(self)
         for who in ("critic", "actor"):
             if "weight_norm" in (self.policy_kwargs.get(f"{who}_network_kwargs") or {}):
                 raise ValueError(
@@ -94,9 +94,8 @@ class CrossQ(SAC):
         else:
             sizes, more = {"critic": (2048, 2048), "actor": (256, 256)}, {}
         bounds = {"log_std_min": -10.0 if self.weight_norm else -20.0, "clip_log_std": True}
-        kwargs = with_networks(kwargs, "crossq", sizes, more, bounds)
-        optimizer = {**(kwargs.get("optimizer_kwargs") or {}), "weight_decay": self.weight_decay}
+        kwargs = with_weight_decay(with_hidden_sizes(kwargs, "crossq", sizes, more, bounds), self.weight_decay)
         is_adam = kwargs.get("optimizer_class", AdamW) in (AdamW, torch.optim.Adam, torch.optim.AdamW)
         if is_adam and not self.weight_norm:
-            optimizer.setdefault("betas", (0.5, 0.999))
-        return {**kwargs, "optimizer_kwargs": optimizer}
+            kwargs["optimizer_kwargs"].setdefault("betas", (0.5, 0.999))
+        return kwargs

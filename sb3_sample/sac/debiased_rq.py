@@ -24,6 +24,7 @@ from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.embeddings import DebiasedRQCnnPolicy, DebiasedRQMultiInputPolicy, DebiasedRQPolicy, Encoder
 from sb3_sample.sac.model_learner import OfLearner
 from sb3_sample.sac.policies import SACPolicy
+from sb3_sample.sac.policy_kwargs import with_weight_decay
 
 _RANGE = Kind(
     "be two finite numbers, the smaller first",
@@ -162,8 +163,7 @@ class DebiasedRQ(SAC):
         noise = {name: name for name in _NOISE}
         checks.check_once("policy_kwargs['actor_kwargs']", self.policy_kwargs.get("actor_kwargs"), noise)
         checks.check_once("replay_buffer_kwargs", self.replay_buffer_kwargs, {"horizon": "encoder_horizon, or n_steps"})
-        if "weight_decay" in (self.policy_kwargs.get("optimizer_kwargs") or {}):
-            raise ValueError("weight_decay is an argument of the algorithm, not of policy_kwargs['optimizer_kwargs']")
+        checks.check_weight_decay(self)
 
     def _complete_arguments(self) -> None:
         super()._complete_arguments()
@@ -175,14 +175,9 @@ class DebiasedRQ(SAC):
         return max(self.encoder_horizon, self.n_steps)
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
-        kwargs = super()._full_policy_kwargs()
+        kwargs = with_weight_decay(super()._full_policy_kwargs(), self.weight_decay)
         noise = {name: getattr(self, name) for name in _NOISE}
-        decay = {"weight_decay": self.weight_decay}
-        return {
-            **kwargs,
-            "actor_kwargs": {**noise, **(kwargs.get("actor_kwargs") or {})},
-            "optimizer_kwargs": {**(kwargs.get("optimizer_kwargs") or {}), **decay},
-        }
+        return {**kwargs, "actor_kwargs": {**noise, **(kwargs.get("actor_kwargs") or {})}}
 
     def _make_head(self) -> ValueHead:
         return HuberHead() if self.n_quantiles is None and self.value_head is None else super()._make_head()

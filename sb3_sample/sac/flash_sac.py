@@ -12,6 +12,7 @@ from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.reward_scale import RewardScale
 from sb3_sample.sac.algorithm import SAC
+from sb3_sample.sac.policy_kwargs import with_networks
 
 #: Width and blocks of the published networks.
 _SIZES: dict[str, dict[str, Any]] = {
@@ -84,9 +85,4 @@ class FlashSAC(SAC):
         return {"average_critics": True, **kwargs} if cls is not None and issubclass(cls, CategoricalHead) else kwargs
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
-        kwargs: dict[str, Any] = super()._full_policy_kwargs()
-        for who, size in _SIZES.items():
-            kwargs.setdefault(f"{who}_network", "flash")
-            if kwargs[f"{who}_network"] == "flash":
-                kwargs[f"{who}_network_kwargs"] = {**size, **(kwargs.get(f"{who}_network_kwargs") or {})}
-        return kwargs
+        return with_networks(super()._full_policy_kwargs(), "flash", _SIZES)

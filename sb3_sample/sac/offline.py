@@ -5,7 +5,7 @@ from typing import Any
 from stable_baselines3.common.preprocessing import get_action_dim
 
 from sb3_sample.arguments import check_unused
-from sb3_sample.constructor import argument
+from sb3_sample.constructor import Given, argument
 from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, TRUE_OR_FALSE, number
 from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.objectives import ClonedValue, Cloning, ImplicitQ, Objective
@@ -27,7 +27,7 @@ class BC(SAC):
     deterministic: bool = argument(default=False, kind=TRUE_OR_FALSE)
     """whether the actor is deterministic"""
 
-    def _construct(self, given: dict[str, Any]) -> None:
+    def _construct(self, given: Given) -> None:
         if given["deterministic"] is True:
             given["backbone"] = "td3"
         super()._construct(given)

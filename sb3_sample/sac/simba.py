@@ -1,6 +1,5 @@
 """SimBa and SimbaV2."""
 
-from collections.abc import Sequence
 from typing import Any
 
 from stable_baselines3.common.type_aliases import Schedule
@@ -9,7 +8,15 @@ from sb3_sample.constructor import argument
 from sb3_sample.kinds import AT_LEAST_0, integer
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.reward_scale import RewardScale
+from sb3_sample.sac import checks
 from sb3_sample.sac.algorithm import SAC
+from sb3_sample.sac.policy_kwargs import with_networks, with_weight_decay
+
+#: Width and blocks of the published networks.
+_SIZES: dict[str, dict[str, Any]] = {
+    "critic": {"width": 512, "n_blocks": 2},
+    "actor": {"width": 128, "n_blocks": 1},
+}
 
 
 class SimBa(SAC):
@@ -41,17 +48,14 @@ class SimBa(SAC):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        _check_n_critics(self)
-        if "weight_decay" in (self.policy_kwargs.get("optimizer_kwargs") or {}):
-            raise ValueError("weight_decay is an argument of the algorithm, not of policy_kwargs['optimizer_kwargs']")
+        checks.check_weight_decay(self)
 
     def _n_critics(self) -> int:
         return self.n_critics
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
-        kwargs = _with_networks(super()._full_policy_kwargs(), "simba", self.n_critics)
-        kwargs["optimizer_kwargs"] = {**(kwargs.get("optimizer_kwargs") or {}), "weight_decay": self.weight_decay}
-        return kwargs
+        kwargs = {**super()._full_policy_kwargs(), "n_critics": self.n_critics}
+        return with_weight_decay(with_networks(kwargs, "simba", _SIZES), self.weight_decay)
 
 
 class SimbaV2(SAC):
@@ -93,34 +97,8 @@ class SimbaV2(SAC):
     """whether the networks read observations less their running mean, by their running standard deviation. The
     statistics are the policy's, and move while training only"""
 
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        _check_n_critics(self)
-
     def _n_critics(self) -> int:
         return self.n_critics
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
-        return _with_networks(super()._full_policy_kwargs(), "simbav2", self.n_critics)
-
-
-def _check_n_critics(agent: Any) -> None:
-    if "n_critics" in agent.policy_kwargs:
-        raise ValueError("n_critics is an argument of the algorithm, not of policy_kwargs")
-
-
-#: Width and blocks of the published networks.
-_SIZES: Sequence[tuple[str, dict[str, Any]]] = (
-    ("critic_network", {"width": 512, "n_blocks": 2}),
-    ("actor_network", {"width": 128, "n_blocks": 1}),
-)
-
-
-def _with_networks(kwargs: dict[str, Any], network: str, n_critics: int) -> dict[str, Any]:
-    """Arguments of the policy with networks of the published sizes where the user's say nothing else."""
-    kwargs["n_critics"] = n_critics
-    for who, size in _SIZES:
-        kwargs.setdefault(who, network)
-        if kwargs[who] == network:
-            kwargs[f"{who}_kwargs"] = {**size, **(kwargs.get(f"{who}_kwargs") or {})}
-    return kwargs
+        return with_networks({**super()._full_policy_kwargs(), "n_critics": self.n_critics}, "simbav2", _SIZES)

@@ -8,8 +8,9 @@ from sb3_sample.constructor import argument
 from sb3_sample.kinds import ABOVE_0, check_value, integer
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.reward_scale import RewardScale
+from sb3_sample.sac import checks
 from sb3_sample.sac.algorithm import SAC
-from sb3_sample.sac.batch_normed import check_batch_size, with_networks
+from sb3_sample.sac.policy_kwargs import with_hidden_sizes
 
 
 class XQC(SAC):
@@ -66,8 +67,8 @@ class XQC(SAC):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_batch_size(self)
+        checks.check_batch_size(self)
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         sizes = {"critic": (512,) * 4, "actor": (256,) * 4}
-        return with_networks(super()._full_policy_kwargs(), "xqc", sizes, {}, {"clip_log_std": True})
+        return with_hidden_sizes(super()._full_policy_kwargs(), "xqc", sizes, {}, {"clip_log_std": True})

@@ -76,11 +76,9 @@ def _factor(text: str) -> tuple[str, list[str]]:
     return name, names
 
 
-def add_sources(parser: argparse.ArgumentParser, pictures: bool = False, output: str = "") -> None:
+def add_runs(parser: argparse.ArgumentParser) -> None:
     """
-    :param parser: gets the runs that a command reads, and its output
-    :param pictures: whether the command draws
-    :param output: help of the output, where it is not a table or a picture
+    :param parser: gets the runs that a command reads
     """
     parser.add_argument(
         "sources",
@@ -89,6 +87,15 @@ def add_sources(parser: argparse.ArgumentParser, pictures: bool = False, output:
         help="folder of a study or with runs at any depth, or a table (.csv, .parquet) that the table command has "
         "written. A label names the agent",
     )
+
+
+def add_sources(parser: argparse.ArgumentParser, pictures: bool = False, output: str = "") -> None:
+    """
+    :param parser: gets the runs that a command reads, and its output
+    :param pictures: whether the command draws
+    :param output: help of the output, where it is not a table or a picture
+    """
+    add_runs(parser)
     parser.add_argument(
         "-p",
         "--published",
@@ -192,11 +199,11 @@ def refusing(command: str) -> Iterator[None]:
     """
     Errors of arguments, files and missing extras end the command with one line; warnings are a line each.
 
-    :param command: its name
+    :param command: its name, after ``sb3-sample``
     """
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        print(f"sb3-sample study {command}: {message}", file=sys.stderr)
+        print(f"sb3-sample {command}: {message}", file=sys.stderr)
 
     try:
         with warnings.catch_warnings():
@@ -204,7 +211,7 @@ def refusing(command: str) -> Iterator[None]:
             warnings.showwarning = show
             yield
     except (ValueError, ImportError, OSError) as error:
-        refuse(f"study {command}", error)
+        refuse(command, error)
 
 
 def markdown(table: pd.DataFrame) -> str:
@@ -265,7 +272,7 @@ def _add_table(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_table(options: argparse.Namespace) -> None:
-    with refusing("table"):
+    with refusing("study table"):
         table = _read(options, *options.metrics)
         runs = table.groupby([*tables.RUN, "metric"], sort=False, dropna=False)["step"].agg(["count", "max"])
         summary = (
@@ -301,7 +308,7 @@ def _add_aggregate(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_aggregate(options: argparse.Namespace) -> None:
-    with refusing("aggregate"):
+    with refusing("study aggregate"):
         if (options.improvement or options.profile) and (options.steps is None or len(options.steps) != 1):
             raise ValueError(f"steps must be one step for --improvement and --profile, not {options.steps}")
         if options.improvement and options.profile:
@@ -339,7 +346,7 @@ def _add_marginalize(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_marginalize(options: argparse.Namespace) -> None:
-    with refusing("marginalize"):
+    with refusing("study marginalize"):
         table = _read(options)
         factors = comparison(options.sources).factors if options.factors is None else dict(options.factors)
         shared = _shared(options, "by", "last", *_INTERVALS)
@@ -365,7 +372,7 @@ def _add_correlate(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_correlate(options: argparse.Namespace) -> None:
-    with refusing("correlate"):
+    with refusing("study correlate"):
         if options.regress and (
             options.by or options.groups or (options.output and options.output.suffix in _PICTURES)
         ):
@@ -396,7 +403,7 @@ def _add_heatmap(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_heatmap(options: argparse.Namespace) -> None:
-    with refusing("heatmap"):
+    with refusing("study heatmap"):
         table = _read(options, *([] if options.value == "score" else [options.value]))
         group = comparison(options.sources).groups.get(options.group, options.group)
         shared = _shared(options, "value", "step")
@@ -413,7 +420,7 @@ def _add_cost(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_cost(options: argparse.Namespace) -> None:
-    with refusing("cost"):
+    with refusing("study cost"):
         shared = _shared(options, "common", *_INTERVALS)
         table = _read(options)
         found = analysis.cost(table, options.steps, _groups(options, table), **shared)

@@ -1,4 +1,4 @@
-"""What a plan costs, before it is run: hours, by the step time of this machine, and bytes."""
+"""Costs of a plan before it is run: hours, by the step time of this machine, and bytes."""
 
 import dataclasses
 import json

@@ -21,7 +21,7 @@ from sb3_sample.saving.locks import Lock, take
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.study.plan import Comparison, Plan, Run
 
-#: What is in a study's folder: its runs, what is said of each, the list of them and the plan as it was read.
+#: Content of a study's folder: its runs, the outcome of each, the list of them and the plan as it was read.
 RUNS, STATE, LIST, PLAN = "runs", "state", "study.json", "plan.yml"
 _LOG = "progress.jsonl"
 #: Bytes of the list, of what is said of one run, and of the end of a log that is looked at.

@@ -126,7 +126,7 @@ def _signals() -> Iterator[None]:
 
 
 class Worker(Protocol):
-    """What makes one run at a time: a process of this machine, or a place in a cluster."""
+    """Maker of one run at a time: a process of this machine, or a place in a cluster."""
 
     #: The run that it makes at present.
     run: Run | None

@@ -1,4 +1,4 @@
-"""What is done, running, failed and waiting of a study, and how long the rest takes."""
+"""States of a study's runs (done, running, failed, waiting), and the time that the rest takes."""
 
 import datetime
 from collections.abc import Sequence

@@ -25,7 +25,7 @@ from sb3_sample.study.runs import Outcome, StudyFolder, checkpointed, this_proce
 
 #: Makes a run: the run, its folder, and options of ``sb3-sample train``.
 Train = Callable[[Run, Path, list[str]], None]
-#: What a process ends with that SIGTERM has ended in an orderly way.
+#: Exit code of a process that SIGTERM has ended in an orderly way.
 TERMINATED = 128 + signal.SIGTERM
 #: Answer of a process that has not made a run to its end: it is to be looked at again.
 TAKEN = {"taken": True}

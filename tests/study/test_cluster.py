@@ -16,23 +16,11 @@ pytest.importorskip("rl_zoo3")
 from sb3_sample import cli, study
 from sb3_sample.study import cluster, schedule
 from sb3_sample.study.runs import StudyFolder
-from tests.study import nothing
+from tests.study import nothing, test_kill
 from tests.study.test_kill import ROOT, outcome, settled
 
-PLAN = """\
-agents:
-  SAC:
-    algo: sac_sample
-    learning_starts: 50
-    buffer_size: 2000
-    replay_ratio: 0.5
-    policy_kwargs: {net_arch: [8]}
-tasks: [Pendulum-v1]
-seeds: [3, 4]
-steps: 2_500
-evaluation: {every: 500, episodes: 1}
-checkpoint_freq: 300
-"""
+#: Long enough that a machine is lost in the midst of it.
+PLAN = test_kill.PLAN.replace("steps: 1_500", "steps: 2_500")
 MEMORY = {"object_store_memory": 100_000_000}
 
 

@@ -8,7 +8,7 @@ from sb3_sample.plots import PUBLISHED
 from sb3_sample.saving.temporary import becoming
 from sb3_sample.study import table as tables
 from sb3_sample.study.aggregate import REPS, Groups, Scores, check_samples
-from sb3_sample.study.analysis_command import add_intervals, add_scores, refusing, steps_of
+from sb3_sample.study.analysis_command import add_intervals, add_runs, add_scores, refusing, steps_of
 from sb3_sample.study.reporting import html
 from sb3_sample.study.reporting import markdown as markdown_pages
 from sb3_sample.study.reporting.content import build
@@ -105,13 +105,7 @@ def _default_path(sources: Sequence[str]) -> Path:
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "sources",
-        nargs="*",
-        metavar="[LABEL=]FOLDER",
-        help="folder of a study or with runs at any depth, or a table (.csv, .parquet) that the table command has "
-        "written. A label names the agent",
-    )
+    add_runs(parser)
     parser.add_argument(
         "-o", "--output", type=Path, metavar="FILE.html", help="the page (default: report.html in FOLDER)"
     )
@@ -163,7 +157,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
-    with refusing("report"):
+    with refusing("study report"):
         output = options.output
         if output is None and options.markdown is None:
             output = _default_path(options.sources)

@@ -40,7 +40,7 @@ from sb3_sample.version import __version__
 UNFOLDED = 12
 #: Letters of an agent's name in a pair.
 PAIR = 12
-#: What checkpoints were made with, in the order of the table.
+#: Circumstances of checkpoints, in the order of the table.
 _MADE_WITH = (
     "sb3_sample", "commit", "torch", "stable_baselines3", "gymnasium", "mujoco", "numpy", "python", "processor",
     "device", "threads", "torch threads",

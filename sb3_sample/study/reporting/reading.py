@@ -168,7 +168,7 @@ def made_with(folder: Path) -> dict[str, str]:
 
 
 def _recorded(path: Path) -> list[dict[str, str]]:
-    """What the runs of a table were made with, by the file beside it that ``studies/evidence.py`` writes."""
+    """Versions and machines of a table's runs, by the file beside it that ``studies/evidence.py`` writes."""
     if not path.is_file():
         return []
     try:

@@ -68,7 +68,7 @@ def _result(facts: Facts) -> list[str]:
 
 
 def _verdict(x: str, y: str, chance: Interval) -> list[str]:
-    """What the probability of improvement says of the two agents with the highest averages."""
+    """Probability of improvement, in words, of the two agents with the highest averages."""
     why = f"A run of {x} beats one of {y} on the same task with probability {interval_text(chance)}."
     if math.isnan(chance.low):
         return [f"{x} is ahead of {y}, without certainty.", why]

@@ -3,17 +3,13 @@
 import argparse
 import json
 import math
-import sys
-import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
-from sb3_sample.exits import refuse
 from sb3_sample.study import table as tables
-from sb3_sample.study.analysis_command import add_scores, add_sources, markdown
+from sb3_sample.study.analysis_command import add_scores, add_sources, markdown, refusing
 from sb3_sample.study.plan import read_plan
 from sb3_sample.study.scaling import figures
 from sb3_sample.study.scaling.budget import DELTA
@@ -37,17 +33,8 @@ def main(argv: Sequence[str]) -> None:
     for name, (words, add, _) in COMMANDS.items():
         add(commands.add_parser(name, help=words, description=f"{words[0].upper()}{words[1:]}."))
     options = parser.parse_args(argv)
-
-    def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        print(f"sb3-sample scaling {options.command}: {message}", file=sys.stderr)
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("always", UserWarning)
-            warnings.showwarning = show
-            COMMANDS[options.command][2](options)
-    except (ValueError, ImportError, OSError) as error:
-        refuse(f"scaling {options.command}", error)
+    with refusing(f"scaling {options.command}"):
+        COMMANDS[options.command][2](options)
 
 
 # ---------------------------------------------------------------- plan

@@ -18,7 +18,7 @@ from sb3_sample.study.scaling.result import Laws
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: What figure 4 is made of: values by replay ratio, one line for each value of an argument.
+#: Data of figure 4: values by replay ratio, one line for each value of an argument.
 _LOGGED = {"batch_size": "diagnostics/overfitting", "learning_rate": "diagnostics/parameter_norm_critic"}
 
 
