@@ -266,6 +266,13 @@ class Dataset:
         return int((self._steps.terminations | self._steps.truncations).sum())
 
     @property
+    def return_range(self) -> float:
+        """Largest less smallest undiscounted return of the episodes, those that are cut off included."""
+        rewards = _numpy(self._steps.rewards).astype(np.float64)
+        returns = [rewards[rows].sum() for rows in self.episodes()]
+        return float(max(returns) - min(returns))
+
+    @property
     def fingerprint(self) -> str:
         """SHA-256 of the transitions, whatever the data set was made of; of their numbers, not of the spaces."""
         if not self._fingerprint:

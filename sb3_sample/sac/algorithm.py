@@ -166,6 +166,8 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
             self._take_prior_data(self.prior_data)
         self._source: ReplaySource | DatasetSource = ReplaySource(self)
         self.learner = self._make_learner(networks=self.policy, counts=self)
+        if self.prior_data is not None:
+            self._tell_of(self.prior_data)
         checks.check_rule(self)
         self._plain_attributes = plain_attributes(self)
         self._watch = MetricWatch(self.device)
@@ -180,6 +182,11 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
                 stacklevel=6,
             )
         self._prior_of = now
+
+    def _tell_of(self, data: Dataset) -> None:
+        """Tell the rule that scales rewards, if any, of a data set."""
+        if self.learner.reward_scaler is not None:
+            self.learner.reward_scaler.on_dataset(data.return_range)
 
     def _check_arguments(self) -> None:
         checks.check(self)
@@ -437,6 +444,7 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
         checks.check_dataset("dataset", dataset, self.observation_space, self.action_space)
         env, source = self.env, self._source
         checks.check_offline(self)
+        self._tell_of(dataset)
         data = DatasetSource(self, dataset)
         self._learns_from, self._source = dataset, data
         norm = self.learner.observation_norm

@@ -193,7 +193,7 @@ class SACArguments(Resumable):
         default=None, kind=one_of(REWARD_SCALES, RewardScale).or_none("rewards as they are")
     )
     """rule by which rewards are divided by a running measure of the return: "simbav2", "xqc", "flashsac", "brc", or a
-    class derived from ``RewardScale``"""
+    class derived from ``RewardScale``; or "linear": rewards times a factor, plus a number"""
     reward_scale_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
     """its arguments"""
     normalize_observations: bool = argument(default=False, kind=TRUE_OR_FALSE)

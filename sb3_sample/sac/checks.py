@@ -18,6 +18,7 @@ from sb3_sample.kinds import (
 )
 from sb3_sample.learner.exploration import EXPLORATIONS
 from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
+from sb3_sample.learner.reward_scale import LinearScale
 from sb3_sample.replay.buffers import DeviceReplayBuffer, ValidationSplit
 from sb3_sample.replay.columns import has_own_columns
 from sb3_sample.replay.compact import CompactReplay
@@ -58,6 +59,12 @@ def check(agent: Any) -> None:
     if agent.reward_scale is None:
         check_unused(agent, ["reward_scale_kwargs"], "reward_scale=None")
     check_one_reward_scale(agent)
+    shift = (agent.reward_scale_kwargs or {}).get("shift", 0)
+    if agent.reward_scale == "linear" and shift != 0 and agent.n_steps > 1:
+        raise ValueError(
+            f"shift={shift} of reward_scale_kwargs would be added once to the returns of "
+            f"n_steps={agent.n_steps} steps: pass n_steps=1, or no shift"
+        )
     _check_schedule(agent)
     _check_tasks(agent)
     of_policy = ["n_quantiles", "n_outputs", "backbone", "normalize_observations", "width_factor"]
@@ -126,10 +133,11 @@ def check_offline(agent: Any) -> None:
     :param agent: the algorithm
     :raises ValueError: if it asks for steps of an environment
     """
-    if agent.reward_scale is not None:
+    scaler = agent.learner.reward_scaler
+    if scaler is not None and scaler.needs_steps:
         raise ValueError(
             f"reward_scale={agent.reward_scale!r} divides by a measure of returns in an environment, and learn_offline "
-            "takes no steps there: pass reward_scale=None, and rewards of a size that suits the critics"
+            "takes no steps there: pass reward_scale=None, or 'linear' for rewards of a size that suits the critics"
         )
 
 
@@ -197,6 +205,21 @@ def check_one_reward_scale(agent: Any) -> None:
         raise ValueError(
             f"reward_scale={agent.reward_scale!r} scales rewards, and so does the VecNormalize of env: pass it "
             "norm_reward=False, or the model reward_scale=None"
+        )
+
+
+def check_scale_is_known(agent: Any) -> None:
+    """
+    Check that rewards can be scaled.
+
+    :param agent: an algorithm that is about to learn
+    :raises ValueError: if their scale is to follow from a data set that there has not been
+    """
+    scaler = agent.learner.reward_scaler
+    if isinstance(scaler, LinearScale) and scaler.waits_for_data:
+        raise ValueError(
+            f"return_range={scaler.return_range} of reward_scale_kwargs is that of a data set: call learn_offline "
+            "first, or pass prior_data=, or factor in its place"
         )
 
 

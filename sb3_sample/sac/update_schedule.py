@@ -27,6 +27,7 @@ class UpdateSchedule:
         the coming environment steps pay for compiling.
         """
         checks.check_one_reward_scale(self)
+        checks.check_scale_is_known(self)
         n_steps = self._total_timesteps - self.num_timesteps
         if self.learning_rate_schedule is not None and self.planned_updates is None:
             self.planned_updates = round(self._updates_in(n_steps)) or None

@@ -384,6 +384,38 @@ def test_rewards_scaled_by_returns_of_an_environment_are_refused(maker: str) -> 
         MAKERS[maker]().learn_offline(data(), 1)
 
 
+@pytest.mark.parametrize("kwargs", [{"shift": -1.0}, {"factor": 4.0}, {"return_range": 1_000.0, "shift": 0.5}])
+def test_rewards_scaled_as_iql_does(kwargs: dict[str, Any], tmp_path: Path) -> None:
+    transitions = data()
+    model = offline(IQL, vec(), reward_scale="linear", reward_scale_kwargs=kwargs)
+    assert model.learn_offline(transitions, 2).num_timesteps == 2
+    rewards, episodes = transitions.plain(slice(None))["rewards"], transitions.episodes()
+    returns = [float(rewards[rows].astype(float).sum()) for rows in episodes]
+    assert len(returns) > 10
+    factor = kwargs.get("factor", 1.0)
+    if "return_range" in kwargs:
+        factor = 1_000.0 / (max(returns) - min(returns))
+    batch = transitions.take(torch.arange(5))
+    scaled = model.learner.reward_scaler.transform(batch, None).rewards
+    np.testing.assert_allclose(scaled[:, 0], rewards[:5] * factor + kwargs.get("shift", 0.0), rtol=1e-5, atol=1e-5)
+    # The scale stays that of the first data set, in files and with others too.
+    model.save(tmp_path / "m")
+    again = IQL.load(tmp_path / "m", env=vec()).learn_offline(data(seed=7), 1)
+    np.testing.assert_array_equal(again.learner.reward_scaler.transform(batch, None).rewards, scaled)
+    assert again.learn(12)._n_updates > 3
+
+
+def test_a_range_of_returns_needs_data() -> None:
+    kwargs: dict[str, Any] = {"reward_scale": "linear", "reward_scale_kwargs": {"return_range": 1_000.0}}
+    with pytest.raises(ValueError, match="return_range=1000.0 of reward_scale_kwargs is that of a data set: call"):
+        offline(IQL, vec(), **kwargs).learn(12)
+    assert offline(SAC, vec(), prior_data=data(), **kwargs).learn(12)._n_updates > 0
+    ends = np.ones(4)
+    same = Dataset.from_arrays(np.eye(4, 3), np.zeros((4, 2)), ends, ends, ends * 0)
+    with pytest.raises(ValueError, match="whose episodes all have the same return: pass factor"):
+        offline(IQL, vec(), **kwargs).learn_offline(same, 1)
+
+
 def test_an_agent_that_learns_from_windows_is_refused() -> None:
     with pytest.raises(ValueError, match="learn_offline: DebiasedRQ learns from windows of several steps"):
         MAKERS["DebiasedRQ"]().learn_offline(data(), 1)
