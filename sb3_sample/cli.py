@@ -85,9 +85,9 @@ def _train(arguments: list[str]) -> None:
 
     options, rest = _own_options(runs.train_parser(), arguments)
     with _arguments("train"), _errors("train"), reading(options.allow_pickle, options.trusted_modules):
-        start = runs.plan(options, rest)
+        data, start = runs.Data.of(options), runs.plan(options, rest)
         _set_command_line("train", rest if start is None else start.arguments)
-        runs.train(start)
+        runs.train(start, data)
 
 
 def _enjoy(arguments: list[str]) -> None:

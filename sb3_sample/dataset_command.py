@@ -15,6 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 import sb3_sample
 from sb3_sample.exits import refuse
 from sb3_sample.replay.dataset import Dataset
+from sb3_sample.replay.reading import HDF5, read_dataset
 from sb3_sample.replay.recording import record
 from sb3_sample.saving.classes import path_of
 from sb3_sample.saving.container import PickledFile
@@ -90,16 +91,9 @@ def _recorded(args: argparse.Namespace) -> Dataset:
 
 
 def _read(args: argparse.Namespace) -> Dataset:
-    if Path(args.source).suffix not in (".hdf5", ".h5"):
-        if args.env is not None:
-            raise ValueError(f"env={args.env!r} is for HDF5 files, which have no spaces: leave it out")
-        return Dataset.from_minari(args.source, memory_map=args.memory_map)
-    found: dict[str, Any] = {}
-    if args.env is not None:
-        env = gym.make(args.env)
-        found = {"observation_space": env.observation_space, "action_space": env.action_space}
-        env.close()
-    return Dataset.from_hdf5(args.source, memory_map=args.memory_map, **found)
+    if args.env is not None and Path(args.source).suffix not in HDF5:
+        raise ValueError(f"env={args.env!r} is for HDF5 files, which have no spaces: leave it out")
+    return read_dataset(args.source, args.env, memory_map=args.memory_map)
 
 
 def facts_of(data: Dataset) -> dict[str, Any]:

@@ -38,7 +38,7 @@ def test_models_of_all_algorithms_are_recorded(tmp_path: Path, capsys: pytest.Ca
         assert "200 transitions of 1 episodes written to" in capsys.readouterr().out
 
 
-def test_convert(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_convert(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     h5py = pytest.importorskip("h5py")
     n, zeros = 12, np.zeros(12, bool)
     ends = zeros.copy()
@@ -50,9 +50,11 @@ def test_convert(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
             "rewards": np.arange(n, dtype=np.float32), "terminals": ends, "timeouts": zeros,
         }.items():  # fmt: skip
             file[name] = values
-    main(["dataset", "convert", str(tmp_path / "old.hdf5"), str(tmp_path / "new"), "--env", "Pendulum-v1"])
+    monkeypatch.chdir(tmp_path)
+    main(["dataset", "convert", "old.hdf5", "sets/new", "--env", "Pendulum-v1"])
     assert "11 transitions of 2 episodes written to" in capsys.readouterr().out
-    rows = Dataset.from_minari(tmp_path / "new").rows(slice(None))
+    rows = Dataset.from_minari("sets/new").rows(slice(None))
+    assert Dataset.from_minari(tmp_path / "sets" / "new").fingerprint == Dataset.from_minari("sets/new").fingerprint
     assert rows["rewards"].tolist() == list(range(11)) and rows["actions"].ravel().tolist() == [1.5] * 11
     assert np.flatnonzero(rows["terminations"]).tolist() == [5]
 

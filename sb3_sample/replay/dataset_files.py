@@ -161,7 +161,7 @@ def _layout(space: spaces.Space, folder: Path) -> dict[str, tuple[tuple[int, ...
 
 def _found(id_or_path: Any, minari: Any) -> Path:
     """The folder with the data of a data set."""
-    tried = [Path(id_or_path).expanduser()]
+    tried = [Path(id_or_path).expanduser().absolute()]
     if _is_id(id_or_path):
         tried.append(Path(minari.storage.get_dataset_path(id_or_path)))
     for folder in (inside for each in tried for inside in (each, each / "data")):
@@ -186,7 +186,8 @@ def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> None:
     if _is_id(id_or_path):
         name, folder = str(id_or_path), Path(minari.storage.get_dataset_path(id_or_path)) / "data"
     else:
-        folder = Path(id_or_path).expanduser() / "data"
+        # Minari looks for its files below a relative folder once more below that folder.
+        folder = Path(id_or_path).expanduser().absolute() / "data"
         name = re.sub(r"[^\w-]", "-", folder.parent.name)
         name = name if _is_id(name) else f"{name}-v0"
     if folder.exists():

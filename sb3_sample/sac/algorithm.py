@@ -91,6 +91,8 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
         "MultiInputPolicy": MultiInputPolicy,
     }
     policy_base: ClassVar[type[SACPolicy]] = SACPolicy
+    #: Whether there is ``learn_offline`` only.
+    learns_from_data_only: ClassVar[bool] = False
     _kept: ClassVar[dict[str, Kept]] = {
         # Saved by its parts.
         "_learner": Kept.NOWHERE,

@@ -1,6 +1,6 @@
 """Agents that learn from data sets: BC, IQL, TD3+BC."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 from stable_baselines3.common.preprocessing import get_action_dim
 
@@ -24,6 +24,7 @@ class BC(SAC):
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
+    learns_from_data_only: ClassVar[bool] = True
     deterministic: bool = argument(default=False, kind=TRUE_OR_FALSE)
     """whether the actor is deterministic"""
 

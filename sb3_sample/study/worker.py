@@ -50,7 +50,7 @@ def train(run: Run, folder: Path, options: list[str]) -> None:
         start = runs.plan(given, rest)
         assert start is not None
         sys.argv = ["sb3-sample train", *start.arguments]
-        runs.train(start)
+        runs.train(start, runs.Data.of(given))
 
 
 def serve(make: Train = train) -> None:
