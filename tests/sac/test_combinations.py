@@ -194,6 +194,13 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
     "`reward_scale_kwargs` without `reward_scale`": [
         (SAC, {"reward_scale_kwargs": {"max_return": 1}}, ("reward_scale_kwargs", "reward_scale=None")),
     ],
+    '`shift` of `reward_scale="linear"` with `n_steps` above 1': [
+        (
+            SAC,
+            {"reward_scale": "linear", "reward_scale_kwargs": {"shift": -1}, "n_steps": 3},
+            ("shift=-1", "n_steps=3"),
+        ),
+    ],
     "`reward_scale` with `VecNormalize(norm_reward=True)`": [
         (SAC, {"reward_scale": "xqc", "env": VecNormalize(vec())}, ("reward_scale='xqc'", "norm_reward=False")),
     ],
