@@ -30,6 +30,7 @@ from sb3_sample.envs.no_environment import NoEnvironment
 from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, not_finite
 from sb3_sample.kinds import check_value, instance, integer
 from sb3_sample.learner.batch import SLOTS, Batch, Noise
+from sb3_sample.learner.learner import Learner
 from sb3_sample.replay.buffers import (
     ValidationDictReplayBuffer,
     ValidationReplayBuffer,
@@ -42,6 +43,7 @@ from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.sources import DatasetSource, ReplaySource
 from sb3_sample.replay.weighted import PrioritizedReplay
 from sb3_sample.sac import checks
+from sb3_sample.sac.apart import ActsApart, Apart
 from sb3_sample.sac.arguments import SACArguments
 from sb3_sample.sac.metrics_log import MetricsLog
 from sb3_sample.sac.model_learner import check_action_space
@@ -71,7 +73,9 @@ class GradientStepBar(ProgressBarCallback):
         return True
 
 
-class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]  # actor
+class SAC(  # type: ignore[misc]  # actor
+    ActsApart, UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
+):
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
     SAC that the DAC, VPL and BRO papers and the regularization study (https://arxiv.org/abs/2403.00514) compare with:
@@ -100,6 +104,9 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
         # Files name it by its fingerprint.
         "prior_data": Kept.NOWHERE,
         "_learns_from": Kept.NOWHERE,
+        # Of the present ``learn``.
+        "_apart": Kept.NOWHERE,
+        "_acts_at": Kept.NOWHERE,
         # Attributes of Stable-Baselines3's, and arguments only of a model without an environment.
         "observation_space": Kept.EVERYWHERE,
         "action_space": Kept.EVERYWHERE,
@@ -144,6 +151,9 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
         self._n_offline_updates = 0
         # The data set of a ``learn_offline`` under way, and what a file names of the prior data.
         self._learns_from: Dataset | None = None
+        # Whether a ``learn`` under way acts in a thread of its own, and how often a second; and that thread.
+        self._acts_at: tuple[bool, float | None] = (False, None)
+        self._apart: Apart | None = None
         self._prior_of: dict[str, Any] | None = None
         #: Gradient steps planned, for ``learning_rate_schedule``; None while they are not known.
         self.planned_updates: int | None = self.schedule_steps
@@ -299,23 +309,40 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        assert isinstance(self.action_space, spaces.Box)
         self.learner.on_observations(self._last_obs)
-        # What has learned from data acts by it from the beginning.
-        if self._n_of_warm_up < learning_starts and self._n_offline_updates == 0:
+        # A model that has learned from data acts by it from the beginning.
+        at_random = self._n_of_warm_up < learning_starts and self._n_offline_updates == 0
+        unscaled, scaled = self._choose(self.learner, self._last_obs, at_random, n_envs)
+        if action_noise is None:
+            return unscaled, scaled
+        scaled = np.clip(scaled + action_noise(), -1, 1)
+        return self.policy.unscale_action(scaled), scaled
+
+    def _choose(
+        self, learner: Learner, observations: Any, at_random: bool, n_envs: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Choose the actions of a step in training.
+
+        :param learner: whose networks act
+        :param observations: of all environments
+        :param at_random: whether the actions are uniformly random
+        :param n_envs: number of environments
+        :return: actions in the environment's units and in [-1, 1], (n_envs, A) each
+        """
+        assert isinstance(self.action_space, spaces.Box)
+        if at_random:
             unscaled = np.array([self.action_space.sample() for _ in range(n_envs)])
             scaled = self.policy.scale_action(unscaled)
         else:
-            assert self._last_obs is not None
+            assert observations is not None
             with torch.inference_mode():
-                observations, _ = self.policy.obs_to_tensor(self._last_obs)
-                actions = self.learner.explore(observations)
+                tensors, _ = self.policy.obs_to_tensor(observations)
+                actions = learner.explore(tensors)
             scaled = actions.cpu().numpy().reshape((n_envs, *self.action_space.shape))
             if not np.isfinite(scaled).all():
                 check_finite_parameters(self)
                 raise diverged(self, not_finite({"the policy's action": scaled.sum()}))
-        if action_noise is not None:
-            scaled = np.clip(scaled + action_noise(), -1, 1)
         return self.policy.unscale_action(scaled), scaled
 
     def _store_transition(
@@ -355,6 +382,8 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
         progress_bar: bool = False,
         checkpoint: str | pathlib.Path | None = None,
         checkpoint_freq: int = CHECKPOINT_FREQ,
+        asynchronous: bool = False,
+        control_frequency: float | None = None,
     ) -> Self:
         """
         Train, as in Stable-Baselines3; with ``checkpoint``, so that nothing is lost when the program ends before it is
@@ -369,6 +398,10 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
         :param checkpoint: folder of the run; None for no checkpoints. Each call of ``learn`` needs a folder of its own
         :param checkpoint_freq: environment steps between two checkpoints
+        :param asynchronous: whether a thread acts while gradient steps are taken, up to the replay ratio, for robots
+            and other environments that take their time (docs/asynchronous.md). The result is then not the same bit by
+            bit
+        :param control_frequency: steps a second of that thread; None: at the environment's own pace
         :return: the trained model
         :raises ValueError: if an argument is out of range, or the folder is of another run (the message names what
             differs) or of an earlier call of ``learn``, cannot be used, or has checkpoints that are all damaged
@@ -379,16 +412,17 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
                 f"prior_data: this model learned with {checks.prior_words(self._prior_of)}, which its file does not "
                 "hold: pass prior_data= to load, or prior_data=None to go on without"
             )
-        return self._learn(
-            total_timesteps,
-            callback,
-            log_interval,
-            tb_log_name,
-            reset_num_timesteps,
-            progress_bar,
-            checkpoint,
-            checkpoint_freq,
-        )
+        with self._acting(asynchronous, control_frequency):
+            return self._learn(
+                total_timesteps,
+                callback,
+                log_interval,
+                tb_log_name,
+                reset_num_timesteps,
+                progress_bar,
+                checkpoint,
+                checkpoint_freq,
+            )
 
     def learn_offline(
         self: Self,
@@ -490,6 +524,8 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
     def _turn(self, callback: BaseCallback, log_interval: int) -> bool:
         if self._learns_from is not None:
             return self._offline_turn(callback, log_interval)
+        if self._acts_at[0]:
+            return self._turn_apart(callback, log_interval)
         assert self.env is not None and self.replay_buffer is not None
         rollout = self.collect_rollouts(
             self.env,

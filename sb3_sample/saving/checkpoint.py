@@ -358,6 +358,16 @@ class Checkpointer:
 
     # ---------------------------------------------------------------- saving
 
+    def is_due(self) -> bool:
+        """
+        :return: whether a checkpoint is to be made after the turn
+        """
+        if self._folder is None:
+            return False
+        assert self._interrupts is not None and self._held is not None
+        due = self._model.num_timesteps // self._every > self._period
+        return due or self._interrupts.received is not None or self._held.has_raised()
+
     def after_turn(self) -> None:
         """
         Save if it is time to, or leave if the process was asked to.

@@ -167,6 +167,8 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
             while self.num_timesteps < total_timesteps:
                 if not self._turn(checkpointer.callback, log_interval):
                     break
+                if checkpointer.is_due() and not self._rest(checkpointer.callback, log_interval):
+                    break
                 checkpointer.after_turn()
             else:
                 self._after_turns()
@@ -211,6 +213,16 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
         :return: False if the callback ended the training, in which case nothing is learned
         """
         raise NotImplementedError
+
+    def _rest(self, callback: BaseCallback, log_interval: int) -> bool:
+        """
+        Bring to an end whatever goes on beside the turns, before a checkpoint.
+
+        :param callback: as in :meth:`_turn`
+        :param log_interval: as in :meth:`_turn`
+        :return: False if the callback ended the training
+        """
+        return True
 
     def _after_turns(self) -> None:
         """Finish a training that no callback has ended."""
