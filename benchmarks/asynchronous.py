@@ -3,10 +3,11 @@ Acting beside learning: an environment whose step blocks for 30 ms, at 20 Hz, wi
 
     OMP_NUM_THREADS=1 python benchmarks/asynchronous.py [--seconds 60]
 
-Three trainings: the learner alone (an environment without delay, as many gradient steps as it can take), acting in a
-thread of its own (``learn(asynchronous=True, control_frequency=20)``), and one after the other. For the two with the
-environment: by how much its steps begin after the periods of 50 ms, and how many periods have none; gradient steps a
-second in all three. The first seconds, in which the gradient step is compiled, are not counted.
+First a program that only sleeps until each period begins, which is as punctual as the machine lets it be. Then three
+trainings: the learner alone (an environment without delay, as many gradient steps as it can take), acting in a thread
+of its own (``learn(asynchronous=True, control_frequency=20)``), and one after the other. By how much steps begin after
+the periods of 50 ms, and how many periods have none; gradient steps a second. The first seconds, in which the gradient
+step is compiled, are not counted.
 """
 
 import argparse
@@ -67,6 +68,28 @@ class Stop(BaseCallback):
         return self.lasted < self.seconds
 
 
+def lateness(periods: np.ndarray) -> dict[str, float]:
+    """
+    :param periods: when steps began, in periods since the first
+    :return: by how much they were late
+    """
+    late = 1_000 * PERIOD * (periods - np.floor(periods + 1e-4))
+    return {f"late_ms_{q}": float(np.percentile(late, q)) for q in (50, 99)}
+
+
+def bare(seconds: float) -> dict[str, float]:
+    """
+    :param seconds: how long
+    :return: how late a program begins its periods that does nothing else
+    """
+    begin, starts = time.perf_counter(), []
+    for number in range(int(seconds / PERIOD)):
+        time.sleep(max(begin + number * PERIOD - time.perf_counter(), 0.0))
+        starts.append(time.perf_counter() - begin)
+        time.sleep(STEP)
+    return lateness(np.array(starts) / PERIOD)
+
+
 def measure(kind: str, seconds: float, compile: bool) -> dict[str, float]:
     """
     :param kind: "alone", "asynchronous" or "synchronous"
@@ -89,8 +112,7 @@ def measure(kind: str, seconds: float, compile: bool) -> dict[str, float]:
         found["steps_per_second"] = len(starts) / (starts[-1] - starts[0])
         # The raster is that of the first step of the training.
         periods = (starts - env.starts[0]) / PERIOD
-        late = 1_000 * PERIOD * (periods - np.floor(periods + 1e-4))
-        found["late_ms_median"], found["late_ms_99"] = (float(np.percentile(late, q)) for q in (50, 99))
+        found |= lateness(periods)
         every = math.floor(periods[-1] + 1e-4) - math.floor(periods[0] + 1e-4) + 1
         found["missed_share"] = 1 - len(np.unique(np.floor(periods + 1e-4))) / every
     return found
@@ -101,11 +123,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=60, help="of each training (60)")
     parser.add_argument("--no-compile", action="store_true", help="gradient steps as PyTorch takes them")
-    parser.add_argument("--rounds", type=int, default=1, help="how often all three (1)")
+    parser.add_argument("--rounds", type=int, default=1, help="how often all of them (1)")
     options = parser.parse_args()
     for _ in range(options.rounds):
-        for kind in ("alone", "asynchronous", "synchronous"):
-            found = measure(kind, options.seconds, not options.no_compile)
+        for kind in ("bare", "alone", "asynchronous", "synchronous"):
+            found = bare(options.seconds) if kind == "bare" else measure(kind, options.seconds, not options.no_compile)
             print(json.dumps({"kind": kind, **{name: round(value, 3) for name, value in found.items()}}), flush=True)
 
 

@@ -55,7 +55,9 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     return lambda *arguments: cli.main([*COMMAND, *arguments, *SMALL])
 
 
-@pytest.mark.parametrize("algo", ["bc", "iql", "td3bc", "bro_fast"])
+@pytest.mark.parametrize(
+    "algo", ["bc", "iql", *(pytest.param(name, marks=pytest.mark.slow) for name in ("td3bc", "bro_fast"))]
+)
 def test_learns_from_a_data_set(run: Run, algo: str) -> None:
     if algo == "bro_fast":
         small = ["buffer_size:2000", "model_size:(1,8)", "batch_size:16"]

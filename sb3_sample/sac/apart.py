@@ -78,10 +78,19 @@ class Apart:
             torch._foreach_copy_(*self._pairs)
             self._handed_over_at = self._model._n_updates
 
-    def after_gradient_step(self) -> None:
-        """Hand over what was learned, before what acts is too old."""
-        self._n_taken += 1
-        if self._model._n_updates - self._handed_over_at >= MAX_AGE:
+    @property
+    def age(self) -> int:
+        """Gradient steps between what learns and what acts."""
+        return self._model._n_updates - self._handed_over_at  # type: ignore[no-any-return]
+
+    def after_gradient_steps(self, n: int) -> None:
+        """
+        Hand over what was learned, before what acts is too old.
+
+        :param n: gradient steps just taken
+        """
+        self._n_taken += n
+        if self.age >= MAX_AGE:
             self._hand_over()
 
     # ---------------------------------------------------------------- acting, in the thread
@@ -91,7 +100,7 @@ class Apart:
         counted = self._n_before + n_before * model.n_envs
         at_random = counted < model.learning_starts and model._n_offline_updates == 0
         with self._lock:
-            age = None if at_random else model._n_updates - self._handed_over_at
+            age = None if at_random else self.age
             actions, scaled = model._choose(self._learner, observations, at_random, model.n_envs)
         return Chosen(actions, scaled, age)
 
@@ -207,7 +216,7 @@ class ActsApart:
             )
 
     def _turn_apart(self: Any, callback: BaseCallback, log_interval: int) -> bool:
-        """Take over what the acting thread has done, then take a gradient step if one is due."""
+        """Take over what the acting thread has done, then take gradient steps that are due."""
         if self._apart is None:
             self._apart = Apart(self, self._acts_at[1])
             self._apart.thread.start()
@@ -216,10 +225,11 @@ class ActsApart:
         for step in apart.thread.taken(wait=apart.n_due == 0):
             if not self._take_over(step, callback, log_interval):
                 return False
-        if apart.n_due > 0:
-            apart.n_due -= 1
-            self.train(1, self.batch_size)
-            apart.after_gradient_step()
+        n_updates = min(apart.n_due, MAX_AGE - apart.age)
+        if n_updates > 0:
+            apart.n_due -= n_updates
+            self.train(n_updates, self.batch_size)
+            apart.after_gradient_steps(n_updates)
         return True
 
     def _rest(self: Any, callback: BaseCallback, log_interval: int) -> bool:
