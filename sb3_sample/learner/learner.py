@@ -19,16 +19,18 @@ from sb3_sample.learner.descent import Descent, descend
 from sb3_sample.learner.execution import Captured, Execution, acting_of
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
+from sb3_sample.learner.objectives import Objective, Prepared
 from sb3_sample.learner.observation_statistics import ObservationStatistics
 from sb3_sample.learner.observations import Observations
 from sb3_sample.learner.parts import Part, logged
 from sb3_sample.learner.pessimism import Pessimism, pessimistic_value
 from sb3_sample.learner.plasticity import ReDo, Resets
+from sb3_sample.learner.q_values import evaluate
 from sb3_sample.learner.randomness import OwnGenerators
 from sb3_sample.learner.reward_scale import RewardScale, task_of
 from sb3_sample.learner.scalars import FixedScalar, LogScalar, TaskLogScalar
 from sb3_sample.learner.schedules import LearningRateSchedule
-from sb3_sample.learner.target import next_step, online_outputs, step_outputs, td_target, values
+from sb3_sample.learner.target import next_step, online_outputs, step_outputs, td_target
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
@@ -77,6 +79,7 @@ class Learner:
     :param redo: recycling of dormant neurons; None for none
     :param make_transforms: each makes a batch transform for the learner, applied in this order
     :param make_reward_scaler: makes the rule that scales rewards for the learner, applied before them; None for none
+    :param make_objective: makes a freshly initialised objective for the learner; None for that of soft actor-critic
     :param learning_rate: of actor, critics and temperature, at the start
     :param schedule: learning rates over the planned gradient steps; None: as :meth:`set_learning_rate` says
     :param temperature_beta1: beta1 of the temperature's Adam
@@ -122,6 +125,7 @@ class Learner:
         redo: ReDo | None = None,
         make_transforms: Sequence[Callable[[Any], BatchTransform]] = (),
         make_reward_scaler: Callable[[Any], RewardScale] | None = None,
+        make_objective: Callable[[Any], Objective] | None = None,
         learning_rate: float = 3e-4,
         schedule: LearningRateSchedule | None = None,
         temperature_beta1: float = 0.9,
@@ -146,6 +150,7 @@ class Learner:
     ):
         self._make_networks, self._make_temperature = make_networks, make_temperature
         self._make_pessimism, self._make_explorer = make_pessimism, make_explorer
+        self._make_objective = make_objective or (lambda learner: Objective())
         self.device, self.verbose, self.learning_rate = torch.device(device), verbose, learning_rate
         self.gamma, self.tau = gamma, tau
         self.schedule = schedule
@@ -165,6 +170,7 @@ class Learner:
             self.explorer = self.make_explorer()
             self.reward_scaler = None if make_reward_scaler is None else make_reward_scaler(self).to(self.device)
             self.transforms: Any = nn.ModuleList(make(self).to(self.device) for make in make_transforms)
+            self.objective = self._make_objective(self)
         self.observation_statistics = None if self.observation_norm is None else ObservationStatistics()
         self.plasticity, self.redo = plasticity, redo
         if redo is not None:
@@ -286,6 +292,14 @@ class Learner:
         """
         return self.networks.make_actor()
 
+    def make_value(self) -> Any:
+        """
+        Make a value network.
+
+        :return: a network of the critics' kind that judges observations alone, (B, O) to (B, 1)
+        """
+        return self.networks.make_value()
+
     def make_optimizer(self, parameters: Iterable[nn.Parameter]) -> Optimizer:
         """
         Make an optimizer.
@@ -328,6 +342,7 @@ class Learner:
         }
         optional = ("redo", "observation_statistics", "reward_scaler")
         parts |= {name: getattr(self, name) for name in optional if getattr(self, name) is not None}
+        parts |= {"objective": self.objective} if self.objective.has_state else {}
         return parts | {f"transforms.{i}": transform for i, transform in enumerate(self.transforms)}
 
     def optimizers(self) -> dict[str, Optimizer]:
@@ -457,7 +472,7 @@ class Learner:
 
         :return: modules that a gradient step reads or writes
         """
-        return self.networks, self.head, self.temperature, self.explorer, self.pessimism_rule
+        return self.networks, self.head, self.temperature, self.explorer, self.pessimism_rule, self.objective
 
     def identities(self) -> tuple[int, ...]:
         """
@@ -467,7 +482,8 @@ class Learner:
         """
         critics = (self.critic, self.critic.trunk, self.critic_target, self.critic_target.trunk)
         optimizers = self.optimizers().values()
-        objects = (self.actor, self.actor.trunk, *critics, self.temperature, self.explorer, self.pessimism_rule)
+        parts = (self.explorer, self.pessimism_rule, self.objective)
+        objects = (self.actor, self.actor.trunk, *critics, self.temperature, *parts)
         sizes = (len(group["params"]) for optimizer in optimizers for group in optimizer.param_groups)
         return (*map(id, (*objects, *optimizers, self.head)), *sizes)
 
@@ -642,32 +658,40 @@ class Learner:
         :param moves_actor: whether actors and temperature learn in this step
         :return: what to log, by name, scalars
         """
-        alpha, metrics = self.temperature_of(batch), {}
+        alpha = self.temperature_of(batch)
+        metrics, prepared = self.objective.prepare(self, batch)
         if self.actor_first and moves_actor:
-            metrics.update(self._learn_actors(batch, noise, alpha))
+            metrics.update(self._learn_actors(batch, noise, alpha, prepared))
             alpha = self.temperature_of(batch)
-        step, of_critics = self._learn_critics(batch, noise, alpha, moves_targets)
-        metrics.update(of_critics)
+        step: CriticStep | None = None
+        if self.objective.learns_critics:
+            step, of_critics = self._learn_critics(batch, noise, alpha, moves_targets, prepared)
+            metrics.update(of_critics)
         if moves_actor and not self.actor_first:
-            metrics.update(self._learn_actors(batch, noise, alpha))
+            metrics.update(self._learn_actors(batch, noise, alpha, prepared))
         elif self.actor.trunk.statistics_every_step and not moves_actor:
             with torch.no_grad():
                 self.actor.gaussian(self.actor.features(self.encoded(batch.observations)))
 
         # Pessimism.
-        rule = self.pessimism_rule
-        metrics.update(logged(rule, "update", rule.update(self, batch, step, noise.pessimism, extra)))
+        if step is not None:
+            rule = self.pessimism_rule
+            metrics.update(logged(rule, "update", rule.update(self, batch, step, noise.pessimism, extra)))
         return {name: value.detach() for name, value in metrics.items()}
 
     def _learn_critics(
-        self, batch: Batch, noise: Noise, alpha: torch.Tensor, moves_targets: bool
-    ) -> tuple[CriticStep, dict[str, torch.Tensor]]:
-        """Take the critics' step, and that of their targets."""
-        # Critics, towards the targets' value of the actor's next action.
-        next_actions, entropy_bonus = next_step(self, batch, alpha, noise.critic)
-        q, next_q = step_outputs(self, batch, next_actions, noise.subset)
-        with torch.no_grad():
-            target = self.head.target(batch, next_q, self.pessimism_rule.value, entropy_bonus)
+        self, batch: Batch, noise: Noise, alpha: torch.Tensor, moves_targets: bool, prepared: Prepared
+    ) -> tuple[CriticStep | None, dict[str, torch.Tensor]]:
+        """Take the critics' step, and that of their targets; None for what the rule of pessimism judges, if nothing."""
+        # Critics, towards the targets' value of the actor's next action, unless the objective has another target.
+        step: CriticStep | None = None
+        if prepared.target is None:
+            next_actions, entropy_bonus = next_step(self, batch, alpha, noise.critic)
+            q, next_q = step_outputs(self, batch, next_actions, noise.subset)
+            with torch.no_grad():
+                target = self.head.target(batch, next_q, self.pessimism_rule.value, entropy_bonus)
+        else:
+            q, target = evaluate(self.critic, batch.observations, batch.actions), prepared.target
         critic_loss = self.head.loss(q, target)
         if self.sam_radius is None:
             self.minimize(self.critic.optimizer, critic_loss)
@@ -676,24 +700,23 @@ class Learner:
         self.critic.project()
         q = self.head.values(q)
         metrics = {"train/critic_loss": critic_loss, "train/q_mean": q.mean()}
+        if prepared.target is None:
+            step = CriticStep(q.detach(), self.head.values(next_q), entropy_bonus, noise.subset)
         if SLOTS in batch.columns:
-            metrics[_TD_ERRORS] = self._errors(batch, q, next_q, entropy_bonus)
+            metrics[_TD_ERRORS] = self._errors(batch, q, step, prepared)
 
         # Targets, by Polyak averaging.
         if moves_targets:
             self._follow(self.critic_target, self.critic)
-        return CriticStep(q.detach(), self.head.values(next_q), entropy_bonus, noise.subset), metrics
+        return step, metrics
 
-    def _learn_actors(self, batch: Batch, noise: Noise, alpha: torch.Tensor) -> dict[str, torch.Tensor]:
+    def _learn_actors(
+        self, batch: Batch, noise: Noise, alpha: torch.Tensor, prepared: Prepared
+    ) -> dict[str, torch.Tensor]:
         """Take the steps of actor, explorer and temperature."""
         # Actor, on the critics, and on their encoder if it is shared.
         observations = self.encoded(batch.observations)
-        if self.actor.trunk.stacks_actor_rows:
-            actions, log_prob = self.actor.sample(observations, noise.actor, self.encoded(batch.next_observations))
-        else:
-            actions, log_prob = self.actor.sample(observations, noise.actor)
-        value = self._actor_value(values(self, self.critic, observations, actions))
-        actor_loss = losses.actor_loss(log_prob, value, alpha.detach())
+        actor_loss, log_prob = self.objective.actor_loss(self, batch, observations, alpha, noise.actor, prepared)
         self.minimize(self.actor.optimizer, actor_loss)
         self.actor.project()
         metrics = {"train/actor_loss": actor_loss}
@@ -704,7 +727,7 @@ class Learner:
         metrics.update(logged(self.explorer, "update", self.explorer.update(self, batch, noise.exploration)))
 
         # Temperature.
-        if self.actor.has_entropy:
+        if self.actor.has_entropy and log_prob is not None:
             entropy = -log_prob.detach().mean()
             by_task = isinstance(self.temperature, TaskLogScalar)
             metrics.update({"train/entropy": entropy, "train/ent_coef": alpha.mean() if by_task else alpha})
@@ -720,14 +743,21 @@ class Learner:
         return metrics
 
     @torch.no_grad()
-    def _errors(self, batch: Batch, q: torch.Tensor, next_q: torch.Tensor, entropy_bonus: torch.Tensor) -> torch.Tensor:
+    def _errors(self, batch: Batch, q: torch.Tensor, step: CriticStep | None, prepared: Prepared) -> torch.Tensor:
         """The largest absolute TD error of any critic, of the means over quantiles, (B,)."""
-        value = self.pessimism_rule.value(self.head.values(next_q))
-        target = td_target(batch, value, entropy_bonus).mean(dim=1)
-        return (q.mean(dim=2) - target).abs().amax(dim=0)
+        target = prepared.target
+        if target is None:
+            assert step is not None
+            target = td_target(batch, self.pessimism_rule.value(step.next_q), step.entropy_bonus)
+        return (q.mean(dim=2) - target.mean(dim=1)).abs().amax(dim=0)
 
-    def _actor_value(self, q: torch.Tensor) -> torch.Tensor:
-        """Value of the ensemble in the actor's objective, (E, B, K) to (B, K)."""
+    def actor_value(self, q: torch.Tensor) -> torch.Tensor:
+        """
+        Value of the ensemble in the actor's objective.
+
+        :param q: (E, B, K)
+        :return: (B, K)
+        """
         if self.actor_pessimism is None:
             return self.pessimism_rule.value(q)
         return pessimistic_value(q, float(self.actor_pessimism))
@@ -833,6 +863,7 @@ class Learner:
         # The explorer's start may depend on the pessimism in force.
         self.restart(self.pessimism_rule, self.make_pessimism(), shrink)
         self.restart(self.explorer, self.make_explorer(), shrink)
+        self.restart(self.objective, self._make_objective(self), shrink)
         for optimizer in self.optimizers().values():
             optimizer.state.clear()
 

@@ -194,6 +194,46 @@ def temperature_loss(alpha: torch.Tensor, entropy: torch.Tensor, target_entropy:
     return alpha * (entropy.detach() - target_entropy)
 
 
+def expectile_loss(difference: torch.Tensor, expectile: float) -> torch.Tensor:
+    """
+    Squared error whose minimum is an expectile, ``mean(|tau - 1(u < 0)| u^2)`` (Kostrikov et al. 2021, eq. 5); half the
+    squared error at 0.5.
+
+    :param difference: u, target less prediction, any shape
+    :param expectile: tau, in (0, 1)
+    :return: scalar
+    """
+    weight = torch.where(difference > 0, expectile, 1 - expectile)
+    return (weight * difference.square()).mean()
+
+
+def advantage_weights(advantage: torch.Tensor, inverse_temperature: float, most: float) -> torch.Tensor:
+    """
+    Compute the weights of actions in a regression on them, ``min(exp(beta * A), most)`` (Kostrikov et al. 2021, eq. 7).
+
+    :param advantage: A, any shape
+    :param inverse_temperature: beta
+    :param most: the largest weight
+    :return: of the same shape
+    """
+    return (inverse_temperature * advantage).exp().clamp(max=most)
+
+
+def cloned_value_loss(value: torch.Tensor, actions: torch.Tensor, cloned: torch.Tensor, weight: float) -> torch.Tensor:
+    """
+    Loss of an actor near given actions, ``mean((a - a*)^2) - lambda * mean(Q)`` with ``lambda = weight / mean(|Q|)``
+    without gradient (Fujimoto and Gu 2021, eqs. 3 and 5).
+
+    :param value: Q, value of the actor's actions, (B,)
+    :param actions: the actor's, (B, A)
+    :param cloned: a*, those to stay near to, (B, A)
+    :param weight: of the value
+    :return: scalar
+    """
+    scale = weight / value.detach().abs().mean()
+    return F.mse_loss(actions, cloned) - scale * value.mean()
+
+
 def optimistic_actor_loss(upper_value: torch.Tensor, kl: torch.Tensor, kl_weight: torch.Tensor) -> torch.Tensor:
     """
     Loss of the optimistic actor, ``-mean(Q_upper) + weight * mean(KL)`` (BRO, algorithm 2, line 12; DAC, eq. 11).

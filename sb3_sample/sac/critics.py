@@ -137,3 +137,56 @@ class CriticEnsemble(BaseModel):
         :return: the parameters that each critic has a copy of, (E, ...) each: all but the features extractor's
         """
         return [*self.trunk.parameters(), *self.head.parameters()]
+
+
+class ValueNetwork(BaseModel):
+    """
+    Value of observations alone, by a network of the critics' kind.
+
+    :param observation_space: observation space
+    :param action_space: action space
+    :param network: class of the trunk
+    :param network_kwargs: its arguments
+    :param features_extractor: extractor of the observation's features
+    :param normalize_images: whether images are divided by 255
+    """
+
+    #: The policy's running normalisation of observations, None for none.
+    observation_norm: RunningNorm | None = None
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        network: type[Network],
+        network_kwargs: dict[str, Any],
+        features_extractor: BaseFeaturesExtractor,
+        normalize_images: bool = True,
+    ):
+        super().__init__(
+            with_plain_sizes(observation_space),
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+        )
+        self._network_args = {"network": network, "network_kwargs": network_kwargs}
+        self.trunk = make_trunk("critic_network", network, features_extractor.features_dim, network_kwargs)
+        self.head: Any = self.trunk.make_head(1)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = {**self._network_args, "features_extractor": self.features_extractor}
+        return {**super()._get_constructor_parameters(), **own}
+
+    def forward(self, obs: PyTorchObs) -> torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them
+        :return: their value, (B, 1)
+        """
+        assert isinstance(self.features_extractor, BaseFeaturesExtractor)
+        seen: PyTorchObs = obs if self.observation_norm is None else self.observation_norm(obs)
+        return self.head(self.trunk(features_of(self, seen, self.features_extractor)))
+
+    def project(self) -> None:
+        """Called after every step of the optimizer: bring weights back to where they belong, in place."""
+        self.trunk.project()
+        project_weights(self.head)

@@ -395,7 +395,7 @@ class Content:
         :return: what to say if the file turns out not to fit: the arguments that it does not have, if any
         """
         names = (argument_names(type(model)) & vars(model).keys()) - self.tree["attributes"].keys()
-        names -= {"env", "device", *given}
+        names -= {"env", "device", *given, *model._excluded_save_params()}
         if not names:
             return ""
         wanted = " or ".join(f"{name}=" for name in sorted(names))

@@ -62,7 +62,7 @@ def training() -> Iterator[Train]:
         given, rest = runs.train_parser().parse_known_args([*run.command(folder), *options])
         start = runs.plan(given, rest)
         assert start is not None
-        train_in_zoo(start, start.arguments)
+        train_in_zoo(start, start.arguments, runs.Data.of(given))
 
     with reading(), runs.training() as train_in_zoo:
         yield make

@@ -60,7 +60,8 @@ class Recorder:
         self.n_recordings = self.n_repetitions = 0
 
     def _memory(self) -> list[torch.Tensor]:
-        modules = (self.model.policy, self.model.temperature, self.model.explorer, self.model.pessimism_rule)
+        parts = (self.model.explorer, self.model.pessimism_rule, self.model.objective)
+        modules = (self.model.policy, self.model.temperature, *parts)
         tensors = [t for module in modules for t in (*module.parameters(), *module.buffers())]
         for optimizer in self.model._optimizers().values():
             tensors += [t for s in optimizer.state.values() for t in s.values() if isinstance(t, torch.Tensor)]
