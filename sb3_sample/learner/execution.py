@@ -5,7 +5,6 @@ All three run the same function, ``Learner.gradient_step``, which is independent
 noise as tensors, does not branch on the value of a tensor, and counts nothing outside of tensors.
 """
 
-import inspect
 import operator
 import re
 import time
@@ -16,6 +15,7 @@ from typing import Any, NamedTuple
 import torch
 
 from sb3_sample.console import say
+from sb3_sample.learner.exploration import Exploration
 from sb3_sample.optim import AdamW
 from sb3_sample.tracing import compile_graph, trace, undone
 
@@ -252,12 +252,11 @@ def acting_of(learner: Any) -> "Captured | None":
     Choose how actions of the training are computed.
 
     :param learner: the learner
-    :return: what captures them; None where they are computed as they are: on a CPU, and for an explorer that does not
-        take its noise as an argument
+    :return: what captures them; None where they are computed as they are: on a CPU, and for an explorer with an ``act``
+        of its own
     """
     asked = learner.compile is True or (learner.compile == "auto" and not foreign_parts(learner))
-    takes_noise = "noise" in inspect.signature(learner.explorer.act).parameters
-    if learner.device.type != "cuda" or not asked or not takes_noise:
+    if learner.device.type != "cuda" or not asked or type(learner.explorer).act is not Exploration.act:
         return None
     return Captured(learner, cuda_graph, optimizers=False)
 

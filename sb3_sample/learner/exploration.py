@@ -28,26 +28,40 @@ class Exploration(Part):
     def __init__(self, learner: Learning):
         super().__init__()
 
-    def draw(self, like: torch.Tensor) -> torch.Tensor:
+    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
         """
-        Draw the noise of one step.
-
-        :param like: tensor of the noise's shape and type, (B, A)
-        :return: standard normal noise, (B, A)
-        """
-        return torch.randn_like(like)
-
-    def act(self, learner: Learning, observations: Any, noise: torch.Tensor | None = None) -> torch.Tensor:
-        """
-        Sample the actions of the training. With the noise given it is a function of tensors: on a GPU it is captured.
+        Sample the actions of the training. An explorer that leaves this as it is, and has its own :meth:`sampled`, is
+        captured on a GPU.
 
         :param learner: the learner
         :param observations: tensors on the device of the model, (B, O) or a dict of them
-        :param noise: from :meth:`draw`, (B, A); drawn if None
+        :return: actions in [-1, 1], (B, A)
+        """
+        return self.sampled(learner, observations, self.draw_noise(learner, observations))
+
+    def draw_noise(self, learner: Learning, observations: Any) -> torch.Tensor:
+        """
+        Draw the noise of one step's actions.
+
+        :param learner: the learner
+        :param observations: tensors on the device of the model, (B, O) or a dict of them
+        :return: standard normal noise, (B, A)
+        """
+        rows = next(iter(observations.values())) if isinstance(observations, dict) else observations
+        like = next(learner.actor.parameters())
+        return torch.randn((len(rows), learner.actor.action_dim), dtype=like.dtype, device=like.device)
+
+    def sampled(self, learner: Learning, observations: Any, noise: torch.Tensor) -> torch.Tensor:
+        """
+        Compute actions, on tensors only: this function is captured.
+
+        :param learner: the learner
+        :param observations: tensors on the device of the model, (B, O) or a dict of them
+        :param noise: from :meth:`draw_noise`, (B, A)
         :return: actions in [-1, 1], (B, A)
         """
         mean, log_std = learner.actor.gaussian(learner.actor.features(observations))
-        return learner.actor.act(mean, log_std.exp(), self.draw(mean) if noise is None else noise)
+        return learner.actor.act(mean, log_std.exp(), noise)
 
     def update(self, learner: Learning, batch: Batch, noise: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         """
@@ -83,8 +97,8 @@ class HeldNoise(Exploration):
         self._held: torch.Tensor | None = None
         self._length = self._n_held = 0
 
-    def draw(self, like: torch.Tensor) -> torch.Tensor:
-        return self.hold(torch.randn_like(like), float(torch.rand(())))
+    def draw_noise(self, learner: Learning, observations: Any) -> torch.Tensor:
+        return self.hold(super().draw_noise(learner, observations), float(torch.rand(())))
 
     def hold(self, fresh: torch.Tensor, uniform: float) -> torch.Tensor:
         """
@@ -223,11 +237,11 @@ class OptimisticExploration(Exploration):
         """Weight of the divergence in the actor's loss."""
         return kl_weight
 
-    def act(self, learner: Learning, observations: Any, noise: torch.Tensor | None = None) -> torch.Tensor:
+    def sampled(self, learner: Learning, observations: Any, noise: torch.Tensor) -> torch.Tensor:
         features = learner.actor.features(observations)
         mean, log_std = learner.actor.gaussian(features)
         mean, std = self._gaussian(observations, features, mean, log_std.exp())
-        return learner.actor.act(mean, self.std_multiplier * std, self.draw(std) if noise is None else noise)
+        return learner.actor.act(mean, self.std_multiplier * std, noise)
 
     def update(self, learner: Learning, batch: Batch, noise: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         observations = learner.encoded(batch.observations)
@@ -421,9 +435,8 @@ class OptimisticActor(OptimisticExploration):
         mean, log_std = self.actor.gaussian(self.actor.features(observations))
         return mean, log_std.exp()
 
-    def act(self, learner: Learning, observations: Any, noise: torch.Tensor | None = None) -> torch.Tensor:
+    def sampled(self, learner: Learning, observations: Any, noise: torch.Tensor) -> torch.Tensor:
         mean, log_std = self.actor.gaussian(self.actor.features(observations))
-        noise = self.draw(mean) if noise is None else noise
         return self.actor.act(mean, self.std_multiplier * log_std.exp(), noise)
 
     def _kl(self, learner: Learning, optimistic: Any, pessimistic: Any) -> torch.Tensor:
@@ -495,9 +508,9 @@ class OptimisticGradient(Exploration):
         length = (scaled * gradient).sum(dim=1, keepdim=True).sqrt()
         return mean + math.sqrt(2 * self.kl_radius) * scaled / (length + 1e-6), std
 
-    def act(self, learner: Learning, observations: Any, noise: torch.Tensor | None = None) -> torch.Tensor:
+    def sampled(self, learner: Learning, observations: Any, noise: torch.Tensor) -> torch.Tensor:
         mean, std = self.shifted_mean(learner, observations)
-        return learner.actor.act(mean, std, self.draw(std) if noise is None else noise)
+        return learner.actor.act(mean, std, noise)
 
 
 #: Choices by the name that the algorithm's ``exploration`` argument takes.

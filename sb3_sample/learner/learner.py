@@ -572,9 +572,7 @@ class Learner:
         if acting is None:
             actions: torch.Tensor = self.explorer.act(self, observations)
             return actions
-        first = next(iter(observations.values())) if isinstance(observations, dict) else observations
-        dtype = next(self.actor.parameters()).dtype
-        noise = self.explorer.draw(torch.empty(len(first), self.actor.action_dim, dtype=dtype, device=self.device))
+        noise = self.explorer.draw_noise(self, observations)
         acting.forget_if_stale(self)
         return acting(type(self).action_step, self, (observations, noise))["actions"]
 
@@ -583,10 +581,10 @@ class Learner:
         Compute the explorer's actions, on tensors only: this function is captured.
 
         :param observations: tensors on the learner's device, (B, O), or a dict of them
-        :param noise: from the explorer's ``draw``, (B, A)
+        :param noise: from the explorer's ``draw_noise``, (B, A)
         :return: "actions", in [-1, 1], (B, A)
         """
-        return {"actions": self.explorer.act(self, observations, noise)}
+        return {"actions": self.explorer.sampled(self, observations, noise)}
 
     def step(
         self, batch: Batch, noise: Noise | None = None, extra: Extra | None = None, eager: bool = False
