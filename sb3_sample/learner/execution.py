@@ -255,10 +255,10 @@ def acting_of(learner: Any) -> "Captured | None":
     :return: what captures them; None where they are computed as they are: on a CPU, and for an explorer with an ``act``
         of its own
     """
-    asked = learner.compile is True or (learner.compile == "auto" and not foreign_parts(learner))
-    if learner.device.type != "cuda" or not asked or type(learner.explorer).act is not Exploration.act:
+    if learner.device.type != "cuda" or type(learner.explorer).act is not Exploration.act:
         return None
-    return Captured(learner, cuda_graph, optimizers=False)
+    asked = learner.compile is True or (learner.compile == "auto" and not foreign_parts(learner))
+    return Captured(learner, cuda_graph, optimizers=False) if asked else None
 
 
 class CannotCompile(Exception):

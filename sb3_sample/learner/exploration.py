@@ -49,7 +49,7 @@ class Exploration(Part):
         """
         rows = next(iter(observations.values())) if isinstance(observations, dict) else observations
         like = next(learner.actor.parameters())
-        return torch.randn((len(rows), learner.actor.action_dim), dtype=like.dtype, device=like.device)
+        return torch.randn_like(like.new_empty((len(rows), learner.actor.action_dim)))
 
     def sampled(self, learner: Learning, observations: Any, noise: torch.Tensor) -> torch.Tensor:
         """
