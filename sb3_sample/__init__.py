@@ -1,6 +1,6 @@
 """Sample-efficient reinforcement learning for users of Stable-Baselines3."""
 
-from sb3_sample.diagnostics import DiagnosticsCallback
+from sb3_sample.diagnostics import DiagnosticsCallback, NoiseScaleCallback
 from sb3_sample.envs import EnvironmentDied, SupervisedSubprocVecEnv, make_env, multi_task_env
 from sb3_sample.faults import TrainingDiverged
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
@@ -75,6 +75,7 @@ __all__ = [
     "FadedReplayBuffer",
     "FlashSAC",
     "MultiTaskEvalCallback",
+    "NoiseScaleCallback",
     "PrioritizedDictReplayBuffer",
     "PrioritizedReplayBuffer",
     "RegularizedSAC",

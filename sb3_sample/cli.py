@@ -1,6 +1,6 @@
 """
 The command ``sb3-sample``: the zoo's commands with the algorithms of this package in them, ``plot``, ``study``,
-``dataset``, ``scaling`` and ``variance``.
+``dataset``, ``scaling``, ``advise`` and ``variance``.
 """
 
 import argparse
@@ -249,6 +249,13 @@ def _scaling(arguments: list[str]) -> None:
         scaling(arguments)
 
 
+def _advise(arguments: list[str]) -> None:
+    from sb3_sample.study.advice_command import main as advise
+
+    with _extras():
+        advise(arguments)
+
+
 COMMANDS: dict[str, Command] = {
     "train": Command(_train, "train an agent, or search for hyperparameters"),
     "enjoy": Command(_enjoy, "run a trained agent"),
@@ -257,6 +264,7 @@ COMMANDS: dict[str, Command] = {
     "study": Command(_study, "make the runs of a plan: agents, tasks, seeds and a grid of arguments"),
     "scaling": Command(_scaling, "fit scaling laws: batch size, learning rate and replay ratio for a budget"),
     "dataset": Command(_dataset, "record, show and convert data sets for offline learning"),
+    "advise": Command(_advise, "which size of BRO and replay ratio gets furthest in some hours of this machine"),
     "variance": Command(_variance, "measure a policy gradient's variance: more actions or a longer trajectory?"),
     "plot_train": Command(_zoo_plot("plot_train"), "draw the return of the training episodes"),
     "all_plots": Command(_zoo_plot("all_plots"), "draw and tabulate the evaluations of several runs"),

@@ -1,5 +1,6 @@
 """
-Makes the project's own evidence: the runs of the plans in studies/evidence, in the order of its file QUEUE.
+Makes the project's own evidence: the runs of the plans in studies/evidence and studies/small, in the order of the file
+QUEUE of the first.
 
     make evidence [WORKERS=2]
 
@@ -43,7 +44,7 @@ COMPLETE = ".complete"
 #: How often a run is tried that fails.
 ATTEMPTS = 2
 #: Settings of a run that change no result.
-FREE = {"checkpoint_freq", "gym_packages"}
+FREE = {"checkpoint_freq", "gym_packages", "measure"}
 
 
 # ---------------------------------------------------------------- with the standard library: what runs where
@@ -319,14 +320,23 @@ def queue() -> list[tuple[str, int]]:
     return [(name, int(seeds)) for name, seeds in lines]
 
 
+def plan_file(name: str) -> Path:
+    """
+    :param name: of a plan
+    :return: its file, in studies/evidence or else in studies/small
+    """
+    path = PLANS / f"{name}.yml"
+    return path if path.exists() else PLANS.parent / "small" / path.name
+
+
 def plan_of(name: str) -> Any:
     """
-    :param name: of a plan in studies/evidence
+    :param name: of a plan
     :return: the plan
     """
     from sb3_sample import study
 
-    return study.read_plan(PLANS / f"{name}.yml")
+    return study.read_plan(plan_file(name))
 
 
 def choose(root: Path, results: Path, left_out: list[str]) -> Order | None:

@@ -3,10 +3,7 @@ The callback that measures overestimation, overfitting and plasticity in a run o
 training as it is.
 """
 
-import contextlib
 import math
-import random
-from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -27,11 +24,11 @@ from sb3_sample.diagnostics.measures import (
     effective_rank,
     global_norm,
 )
+from sb3_sample.diagnostics.reading import batch_at, newest_overfitting, noise, targets, training_places, untouched
 from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.pessimism import epistemic_std
-from sb3_sample.learner.target import bootstrap, values
+from sb3_sample.learner.target import values
 from sb3_sample.networks import neuron_scores
-from sb3_sample.replay.buffers import samples_at
 from sb3_sample.sac import SAC
 from sb3_sample.saving.rings import Ring
 
@@ -264,11 +261,12 @@ class DiagnosticsCallback(BaseCallback):
         """
         if self._store is None:
             raise ValueError("the callback knows no model yet: call init_callback(model) first")
-        with _untouched(self.model), torch.no_grad():
+        with untouched(self.model), torch.no_grad():
             results = self._overestimation()
             training = self._training_batch()
             if training is not None:
                 results |= self._overfitting(training) | self._networks(training)
+                results |= newest_overfitting(self.model, self.batch_size, self._rng)
             results |= self._norms()
         self.last_results = results
         return results
@@ -302,7 +300,7 @@ class DiagnosticsCallback(BaseCallback):
         observation: Any = self._env.reset()
         for step in range(self.rollout_length):
             tensors = self._to_tensors(observation)
-            action, log_prob = self.model.actor.sample(tensors, self._noise(1))
+            action, log_prob = self.model.actor.sample(tensors, noise(self.model, self._rng, 1))
             scaled = action.cpu().numpy().reshape(1, *self.model.action_space.shape)
             next_observation, reward, done, infos = self._env.step(self.model.policy.unscale_action(scaled))
             last: Any = next_observation
@@ -338,7 +336,7 @@ class DiagnosticsCallback(BaseCallback):
         assert self._store is not None
         n = self._store.size()
         positions = self._rng.choice(n, min(self.batch_size, n), replace=False)
-        on_validation = self._td_error(self._batch(self._store, positions, np.zeros_like(positions)))
+        on_validation = self._td_error(batch_at(self.model, self._store, positions))
         on_training = self._td_error(training)
         results = {"td_error_validation": on_validation, "td_error_training": on_training}
         if on_training != 0:
@@ -348,14 +346,7 @@ class DiagnosticsCallback(BaseCallback):
     def _td_error(self, batch: Batch) -> float:
         """Mean squared TD error of the critics' mean."""
         model = self.model
-        if model.reward_scaler is not None:
-            batch = model.reward_scaler.transform(batch, None)
-        subset = None
-        if model.target_subset is not None:
-            subset = torch.from_numpy(self._rng.permutation(model.critic.n_critics)[: model.target_subset])
-        noise = self._noise(len(batch.actions))
-        next_q, entropy_bonus = bootstrap(model.learner, batch, model.temperature(), noise, subset)
-        target = model.learner.head.target(batch, next_q, model.pessimism_rule.value, entropy_bonus)
+        batch, target = targets(model, batch, self._rng)
         q = values(model.learner, model.critic, batch.observations, batch.actions)
         return (q.mean(dim=(0, 2)) - model.learner.head.mean_target(target).squeeze(1)).square().mean().item()
 
@@ -392,10 +383,6 @@ class DiagnosticsCallback(BaseCallback):
 
     # ---------------------------------------------------------------- data
 
-    def _noise(self, n: int) -> torch.Tensor:
-        noise = self._rng.standard_normal((n, self.model.actor.action_dim), dtype=np.float32)
-        return torch.as_tensor(noise, device=self.model.device)
-
     def _to_tensors(self, observation: Any) -> Any:
         normalize = self.model.get_vec_normalize_env()
         if normalize is not None:
@@ -406,21 +393,10 @@ class DiagnosticsCallback(BaseCallback):
         """Transitions that the algorithm trains on, none twice; None if there are none yet."""
         buffer = self.model.replay_buffer
         assert buffer is not None
-        usable = np.ones((buffer.size(), buffer.n_envs), dtype=bool)
-        held_out = getattr(buffer, "held_out", None)
-        if held_out is not None:
-            usable &= ~held_out[: len(usable)]
-        if buffer.optimize_memory_usage and buffer.full:
-            usable[buffer.pos] = False  # its next observation is overwritten
-        places = np.flatnonzero(usable)
+        places = training_places(buffer)
         if len(places) == 0:
             return None
-        places = self._rng.choice(places, min(self.batch_size, len(places)), replace=False)
-        return self._batch(buffer, *np.divmod(places, buffer.n_envs))
-
-    def _batch(self, buffer: ReplayBuffer, positions: np.ndarray, env_indices: np.ndarray) -> Batch:
-        samples = samples_at(buffer, positions, env_indices, self.model.get_vec_normalize_env())
-        return Batch.of(samples, self.model.gamma)
+        return batch_at(self.model, buffer, self._rng.choice(places, min(self.batch_size, len(places)), replace=False))
 
 
 def _environments(env: GymEnv) -> set[int]:
@@ -428,20 +404,3 @@ def _environments(env: GymEnv) -> set[int]:
     innermost = env.unwrapped
     inside = [e.unwrapped for e in innermost.envs] if isinstance(innermost, DummyVecEnv) else []
     return {id(e) for e in [innermost, *inside]}
-
-
-@contextlib.contextmanager
-def _untouched(model: SAC) -> Iterator[None]:
-    """The model's networks in evaluation mode; afterwards their modes and the global generators are as before."""
-    modes = {module: module.training for module in model.policy.modules()}
-    python_state, numpy_state = random.getstate(), np.random.get_state()  # noqa: NPY002
-    cuda = [model.device] if model.device.type == "cuda" else []
-    try:
-        with torch.random.fork_rng(devices=cuda):
-            model.policy.eval()
-            yield
-    finally:
-        random.setstate(python_state)
-        np.random.set_state(numpy_state)  # noqa: NPY002
-        for module, mode in modes.items():
-            module.training = mode

@@ -1,6 +1,6 @@
 """
-Quantities of the papers (Overestimation, Overfitting and Plasticity, section 3; VPL, appendix E.2) from the numbers
-that they are made of: no model, no environment.
+Quantities of the papers (Overestimation, Overfitting and Plasticity, section 3; VPL, appendix E.2; Value-Based Deep RL
+Scales Predictably, appendix F) from the numbers that they are made of: no model, no environment.
 
 Shapes use the letters E critics, B batch, N neurons.
 """
@@ -94,3 +94,25 @@ def global_norm(tensors: list[torch.Tensor]) -> float:
     :return: the L2 norm of all their elements together
     """
     return torch.stack([torch.linalg.vector_norm(tensor.detach()) for tensor in tensors]).norm().item()
+
+
+def noise_scale(
+    small: float, large: float, small_batch: int = 64, large_batch: int = 1024
+) -> tuple[float, float, float]:
+    """
+    Critical batch size by the norms of gradients of two batch sizes ("Value-Based Deep RL Scales
+    Predictably", Rybkin et al. 2025, appendix F; McCandlish et al. 2018).
+
+    :param small: squared norm of the gradient of the small batch, averaged over batches first
+    :param large: of the large batch
+    :param small_batch: rows
+    :param large_batch: rows
+    :return: squared norm of the true gradient, trace of the covariance of one row's, and their ratio, the critical
+        batch size (inf where the first is not above 0)
+    :raises ValueError: the batch sizes do not ascend
+    """
+    if not 0 < small_batch < large_batch:
+        raise ValueError(f"batch sizes must ascend from above 0, not {small_batch}, {large_batch}")
+    signal = (large_batch * large - small_batch * small) / (large_batch - small_batch)
+    noise = (small - large) / (1 / small_batch - 1 / large_batch)
+    return signal, noise, noise / signal if signal > 0 else float("inf")

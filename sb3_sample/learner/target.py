@@ -20,8 +20,20 @@ def values(learner: Learning, critics: Any, observations: Any, actions: torch.Te
     :param actions: actions in [-1, 1], (B, A)
     :return: values for rules of pessimism and actors, (E, B, K)
     """
-    found: torch.Tensor = learner.head.values(evaluate(_at_rest(critics), observations, actions))
+    found: torch.Tensor = learner.head.values(outputs(critics, observations, actions))
     return found
+
+
+def outputs(critics: Any, observations: Any, actions: torch.Tensor) -> torch.Tensor:
+    """
+    Outputs of critics, as the head's loss and target take them, outside of the critics' step.
+
+    :param critics: its critics, or the target critics
+    :param observations: (B, O), or a dict of them
+    :param actions: actions in [-1, 1], (B, A)
+    :return: (E, B, n_outputs)
+    """
+    return evaluate(_at_rest(critics), observations, actions)
 
 
 def _at_rest(critics: Any) -> Any:

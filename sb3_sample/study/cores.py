@@ -23,6 +23,14 @@ def free_cores() -> int:
     """
     :return: cores that this process may use and that nobody uses at present, at least 1
     """
+    return max(round(idle_cores()), 1)
+
+
+def idle_cores() -> float:
+    """
+    :return: cores that this process may use and that nobody uses at present, with their parts; all that it may use
+        where the system does not tell
+    """
     usable = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
     free = float(len(usable))
     with contextlib.suppress(OSError, ValueError):
@@ -33,7 +41,7 @@ def free_cores() -> int:
     with contextlib.suppress(OSError, ValueError):
         quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
         free = min(free, int(quota) / int(period))  # "max": a ValueError
-    return max(round(free), 1)
+    return free
 
 
 def _idle(usable: set[int]) -> dict[int, tuple[int, int]]:

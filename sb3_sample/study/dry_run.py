@@ -10,15 +10,27 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from sb3_sample.learner.execution import PAYS_FROM
+from sb3_sample.sac.bro import BRO, BROFast
+from sb3_sample.study.advice import SUITES
 from sb3_sample.study.cores import free_cores, threads_of_libraries
 from sb3_sample.study.plan import Plan, Run, constructor_arguments, read_plan
 from sb3_sample.study.runs import StudyFolder, checkpointed
+from sb3_sample.study.step_times import StepTimes, cache_file, stored
 from sb3_sample.study.worker import train
 
 #: Seconds for which the step time of an agent on a task is measured.
 SECONDS = 3.0
 #: Steps of random actions before that.
 WARM_UP = 500
+#: Algorithms whose step times may be known, and arguments that change neither these nor how steps are run.
+_TIMED = {"bro": BRO, "bro_fast": BROFast}
+_UNTIMED = {
+    "replay_ratio", "model_size", "resets", "reset_gradient_steps", "learning_starts", "buffer_size", "learning_rate",
+    "gamma", "tau",
+}  # fmt: skip
+#: Gradient steps an environment step of a probe whose step time is known: too few to count.
+_HARDLY_ANY = 1e-3
 _PROBE = (sys.executable, "-c", "from sb3_sample.study.dry_run import probe; probe()")
 
 
@@ -77,6 +89,7 @@ def estimate(
     """
     Estimate what a plan costs. The step time is measured on this machine, by the first seconds of a training of each
     agent on the first task and of the first agent on each task; that of another pair is the product of the two ratios.
+    Where ``sb3-sample advise`` has kept the times of BRO's gradient steps, these are taken and not measured again.
 
     :param plan: a plan or its file
     :param folder: the study's, of which what is done is not counted; ``runs/<name of the plan>`` if None
@@ -92,19 +105,30 @@ def estimate(
     place = StudyFolder(Path("runs") / plan.name if folder is None else folder)
     at_once = max(free_cores() // threads, 1) if workers is None else workers
     left = [run for run in plan.runs if not place.outcome(run).done]
+    times = stored(threads, device)
     costs: dict[tuple[str, str], Cost] = {}
     seconds = n_bytes = 0.0
+    of_plan = {(run.variant, run.task): run for run in plan.runs}
     for run in left:
         base = left[0]
-        for probe in (base, dataclasses.replace(run, task=base.task), dataclasses.replace(base, task=run.task)):
-            if (probe.variant, probe.task) not in costs:
-                say(f"measuring {probe.variant} on {probe.task}")
-                costs[probe.variant, probe.task] = measure(probe, threads, device)
-        first, agent, task = (
-            costs[base.variant, base.task],
-            costs[run.variant, base.task],
-            costs[base.variant, run.task],
-        )
+        pairs = [(base.variant, base.task), (run.variant, base.task), (base.variant, run.task)]
+        if not all(pair in of_plan for pair in pairs):
+            # Agents that have data of some tasks only.
+            pairs = [(run.variant, run.task)] * 3
+        for pair in pairs:
+            if pair not in costs:
+                probe = of_plan[pair]
+                learning = None if times is None else seconds_of_learning(probe, times)
+                known = "" if learning is None else f", gradient steps of {cache_file()}"
+                say(f"measuring {probe.variant} on {probe.task}{known}")
+                if learning is None:
+                    cost = measure(probe, threads, device)
+                else:
+                    arguments = {**probe.arguments, "replay_ratio": _HARDLY_ANY, "compile": False}
+                    cost = measure(dataclasses.replace(probe, arguments=arguments), threads, device)
+                    cost = cost._replace(seconds=cost.seconds + learning)
+                costs[pair] = cost
+        first, agent, task = (costs[pair] for pair in pairs)
         seconds += run.steps * agent.seconds * task.seconds / first.seconds
         # Networks are the agent's, observations the task's.
         n_bytes += agent.bytes_of_run * task.bytes_of_run / first.bytes_of_run
@@ -112,6 +136,27 @@ def estimate(
     return Estimate(
         len(plan.runs), len(plan.runs) - len(left), seconds / 3600, min(at_once, max(len(left), 1)), n_bytes
     )
+
+
+def seconds_of_learning(run: Run, times: StepTimes) -> float | None:
+    """
+    :param run: the run
+    :param times: of the machine
+    :return: seconds of the gradient steps of an environment step; None where the times are not those of such a run
+    """
+    if run.algo not in _TIMED or not set(run.arguments) <= _UNTIMED or run.data:
+        return None
+    if run.task.partition("/")[0] not in SUITES:  # which alone have no settings of their own
+        return None
+    defaults = _TIMED[run.algo].constructor_arguments
+    size, ratio, warm_up = (
+        run.arguments.get(name, defaults[name].default) for name in ("model_size", "replay_ratio", "learning_starts")
+    )
+    if not isinstance(size, str) or size not in times.gradient_step or ratio is None:
+        return None
+    if times.how == "compiled" and ratio * (run.steps - warm_up) < PAYS_FROM:
+        return None
+    return float(ratio * times.gradient_step[size])
 
 
 def _buffer_size(run: Run) -> float:
@@ -136,7 +181,7 @@ def measure(run: Run, threads: int, device: str) -> Cost:
             arguments["learning_starts"] = WARM_UP
         # As many steps as the run has, since what is compiled depends on them.
         order = {
-            "run": dataclasses.replace(run, arguments=arguments, eval_freq=run.steps).as_json(),
+            "run": dataclasses.replace(run, arguments=arguments, eval_freq=run.steps, measure=0).as_json(),
             "options": ["--num-threads", str(threads), "--device", device],
         }
         env = {**os.environ, **threads_of_libraries(threads)}

@@ -29,7 +29,7 @@ from sb3_sample.shallow_yaml import ShallowLoader
 #: Entries of a plan; those after the first four have defaults.
 ENTRIES = (
     "agents", "tasks", "seeds", "steps", "evaluation", "grid", "checkpoint_freq", "env_kwargs", "gym_packages",
-    "groups", "factors",
+    "groups", "factors", "measure",
 )  # fmt: skip
 REQUIRED = ENTRIES[:4]
 #: Entries of an agent besides its arguments: what it learns from, and how long.
@@ -75,6 +75,7 @@ class Run:
     :param checkpoint_freq: environment steps between two checkpoints
     :param env_kwargs: arguments of the environment
     :param gym_packages: modules that register environments
+    :param measure: environment steps between two measurements of the noise scale and of overfitting, none if 0
     :param data: data sets that it learns from, ``dataset`` and ``prior_data`` as ``train`` has them, and the
         ``offline_steps``; those that there are
     """
@@ -91,6 +92,7 @@ class Run:
     checkpoint_freq: int = CHECKPOINT_FREQ
     env_kwargs: dict[str, Any] = dataclasses.field(default_factory=dict)
     gym_packages: tuple[str, ...] = ()
+    measure: int = 0
     data: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     @functools.cached_property
@@ -132,8 +134,11 @@ class Run:
         for name, value in self.data.items():
             home = isinstance(value, str) and value.startswith("~")
             command += [f"--{name.replace('_', '-')}", str(Path(value).expanduser() if home else value)]
-        if self.arguments:
-            command += ["-params", *(f"{name}:{value!r}" for name, value in self.arguments.items())]
+        arguments = dict(self.arguments)
+        if self.measure:
+            arguments["callback"] = {"sb3_sample.diagnostics.NoiseScaleCallback": {"every": self.measure}}
+        if arguments:
+            command += ["-params", *(f"{name}:{value!r}" for name, value in arguments.items())]
         return command
 
     def as_json(self) -> dict[str, Any]:
@@ -141,8 +146,9 @@ class Run:
         :return: the run as JSON has it
         """
         found = {**dataclasses.asdict(self), "gym_packages": list(self.gym_packages)}
-        if not self.data:
-            del found["data"]
+        for name in ("measure", "data"):
+            if not found[name]:
+                del found[name]  # as runs were written before there was one
         return found
 
     @classmethod
@@ -314,8 +320,11 @@ class _Reader:
         freq = CHECKPOINT_FREQ
         if "checkpoint_freq" in entries:
             freq = self._count(entries["checkpoint_freq"].value, "checkpoint_freq")
+        measure = self._count(entries["measure"].value, "measure") if "measure" in entries else 0
         env_kwargs = self._env_kwargs(entries)
         variants = list(self._variants(agents, grid))
+        if measure:
+            self._check_measured(entries["measure"].value, agents)
         runs = tuple(
             Run(
                 agent.name,
@@ -330,6 +339,7 @@ class _Reader:
                 freq,
                 env_kwargs,
                 packages,
+                measure,
                 _data_on(agent.data, task),
             )
             for seed in seeds
@@ -540,6 +550,16 @@ class _Reader:
         except (ValueError, TypeError, AssertionError) as error:
             where = f" with {', '.join(f'{k}={v!r}' for k, v in point.items())} of grid" if point else ""
             raise self._fail(agent.node, f"agent {agent.name!r}{where} cannot be made: {error}") from error
+
+    def _check_measured(self, node: yaml.Node, agents: list[_Agent]) -> None:
+        """The noise scale is of the critics of the off-policy family."""
+        from sb3_sample.sac import SAC
+
+        for agent in agents:
+            if not issubclass(_algorithms()[agent.algo].algorithm, SAC):
+                raise self._fail(
+                    node, f"measure is of off-policy agents, and {agent.name!r} is {agent.algo}: leave it out"
+                )
 
     def _groups(self, entries: Mapping[str, _Entry], tasks: list[str]) -> dict[str, list[str]]:
         if "groups" not in entries:

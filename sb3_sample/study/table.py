@@ -39,6 +39,8 @@ STATISTICS = ("mean", "std", "min", "max", "iqm", "n_seeds")
 
 _EVALUATED = {"return": "results", "success_rate": "successes", "episode_length": "ep_lengths"}
 _MONITORED = {"return": "r", "success_rate": "is_success", "episode_length": "l"}
+#: Those of the training episodes, beside evaluations.
+ONLINE = {f"online_{metric}": _MONITORED[metric] for metric in ("return", "success_rate")}
 _RECORD, _LOG = "run.json", "progress.jsonl"
 _SECONDS = "time/time_elapsed"
 #: A line of the log, as far as the time.
@@ -128,8 +130,9 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
     :param sources: folders of runs, or folders with runs at any depth, or tables as :func:`write` writes them.
         ``"LABEL=FOLDER"`` names the agent; else it has the name of the study's plan or, outside of a study, of its
         algorithm or, where no file says that, of the folder above the run's
-    :param metrics: patterns of the metrics to keep: "return", "success_rate", "episode_length", "hours" and whatever
-        ``progress.jsonl`` has, e.g. "train/*"
+    :param metrics: patterns of the metrics to keep: "return", "success_rate", "episode_length", "hours",
+        "online_return" and "online_success_rate" (the training episodes, which explore, also of runs with evaluations)
+        and whatever ``progress.jsonl`` has, e.g. "train/*"
     :return: columns :data:`COLUMNS`, in the order of the sources. Where a run's files do not say its seed, it is its
         number among the runs of that agent and task, from 0 on
     :raises ValueError: there is no run in a source, a file is damaged, a run does not say its task, or two runs have
@@ -244,6 +247,12 @@ def _measured(folder: Path, run: _Run, metrics: Sequence[str]) -> dict[str, tupl
         for metric, column in _MONITORED.items():
             if column in monitored and len(monitored):
                 found[metric] = steps, monitored[column].to_numpy(float)
+    if any(_matches(metric, metrics) for metric in ONLINE) and any(folder.glob("*monitor.csv")):
+        monitored = read_monitors(folder) if monitored is None else monitored
+        for metric, column in ONLINE.items():
+            if column in monitored and len(monitored):
+                ended = monitored["l"].cumsum().to_numpy() * run.repeat
+                found[metric] = ended, monitored[column].to_numpy(float)
     if "episode_length" in found:
         found["episode_length"] = (steps, found["episode_length"][1] * run.repeat)
     logged = _logged(folder / _LOG, run.repeat * run.skip, metrics)

@@ -38,7 +38,7 @@ from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
 from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO
-from sb3_sample.diagnostics import DiagnosticsCallback
+from sb3_sample.diagnostics import DiagnosticsCallback, NoiseScaleCallback
 from sb3_sample.envs import make_env
 from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.replay.compact import CompactReplay
@@ -136,6 +136,7 @@ def callbacks(folder: str, env: dict[str, Any], evaluate: bool = False, diagnose
     if diagnose:
         # At steps where the last gradients are those from before a checkpoint, too.
         others.append(DiagnosticsCallback(environment(**{**env, "n": 1}), every=97, rollout_length=20, seed=3))
+        others.append(NoiseScaleCallback(every=31, window=3, seed=4))
     return [evaluation, *others]
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import runpy
 import shutil
 import signal
 import subprocess
@@ -143,3 +144,12 @@ def test_bad_numbers_are_refused(checkout: Path) -> None:
     process = evidence(checkout, "--workers", "0")
     process.communicate()
     assert process.returncode == 2 and not os.path.exists(checkout.parent / "root" / "trees")
+
+
+def test_every_plan_of_the_queue_is_there() -> None:
+    module = runpy.run_path(str(ROOT / "studies" / "evidence.py"))
+    names = [name for name, _ in module["queue"]()]
+    assert {"bro_fast", "scaling"} <= set(names)
+    for name in names:
+        assert module["plan_file"](name).is_file(), name
+    assert module["plan_file"]("scaling") == ROOT / "studies" / "small" / "scaling.yml"

@@ -68,6 +68,20 @@ def test_a_run_is_a_command_of_train(plan_of) -> None:
     ]  # fmt: skip
 
 
+def test_a_plan_whose_runs_measure_their_gradients(plan_of) -> None:
+    run = plan_of(GOOD + "measure: 1_000\n").runs[0]
+    measure = "callback:{'sb3_sample.diagnostics.NoiseScaleCallback': {'every': 1000}}"
+    assert run.command(Path("x"))[-3:] == ["learning_starts:500", "replay_ratio:1", measure]
+    assert Run.of_json(run.as_json()) == run and run.kind == plan_of(GOOD).runs[0].kind
+    assert "measure" not in plan_of(GOOD).runs[0].as_json()
+    with pytest.raises(PlanError, match="line 14: measure must be a whole number of at least 1, not 0"):
+        plan_of(GOOD + "measure: 0\n")
+    ppo = GOOD.replace("  BRO Fast:\n    algo: bro_fast\n    model_size: 0.55M\n", "").replace("sac_sample", "mbma_ppo")
+    ppo = ppo.replace("    learning_starts: 500\n", "").replace("grid:\n  replay_ratio: [1, 2]\n", "")
+    with pytest.raises(PlanError, match="measure is of off-policy agents, and 'SAC' is mbma_ppo: leave it out"):
+        plan_of(ppo + "measure: 10\n")
+
+
 def test_a_suite_is_its_tasks_each_once(plan_of) -> None:
     text = GOOD.replace("[Pendulum-v1, dmc/cheetah-run-v0]", "[bro-dmc, VPL_DMC, Pendulum-v1]")
     tasks = list(dict.fromkeys(run.task for run in plan_of(text.replace("[0, 7]", "2")).runs))

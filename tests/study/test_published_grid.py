@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 
 from sb3_sample import study
+from sb3_sample.study.advice import published_grid
 
 ROOT = Path(__file__).parents[2]
 REFERENCE = Path(os.environ.get("SB3_SAMPLE_REFERENCE", ROOT.parent / "shared" / "reference"))
@@ -75,3 +76,28 @@ def test_a_part_of_the_grid(grid: pd.DataFrame) -> None:
     pd.testing.assert_frame_equal(part, whole.reset_index(drop=True))
     with pytest.raises(ValueError, match=r"ratios must be of 1, 2, 5, 10, 15, not 3"):
         read_grid(REFERENCE / "bro_grid.npz", ratios=[3])
+
+
+@pytest.mark.slow
+def test_the_statistics_in_the_package_are_those_of_the_grid() -> None:
+    """Of the one configuration whose tasks have different numbers of runs, with the intervals."""
+    module = runpy.run_path(str(ROOT / "studies" / "published_grid.py"))
+    found = module["statistics"](module["read_grid"](REFERENCE / "bro_grid.npz", ratios=[15], sizes=["26.31M"]))
+    shipped = published_grid()
+    shipped = shipped[(shipped["replay_ratio"] == 15) & (shipped["model_size"] == "26.31M")].reset_index(drop=True)
+    names = ["iqm", "low", "high"]
+    np.testing.assert_allclose(found[names], shipped[names], atol=1.01e-4)
+    others = [name for name in shipped if name not in names]
+    pd.testing.assert_frame_equal(found[others], shipped[others], check_dtype=False)
+
+
+def test_the_package_has_the_tables_beside_the_grid() -> None:
+    shipped = published_grid().set_index(["suite", "replay_ratio", "model_size", "env_step"])["iqm"]
+    for suite, heading, unit, digit in (
+        ("dmc", "15 DeepMind Control tasks (return, 0 to 1,000): IQM", 1_000, 1.0),
+        ("metaworld", "15 Meta-World v2 tasks (success rate in percent): IQM", 100, 0.1),
+        ("myosuite", "10 MyoSuite tasks (success rate in percent): IQM", 100, 0.1),
+    ):
+        for (ratio, size), values in published(heading).items():
+            for step, value in zip(STEPS, values, strict=True):
+                assert abs(shipped[suite, int(ratio), size, step] * unit - value) <= 0.56 * digit

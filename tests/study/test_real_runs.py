@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("rl_zoo3")
 
 from sb3_sample import cli, study
+from sb3_sample.study.plan import Run
 
 COMMAND = [
     "train", "--algo", "sac_sample", "--env", "dmc/cartpole-swingup-v0", "--device", "cpu", "--eval-freq", "200",
@@ -43,3 +44,18 @@ def test_runs_of_the_train_command(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert list(both["agent"]) == ["own", "zoo"] and both["iqm"].between(0, 1).all()
     np.testing.assert_allclose(*both["iqm"])
     assert set(study.read("own", ["train/critic_loss"])["metric"]) == {"train/critic_loss"}
+
+
+def test_a_run_that_measures_its_gradients(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["sb3-sample"])
+    arguments = {"learning_starts": 50, "buffer_size": 500, "replay_ratio": 0.1, "policy_kwargs": {"net_arch": [8]}}
+    run = Run("SAC", "sac_sample", arguments, {}, "Pendulum-v1", 0, 400, 200, 1, 1_000, measure=150)
+    cli.main(["train", *run.command(tmp_path), "--device", "cpu", "--num-threads", "1"])
+    metrics = ["return", "online_return", "diagnostics/*"]
+    found = {name: rows.set_index("step")["value"] for name, rows in study.read(tmp_path, metrics).groupby("metric")}
+    assert list(found["return"].index) == [200, 400]
+    # Two episodes of 200 steps.
+    assert list(found["online_return"].index) == [200, 400]
+    assert not np.allclose(found["return"], found["online_return"])
+    for name in ("gradient_square_64", "gradient_square_1024", "overfitting_newest", "parameter_norm_critic"):
+        assert list(found[f"diagnostics/{name}"].index) == [150, 300]

@@ -1,12 +1,19 @@
 """``sb3-sample scaling`` on made-up runs."""
 
+import json
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from sb3_sample import cli, study
+from sb3_sample.study import scaling
+from sb3_sample.study.reporting import figures as report_figures
+from sb3_sample.study.reporting import laws as report_laws
+from sb3_sample.study.reporting import pieces
+from sb3_sample.study.scaling import figures
 from sb3_sample.study.table import COLUMNS, to_json
 
 
@@ -64,12 +71,119 @@ def test_errors_are_one_line(table: Path, tmp_path: Path, capsys: pytest.Capture
         assert error.value.code == 2 and words in said and "Traceback" not in said, (command, said)
 
 
-def test_the_figures(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.fixture(scope="module")
+def measured(table: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with what they have measured: a gradient of 1 with a noise of 40 times the replay ratio."""
+    runs = study.load(table)
+    parts = [runs]
+    for (_, arguments, seed), rows in runs.groupby(["agent", "arguments", "seed"]):
+        noise = 40 * json.loads(str(arguments))["replay_ratio"]
+        for metric, value in (
+            ("gradient_square_64", 1 + noise / 64), ("gradient_square_1024", 1 + noise / 1024),
+            ("overfitting_newest", noise), ("parameter_norm_critic", 1.0),
+        ):  # fmt: skip
+            parts.append(rows.assign(metric=f"diagnostics/{metric}", value=value * (0.9 + 0.1 * seed)))
+    path = tmp_path_factory.mktemp("measured") / "runs.csv"
+    study.write(pd.concat(parts, ignore_index=True)[COLUMNS], path)
+    return path
+
+
+def test_the_figures(measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("matplotlib")
-    cli.main(["scaling", "plot", f"BRO={table}", *LEVELS, "-o", str(tmp_path / "figures")])
-    names = sorted(path.stem.rpartition("figure_")[2][0] for path in (tmp_path / "figures").iterdir())
-    assert names == ["1", "2", "3", "5", "6", "7", "9"]
-    assert "not drawn: figure_4_overfitting: the runs have not recorded" in capsys.readouterr().out
+    cli.main(["scaling", "plot", f"BRO={measured}", *LEVELS, "-o", str(tmp_path / "figures")])
+    names = {path.stem.rpartition("figure_")[2].partition("_")[0] for path in (tmp_path / "figures").iterdir()}
+    assert names == {"1", "2", "3", "4", "5", "6", "7", "9", "10", "11"}
+    assert "not drawn" not in capsys.readouterr().out
+
+
+def test_what_was_not_recorded_is_not_drawn(table: Path) -> None:
+    runs = study.read(f"BRO={table}")
+    with pytest.raises(ValueError, match="the runs have recorded none of diagnostics/overfitting_newest, "):
+        figures.logged(runs)
+    with pytest.raises(ValueError, match="the runs have not recorded diagnostics/gradient_square_64 and "):
+        figures.critical(runs)
+
+
+def test_the_critical_batch_size_is_of_the_mean_squared_norms(measured: Path) -> None:
+    pytest.importorskip("matplotlib")
+    table = study.read(f"BRO={measured}")
+    found = figures.squares(table)
+    assert list(found) == [("dmc/walker-run-v0", ratio) for ratio in (1.0, 2.0, 4.0, 8.0)]
+    for (_, ratio), means in found.items():
+        # Seeds have 0.9, 1 and 1.1 of it: the mean is the whole.
+        np.testing.assert_allclose(means[64], 1 + 40 * ratio / 64)
+        np.testing.assert_allclose(means[1024], 1 + 40 * ratio / 1024)
+    lines = figures.critical(table).axes[0].get_lines()
+    assert [line.get_label() for line in lines] == ["1", "2", "4", "8"]
+    for line, ratio in zip(lines, (1, 2, 4, 8), strict=True):
+        np.testing.assert_allclose(line.get_ydata(), 40 * ratio)
+    laws = scaling.fit(table, [300, 400, 500, 600, 700], reps=4)
+    (points,) = figures.critical_and_best(laws, table).axes[0].get_lines()
+    np.testing.assert_allclose(points.get_xdata(), [40, 80, 160, 320])
+    best = laws.hyperparameters["batch_size"].values
+    np.testing.assert_allclose(points.get_ydata(), best["value"])
+    # Where no gradient is left beside the noise there is no number.
+    lost = table.assign(value=np.where(table["metric"].str.endswith("_1024"), 0.01, table["value"]))
+    assert np.isnan(figures.critical(lost).axes[0].get_lines()[0].get_ydata()).all()
+    with pytest.raises(ValueError, match="no task and replay ratio has both"):
+        figures.critical_and_best(laws, lost)
+
+
+def test_online_returns(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runs = study.load(table)
+    path, poor = tmp_path / "runs.csv", runs.assign(value=0.0)
+    study.write(pd.concat([poor, runs.assign(metric="online_return")], ignore_index=True), path)
+    for source in (f"BRO={table}", f"BRO={path}"):
+        cli.main(["scaling", "fit", source, *LEVELS, *(["--online"] if source.endswith(str(path)) else [])])
+    first, second = capsys.readouterr().out.split("# Scaling laws of")[1:]
+    assert first == second
+    with pytest.raises(
+        SystemExit, match="online needs the Monitor files of all runs, and BRO on dmc/walker-run-v0, seed 0"
+    ):
+        cli.main(["scaling", "fit", f"BRO={table}", *LEVELS, "--online"])
+    with pytest.raises(SystemExit, match="published runs have no online returns"):
+        cli.main(["scaling", "fit", f"BRO={table}", "-p", "BRO", *LEVELS, "--online"])
+
+
+def test_the_laws_are_in_the_report(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("jinja2")
+    pytest.importorskip("rliable.library")
+    file = tmp_path / "laws.json"
+    cli.main(["scaling", "fit", f"BRO={table}", *LEVELS, "-o", str(file)])
+    said = capsys.readouterr().out
+    command = ["study", "report", str(table), "--curves", "none", "--reps", "5", "--laws", str(file)]
+    with mock.patch.object(report_figures, "png", lambda figure: figure.name.encode()):
+        cli.main([*command, "--markdown", str(tmp_path / "report.md")])
+    page = (tmp_path / "report.md").read_text()
+    assert (tmp_path / "report_files" / "scaling.png").exists()
+    section = page.partition("Scaling laws")[2].partition("Costs")[0]
+    # Every number of the page of "fit".
+    rows = [line for line in said.splitlines() if line.startswith("| ") and "---" not in line]
+    assert len(rows) > 20
+    plain = section.replace("\\", "")
+    for row in rows:
+        for cell in row.strip("| ").split(" | "):
+            assert cell in plain, cell
+    for limit in said.partition("## Limits")[2].partition("Saved")[0].strip().splitlines():
+        assert limit.removeprefix("- ") in plain
+    (tmp_path / "none.json").write_text("{}")
+    with pytest.raises(SystemExit, match="is no file of scaling laws"):
+        cli.main([*command[:-1], str(tmp_path / "none.json"), "-o", str(tmp_path / "r.html")])
+
+
+def test_the_reports_figure_has_laws_and_points(table: Path) -> None:
+    pytest.importorskip("matplotlib")
+    laws = scaling.fit(study.read(f"BRO={table}"), [300, 500, 700], reps=4)
+    figure = report_laws.scaling(laws).parts[1]
+    assert isinstance(figure, pieces.Figure) and len(figure.panels) == 3
+    steps = figure.panels[0]
+    assert isinstance(steps, pieces.Lines)
+    for level in laws.levels:
+        lines = [line for line in steps.lines if line.agent.name == f"level {level.level:.0f}"]
+        assert [len(line.x) for line in lines] == [60, 1, 1, 1, 1]
+        assert [line.y[0] for line in lines[1:]] == level.points.tolist()
+        np.testing.assert_allclose(lines[0].y, level.law().steps(np.array(lines[0].x)))
+    assert report_figures.png(figure).startswith(b"\x89PNG")
 
 
 def test_a_plan_is_one_that_study_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -88,9 +202,10 @@ def test_a_plan_is_one_that_study_takes(tmp_path: Path, capsys: pytest.CaptureFi
         "--steps",
         "3e4",
     ]
-    cli.main([*command, "-params", "model_size:0.55M", "resets:[]"])
+    cli.main([*command, "--measure", "1e3", "-params", "model_size:0.55M", "resets:[]"])
     assert capsys.readouterr().out.startswith("45 runs of 30,000 steps")
     runs = study.read_plan(path).runs
+    assert {run.measure for run in runs} == {1_000}
     pairs = {(run.arguments["batch_size"], run.arguments["learning_rate"]) for run in runs}
     assert pairs == {(64, 3e-4), (128, 3e-4), (256, 3e-4), (128, 1.5e-4), (128, 6e-4)}
     with pytest.raises(SystemExit):

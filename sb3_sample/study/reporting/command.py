@@ -14,6 +14,8 @@ from sb3_sample.study.reporting import markdown as markdown_pages
 from sb3_sample.study.reporting.content import build
 from sb3_sample.study.reporting.pieces import Report
 from sb3_sample.study.reporting.reading import Source, gather
+from sb3_sample.study.scaling.files import read_laws
+from sb3_sample.study.scaling.result import Laws
 
 
 def report(
@@ -30,6 +32,7 @@ def report(
     groups: Groups | None = None,
     scores: Scores | None = None,
     all_tasks: bool = False,
+    laws: Laws | str | Path | None = None,
     reps: int = REPS,
     confidence: float = 0.95,
     seed: int = 0,
@@ -55,6 +58,7 @@ def report(
     :param groups: of tasks, see :func:`~sb3_sample.study.aggregate`
     :param scores: of tasks without a common one, likewise
     :param all_tasks: average each agent over all its tasks, not over those that every agent has reached the step on
+    :param laws: scaling laws that the report has too, of :func:`~sb3_sample.study.scaling.fit` or a file of them
     :param reps: bootstrap samples
     :param confidence: of the intervals
     :param seed: of the bootstrap
@@ -71,6 +75,7 @@ def report(
             raise ValueError(f"{name} must end in {ending}, not {str(each)!r}")
     if pictures is not None and markdown is None:
         raise ValueError("pictures are those of markdown, which is not given")
+    of_runs = laws if laws is None or isinstance(laws, Laws) else read_laws(laws)
     gathered = gather(folders, published, plan)
     found = build(
         gathered,
@@ -83,6 +88,7 @@ def report(
         reps=reps,
         confidence=confidence,
         seed=seed,
+        laws=of_runs,
     )
     if path is not None:
         text = html.page(found)
@@ -152,6 +158,9 @@ def _add(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="average each agent over all its tasks, not over those that every agent has reached the step on",
     )
+    parser.add_argument(
+        "--laws", type=Path, metavar="FILE.json", help="scaling laws, as sb3-sample scaling fit -o writes them"
+    )
     add_scores(parser, planned=False)
     add_intervals(parser)
 
@@ -174,6 +183,7 @@ def _run(options: argparse.Namespace) -> None:
             groups=options.groups,
             scores=dict(options.score),
             all_tasks=options.all_tasks,
+            laws=options.laws,
             reps=options.reps,
             confidence=options.confidence,
             seed=options.seed,

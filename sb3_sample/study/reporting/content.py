@@ -12,6 +12,7 @@ from sb3_sample.plots import METRICS, Curve
 from sb3_sample.study.aggregate import Groups, Scores, score_for
 from sb3_sample.study.reporting.curves import Curves, Looks, dressed, task_curves
 from sb3_sample.study.reporting.facts import Facts, compute
+from sb3_sample.study.reporting.laws import scaling
 from sb3_sample.study.reporting.pieces import (
     DASH,
     STEPS,
@@ -32,6 +33,7 @@ from sb3_sample.study.reporting.pieces import (
 )
 from sb3_sample.study.reporting.reading import Gathered
 from sb3_sample.study.reporting.summary import holes, missing, summary
+from sb3_sample.study.scaling.result import Laws
 from sb3_sample.study.states import FAILED, STATES, Status
 from sb3_sample.study.table import RUN
 from sb3_sample.version import __version__
@@ -60,6 +62,7 @@ def build(
     reps: int,
     confidence: float,
     seed: int,
+    laws: Laws | None = None,
 ) -> Report:
     """
     :param gathered: runs
@@ -72,6 +75,7 @@ def build(
     :param reps: likewise
     :param confidence: likewise
     :param seed: likewise
+    :param laws: scaling laws that the report has too
     :return: the report
     :raises ValueError: an argument is out of range
     """
@@ -95,6 +99,7 @@ def build(
         _tasks(drawn, looks),
         _profiles(facts, looks.runs),
         _improvement(facts, looks.runs),
+        *([] if laws is None else [scaling(laws)]),
         _costs(gathered),
         _settings(gathered, how),
     ]

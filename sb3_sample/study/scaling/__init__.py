@@ -4,8 +4,9 @@ Scaling laws of value-based reinforcement learning: which batch size, learning r
 :func:`sb3_sample.study.read`; the command is ``sb3-sample scaling``.
 """
 
+from sb3_sample.diagnostics.measures import noise_scale
 from sb3_sample.study.scaling.best import best_hyperparameters
-from sb3_sample.study.scaling.budget import BudgetLaw, ComputeLaw, Point, fit_budget, noise_scale
+from sb3_sample.study.scaling.budget import BudgetLaw, ComputeLaw, Point, fit_budget
 from sb3_sample.study.scaling.crossings import crossings, default_levels, isotonic
 from sb3_sample.study.scaling.files import read_laws, summary, write_laws
 from sb3_sample.study.scaling.fitting import fit, normalize

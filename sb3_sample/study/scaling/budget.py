@@ -234,27 +234,6 @@ def fit_budget(budget: Sequence[float] | np.ndarray, replay_ratio: Sequence[floa
     return BudgetLaw((y.mean(axis=-1) - exponent * x.mean(axis=-1))[()], exponent[()])
 
 
-def noise_scale(
-    small: float, large: float, small_batch: int = 64, large_batch: int = 1024
-) -> tuple[float, float, float]:
-    """
-    Critical batch size by the norms of gradients of two batch sizes (appendix F; McCandlish et al. 2018).
-
-    :param small: squared norm of the gradient of the small batch, averaged over batches first
-    :param large: of the large batch
-    :param small_batch: rows
-    :param large_batch: rows
-    :return: squared norm of the true gradient, trace of the covariance of one row's, and their ratio, the critical
-        batch size (inf where the first is not above 0)
-    :raises ValueError: the batch sizes do not ascend
-    """
-    if not 0 < small_batch < large_batch:
-        raise ValueError(f"batch sizes must ascend from above 0, not {small_batch}, {large_batch}")
-    signal = (large_batch * large - small_batch * small) / (large_batch - small_batch)
-    noise = (small - large) / (1 / small_batch - 1 / large_batch)
-    return signal, noise, noise / signal if signal > 0 else float("inf")
-
-
 def _check(name: str, value: float) -> None:
     if not (np.isfinite(value) and value > 0):
         raise ValueError(f"{name} must be a positive number, not {value!r}")

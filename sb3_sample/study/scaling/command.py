@@ -2,19 +2,19 @@
 
 import argparse
 import json
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pandas as pd
 
 from sb3_sample.study import table as tables
-from sb3_sample.study.analysis_command import add_scores, add_sources, markdown, refusing
+from sb3_sample.study.analysis_command import add_scores, add_sources, refusing
 from sb3_sample.study.plan import read_plan
 from sb3_sample.study.scaling import figures
 from sb3_sample.study.scaling.budget import DELTA
-from sb3_sample.study.scaling.files import read_laws, summary, write_laws
+from sb3_sample.study.scaling.files import read_laws, write_laws
 from sb3_sample.study.scaling.fitting import REPS, fit
+from sb3_sample.study.scaling.page import page
 from sb3_sample.study.scaling.result import Estimate, Laws
 
 #: A command: its help, what adds its arguments, and what runs it.
@@ -62,6 +62,13 @@ def _add_plan(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episodes", type=int, default=5, help="of an evaluation (default: 5)")
     parser.add_argument(
         "-params", "--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="further arguments, as of train"
+    )
+    parser.add_argument(
+        "--measure",
+        type=float,
+        metavar="STEPS",
+        help="have the runs measure the noise scale of their gradients and their overfitting every so many steps, for "
+        "figures 4, 10 and 11",
     )
     parser.add_argument("--gym-packages", nargs="+", default=[], help="modules that register environments")
 
@@ -116,6 +123,8 @@ def plan_text(options: argparse.Namespace) -> str:
         f"steps: {int(options.steps)}",
         f"evaluation: {{every: {every}, episodes: {options.episodes}}}",
     ]
+    if options.measure is not None:
+        lines.append(f"measure: {options.measure:g}")
     if options.gym_packages:
         lines.append(f"gym_packages: [{', '.join(options.gym_packages)}]")
     return "\n".join(lines) + "\n"
@@ -169,6 +178,11 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--loss", choices=("log", "squared"), default="log", help="of the data law (default: log)")
     parser.add_argument(
+        "--online",
+        action="store_true",
+        help="the returns of training episodes in place of evaluations, as the authors' code has them",
+    )
+    parser.add_argument(
         "--keep-after-reset",
         action="store_true",
         help="count evaluations after a reset before the mean is back, as the authors' code does",
@@ -183,10 +197,34 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 def _table(options: argparse.Namespace) -> pd.DataFrame:
     if not options.sources and not options.published:
         raise ValueError("sources must be at least one folder or table, or --published runs")
-    parts = [tables.read(options.sources)] if options.sources else []
+    if options.online and options.published:
+        raise ValueError("published runs have no online returns: give --online or --published, not both")
+    metrics = (*tables.METRICS, "online_*") if options.online else tables.METRICS
+    parts = [tables.read(options.sources, metrics)] if options.sources else []
     if options.published:
         parts.append(tables.published_runs(options.published))
-    return pd.concat(parts, ignore_index=True)
+    table = pd.concat(parts, ignore_index=True)
+    return online(table) if options.online else table
+
+
+def online(table: pd.DataFrame) -> pd.DataFrame:
+    """
+    :param table: of :func:`~sb3_sample.study.read`, with ``online_return`` or ``online_success_rate``
+    :return: the same with these in the place of ``return`` and ``success_rate``
+    :raises ValueError: a run does not have them
+    """
+    prefix = "online_"
+    there = table["metric"].str.startswith(prefix)
+    evaluated = table["metric"].isin([metric.removeprefix(prefix) for metric in tables.ONLINE])
+    runs = set(table.loc[there, tables.RUN].itertuples(index=False, name=None))
+    for run in table.loc[evaluated, tables.RUN].itertuples(index=False, name=None):
+        if run not in runs:
+            agent, _, task, seed = run
+            raise ValueError(
+                f"online needs the Monitor files of all runs, and {agent} on {task}, seed {seed}, has none"
+            )
+    kept = table[~evaluated]
+    return kept.assign(metric=kept["metric"].str.removeprefix(prefix)).reset_index(drop=True)
 
 
 def _fitted(options: argparse.Namespace, table: pd.DataFrame) -> Laws:
@@ -221,92 +259,6 @@ def _run_fit(options: argparse.Namespace) -> None:
     if options.output is not None:
         write_laws(laws, options.output)
         print(f"\nSaved to {options.output}")
-
-
-def _words(found: dict[str, float | None] | None) -> str:
-    if found is None or found["value"] is None:
-        return "not determined"
-    return str(Estimate(*(math.nan if value is None else value for value in found.values())))
-
-
-def page(laws: Laws) -> str:
-    """
-    :param laws: of :func:`fit`
-    :return: their numbers with 95% intervals and their limits, as Markdown
-    """
-    found = summary(laws)
-    parts = [
-        f"# Scaling laws of {len(laws.tasks)} tasks, {laws.seeds} seeds\n",
-        f"Replay ratios {', '.join(f'{ratio:g}' for ratio in laws.replay_ratios)}. In brackets 95% intervals over "
-        "seeds.",
-    ]
-    for name, law in found["hyperparameters"].items():
-        parts.append(f"\n## {name}: intercept · sigma^slope\n\nslope {_words(law['slope'])}\n")
-        rows = [{"task": task, "at sigma = 1": _words(value)} for task, value in law["intercepts"].items()]
-        parts.append(markdown(pd.DataFrame(rows)))
-        chosen = laws.hyperparameters[name].values.drop(columns="name")
-        parts.append(f"\nChosen at {laws.choice_level:g}:\n\n{_plain_table(chosen)}")
-    parts.append("\n## Environment steps: d_min · (1 + (beta / sigma)^alpha)\n")
-    rows = [
-        {
-            "level": f"{row['level']:.0f}", "d_min": _words(row["d_min"]), "beta": _words(row["beta"]),
-            "alpha": _words(row["alpha"]), "tasks": len(row["tasks"]),
-            "worst fit": f"{max(abs(f / s - 1) for f, s in zip(row['fitted'], row['steps'], strict=True)):.1%}",
-        }
-        for row in found["data"]
-    ]  # fmt: skip
-    parts.append(markdown(pd.DataFrame(rows)))
-    if "budgets" in found:
-        parts.append("\n## Budget: least C + δ D\n")
-        rows = [
-            {
-                "level": f"{row['level']:.0f}",
-                **{
-                    name: str(Estimate(*(_number(row[f"{name}{end}"]) for end in ("", "_low", "_high"))))
-                    for name in ("replay_ratio", "budget")
-                },
-                "within the runs": "yes" if row["within"] else "no",
-            }
-            for row in found["budgets"]
-        ]
-        parts.append(markdown(pd.DataFrame(rows)))
-    if "budget" in found:
-        words = {name: _words(value) for name, value in found["budget"].items()}
-        parts.append(
-            "\nBest replay ratio = coefficient · F^exponent: logarithm of the coefficient "
-            f"{words['log_coefficient']}, exponent {words['exponent']}"
-        )
-        held = laws.budgets().iloc[-2:]
-        law = laws.budget_laws()[0]
-        errors = [
-            f"{float(law.replay_ratio(row.budget)[0]) / row.replay_ratio - 1:+.0%} at {row.level:.0f}"
-            for row in held.itertuples()
-        ]
-        parts.append(f"The two largest budgets are held out; the law's replay ratio there: {', '.join(errors)}")
-    limits = list(laws.notes)
-    for row in found["data"]:
-        limits += [f"level {row['level']:.0f}: {doubt}" for doubt in row["doubts"]]
-        if row["left_out"]:
-            limits.append(f"level {row['level']:.0f}: without {', '.join(row['left_out'])}, which do not reach it")
-        if any(row["censored"]):
-            at = [f"{r:g}" for r, hit in zip(row["replay_ratios"], row["censored"], strict=True) if hit]
-            limits.append(
-                f"level {row['level']:.0f}: not reached by every task at replay ratio {', '.join(at)}: a bound"
-            )
-    if limits:
-        parts.append("\n## Limits\n\n" + "\n".join(f"- {limit}" for limit in limits))
-    return "\n".join(parts)
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
-
-
-def _plain_table(table: pd.DataFrame) -> str:
-    shown = table.copy()
-    for name in ("replay_ratio", "value", "std", "decided", "edge"):
-        shown[name] = [f"{value:.3g}" for value in shown[name]]
-    return markdown(shown)
 
 
 # ---------------------------------------------------------------- predict

@@ -1,4 +1,4 @@
-"""The paper's figures 1 to 7 and 9, of runs of one's own."""
+"""The paper's figures 1 to 7 and 9 to 11, of runs of one's own."""
 
 import argparse
 import warnings
@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from sb3_sample.diagnostics.gradient_noise import LARGE, SMALL
+from sb3_sample.diagnostics.measures import noise_scale
 from sb3_sample.study.analysis import argument
 from sb3_sample.study.analysis_command import new_figure
 from sb3_sample.study.scaling.best import cells, choose
@@ -18,8 +20,15 @@ from sb3_sample.study.scaling.result import Laws
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Data of figure 4: values by replay ratio, one line for each value of an argument.
-_LOGGED = {"batch_size": "diagnostics/overfitting", "learning_rate": "diagnostics/parameter_norm_critic"}
+#: Data of figure 4: values by replay ratio, one line for each value of an argument; the first that was recorded.
+_LOGGED = {
+    "batch_size": ("diagnostics/overfitting_newest", "diagnostics/overfitting"),
+    "learning_rate": ("diagnostics/parameter_norm_critic",),
+}
+#: Data of figures 10 and 11: squared norms of the critics' gradients of two batch sizes.
+_SQUARES = {size: f"diagnostics/gradient_square_{size}" for size in (SMALL, LARGE)}
+#: Measurements that are averaged in figure 10.
+_WINDOW = 10
 
 
 def draw_all(
@@ -32,15 +41,21 @@ def draw_all(
     :return: figures by name, and why one of them cannot be drawn by name
     :raises ImportError: matplotlib is not installed
     """
+    of_one = table
+    for name, chosen in (("agent", options.agent), ("model_size", options.size)):
+        if chosen is not None:
+            of_one = of_one[[value == chosen for value in argument(of_one, name)]]
     figures: dict[str, Callable[[], Figure]] = {
         "figure_1_frontier": lambda: frontier(laws),
         "figure_2_steps_and_compute": lambda: steps_and_compute(laws),
         "figure_3_budgets": lambda: budgets(laws),
-        "figure_4_overfitting": lambda: logged(table),
+        "figure_4_overfitting": lambda: logged(of_one),
         "figure_5_hyperparameters": lambda: hyperparameters(laws),
         "figure_6_extrapolation": lambda: extrapolation(laws, table, options),
         "figure_7_choice": lambda: choice(laws, table, options),
         "figure_9_levels": lambda: levels(laws),
+        "figure_10_critical_batch_size": lambda: critical(of_one),
+        "figure_11_critical_and_best": lambda: critical_and_best(laws, of_one),
     }
     drawn, without = {}, {}
     for name, draw in figures.items():
@@ -156,9 +171,14 @@ def logged(table: pd.DataFrame) -> "Figure":
         learning rate; lines by least squares
     :raises ValueError: the runs have recorded neither, or differ in no such argument
     """
-    found = {name: metric for name, metric in _LOGGED.items() if (table["metric"] == metric).any()}
+    recorded = set(table["metric"])
+    there = {name: [metric for metric in metrics if metric in recorded] for name, metrics in _LOGGED.items()}
+    found = {name: metrics[0] for name, metrics in there.items() if metrics}
     if not found:
-        raise ValueError(f"the runs have not recorded {' or '.join(_LOGGED.values())} (DiagnosticsCallback)")
+        raise ValueError(
+            f"the runs have recorded none of {', '.join(sum(_LOGGED.values(), ()))} (NoiseScaleCallback, "
+            "DiagnosticsCallback)"
+        )
     figure, axes = _axes(len(found))
     for each, (name, metric) in zip(axes, found.items(), strict=True):
         rows = table[table["metric"] == metric].dropna(subset=["value"])
@@ -308,4 +328,77 @@ def levels(laws: Laws) -> "Figure":
         axes.plot(fine, each.law().steps(fine), color=color, label=f"{each.level:.0f}")
     axes.legend(title="J", frameon=False, fontsize=7)
     _log(axes, "replay ratio", "D (environment steps)")
+    return figure
+
+
+def squares(table: pd.DataFrame) -> dict[tuple[str, float], pd.DataFrame]:
+    """
+    :param table: of runs that have recorded the norms of their gradients (NoiseScaleCallback)
+    :return: by task and replay ratio the squared norms by step (rows) and batch size (columns 64 and 1,024), the mean
+        over the seeds and over whatever else the runs differ in
+    :raises ValueError: the runs have recorded none, or do not say their replay ratio
+    """
+    rows = table[table["metric"].isin(list(_SQUARES.values()))].dropna(subset=["value"])
+    if not len(rows):
+        raise ValueError(f"the runs have not recorded {' and '.join(_SQUARES.values())} (NoiseScaleCallback)")
+    rows = rows.assign(ratio=pd.to_numeric(pd.Series(argument(rows, "replay_ratio"), index=rows.index), "coerce"))
+    if rows["ratio"].isna().any():
+        raise ValueError("runs must have been given a replay_ratio")
+    found = {}
+    for (task, ratio), part in rows.groupby(["task", "ratio"], sort=True):
+        means = part.pivot_table(index="step", columns="metric", values="value")
+        found[str(task), float(ratio)] = means.rename(columns={name: size for size, name in _SQUARES.items()})
+    return found
+
+
+def critical(table: pd.DataFrame) -> "Figure":
+    """
+    :param table: as for :func:`squares`
+    :return: figure 10: critical batch size over the training, by rolling means of the squared norms; gaps where these
+        leave no gradient beside the noise
+    """
+    found = squares(table)
+    tasks = list(dict.fromkeys(task for task, _ in found))
+    figure, axes = _axes(len(tasks))
+    for each, task in zip(axes, tasks, strict=True):
+        for (own, ratio), means in found.items():
+            if own == task:
+                rolled = means.rolling(_WINDOW, min_periods=1).mean()
+                sizes = [noise_scale(row[SMALL], row[LARGE], SMALL, LARGE)[2] for _, row in rolled.iterrows()]
+                each.plot(rolled.index, np.where(np.isfinite(sizes), sizes, np.nan), label=f"{ratio:g}")
+        each.set_yscale("log")
+        each.set_title(task)
+        each.set_xlabel("environment steps")
+        each.set_ylabel("critical batch size")
+        each.legend(title="replay ratio", frameon=False, fontsize=7)
+    return figure
+
+
+def critical_and_best(laws: Laws, table: pd.DataFrame) -> "Figure":
+    """
+    :param laws: of the runs
+    :param table: as for :func:`squares`
+    :return: figure 11: the best batch size against the critical one, that of the mean squared norms over the second
+        half of the training, a point a task and replay ratio
+    :raises ValueError: there is no best batch size, or no critical one beside it
+    """
+    if "batch_size" not in laws.hyperparameters:
+        raise ValueError("batch size was not swept")
+    best = laws.hyperparameters["batch_size"].values.set_index(["task", "replay_ratio"])["value"].dropna()
+    points: dict[str, list[tuple[float, float]]] = {}
+    for key, means in squares(table).items():
+        late = means[means.index >= means.index[-1] / 2].mean()
+        size = noise_scale(late[SMALL], late[LARGE], SMALL, LARGE)[2]
+        if key in best.index and np.isfinite(size):
+            points.setdefault(key[0], []).append((size, float(best[key])))
+    if not points:
+        raise ValueError("no task and replay ratio has both a best and a critical batch size")
+    figure, (axes,) = _axes(1, 6)
+    for task, pairs in points.items():
+        axes.plot(*zip(*pairs, strict=True), "o", label=task)
+    sizes = np.log([pair for pairs in points.values() for pair in pairs])
+    if len(sizes) > 2:
+        axes.set_title(f"R = {np.corrcoef(sizes.T)[0, 1]:.2f}")
+    axes.legend(frameon=False, fontsize=7)
+    _log(axes, "critical batch size", "best batch size")
     return figure

@@ -134,7 +134,8 @@ def fit(
     if fewest < 2:
         notes.append("one seed a configuration: there are no intervals")
     elif fewest < 5:
-        notes.append(f"{fewest} seeds a configuration: the intervals are wide, and cover less than they say")
+        unknown = "" if fewest > 2 else ", and how often they hold was not measured"
+        notes.append(f"{fewest} seeds a configuration: the intervals are wide{unknown}")
 
     choice = float(wanted[-1] if choice_level is None else check_levels([choice_level])[0])
     hyperparameters = _hyperparameters(grid, choice, stages, draws, rng, notes)

@@ -30,7 +30,7 @@ def interval(
     Samples of three or four seeds do not reach as far out as that: there the distances of the plain percentiles from
     the number are multiplied, by logarithms where all are positive.
 
-    BCa intervals, whose correction of a bias is itself estimated, cover less here (``benchmarks/scaling_coverage.py``).
+    BCa and studentised intervals cover less here (``benchmarks/scaling_coverage.py``).
 
     :param point: (...) of all seeds
     :param reps: (R, ...)
