@@ -223,5 +223,5 @@ class SACArguments(Resumable):
     _action_space: spaces.Box | None = argument(alias="action_space", default=None, of_training=True)
     """of a model without an environment, with ``observation_space``"""
     compile: bool | str = argument(default="auto")
-    """whether ``torch.compile`` makes one program of the gradient step; "auto": where that pays back within the run, on
+    """whether Inductor makes one program of the gradient step; "auto": where that pays back within the run, on
     a CPU or a GPU with a compiler at hand, see docs/performance.md"""
