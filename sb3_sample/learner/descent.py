@@ -10,28 +10,26 @@ from sb3_sample.optim import AdamW
 from sb3_sample.tracing import is_tracing
 
 
-class Descent:
-    """Steps of one learner's optimizers and targets."""
+def minimize(optimizer: Optimizer, loss: torch.Tensor) -> None:
+    """
+    Take one step of an optimizer. Only its own parameters get a gradient, also where the loss depends on others.
 
-    def minimize(self, optimizer: Optimizer, loss: torch.Tensor) -> None:
-        """
-        Take one step of an optimizer. Only its own parameters get a gradient, also where the loss depends on others.
+    :param optimizer: the optimizer
+    :param loss: scalar
+    """
+    descend(optimizer, torch.autograd.grad(loss, parameters_of(optimizer), allow_unused=True))
 
-        :param optimizer: the optimizer
-        :param loss: scalar
-        """
-        descend(optimizer, torch.autograd.grad(loss, parameters_of(optimizer), allow_unused=True))
 
-    def follow(self, target: Any, online: Any, tau: float) -> None:
-        """
-        Take one step of Polyak averaging of the parameters.
+def follow(target: Any, online: Any, tau: float) -> None:
+    """
+    Take one step of Polyak averaging of the parameters.
 
-        :param target: network that follows
-        :param online: network that is followed
-        :param tau: weight of the latter
-        """
-        with torch.no_grad():
-            torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), weight=tau)
+    :param target: network that follows
+    :param online: network that is followed
+    :param tau: weight of the latter
+    """
+    with torch.no_grad():
+        torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), weight=tau)
 
 
 def parameters_of(optimizer: Optimizer) -> list[torch.Tensor]:
@@ -81,7 +79,7 @@ class _Minimize(torch.autograd.Function):
         return losses.detach(), 0
 
 
-class StackedDescent(Descent):
+class StackedDescent:
     """
     Steps of S learners' optimizers and targets, inside of ``torch.vmap`` over the learners.
 

@@ -221,14 +221,14 @@ class LearnerGroup:
     def _in_force(self, numbers: Sequence[torch.Tensor]) -> Iterator[None]:
         """Have the first learner's step be that of all."""
         before = [(values, name, values[name]) for values, name, _ in self._differing]
-        descent = self._first.descent
-        self._first.descent = self._descent
+        first = vars(self._first)
+        first.update(minimize=self._descent.minimize, follow=self._descent.follow)
         try:
             for (values, name, _), number in zip(self._differing, numbers, strict=True):
                 values[name] = number
             yield
         finally:
-            self._first.descent = descent
+            del first["minimize"], first["follow"]
             for values, name, value in before:
                 values[name] = value
 

@@ -15,7 +15,7 @@ from torch.optim import Optimizer
 
 from sb3_sample.learner import first_step, losses
 from sb3_sample.learner.batch import SLOTS, Batch, CriticStep, Extra, Noise
-from sb3_sample.learner.descent import Descent, descend
+from sb3_sample.learner.descent import descend, follow, minimize
 from sb3_sample.learner.execution import Captured, Execution, acting_of
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
@@ -185,8 +185,6 @@ class Learner:
         self.make_execution: Callable[[Any, str], Any] = Execution.of
         # The explorer, and what captures its actions.
         self._acting: tuple[Exploration, Captured | None] | None = None
-        #: Steps of optimizers and targets.
-        self.descent = Descent()
         #: Whether ``.grad`` holds the gradients of another gradient step than the last, as a compiled one leaves none.
         self.gradients_are_stale = False
         # Whether the shapes of a gradient step, and those of the explorer's actions, were checked.
@@ -762,7 +760,7 @@ class Learner:
 
     def _follow(self, target: Any, online: Any) -> None:
         """Take one step of Polyak averaging; with ``tau=1`` the target is the online network."""
-        self.descent.follow(target, online, self.tau)
+        self.follow(target, online, self.tau)
         with torch.no_grad():
             # Running statistics, as in Stable-Baselines3.
             statistics = zip(target.statistics(), online.statistics(), strict=True)
@@ -785,14 +783,27 @@ class Learner:
         )
         descend(self.critic.optimizer, gradients)
 
-    def minimize(self, optimizer: Optimizer, loss: torch.Tensor) -> None:
+    @staticmethod
+    def follow(target: Any, online: Any, tau: float) -> None:
+        """
+        Take one step of Polyak averaging of the parameters. A group has its own in this place, as of :meth:`minimize`.
+
+        :param target: network that follows
+        :param online: network that is followed
+        :param tau: weight of the latter
+        """
+        follow(target, online, tau)
+
+    @staticmethod
+    def minimize(optimizer: Optimizer, loss: torch.Tensor) -> None:
         """
         Take one step of an optimizer. Only its own parameters get a gradient, also where the loss depends on others.
+        A group puts its own in this place while it takes the step of all its learners.
 
         :param optimizer: the optimizer
         :param loss: scalar
         """
-        self.descent.minimize(optimizer, loss)
+        minimize(optimizer, loss)
 
     # ---------------------------------------------------------------- its state
 

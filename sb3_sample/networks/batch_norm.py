@@ -82,8 +82,8 @@ class BatchNorm(nn.Module):
         elif self.unbiased and not self.running_unbiased:
             var = var * ((n - 1) / n)
         # Not in place: torch.vmap, by which many learners are one, has a rule for this form.
-        self.running_mean.copy_(self.running_mean.lerp(mean.detach(), self.momentum))
-        self.running_var.copy_(self.running_var.lerp(var.detach(), self.momentum))
+        for running, now in ((self.running_mean, mean), (self.running_var, var)):
+            running.copy_(running.lerp(now.detach().to(running.dtype), self.momentum))
 
     def extra_repr(self) -> str:
         return f"n_features={self.n_features}, n_copies={self.n_copies}, eps={self.eps}, momentum={self.momentum}"

@@ -19,7 +19,7 @@ from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
 from sb3_sample.networks import Network, RunningNorm, project_weights
 from sb3_sample.networks.modes import evaluated
-from sb3_sample.sac.features import features_of
+from sb3_sample.sac.features import TensorFeatures
 from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
 
 # The log standard deviation is squashed into this interval by a tanh.
@@ -32,7 +32,7 @@ LOG_STD_ARGUMENTS = ("log_std_min", "log_std_max", "clip_log_std")
 GAUSSIAN_ARGUMENTS = (*LOG_STD_ARGUMENTS, "initial_std")
 
 
-class Actor(BasePolicy):
+class Actor(TensorFeatures, BasePolicy):
     """
     Tanh-Gaussian actor: ``a = tanh(mean + std * noise)``, the log standard deviation squashed by a tanh into
     [-10, 2] (BRO, section B.1; bounds and squashing as in the published code), or clipped.
@@ -154,9 +154,9 @@ class Actor(BasePolicy):
         seen: PyTorchObs = obs if self.observation_norm is None else self.observation_norm(obs)
         if self.shares_encoder:
             with torch.no_grad():
-                return features_of(self, seen, self._encoder)
+                return self.extract_features(seen, self._encoder)
         assert isinstance(self.features_extractor, BaseFeaturesExtractor)
-        return features_of(self, seen, self.features_extractor)
+        return self.extract_features(seen, self.features_extractor)
 
     def project(self) -> None:
         """Called after every step of the optimizer: bring weights back to where they belong, in place."""

@@ -17,11 +17,11 @@ from torch import nn
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.q_values import QValues
 from sb3_sample.networks import Network, RunningNorm, project_weights
-from sb3_sample.sac.features import features_of
+from sb3_sample.sac.features import TensorFeatures
 from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
 
 
-class CriticEnsemble(BaseModel):
+class CriticEnsemble(TensorFeatures, BaseModel):
     """
     E critics with K outputs each, evaluated at once.
 
@@ -75,7 +75,7 @@ class CriticEnsemble(BaseModel):
             return torch.cat((obs.features, actions), dim=1)
         assert isinstance(self.features_extractor, BaseFeaturesExtractor)
         seen: PyTorchObs = obs if self.observation_norm is None else self.observation_norm(obs)
-        return torch.cat((features_of(self, seen, self.features_extractor), actions), dim=1)
+        return torch.cat((self.extract_features(seen, self.features_extractor), actions), dim=1)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         own = {**self._network_args, "features_extractor": self.features_extractor, "n_critics": self.n_critics}
@@ -139,7 +139,7 @@ class CriticEnsemble(BaseModel):
         return [*self.trunk.parameters(), *self.head.parameters()]
 
 
-class ValueNetwork(BaseModel):
+class ValueNetwork(TensorFeatures, BaseModel):
     """
     Value of observations alone, by a network of the critics' kind.
 
@@ -184,7 +184,7 @@ class ValueNetwork(BaseModel):
         """
         assert isinstance(self.features_extractor, BaseFeaturesExtractor)
         seen: PyTorchObs = obs if self.observation_norm is None else self.observation_norm(obs)
-        return self.head(self.trunk(features_of(self, seen, self.features_extractor)))
+        return self.head(self.trunk(self.extract_features(seen, self.features_extractor)))
 
     def project(self) -> None:
         """Called after every step of the optimizer: bring weights back to where they belong, in place."""

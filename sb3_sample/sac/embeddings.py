@@ -28,7 +28,7 @@ from sb3_sample.networks.normed_mlp import NormedMLP, xavier_linear
 from sb3_sample.optim import AdamW
 from sb3_sample.sac.actors import DeterministicActor
 from sb3_sample.sac.critics import CriticEnsemble
-from sb3_sample.sac.features import features_of
+from sb3_sample.sac.features import TensorFeatures
 from sb3_sample.sac.policies import SACPolicy
 
 
@@ -138,7 +138,7 @@ class EmbeddedCritics(CriticEnsemble):
         :return: embeddings of both, (B, P), with a gradient to the actions only
         """
         with torch.no_grad():
-            states = obs.features if isinstance(obs, Encoded) else features_of(self, obs, self._encoder)
+            states = obs.features if isinstance(obs, Encoded) else self.extract_features(obs, self._encoder)
         return self._encoder.pair(states, actions)  # type: ignore[no-any-return]
 
     def statistics(self) -> list[torch.Tensor]:
@@ -148,7 +148,7 @@ class EmbeddedCritics(CriticEnsemble):
         return []
 
 
-class DebiasedRQPolicy(SACPolicy):
+class DebiasedRQPolicy(TensorFeatures, SACPolicy):
     """
     The networks of DR.Q: encoder, actor and critics, and the targets of all three.
 
@@ -293,7 +293,7 @@ class DebiasedRQPolicy(SACPolicy):
         :param target: by the target encoder
         :return: their embeddings, (B, D)
         """
-        return features_of(self, obs, self.encoder_target if target else self.encoder)  # type: ignore[no-any-return]
+        return self.extract_features(obs, self.encoder_target if target else self.encoder)  # type: ignore[no-any-return]
 
 
 class DebiasedRQCnnPolicy(DebiasedRQPolicy):

@@ -7,17 +7,22 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import preprocess_obs
 
 
-def features_of(model: Any, observations: Any, extractor: Any) -> torch.Tensor:
-    """
-    Extract features.
+class TensorFeatures:
+    """Part of actors, critics and policies, before Stable-Baselines3's class: their features of observations."""
 
-    :param model: actor or critics, for the observation space and whether images are divided by 255
-    :param observations: (B, O), or a dict of them
-    :param extractor: features extractor
-    :return: features, (B, F)
-    """
-    found: torch.Tensor = extractor(_preprocessed(observations, model.observation_space, model.normalize_images))
-    return found
+    observation_space: spaces.Space[Any]
+    normalize_images: bool
+
+    def extract_features(self, obs: Any, features_extractor: Any) -> torch.Tensor:
+        """
+        Extract features, as in Stable-Baselines3.
+
+        :param obs: (B, O), or a dict of them
+        :param features_extractor: features extractor
+        :return: features, (B, F)
+        """
+        found: torch.Tensor = features_extractor(_preprocessed(obs, self.observation_space, self.normalize_images))
+        return found
 
 
 def _preprocessed(observations: Any, space: spaces.Space[Any], normalize_images: bool) -> Any:

@@ -396,6 +396,8 @@ class Content:
         """
         names = (argument_names(type(model)) & vars(model).keys()) - self.tree["attributes"].keys()
         names -= {"env", "device", *given, *model._excluded_save_params()}
+        # A model has its spaces from the file or from the environment, and never by default.
+        names -= {"observation_space", "action_space"}
         if not names:
             return ""
         wanted = " or ".join(f"{name}=" for name in sorted(names))
