@@ -95,7 +95,7 @@ class Evaluation(EvalCallback):
                 self.solved = bool(again >= SOLVED)
         if self.num_timesteps == AGENT["learning_starts"] and self.model.compiled:
             # The first gradient step comes next, and nothing else is printed meanwhile.
-            tqdm.write("Compiling the update (torch.compile): a minute on free cores, several on busy ones ...")
+            tqdm.write("Compiling the update: a minute on free cores, several on busy ones ...")
             sys.stdout.flush()
         return not self.solved
 

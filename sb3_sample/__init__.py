@@ -7,6 +7,7 @@ from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
 from sb3_sample.replay.dataset import Dataset
+from sb3_sample.replay.recording import record
 from sb3_sample.replay.weighted import (
     FadedDictReplayBuffer,
     FadedReplayBuffer,
@@ -16,15 +17,18 @@ from sb3_sample.replay.weighted import (
     WindowReplayBuffer,
 )
 from sb3_sample.sac import (
+    BC,
     BRC,
     BRO,
     BROTD3,
     DAC,
     GPLSAC,
+    IQL,
     OAC,
     OPLSAC,
     SAC,
     SRSAC,
+    TD3BC,
     TOPSAC,
     VPLSAC,
     XQC,
@@ -36,15 +40,18 @@ from sb3_sample.sac import (
     SimBa,
     SimbaV2,
 )
+from sb3_sample.sac.many import train_many
 from sb3_sample.training.task_evaluation import MultiTaskEvalCallback, evaluate_tasks
 from sb3_sample.version import __version__
 
 __all__ = [
+    "BC",
     "BRC",
     "BRO",
     "BROTD3",
     "DAC",
     "GPLSAC",
+    "IQL",
     "MBMAPPO",
     "MBPOPPO",
     "OAC",
@@ -52,6 +59,7 @@ __all__ = [
     "QMAPPO",
     "SAC",
     "SRSAC",
+    "TD3BC",
     "TOPSAC",
     "VPLSAC",
     "XQC",
@@ -82,4 +90,6 @@ __all__ = [
     "evaluate_tasks",
     "make_env",
     "multi_task_env",
+    "record",
+    "train_many",
 ]

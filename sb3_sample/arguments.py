@@ -53,29 +53,30 @@ _LEARN: dict[str, Kind] = {
 }
 
 
-def check_every(agent: Any) -> None:
+def check_every(agent: Any, needs_spaces: bool = True) -> None:
     """
     Check every argument that has a kind, and what all policies take. There are spaces unless a model is made without an
     environment.
 
     :param agent: an algorithm whose arguments are stored and whose networks do not exist yet
+    :param needs_spaces: whether it is an error that there are no spaces yet
     :raises ValueError: if one of them is of another kind, or the policy is not one for the observations, or takes none
         of an entry's name in ``policy_kwargs``
     """
-    if not hasattr(agent, "observation_space"):
+    if needs_spaces and not hasattr(agent, "observation_space"):
         raise ValueError(f"env must {_ENVIRONMENT.words}, not None")
     for name, argument in type(agent).constructor_arguments.items():
         if argument.kind is not None:
             # Stable-Baselines3 stores some under the argument's name that are declared under another for their type.
             attribute = argument.attribute if argument.attribute in vars(agent) else name
             setattr(agent, attribute, check_value(name, getattr(agent, attribute), argument.kind))
-    kwargs, space = agent.policy_kwargs, agent.observation_space
+    kwargs, space = agent.policy_kwargs, getattr(agent, "observation_space", None)
     for name, kind in EVERY_POLICY.items():
         if name in kwargs:
             check_value(f"policy_kwargs[{name!r}]", kwargs[name], kind)
     _check_names(kwargs, agent.policy_class)
     policy = named_policy(agent)
-    if policy is None or "features_extractor_class" in kwargs:
+    if policy is None or space is None or "features_extractor_class" in kwargs:
         return
     if policy == "MultiInputPolicy" and not isinstance(space, spaces.Dict):
         raise ValueError(f"policy='MultiInputPolicy' needs Dict observations, not {space}: use 'MlpPolicy'")
@@ -186,7 +187,9 @@ def check_learn(agent: Any, learn: Mapping[str, Any]) -> int:
     :raises ValueError: if one of them is of another kind, or there is no environment
     """
     if agent.env is None:
-        raise NotAllowed("env: the model was loaded without one: pass env= to load, or call set_env, before learn")
+        raise NotAllowed(
+            "env: the model was made or loaded without one: pass env= to it, or call set_env, before learn"
+        )
     for name, kind in _LEARN.items():
         check_value(name, learn[name], kind)
     return math.ceil(learn["total_timesteps"])

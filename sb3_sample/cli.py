@@ -1,6 +1,6 @@
 """
 The command ``sb3-sample``: the zoo's commands with the algorithms of this package in them, ``plot``, ``study``,
-``scaling``, ``advise`` and ``variance``.
+``dataset``, ``scaling``, ``advise`` and ``variance``.
 """
 
 import argparse
@@ -85,9 +85,11 @@ def _train(arguments: list[str]) -> None:
 
     options, rest = _own_options(runs.train_parser(), arguments)
     with _arguments("train"), _errors("train"), reading(options.allow_pickle, options.trusted_modules):
-        start = runs.plan(options, rest)
-        _set_command_line("train", rest if start is None else start.arguments)
-        runs.train(start)
+        if options.seeds is not None:
+            runs.train_seeds(options, rest)
+        else:
+            data = runs.Data.of(options)
+            runs.train(runs.plan(options, rest), rest, data)
 
 
 def _enjoy(arguments: list[str]) -> None:
@@ -229,6 +231,12 @@ def _extras() -> Iterator[None]:
         raise
 
 
+def _dataset(arguments: list[str]) -> None:
+    from sb3_sample.dataset_command import main as dataset
+
+    dataset(arguments)
+
+
 def _study(arguments: list[str]) -> None:
     from sb3_sample.study.command import main as study
 
@@ -258,6 +266,7 @@ COMMANDS: dict[str, Command] = {
     "study": Command(_study, "make the runs of a plan: agents, tasks, seeds and a grid of arguments"),
     "scaling": Command(_scaling, "fit scaling laws: batch size, learning rate and replay ratio for a budget"),
     "advise": Command(_advise, "which size of BRO and replay ratio gets furthest in some hours of this machine"),
+    "dataset": Command(_dataset, "record, show and convert data sets for offline learning"),
     "variance": Command(_variance, "measure a policy gradient's variance: more actions or a longer trajectory?"),
     "plot_train": Command(_zoo_plot("plot_train"), "draw the return of the training episodes"),
     "all_plots": Command(_zoo_plot("all_plots"), "draw and tabulate the evaluations of several runs"),

@@ -6,6 +6,8 @@ from typing import Any
 import torch
 from torch.optim import Optimizer
 
+from sb3_sample.tracing import is_tracing
+
 # With weight decay the step takes three passes over the parameters. On a CPU they run over pieces that fit the
 # cache, all passes on one piece before the next: 2**18 floats are 1 MiB of parameters.
 CHUNK = 2**18
@@ -49,9 +51,13 @@ class AdamW(Optimizer):
         self.capturable = False
         # The groups' learning rates as a tensor, and the numbers that it holds.
         self._rates: torch.Tensor | None = None
-        self._rates_held: list[float] = []
+        self._rates_held: list[float | tuple[float, ...]] = []
         # By group, how many steps each parameter has taken.
         self._steps: list[torch.Tensor] = []
+        # Number of parameters whose moments exist; another one if moments were cleared.
+        self._n_prepared = -1
+        #: Number of times that :meth:`prepare` has made tensors.
+        self.version = 0
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -76,6 +82,8 @@ class AdamW(Optimizer):
         stand in tensors. Compiled and captured steps, which know tensors only, then find both.
         """
         self.prepare_rates()
+        if len(self.state) == self._n_prepared == sum(len(group["params"]) for group in self.param_groups):
+            return
         device = self.param_groups[0]["params"][0].device
         for i, group in enumerate(self.param_groups):
             params = group["params"]
@@ -96,21 +104,31 @@ class AdamW(Optimizer):
         if any(p is not q for p, q in zip(self.state, parameters, strict=False)):
             ordered = {p: self.state.pop(p) for p in parameters if p in self.state}
             self.state.update(ordered)
+        self._n_prepared = len(self.state)
+        self.version += 1
 
     @torch.no_grad()
     def prepare_rates(self) -> None:
         """Bring the tensors with the learning rates up to date, which change with the steps in a schedule."""
-        rates = [float(group["lr"]) for group in self.param_groups]
+        # Of stacked parameters of several learners, a group may have a rate for each.
+        rates = [lr if isinstance(lr := group["lr"], tuple) else float(lr) for group in self.param_groups]
         first = self.param_groups[0]["params"][0]
         device = first.device
         # torch's fused kernel reads a float32 on a GPU.
         dtype = torch.float64 if first.dtype is torch.float64 and device.type == "cpu" else torch.float32
         is_held = self._rates is not None and self._rates.device == device and self._rates.dtype is dtype
-        if self._rates is None or not is_held or len(self._rates_held) != len(rates):
-            self._rates, self._rates_held = torch.tensor(rates, dtype=dtype, device=device), rates
-        elif self._rates_held != rates:
-            self._rates.copy_(torch.tensor(rates, dtype=dtype))
-            self._rates_held = rates
+        if is_held and self._rates_held == rates:
+            return
+        shapes = [[len(r) if isinstance(r, tuple) else 0 for r in of] for of in (rates, self._rates_held)]
+        if self._rates is None or not is_held or shapes[0] != shapes[1]:
+            self._rates = torch.tensor(rates, dtype=dtype, device=device)
+        else:
+            for i, (rate, held) in enumerate(zip(rates, self._rates_held, strict=True)):
+                # Filled in, as a copy from the host would wait for a GPU.
+                for j, value in enumerate(rate if isinstance(rate, tuple) else (rate,)):
+                    if rate != held:
+                        (self._rates[i, j] if isinstance(rate, tuple) else self._rates[i]).fill_(value)
+        self._rates_held = rates
 
     def read_tensors(self) -> list[torch.Tensor]:
         """
@@ -122,6 +140,7 @@ class AdamW(Optimizer):
         # Called by load_state_dict, copy and pickle: what follows from the state is made anew by prepare.
         super().__setstate__(state)
         self.capturable, self._rates, self._rates_held, self._steps = False, None, [], []
+        self._n_prepared, self.version = -1, getattr(self, "version", 0)
 
     @torch.no_grad()
     def apply(self, gradients: Sequence[torch.Tensor | None]) -> None:
@@ -140,14 +159,18 @@ class AdamW(Optimizer):
             if len(used) == len(params):
                 steps.add_(1)
             else:
-                steps[[j for j, _, _ in used]] += 1
+                steps[..., [j for j, _, _ in used]] += 1
             rows: list[tuple[torch.Tensor, ...]] = [
-                (p, _laid_out_like(p, g), self.state[p]["exp_avg"], self.state[p]["exp_avg_sq"], steps[j])
+                (p, _laid_out_like(p, g), self.state[p]["exp_avg"], self.state[p]["exp_avg_sq"], steps[..., j])
                 for j, p, g in used
             ]
-            if torch.compiler.is_compiling():
+            differ = self._rates.dim() > 1 or isinstance(group["weight_decay"], torch.Tensor)
+            if is_tracing() or differ:
                 _plain_adamw(group, rows, self._rates[i])
                 continue
+            if steps.dim() > 1:
+                # Learners side by side have taken as many.
+                rows = [(*tensors, step[0]) for *tensors, step in rows]
             rate = self._rates[i] if self.capturable else group["lr"]
             if group["weight_decay"] == 0:
                 _adam(group, rate, *zip(*rows, strict=True))
@@ -160,18 +183,33 @@ class AdamW(Optimizer):
 
 
 def _plain_adamw(group: dict[str, Any], rows: list[tuple[torch.Tensor, ...]], rate: torch.Tensor) -> None:
-    """The step written out, for a compiler to fuse. The corrections, 1 minus nearly 1, need float64."""
+    """
+    The step written out for all parameters at once, which a compiler fuses. The corrections, 1 minus nearly 1, need
+    float64. Counts of steps, rates and decays may be those of S learners, whose parameters are stacked.
+    """
     beta1, beta2 = group["betas"]
-    for p, grad, exp_avg, exp_avg_sq, step in rows:
-        n = step.double()
-        size = (rate / (1 - beta1**n)).to(p.dtype)
-        root = (1 - beta2**n).rsqrt().to(p.dtype)
-        exp_avg.lerp_(grad, 1 - beta1)
-        exp_avg_sq.lerp_(grad * grad, 1 - beta2)
-        change = size * (exp_avg / (exp_avg_sq.sqrt() * root + group["eps"]))
-        if group["weight_decay"] != 0:
-            change = change + rate * group["weight_decay"] * p
-        p.sub_(change)
+    p, grad, exp_avg, exp_avg_sq, step = map(list, zip(*rows, strict=True))
+    sizes, roots = [], []
+    for of, n in zip(p, step, strict=True):
+        n = n.double()
+        sizes.append(_by_learner(rate / (1 - beta1**n), of))
+        roots.append(_by_learner((1 - beta2**n).rsqrt(), of))
+    torch._foreach_lerp_(exp_avg, grad, 1 - beta1)
+    torch._foreach_lerp_(exp_avg_sq, torch._foreach_mul(grad, grad), 1 - beta2)
+    change = torch._foreach_mul(torch._foreach_sqrt(exp_avg_sq), roots)
+    change = torch._foreach_div(exp_avg, torch._foreach_add(change, group["eps"]))
+    change = torch._foreach_mul(change, sizes)
+    decay = group["weight_decay"]
+    if isinstance(decay, torch.Tensor) or decay != 0:
+        decays = [_by_learner(rate * decay, of) for of in p]
+        change = torch._foreach_add(change, torch._foreach_mul(p, decays))
+    torch._foreach_sub_(p, change)
+
+
+def _by_learner(values: torch.Tensor, p: torch.Tensor) -> torch.Tensor:
+    """A number, or one for each of S learners, (S,), in the shape and type in which a parameter takes it."""
+    values = values.to(p.dtype)
+    return values.view(-1, *[1] * (p.dim() - 1)) if values.dim() == 1 else values
 
 
 def _laid_out_like(p: torch.Tensor, grad: torch.Tensor) -> torch.Tensor:

@@ -10,6 +10,9 @@ of the checkout; one that was interrupted goes on under the commit that it began
 to ``docs/evidence`` of the checkout: evaluations as a table (``<plan>.csv``, as ``sb3-sample study table`` has it), and
 settings, commit and machine of each run (``<plan>.json``).
 
+A program of a plan's name, ``<plan>.py`` beside it, makes what its runs read, such as data sets; it is called before
+each of them, and makes what is not there.
+
 Runs have a low priority and one thread each. Ctrl-C and SIGTERM have them save and end; after
 ``kill -9`` they do so by themselves. To pause one, ``kill -STOP`` its number, which is said when a run begins.
 """
@@ -21,6 +24,7 @@ import hashlib
 import json
 import os
 import platform
+import runpy
 import shutil
 import signal
 import subprocess
@@ -402,6 +406,17 @@ def collect(root: Path, results: Path) -> None:
             (results / f"{name}.json").write_text(json.dumps(records, indent=1) + "\n")
 
 
+def prepare(plan: str) -> None:
+    """
+    Make what the runs of a plan read, such as data sets, by the program of its name beside it, if there is one.
+
+    :param plan: its name
+    """
+    program = PLANS / f"{plan}.py"
+    if program.exists():
+        runpy.run_path(str(program))["main"]([])
+
+
 def run(folder: str, name: str) -> None:
     """
     Make a run, or go on with it, until this process is told to end or its standard input does.
@@ -420,6 +435,7 @@ def run(folder: str, name: str) -> None:
     os.nice(10)
     threading.Thread(target=listen, daemon=True).start()
     place = StudyFolder(folder)
+    prepare(place.path.parent.name)
     (chosen,) = (each for each in place.runs() if each.name == name)
     outcome = attempt(place, chosen, ["--num-threads", "1", "--device", "cpu"], threads=1)
     if outcome is not None and outcome.traceback:

@@ -117,8 +117,8 @@ def test_an_argument_of_the_policy_is_refused_with_its_place() -> None:
         BRO("MlpPolicy", "Pendulum-v1", n_critics=5)  # type: ignore[call-arg]
     with pytest.raises(TypeError, match=r"'ortho_init'\. It is passed as policy_kwargs=dict\(ortho_init=\.\.\.\)$"):
         MBMAPPO("MlpPolicy", "Pendulum-v1", ortho_init=False)  # type: ignore[call-arg]
-    with pytest.raises(TypeError, match="'observation_space'(?!.*policy_kwargs)"):
-        BRO("MlpPolicy", "Pendulum-v1", observation_space=None)  # type: ignore[call-arg]
+    with pytest.raises(TypeError, match="'lr_schedule'(?!.*policy_kwargs)"):
+        BRO("MlpPolicy", "Pendulum-v1", lr_schedule=None)  # type: ignore[call-arg]
 
 
 class Frugal(BROFast):

@@ -59,11 +59,13 @@ BUILT = [
 ON_POLICY = sorted(name for name, entry in zoo.ALGORITHMS.items() if issubclass(entry.algorithm, SimulatedPPO))
 #: What came after BRO, each with settings of its own.
 SUCCESSORS = ("brc", "crossq", "dr_q", "flash_sac", "simba", "simbav2", "xqc")
+#: What learns from data.
+OFFLINE = ("bc", "iql", "td3bc")
 #: Algorithms with the settings that DAC, VPL and the regularization study (2403.00514) share.
 FAMILY = sorted(
     name
     for name, entry in zoo.ALGORITHMS.items()
-    if not issubclass(entry.algorithm, BRO) and name not in (*ON_POLICY, *SUCCESSORS)
+    if not issubclass(entry.algorithm, BRO) and name not in (*ON_POLICY, *SUCCESSORS, *OFFLINE)
 )
 
 

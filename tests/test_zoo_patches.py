@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[1]
 ZOO = sorted((ROOT / "sb3_sample/zoo").glob("*.py"))
 #: What other files of the zoo's commands may set: the command line, which the zoo reads, and the writer of a
 #: TensorBoard log that a run goes on with.
-OWN = {"sys.argv", "each.writer"}
+OWN = {"sys.argv", "each.writer", "model.num_timesteps"}
 #: What ``register`` replaces in ``rl_zoo3``.
 FOR_GOOD = {
     "rl_zoo3.exp_manager.VecNormalize", "rl_zoo3.utils.VecNormalize",

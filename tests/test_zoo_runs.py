@@ -194,7 +194,7 @@ def test_copies_of_the_model_go_on_and_a_progress_bar_may_come(run) -> None:
 
 def test_what_cannot_have_checkpoints_is_refused(run, tmp_path: Path) -> None:
     for arguments in (["--run-dir", "a"], ["--checkpoint-freq", "10"]):
-        with pytest.raises(SystemExit, match=r"--algo ppo has no checkpoints .* of this package, brc, .*, vpl_sac"):
+        with pytest.raises(SystemExit, match=r"--algo ppo has no checkpoints .* of this package, bc, .*, vpl_sac"):
             cli.main(["train", "--algo", "ppo", "--env", "Pendulum-v1", *arguments])
     with pytest.raises(SystemExit, match="-optimize has no checkpoints"):
         run("--run-dir", "a", "-optimize")

@@ -327,8 +327,9 @@ class DiagnosticsCallback(BaseCallback):
         normalize = self.model.get_vec_normalize_env()
         if normalize is not None:
             following = normalize.normalize_reward(following)
-        if self.model.reward_scaler is not None:
-            following = following / self.model.reward_scaler.divisor(None).item()
+        scaler = self.model.reward_scaler
+        if scaler is not None:
+            following = following / scaler.divisor(None).item() + scaler.shift
         return Rollout(value, following.astype(np.float64), np.array(log_probs), terminated)
 
     def _overfitting(self, training: Batch) -> dict[str, float]:

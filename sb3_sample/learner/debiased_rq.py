@@ -89,7 +89,7 @@ class DebiasedRQLearner(Learner):
         """
         execution = super().prepared_execution()
         if self._encoder_execution is None or not self._encoder_execution.serves(self):
-            self._encoder_execution = Execution.of(self, "encoder_step")
+            self._encoder_execution = self.make_execution(self, "encoder_step")
         self._encoder_execution.prepare(self)
         return execution
 

@@ -1,43 +1,34 @@
 """
-Execution of the gradient step: operation by operation, compiled by ``torch.compile``, or captured as a CUDA graph.
+Execution of the gradient step: operation by operation, compiled by Inductor, or captured as a CUDA graph.
 
 All three run the same function, ``Learner.gradient_step``, which is independent of them: it takes the batch and all the
 noise as tensors, does not branch on the value of a tensor, and counts nothing outside of tensors.
 """
 
+import operator
 import re
 import time
-import types
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 
 from sb3_sample.console import say
+from sb3_sample.learner.exploration import Exploration
 from sb3_sample.optim import AdamW
+from sb3_sample.tracing import compile_graph, trace, undone
 
 #: With ``compile="auto"``, gradient steps in one ``learn`` from which on compiling pays: it takes the time of some
 #: thousand steps (docs/performance.md). A number of steps, not a measurement, so that a seed fixes the whole run.
 PAYS_FROM = 20_000
 #: The first torch that a gradient step is compiled with.
-COMPILES_FROM = (2, 13)
+COMPILES_FROM = (2, 11)
 
 Metrics = dict[str, torch.Tensor]
 #: Runs a function without its effects taking place, and gives back what repeats them, and its result, whose tensors
 #: each repetition fills anew.
 Recorder = Callable[[Callable[[], Metrics]], tuple[Callable[[], None], Metrics]]
-
-
-def _compilation_errors() -> tuple[type[Exception], ...]:
-    """
-    Errors of torch where it cannot compile: the first is raised where the tracing of gradients is switched off, the
-    last where the same was compiled for too many settings. Imported when needed, since it takes a second.
-    """
-    from torch._dynamo.exc import FailOnRecompileLimitHit, TorchDynamoException, Unsupported
-    from torch._inductor.exc import InductorError
-
-    return Unsupported, TorchDynamoException, InductorError, FailOnRecompileLimitHit
 
 
 def old_torch() -> str | None:
@@ -161,22 +152,22 @@ class Execution:
         recorder: Recorder | None = None,
         method: str = "gradient_step",
     ):
-        self.compiled, self.fall_back, self._method = compiled, fall_back, method
-        #: Seconds spent on compiling, over all inputs and settings that the step was compiled for.
-        self.seconds_compiling = 0.0
+        self.fall_back = fall_back
         self._step: Callable[..., Metrics] = getattr(type(learner), method)
-        if compiled:
-            # The compiler keeps what it made by the code object. With one for each model, models neither use each
-            # other's nor reach the limit of compilations together.
-            step: Any = self._step
-            own = types.FunctionType(
-                step.__code__.replace(), step.__globals__, step.__name__, step.__defaults__, step.__closure__
-            )
-            self._step = torch.compile(
-                own, fullgraph=True, dynamic=False, options={"guard_filter_fn": _settings_and_inputs}
-            )
-        self._captured = None if recorder is None else Captured(recorder)
-        self._modules = _modules(learner)
+        self._compiled = Compiled(learner) if compiled else None
+        self._captured = None if recorder is None else Captured(learner, recorder)
+        self._modules = learner.identities()
+        self._optimizers = [o for o in learner.optimizers().values() if isinstance(o, AdamW)]
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the gradient step is compiled."""
+        return self._compiled is not None
+
+    @property
+    def seconds_compiling(self) -> float:
+        """Seconds spent on compiling, over all inputs and settings that the step was compiled for."""
+        return 0.0 if self._compiled is None else self._compiled.seconds
 
     def serves(self, learner: Any) -> bool:
         """
@@ -185,7 +176,7 @@ class Execution:
         :param learner: the learner
         :return: whether it still has the networks, parts, optimizers and loss that this was made for
         """
-        return self._modules == _modules(learner)
+        return self._modules == learner.identities()
 
     @classmethod
     def of(cls, learner: Any, method: str = "gradient_step") -> "Execution":
@@ -217,12 +208,13 @@ class Execution:
 
         :param learner: the learner
         """
-        for optimizer in learner.optimizers().values():
-            if isinstance(optimizer, AdamW):
-                optimizer.capturable = self._captured is not None
-                optimizer.prepare()
+        for optimizer in self._optimizers:
+            optimizer.capturable = self._captured is not None
+            optimizer.prepare()
+        if self._compiled is not None:
+            self._compiled.prepare(learner)
         if self._captured is not None:
-            self._captured.forget_if_stale(learner)
+            self._captured.forget_if_stale(learner, None if self._compiled is None else self._compiled.version)
 
     def __call__(self, learner: Any, *inputs: Any, eager: bool = False) -> Metrics:
         """
@@ -234,75 +226,173 @@ class Execution:
         :return: its result; that of a captured step is valid until the next one
         """
         if eager:
-            return getattr(type(learner), self._method)(learner, *inputs)  # type: ignore[no-any-return]
+            return self._step(learner, *inputs)
         if self._captured is not None:
             return self._captured(self._run, learner, inputs)
         return self._run(learner, *inputs)
 
     def _run(self, learner: Any, *inputs: Any) -> Metrics:
-        if not self.compiled:
+        if self._compiled is None:
             return self._step(learner, *inputs)
         try:
-            try:
-                return self._step(learner, *inputs)
-            except _compilation_errors()[0]:
-                # Not compiled yet for these inputs or settings: to trace gradients needs a switch.
-                return self._compile(learner, *inputs)
-        except _compilation_errors() as error:
-            # Raised before anything of the step has been run.
-            reason = str(error).strip().splitlines()[0]
-            if raised := re.search(r"raised exception (\w+\(.*\))", str(error)):
-                reason = f"it raises {raised[1]}"
-            if "RecompileLimit" in type(error).__name__:
-                reason = "a setting that it reads changes again and again, and each change has it compiled anew"
+            return self._compiled(self._step, learner, inputs)
+        except CannotCompile as error:
+            # Raised before anything of the step has taken effect.
             if not self.fall_back:
-                if raised:
-                    # Eagerly it is raised as it is, from its place.
-                    getattr(type(learner), self._method)(learner, *inputs)
                 raise RuntimeError(
-                    f"compile=True, but the gradient step cannot be compiled: {reason}. Pass compile=False, or 'auto'"
+                    f"compile=True, but the gradient step cannot be compiled: {error}. Pass compile=False, or 'auto'"
                 ) from error
-            warnings.warn(f"The gradient step is not compiled, as it cannot be: {reason}", stacklevel=2)
-            self.compiled = learner.compiled = False
-            self._step = getattr(type(learner), self._method)
+            warnings.warn(f"The gradient step is not compiled, as it cannot be: {error}", stacklevel=2)
+            self._compiled, learner.compiled = None, False
             return self._step(learner, *inputs)
 
-    def _compile(self, learner: Any, *inputs: Any) -> Metrics:
+
+def acting_of(learner: Any) -> "Captured | None":
+    """
+    Choose how actions of the training are computed.
+
+    :param learner: the learner
+    :return: what captures them; None where they are computed as they are: on a CPU, and for an explorer with an ``act``
+        of its own
+    """
+    if learner.device.type != "cuda" or type(learner.explorer).act is not Exploration.act:
+        return None
+    asked = learner.compile is True or (learner.compile == "auto" and not foreign_parts(learner))
+    return Captured(learner, cuda_graph, optimizers=False) if asked else None
+
+
+class CannotCompile(Exception):
+    """Error of a gradient step that can be run but not compiled."""
+
+
+class _Program(NamedTuple):
+    """A compiled gradient step, for one kind of inputs."""
+
+    #: What was traced, in words, and the tensors beside the state that it reads.
+    code: str
+    further: list[torch.Tensor]
+    function: Callable[..., Sequence[torch.Tensor]]
+    #: Names of its results.
+    names: list[str]
+
+
+class Compiled:
+    """
+    Compiled gradient steps of a learner, one for each kind of inputs.
+
+    A compiled step holds all numbers and words that it read when it was traced. If one of those that it may have read
+    changes, it is traced anew, in about a second, and compiled anew if what was traced differs. Parameters, moments,
+    counts of steps and learning rates are tensors, which it is given.
+
+    :param learner: the learner
+    """
+
+    #: Programs that are made before it is taken that a setting changes all the time.
+    MAX_PROGRAMS = 8
+
+    def __init__(self, learner: Any):
+        #: Seconds spent on tracing and compiling.
+        self.seconds = 0.0
+        #: Number of changes of settings that were found.
+        self.version = 0
+        self._programs: dict[Any, tuple[int, _Program]] = {}
+        self._n_made = 0
+        self._tensors = _Tensors(learner)
+        self._settings = Settings(learner, private=True)
+
+    def prepare(self, learner: Any) -> None:
+        """
+        Look for other settings and other tensors.
+
+        :param learner: the learner
+        """
+        self._tensors.renew()
+        if self._settings.have_changed():
+            self.version += 1
+
+    def __call__(self, step: Callable[..., Metrics], learner: Any, inputs: tuple[Any, ...]) -> Metrics:
+        """
+        Run one gradient step, compiled for its kind of inputs and for the settings in force.
+
+        :param step: the step
+        :param learner: its first argument
+        :param inputs: its other arguments
+        :return: its result
+        :raises CannotCompile: if it cannot be compiled; nothing has taken effect
+        """
+        kind = _kind(inputs)
+        version, program = self._programs.get(kind, (-1, None))
+        if program is None or version != self.version:
+            program = self._made(step, learner, inputs, program)
+            self._programs[kind] = self.version, program
+            if all(version == self.version for version, _ in self._programs.values()):
+                self._settings.did_not_change_the_step()
+        with torch.no_grad():
+            given = (x.contiguous() for x in tensors_of(inputs))
+            results = program.function(*self._tensors.all, *program.further, *given)
+        return dict(zip(program.names, results, strict=True))
+
+    def _made(
+        self, step: Callable[..., Metrics], learner: Any, inputs: tuple[Any, ...], old: _Program | None
+    ) -> _Program:
+        """A program for the inputs: the old one if it would come out the same."""
+        start = time.perf_counter()
+        own = inputs_like(inputs, lambda x: x.clone(memory_format=torch.contiguous_format))
+        names: list[str] = []
+
+        def run(*tensors: torch.Tensor) -> list[torch.Tensor]:
+            given = iter(tensors)
+            metrics = step(learner, *inputs_like(own, lambda _: next(given)))
+            names[:] = metrics
+            return list(metrics.values())
+
+        further: list[torch.Tensor] = []
+        try:
+            graph = trace(run, self._tensors.all, tensors_of(own))
+            # Tensors that are neither state nor input: as inputs, so that their values are those of the day.
+            further = [getattr(graph, str(node.target)) for node in graph.graph.nodes if node.op == "get_attr"]
+            if further:
+                graph = trace(run, [*self._tensors.all, *further], tensors_of(own))
+        except Exception as error:
+            # An error of the step itself is raised as it is, from its place.
+            with undone(self._tensors.all, learner.device):
+                step(learner, *inputs)
+            raise CannotCompile(str(error).strip().splitlines()[0]) from error
+        if old is not None and graph.code == old.code and _are_same(further, old.further):
+            return old
+        self._settings.changed_the_step()
+        self._n_made += 1
+        if self._n_made > self.MAX_PROGRAMS:
+            raise CannotCompile("a setting that it reads changes again and again, and each change has it compiled anew")
         if learner.verbose >= 1:
             say("Compiling the gradient step ...")
-        start = time.perf_counter()
-        with torch._dynamo.config.patch(trace_autograd_ops=True):
-            metrics = self._step(learner, *inputs)
-        seconds = time.perf_counter() - start
-        self.seconds_compiling += seconds
+        code = graph.code
+        try:
+            with torch.no_grad():
+                function = compile_graph(graph, [*self._tensors.all, *further, *tensors_of(own)])
+        except Exception as error:
+            raise CannotCompile(f"{type(error).__name__}: {error}".strip().splitlines()[0]) from error
+        self.seconds += time.perf_counter() - start
         if learner.verbose >= 1:
-            say(f"Compiled in {seconds:.1f} s")
-        return metrics
+            say(f"Compiled in {time.perf_counter() - start:.1f} s")
+        return _Program(code, further, function, names)
 
 
-def _settings_and_inputs(guards: Sequence[Any]) -> list[bool]:
+def _are_same(ours: Sequence[torch.Tensor], theirs: Sequence[torch.Tensor]) -> bool:
+    return len(ours) == len(theirs) and all(a is b for a, b in zip(ours, theirs, strict=True))
+
+
+def tensors_of(inputs: Any) -> list[torch.Tensor]:
     """
-    Select the conditions of a compiled step that are checked before each step.
+    List the tensors of nested tuples and dicts.
 
-    Most conditions are on parameters, modules and functions, and checking them takes as long as a small network's
-    forward pass. :meth:`Execution.serves` checks them instead. A learning rate may change: it is read from a tensor.
+    :param inputs: the tuples and dicts
+    :return: their tensors, in a fixed order
     """
-    settings = ("CONSTANT_MATCH", "EQUALS_MATCH", "GRAD_MODE", "GLOBAL_STATE", "DETERMINISTIC_ALGORITHMS")
-    inputs = ("batch", "noise", "extra", "moves_targets", "moves_actor")
-
-    def matters(guard: Any) -> bool:
-        of_input = guard.name.removeprefix("L['").startswith(inputs)
-        return of_input or (guard.guard_type in settings and not guard.name.endswith("['lr']"))
-
-    return [matters(guard) for guard in guards]
-
-
-def _tensors(inputs: Any) -> list[torch.Tensor]:
-    """Tensors of nested tuples and dicts, in a fixed order."""
     if isinstance(inputs, torch.Tensor):
         return [inputs]
     values = inputs.values() if isinstance(inputs, dict) else inputs if isinstance(inputs, tuple) else ()
-    return [tensor for value in values for tensor in _tensors(value)]
+    return [tensor for value in values for tensor in tensors_of(value)]
 
 
 def _kind(inputs: Any) -> Any:
@@ -314,14 +404,20 @@ def _kind(inputs: Any) -> Any:
     return tuple(map(_kind, inputs)) if isinstance(inputs, tuple) else inputs
 
 
-def _like(inputs: Any, make: Callable[[torch.Tensor], torch.Tensor]) -> Any:
-    """Copy of nested tuples and dicts with other tensors."""
+def inputs_like(inputs: Any, make: Callable[[torch.Tensor], torch.Tensor]) -> Any:
+    """
+    Copy nested tuples and dicts with other tensors.
+
+    :param inputs: the tuples and dicts
+    :param make: makes a tensor of each, in the order of :func:`tensors_of`
+    :return: the same with what was made
+    """
     if isinstance(inputs, torch.Tensor):
         return make(inputs)
     if isinstance(inputs, dict):
-        return {key: _like(value, make) for key, value in inputs.items()}
+        return {key: inputs_like(value, make) for key, value in inputs.items()}
     if isinstance(inputs, tuple):
-        values = [_like(value, make) for value in inputs]
+        values = [inputs_like(value, make) for value in inputs]
         return type(inputs)(*values) if hasattr(inputs, "_fields") else tuple(values)
     return inputs
 
@@ -348,26 +444,32 @@ class Captured:
     If one of them moves to another place (loading, a reinitialised optimizer), or a number outside of tensors changes,
     :meth:`forget_if_stale` drops the captured steps, and they are captured anew.
 
+    :param learner: the learner
     :param recorder: what captures
+    :param optimizers: whether what is captured reads the optimizers' tensors
     """
 
     #: Steps of each kind that are run as they are before one is captured, as CUDA's libraries set themselves up.
     WARM_UP = 3
 
-    def __init__(self, recorder: Recorder):
+    def __init__(self, learner: Any, recorder: Recorder, optimizers: bool = True):
         self._recorder = recorder
+        self._tensors = _Tensors(learner, optimizers)
+        self._settings = Settings(learner, private=False)
         self._runs: dict[Any, int] = {}
         self._recorded: dict[Any, tuple[Any, Callable[[], None], Metrics]] = {}
         self._held: Any = None
 
-    def forget_if_stale(self, learner: Any) -> None:
+    def forget_if_stale(self, learner: Any, program: int | None = None) -> None:
         """
         Drop the captured steps if the model has other tensors or other settings than at their capture.
 
         :param learner: the learner
+        :param program: number of the compiled steps that are captured, if they are
         """
-        now = _places(learner), _settings(learner)
-        if now != self._held:
+        self._tensors.renew()
+        now = [program, *(t.data_ptr() for t in self._tensors.all)]
+        if self._settings.have_changed() or now != self._held:
             self._recorded.clear()
             self._held = now
 
@@ -385,10 +487,10 @@ class Captured:
         if runs <= self.WARM_UP:
             return _aside(lambda: step(learner, *inputs)) if learner.device.type == "cuda" else step(learner, *inputs)
         if kind not in self._recorded:
-            own = _like(inputs, torch.clone)
+            own = inputs_like(inputs, torch.clone)
             self._recorded[kind] = (own, *self._recorder(lambda: step(learner, *own)))
         own, repeat, metrics = self._recorded[kind]
-        torch._foreach_copy_(_tensors(own), _tensors(inputs))
+        torch._foreach_copy_(tensors_of(own), tensors_of(inputs))
         repeat()
         # The caller adds to what it is given.
         return dict(metrics)
@@ -404,24 +506,39 @@ def _aside(run: Callable[[], Metrics]) -> Metrics:
     return metrics
 
 
-def _modules(learner: Any) -> tuple[Any, ...]:
-    """Identities of the objects that a compiled or captured step was made for."""
-    critics = (learner.critic, learner.critic.trunk, learner.critic_target, learner.critic_target.trunk)
-    networks = (learner.actor, learner.actor.trunk, *critics, learner.temperature)
-    parts = (learner.explorer, learner.pessimism_rule, *learner.optimizers().values())
-    groups = [len(group["params"]) for optimizer in learner.optimizers().values() for group in optimizer.param_groups]
-    return (*map(id, (*networks, *parts, learner.head)), *groups)
+class _Tensors:
+    """
+    Tensors that a gradient step reads or writes besides its inputs, each once: parameters and buffers, moments, counts
+    of steps and learning rates.
 
+    :param learner: the learner
+    :param optimizers: whether those of its optimizers are among them
+    """
 
-def _places(learner: Any) -> tuple[int, ...]:
-    """Addresses of all tensors that a gradient step reads or writes, without its inputs."""
-    modules = (learner.networks, learner.head, learner.temperature, learner.explorer, learner.pessimism_rule)
-    tensors = [t for module in modules for t in (*module.parameters(), *module.buffers())]
-    for optimizer in learner.optimizers().values():
-        tensors += [t for state in optimizer.state.values() for t in state.values() if isinstance(t, torch.Tensor)]
-        if isinstance(optimizer, AdamW):
-            tensors += optimizer.read_tensors()
-    return tuple(t.data_ptr() for t in tensors)
+    def __init__(self, learner: Any, optimizers: bool = True):
+        tensors = (t for module in learner.step_modules() for t in (*module.parameters(), *module.buffers()))
+        self._of_modules = list({id(t): t for t in tensors}.values())
+        self._optimizers = list(learner.optimizers().values()) if optimizers else []
+        self._versions: list[Any] = []
+        #: The tensors.
+        self.all: list[torch.Tensor] = self._of_modules
+
+    def renew(self) -> None:
+        """Look for tensors that optimizers have made since the last call."""
+        versions = [(getattr(o, "version", None), len(o.state)) for o in self._optimizers]
+        rates = [getattr(o, "_rates", None) for o in self._optimizers]
+        if self._versions and versions == self._versions[0] and all(map(operator.is_, rates, self._versions[1])):
+            return
+        self._versions = [versions, rates]
+        self.all = list(self._of_modules)
+        for optimizer in self._optimizers:
+            # Counts of steps are places in one vector, which comes after them.
+            own = isinstance(optimizer, AdamW)
+            for state in optimizer.state.values():
+                tensors = {k: t for k, t in state.items() if isinstance(t, torch.Tensor) and not (own and k == "step")}
+                self.all += tensors.values()
+            if own:
+                self.all += optimizer.read_tensors()
 
 
 #: Public numbers of a part or of the learner that are no settings: they move with the run, and the gradient step does
@@ -429,19 +546,50 @@ def _places(learner: Any) -> tuple[int, ...]:
 NO_SETTINGS = {"arm", "training", "gradients_are_stale"}
 
 
-def _settings(learner: Any) -> list[Any]:
-    """Numbers and words that a gradient step may read: the learner's own, its modules' and its optimizers'."""
+class Settings:
+    """
+    Numbers and words that a gradient step may read: the learner's own, its modules' and its optimizers'.
 
-    def plain(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-        return {name: value for name, value in values if isinstance(value, (int, float, str, type(None)))}
+    :param learner: the learner
+    :param private: whether private ones count in classes from outside of this package, whose own have public names
+    """
 
-    roots = (learner.networks, learner.head, learner.explorer, learner.pessimism_rule)
-    modules = [module for root in roots for module in root.modules()]
-    settings: list[Any] = []
-    for owner in (learner, *modules):
-        public = ((k, v) for k, v in vars(owner).items() if not k.startswith("_") and k not in NO_SETTINGS)
-        settings.append(plain(public))
-    for optimizer in learner.optimizers().values():
-        for group in optimizer.param_groups:
-            settings.append({k: v for k, v in group.items() if k not in ("params", "lr")})
-    return settings
+    def __init__(self, learner: Any, private: bool):
+        modules = [module for root in learner.step_modules() for module in root.modules()]
+        self._held: list[tuple[dict[str, Any], str, Any]] = []
+        for owner in (learner, *modules):
+            of_torch = type(owner).__module__.split(".")[0] == "torch"
+            every = private and not of_torch and not _is_ours(type(owner))
+            for name, value in vars(owner).items():
+                is_plain = isinstance(value, (int, float, str, type(None)))
+                if is_plain and (every or not name.startswith("_")) and name not in NO_SETTINGS:
+                    self._held.append((vars(owner), name, value))
+        for optimizer in learner.optimizers().values():
+            for group in optimizer.param_groups:
+                self._held += [(group, name, value) for name, value in group.items() if name not in ("params", "lr")]
+        #: Places of those that changed, and changed nothing in the step.
+        self._unread: set[int] = set()
+        self._changed: set[int] = set()
+
+    def have_changed(self) -> bool:
+        """
+        :return: whether one has another value than at the last call
+        """
+        changed = [
+            (i, values[name])
+            for i, (values, name, value) in enumerate(self._held)
+            if (now := values.get(name)) is not value and now != value
+        ]
+        for i, value in changed:
+            self._held[i] = (*self._held[i][:2], value)
+        self._changed.update({i for i, _ in changed} - self._unread)
+        return any(i not in self._unread for i, _ in changed)
+
+    def changed_the_step(self) -> None:
+        """Take note that the changes so far made another step."""
+        self._changed, self._unread = set(), set()
+
+    def did_not_change_the_step(self) -> None:
+        """Take note that the changes since the last call of :meth:`changed_the_step` made no other step."""
+        self._unread |= self._changed
+        self._changed = set()

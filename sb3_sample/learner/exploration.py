@@ -30,14 +30,38 @@ class Exploration(Part):
 
     def act(self, learner: Learning, observations: Any) -> torch.Tensor:
         """
-        Sample the actions of the training.
+        Sample the actions of the training. An explorer that leaves this as it is, and has its own :meth:`sampled`, is
+        captured on a GPU.
 
         :param learner: the learner
         :param observations: tensors on the device of the model, (B, O) or a dict of them
         :return: actions in [-1, 1], (B, A)
         """
+        return self.sampled(learner, observations, self.draw_noise(learner, observations))
+
+    def draw_noise(self, learner: Learning, observations: Any) -> torch.Tensor:
+        """
+        Draw the noise of one step's actions.
+
+        :param learner: the learner
+        :param observations: tensors on the device of the model, (B, O) or a dict of them
+        :return: standard normal noise, (B, A)
+        """
+        rows = next(iter(observations.values())) if isinstance(observations, dict) else observations
+        like = next(learner.actor.parameters())
+        return torch.randn_like(like.new_empty((len(rows), learner.actor.action_dim)))
+
+    def sampled(self, learner: Learning, observations: Any, noise: torch.Tensor) -> torch.Tensor:
+        """
+        Compute actions, on tensors only: this function is captured.
+
+        :param learner: the learner
+        :param observations: tensors on the device of the model, (B, O) or a dict of them
+        :param noise: from :meth:`draw_noise`, (B, A)
+        :return: actions in [-1, 1], (B, A)
+        """
         mean, log_std = learner.actor.gaussian(learner.actor.features(observations))
-        return learner.actor.act(mean, log_std.exp(), torch.randn_like(mean))
+        return learner.actor.act(mean, log_std.exp(), noise)
 
     def update(self, learner: Learning, batch: Batch, noise: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         """
@@ -73,10 +97,8 @@ class HeldNoise(Exploration):
         self._held: torch.Tensor | None = None
         self._length = self._n_held = 0
 
-    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
-        mean, log_std = learner.actor.gaussian(learner.actor.features(observations))
-        held = self.hold(torch.randn_like(mean), float(torch.rand(())))
-        return learner.actor.act(mean, log_std.exp(), held)
+    def draw_noise(self, learner: Learning, observations: Any) -> torch.Tensor:
+        return self.hold(super().draw_noise(learner, observations), float(torch.rand(())))
 
     def hold(self, fresh: torch.Tensor, uniform: float) -> torch.Tensor:
         """
@@ -215,11 +237,11 @@ class OptimisticExploration(Exploration):
         """Weight of the divergence in the actor's loss."""
         return kl_weight
 
-    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
+    def sampled(self, learner: Learning, observations: Any, noise: torch.Tensor) -> torch.Tensor:
         features = learner.actor.features(observations)
         mean, log_std = learner.actor.gaussian(features)
         mean, std = self._gaussian(observations, features, mean, log_std.exp())
-        return learner.actor.act(mean, self.std_multiplier * std, torch.randn_like(std))
+        return learner.actor.act(mean, self.std_multiplier * std, noise)
 
     def update(self, learner: Learning, batch: Batch, noise: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         observations = learner.encoded(batch.observations)
@@ -413,9 +435,9 @@ class OptimisticActor(OptimisticExploration):
         mean, log_std = self.actor.gaussian(self.actor.features(observations))
         return mean, log_std.exp()
 
-    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
+    def sampled(self, learner: Learning, observations: Any, noise: torch.Tensor) -> torch.Tensor:
         mean, log_std = self.actor.gaussian(self.actor.features(observations))
-        return self.actor.act(mean, self.std_multiplier * log_std.exp(), torch.randn_like(mean))
+        return self.actor.act(mean, self.std_multiplier * log_std.exp(), noise)
 
     def _kl(self, learner: Learning, optimistic: Any, pessimistic: Any) -> torch.Tensor:
         if self.kl_direction == "pessimistic_to_optimistic":
@@ -486,9 +508,9 @@ class OptimisticGradient(Exploration):
         length = (scaled * gradient).sum(dim=1, keepdim=True).sqrt()
         return mean + math.sqrt(2 * self.kl_radius) * scaled / (length + 1e-6), std
 
-    def act(self, learner: Learning, observations: Any) -> torch.Tensor:
+    def sampled(self, learner: Learning, observations: Any, noise: torch.Tensor) -> torch.Tensor:
         mean, std = self.shifted_mean(learner, observations)
-        return learner.actor.act(mean, std, torch.randn_like(std))
+        return learner.actor.act(mean, std, noise)
 
 
 #: Choices by the name that the algorithm's ``exploration`` argument takes.

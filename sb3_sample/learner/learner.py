@@ -15,19 +15,22 @@ from torch.optim import Optimizer
 
 from sb3_sample.learner import first_step, losses
 from sb3_sample.learner.batch import SLOTS, Batch, CriticStep, Extra, Noise
-from sb3_sample.learner.execution import Execution
+from sb3_sample.learner.descent import descend, follow, minimize
+from sb3_sample.learner.execution import Captured, Execution, acting_of
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
+from sb3_sample.learner.objectives import Objective, Prepared
 from sb3_sample.learner.observation_statistics import ObservationStatistics
 from sb3_sample.learner.observations import Observations
 from sb3_sample.learner.parts import Part, logged
 from sb3_sample.learner.pessimism import Pessimism, pessimistic_value
 from sb3_sample.learner.plasticity import ReDo, Resets
+from sb3_sample.learner.q_values import evaluate
 from sb3_sample.learner.randomness import OwnGenerators
 from sb3_sample.learner.reward_scale import RewardScale, task_of
 from sb3_sample.learner.scalars import FixedScalar, LogScalar, TaskLogScalar
 from sb3_sample.learner.schedules import LearningRateSchedule
-from sb3_sample.learner.target import next_step, online_outputs, step_outputs, td_target, values
+from sb3_sample.learner.target import next_step, online_outputs, step_outputs, td_target
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
@@ -76,6 +79,7 @@ class Learner:
     :param redo: recycling of dormant neurons; None for none
     :param make_transforms: each makes a batch transform for the learner, applied in this order
     :param make_reward_scaler: makes the rule that scales rewards for the learner, applied before them; None for none
+    :param make_objective: makes a freshly initialised objective for the learner; None for that of soft actor-critic
     :param learning_rate: of actor, critics and temperature, at the start
     :param schedule: learning rates over the planned gradient steps; None: as :meth:`set_learning_rate` says
     :param temperature_beta1: beta1 of the temperature's Adam
@@ -121,6 +125,7 @@ class Learner:
         redo: ReDo | None = None,
         make_transforms: Sequence[Callable[[Any], BatchTransform]] = (),
         make_reward_scaler: Callable[[Any], RewardScale] | None = None,
+        make_objective: Callable[[Any], Objective] | None = None,
         learning_rate: float = 3e-4,
         schedule: LearningRateSchedule | None = None,
         temperature_beta1: float = 0.9,
@@ -145,6 +150,7 @@ class Learner:
     ):
         self._make_networks, self._make_temperature = make_networks, make_temperature
         self._make_pessimism, self._make_explorer = make_pessimism, make_explorer
+        self._make_objective = make_objective or (lambda learner: Objective())
         self.device, self.verbose, self.learning_rate = torch.device(device), verbose, learning_rate
         self.gamma, self.tau = gamma, tau
         self.schedule = schedule
@@ -164,6 +170,7 @@ class Learner:
             self.explorer = self.make_explorer()
             self.reward_scaler = None if make_reward_scaler is None else make_reward_scaler(self).to(self.device)
             self.transforms: Any = nn.ModuleList(make(self).to(self.device) for make in make_transforms)
+            self.objective = self._make_objective(self)
         self.observation_statistics = None if self.observation_norm is None else ObservationStatistics()
         self.plasticity, self.redo = plasticity, redo
         if redo is not None:
@@ -174,6 +181,10 @@ class Learner:
             self.temperature_optimizer = AdamW(self.temperature.parameters(), lr=learning_rate, betas=betas)
         self._parts_mode = ModeSwitch(*self.parts().values())
         self._execution: Execution | None = None
+        #: Chooses how the gradient steps are run: takes the learner and the method's name.
+        self.make_execution: Callable[[Any, str], Any] = Execution.of
+        # The explorer, and what captures its actions.
+        self._acting: tuple[Exploration, Captured | None] | None = None
         #: Whether ``.grad`` holds the gradients of another gradient step than the last, as a compiled one leaves none.
         self.gradients_are_stale = False
         # Whether the shapes of a gradient step, and those of the explorer's actions, were checked.
@@ -279,6 +290,14 @@ class Learner:
         """
         return self.networks.make_actor()
 
+    def make_value(self) -> Any:
+        """
+        Make a value network.
+
+        :return: a network of the critics' kind that judges observations alone, (B, O) to (B, 1)
+        """
+        return self.networks.make_value()
+
     def make_optimizer(self, parameters: Iterable[nn.Parameter]) -> Optimizer:
         """
         Make an optimizer.
@@ -321,6 +340,7 @@ class Learner:
         }
         optional = ("redo", "observation_statistics", "reward_scaler")
         parts |= {name: getattr(self, name) for name in optional if getattr(self, name) is not None}
+        parts |= {"objective": self.objective} if self.objective.has_state else {}
         return parts | {f"transforms.{i}": transform for i, transform in enumerate(self.transforms)}
 
     def optimizers(self) -> dict[str, Optimizer]:
@@ -444,6 +464,27 @@ class Learner:
 
     # ---------------------------------------------------------------- the update
 
+    def step_modules(self) -> tuple[nn.Module, ...]:
+        """
+        List the modules of the gradient step.
+
+        :return: modules that a gradient step reads or writes
+        """
+        return self.networks, self.head, self.temperature, self.explorer, self.pessimism_rule, self.objective
+
+    def identities(self) -> tuple[int, ...]:
+        """
+        Identify what a compiled or captured gradient step is made for.
+
+        :return: identities of networks, parts, optimizers and loss, and the optimizers' numbers of parameters
+        """
+        critics = (self.critic, self.critic.trunk, self.critic_target, self.critic_target.trunk)
+        optimizers = self.optimizers().values()
+        parts = (self.explorer, self.pessimism_rule, self.objective)
+        objects = (self.actor, self.actor.trunk, *critics, self.temperature, *parts)
+        sizes = (len(group["params"]) for optimizer in optimizers for group in optimizer.param_groups)
+        return (*map(id, (*objects, *optimizers, self.head)), *sizes)
+
     @property
     def seconds_compiling(self) -> float:
         """Seconds spent on compiling the gradient step."""
@@ -451,7 +492,7 @@ class Learner:
 
     def forget_execution(self) -> None:
         """Drop the execution: how the gradient steps are run is decided anew before the next one."""
-        self._execution = None
+        self._execution = self._acting = None
 
     def prepared_execution(self) -> Execution:
         """
@@ -460,7 +501,7 @@ class Learner:
         :return: runner of the gradient steps
         """
         if self._execution is None or not self._execution.serves(self):
-            self._execution = Execution.of(self)
+            self._execution = self.make_execution(self, "gradient_step")
         self._execution.prepare(self)
         return self._execution
 
@@ -515,11 +556,33 @@ class Learner:
         :return: actions in [-1, 1], (B, A)
         :raises ValueError: if the explorer's first actions are something else
         """
-        actions = self.explorer.act(self, observations)
+        actions = self._actions(observations)
         if not self._checked_actions:
             first_step.check_actions(self, observations, actions)
             self._checked_actions = True
         return actions
+
+    def _actions(self, observations: Any) -> torch.Tensor:
+        """The explorer's actions, on a GPU by a captured graph."""
+        if self._acting is None or self._acting[0] is not self.explorer:
+            self._acting = self.explorer, acting_of(self)
+        acting = self._acting[1]
+        if acting is None:
+            actions: torch.Tensor = self.explorer.act(self, observations)
+            return actions
+        noise = self.explorer.draw_noise(self, observations)
+        acting.forget_if_stale(self)
+        return acting(type(self).action_step, self, (observations, noise))["actions"]
+
+    def action_step(self, observations: Any, noise: torch.Tensor) -> dict[str, torch.Tensor]:
+        """
+        Compute the explorer's actions, on tensors only: this function is captured.
+
+        :param observations: tensors on the learner's device, (B, O), or a dict of them
+        :param noise: from the explorer's ``draw_noise``, (B, A)
+        :return: "actions", in [-1, 1], (B, A)
+        """
+        return {"actions": self.explorer.sampled(self, observations, noise)}
 
     def step(
         self, batch: Batch, noise: Noise | None = None, extra: Extra | None = None, eager: bool = False
@@ -591,32 +654,40 @@ class Learner:
         :param moves_actor: whether actors and temperature learn in this step
         :return: what to log, by name, scalars
         """
-        alpha, metrics = self.temperature_of(batch), {}
+        alpha = self.temperature_of(batch)
+        metrics, prepared = self.objective.prepare(self, batch)
         if self.actor_first and moves_actor:
-            metrics.update(self._learn_actors(batch, noise, alpha))
+            metrics.update(self._learn_actors(batch, noise, alpha, prepared))
             alpha = self.temperature_of(batch)
-        step, of_critics = self._learn_critics(batch, noise, alpha, moves_targets)
-        metrics.update(of_critics)
+        step: CriticStep | None = None
+        if self.objective.learns_critics:
+            step, of_critics = self._learn_critics(batch, noise, alpha, moves_targets, prepared)
+            metrics.update(of_critics)
         if moves_actor and not self.actor_first:
-            metrics.update(self._learn_actors(batch, noise, alpha))
+            metrics.update(self._learn_actors(batch, noise, alpha, prepared))
         elif self.actor.trunk.statistics_every_step and not moves_actor:
             with torch.no_grad():
                 self.actor.gaussian(self.actor.features(self.encoded(batch.observations)))
 
         # Pessimism.
-        rule = self.pessimism_rule
-        metrics.update(logged(rule, "update", rule.update(self, batch, step, noise.pessimism, extra)))
+        if step is not None:
+            rule = self.pessimism_rule
+            metrics.update(logged(rule, "update", rule.update(self, batch, step, noise.pessimism, extra)))
         return {name: value.detach() for name, value in metrics.items()}
 
     def _learn_critics(
-        self, batch: Batch, noise: Noise, alpha: torch.Tensor, moves_targets: bool
-    ) -> tuple[CriticStep, dict[str, torch.Tensor]]:
-        """Take the critics' step, and that of their targets."""
-        # Critics, towards the targets' value of the actor's next action.
-        next_actions, entropy_bonus = next_step(self, batch, alpha, noise.critic)
-        q, next_q = step_outputs(self, batch, next_actions, noise.subset)
-        with torch.no_grad():
-            target = self.head.target(batch, next_q, self.pessimism_rule.value, entropy_bonus)
+        self, batch: Batch, noise: Noise, alpha: torch.Tensor, moves_targets: bool, prepared: Prepared
+    ) -> tuple[CriticStep | None, dict[str, torch.Tensor]]:
+        """Take the critics' step, and that of their targets; None for what the rule of pessimism judges, if nothing."""
+        # Critics, towards the targets' value of the actor's next action, unless the objective has another target.
+        step: CriticStep | None = None
+        if prepared.target is None:
+            next_actions, entropy_bonus = next_step(self, batch, alpha, noise.critic)
+            q, next_q = step_outputs(self, batch, next_actions, noise.subset)
+            with torch.no_grad():
+                target = self.head.target(batch, next_q, self.pessimism_rule.value, entropy_bonus)
+        else:
+            q, target = evaluate(self.critic, batch.observations, batch.actions), prepared.target
         critic_loss = self.head.loss(q, target)
         if self.sam_radius is None:
             self.minimize(self.critic.optimizer, critic_loss)
@@ -625,24 +696,23 @@ class Learner:
         self.critic.project()
         q = self.head.values(q)
         metrics = {"train/critic_loss": critic_loss, "train/q_mean": q.mean()}
+        if prepared.target is None:
+            step = CriticStep(q.detach(), self.head.values(next_q), entropy_bonus, noise.subset)
         if SLOTS in batch.columns:
-            metrics[_TD_ERRORS] = self._errors(batch, q, next_q, entropy_bonus)
+            metrics[_TD_ERRORS] = self._errors(batch, q, step, prepared)
 
         # Targets, by Polyak averaging.
         if moves_targets:
             self._follow(self.critic_target, self.critic)
-        return CriticStep(q.detach(), self.head.values(next_q), entropy_bonus, noise.subset), metrics
+        return step, metrics
 
-    def _learn_actors(self, batch: Batch, noise: Noise, alpha: torch.Tensor) -> dict[str, torch.Tensor]:
+    def _learn_actors(
+        self, batch: Batch, noise: Noise, alpha: torch.Tensor, prepared: Prepared
+    ) -> dict[str, torch.Tensor]:
         """Take the steps of actor, explorer and temperature."""
         # Actor, on the critics, and on their encoder if it is shared.
         observations = self.encoded(batch.observations)
-        if self.actor.trunk.stacks_actor_rows:
-            actions, log_prob = self.actor.sample(observations, noise.actor, self.encoded(batch.next_observations))
-        else:
-            actions, log_prob = self.actor.sample(observations, noise.actor)
-        value = self._actor_value(values(self, self.critic, observations, actions))
-        actor_loss = losses.actor_loss(log_prob, value, alpha.detach())
+        actor_loss, log_prob = self.objective.actor_loss(self, batch, observations, alpha, noise.actor, prepared)
         self.minimize(self.actor.optimizer, actor_loss)
         self.actor.project()
         metrics = {"train/actor_loss": actor_loss}
@@ -653,7 +723,7 @@ class Learner:
         metrics.update(logged(self.explorer, "update", self.explorer.update(self, batch, noise.exploration)))
 
         # Temperature.
-        if self.actor.has_entropy:
+        if self.actor.has_entropy and log_prob is not None:
             entropy = -log_prob.detach().mean()
             by_task = isinstance(self.temperature, TaskLogScalar)
             metrics.update({"train/entropy": entropy, "train/ent_coef": alpha.mean() if by_task else alpha})
@@ -669,22 +739,29 @@ class Learner:
         return metrics
 
     @torch.no_grad()
-    def _errors(self, batch: Batch, q: torch.Tensor, next_q: torch.Tensor, entropy_bonus: torch.Tensor) -> torch.Tensor:
+    def _errors(self, batch: Batch, q: torch.Tensor, step: CriticStep | None, prepared: Prepared) -> torch.Tensor:
         """The largest absolute TD error of any critic, of the means over quantiles, (B,)."""
-        value = self.pessimism_rule.value(self.head.values(next_q))
-        target = td_target(batch, value, entropy_bonus).mean(dim=1)
-        return (q.mean(dim=2) - target).abs().amax(dim=0)
+        target = prepared.target
+        if target is None:
+            assert step is not None
+            target = td_target(batch, self.pessimism_rule.value(step.next_q), step.entropy_bonus)
+        return (q.mean(dim=2) - target.mean(dim=1)).abs().amax(dim=0)
 
-    def _actor_value(self, q: torch.Tensor) -> torch.Tensor:
-        """Value of the ensemble in the actor's objective, (E, B, K) to (B, K)."""
+    def actor_value(self, q: torch.Tensor) -> torch.Tensor:
+        """
+        Value of the ensemble in the actor's objective.
+
+        :param q: (E, B, K)
+        :return: (B, K)
+        """
         if self.actor_pessimism is None:
             return self.pessimism_rule.value(q)
         return pessimistic_value(q, float(self.actor_pessimism))
 
     def _follow(self, target: Any, online: Any) -> None:
         """Take one step of Polyak averaging; with ``tau=1`` the target is the online network."""
+        self.follow(target, online, self.tau)
         with torch.no_grad():
-            torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), weight=self.tau)
             # Running statistics, as in Stable-Baselines3.
             statistics = zip(target.statistics(), online.statistics(), strict=True)
             for ours, theirs in statistics:
@@ -704,30 +781,29 @@ class Learner:
             self.sam_radius,
             [len(p) if id(p) in copied else None for p in parameters],
         )
-        self._descend(self.critic.optimizer, gradients)
+        descend(self.critic.optimizer, gradients)
+
+    @staticmethod
+    def follow(target: Any, online: Any, tau: float) -> None:
+        """
+        Take one step of Polyak averaging of the parameters. A group has its own in this place, as of :meth:`minimize`.
+
+        :param target: network that follows
+        :param online: network that is followed
+        :param tau: weight of the latter
+        """
+        follow(target, online, tau)
 
     @staticmethod
     def minimize(optimizer: Optimizer, loss: torch.Tensor) -> None:
         """
         Take one step of an optimizer. Only its own parameters get a gradient, also where the loss depends on others.
+        A group puts its own in this place while it takes the step of all its learners.
 
         :param optimizer: the optimizer
         :param loss: scalar
         """
-        parameters = [p for group in optimizer.param_groups for p in group["params"]]
-        Learner._descend(optimizer, torch.autograd.grad(loss, parameters, allow_unused=True))
-
-    @staticmethod
-    def _descend(optimizer: Optimizer, gradients: Sequence[torch.Tensor | None]) -> None:
-        """Take one step of an optimizer with gradients in the order of its parameters."""
-        if torch.compiler.is_compiling():
-            assert isinstance(optimizer, AdamW)
-            optimizer.apply(gradients)
-            return
-        parameters = [p for group in optimizer.param_groups for p in group["params"]]
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            parameter.grad = gradient
-        optimizer.step()
+        minimize(optimizer, loss)
 
     # ---------------------------------------------------------------- its state
 
@@ -796,6 +872,7 @@ class Learner:
         # The explorer's start may depend on the pessimism in force.
         self.restart(self.pessimism_rule, self.make_pessimism(), shrink)
         self.restart(self.explorer, self.make_explorer(), shrink)
+        self.restart(self.objective, self._make_objective(self), shrink)
         for optimizer in self.optimizers().values():
             optimizer.state.clear()
 

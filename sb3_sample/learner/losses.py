@@ -6,12 +6,14 @@ Shapes use the letters B batch, E critics, K quantiles, A action. The papers cit
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 
 from sb3_sample.learner.q_values import QValues
+from sb3_sample.tracing import is_tracing
 
 
 def td_target(
@@ -46,7 +48,52 @@ def squared_error(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     return (q - target).square().sum() / target.shape[0]
 
 
-class _QuantileHuber(torch.autograd.Function):
+#: Function of predictions (E, N, K) and targets (N, K') that gives each sample's loss, (N,), and the gradient of their
+#: sum for the predictions, (E, N, K).
+LossAndGradient = Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
+
+
+class _KnownGradient(torch.autograd.Function):
+    """
+    Mean over the batch of a loss that comes with its gradient. It takes G batches one after the other, so that
+    ``torch.vmap`` over it, as over the losses of many learners, is one call.
+    """
+
+    @staticmethod
+    def forward(
+        q: torch.Tensor, target: torch.Tensor, compute: LossAndGradient, n_batches: int
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        loss, gradient = compute(q, target)
+        scale = n_batches / (target.shape[0] * target.shape[1])
+        return (loss.view(n_batches, -1).sum(dim=1) * scale).to(q.dtype), (gradient * scale).to(q.dtype)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        ctx.mark_non_differentiable(output[1])
+        ctx.save_for_backward(output[1])
+
+    @staticmethod
+    def backward(ctx: Any, of_loss: torch.Tensor, _: Any) -> tuple[torch.Tensor, None, None, None]:  # type: ignore[override]
+        (gradient,) = ctx.saved_tensors
+        n_critics, rows, n_quantiles = gradient.shape
+        by_batch = gradient.view(n_critics, len(of_loss), -1, n_quantiles) * of_loss.view(-1, 1, 1)
+        return by_batch.view(n_critics, rows, n_quantiles), None, None, None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: Any, q: torch.Tensor, target: torch.Tensor, compute: Any, n_batches: int) -> Any:
+        n = info.batch_size
+        q, target = (
+            x.expand(n, *x.shape) if axis is None else x.movedim(axis, 0)
+            for x, axis in zip((q, target), in_dims, strict=False)
+        )
+        rows = n * q.shape[2]
+        loss, gradient = _KnownGradient.apply(
+            q.transpose(0, 1).reshape(q.shape[1], rows, -1), target.reshape(rows, -1), compute, n * n_batches
+        )
+        return (loss.view(n, n_batches), gradient.view(q.shape[1], n, *q.shape[2:])), (0, 1)
+
+
+def _huber_sorted(q: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """
     Quantile Huber loss with threshold 1 from sorted targets, without the K x K pairs.
 
@@ -60,71 +107,49 @@ class _QuantileHuber(torch.autograd.Function):
     The borders of the intervals are found by binary search, the sums over them as differences of prefix sums of y and
     y^2. The prefix sums are float64 since they are differences of large numbers.
     """
+    n_critics, n_rows, n_quantiles = q.shape
+    n_targets = target.shape[1]
+    y = target.sort(dim=1).values
+    # Distances to the sample's middle target: the same differences of smaller numbers.
+    centre = y[:, n_targets // 2, None]
+    y = y - centre
+    x = (q - centre).transpose(0, 1).reshape(n_rows, -1)
+    borders = torch.searchsorted(y.expand(3, -1, -1).contiguous(), torch.stack((x - 1, x, x + 1)))
 
-    @staticmethod
-    def forward(ctx: Any, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
-        n_critics, batch_size, n_quantiles = q.shape
-        n_targets = target.shape[1]
-        y = target.sort(dim=1).values
-        # Distances to the sample's middle target: the same differences of smaller numbers.
-        centre = y[:, n_targets // 2, None]
-        y = y - centre
-        x = (q - centre).transpose(0, 1).reshape(batch_size, -1)
-        borders = torch.searchsorted(y.expand(3, -1, -1).contiguous(), torch.stack((x - 1, x, x + 1)))
+    y, x = y.double(), x.double()
+    sums = F.pad(y.cumsum(dim=1), (1, 0))
+    squares = F.pad(y.square().cumsum(dim=1), (1, 0))
+    n_far_below, n_below, n_not_far_above = borders
+    s_far_below, s_below, s_not_far_above = sums.expand(3, -1, -1).gather(2, borders)
+    q_far_below, q_below, q_not_far_above = squares.expand(3, -1, -1).gather(2, borders)
+    n_near_below, n_near_above = n_below - n_far_below, n_not_far_above - n_below
+    s_near_below, s_near_above = s_below - s_far_below, s_not_far_above - s_below
+    n_far_above, s_far_above = n_targets - n_not_far_above, sums[:, -1:] - s_not_far_above
+    # Sums of x - y over the near intervals, of which the sums of their squares are made.
+    d_near_below, d_near_above = n_near_below * x - s_near_below, n_near_above * x - s_near_above
 
-        y, x = y.double(), x.double()
-        sums = F.pad(y.cumsum(dim=1), (1, 0))
-        squares = F.pad(y.square().cumsum(dim=1), (1, 0))
-        n_far_below, n_below, n_not_far_above = borders
-        s_far_below, s_below, s_not_far_above = sums.expand(3, -1, -1).gather(2, borders)
-        q_far_below, q_below, q_not_far_above = squares.expand(3, -1, -1).gather(2, borders)
-        n_near_below, n_near_above = n_below - n_far_below, n_not_far_above - n_below
-        s_near_below, s_near_above = s_below - s_far_below, s_not_far_above - s_below
-        n_far_above, s_far_above = n_targets - n_not_far_above, sums[:, -1:] - s_not_far_above
-        # Sums of x - y over the near intervals, of which the sums of their squares are made.
-        d_near_below, d_near_above = n_near_below * x - s_near_below, n_near_above * x - s_near_above
-
-        t = ((torch.arange(n_quantiles, device=q.device, dtype=y.dtype) + 0.5) / n_quantiles).repeat(n_critics)
-        grad = torch.lerp(n_far_below + d_near_below, d_near_above - n_far_above, t)
-        below = n_far_below * (x - 0.5) - s_far_below
-        below += (x * (d_near_below - s_near_below) + q_below - q_far_below) / 2
-        above = s_far_above - n_far_above * (x + 0.5)
-        above += (x * (d_near_above - s_near_above) + q_not_far_above - q_below) / 2
-        loss = torch.lerp(below, above, t).sum()
-
-        scale = 1 / (n_targets * batch_size)
-        ctx.save_for_backward((grad * scale).to(q.dtype).view(batch_size, n_critics, n_quantiles).transpose(0, 1))
-        return (loss * scale).to(q.dtype)
-
-    @staticmethod
-    def backward(ctx: Any, grad_output: torch.Tensor) -> tuple[torch.Tensor, None]:  # type: ignore[override]
-        (grad,) = ctx.saved_tensors
-        return grad_output * grad, None
+    t = ((torch.arange(n_quantiles, device=q.device, dtype=y.dtype) + 0.5) / n_quantiles).repeat(n_critics)
+    gradient = torch.lerp(n_far_below + d_near_below, d_near_above - n_far_above, t)
+    below = n_far_below * (x - 0.5) - s_far_below
+    below += (x * (d_near_below - s_near_below) + q_below - q_far_below) / 2
+    above = s_far_above - n_far_above * (x + 0.5)
+    above += (x * (d_near_above - s_near_above) + q_not_far_above - q_below) / 2
+    return torch.lerp(below, above, t).sum(dim=1), gradient.view(n_rows, n_critics, n_quantiles).transpose(0, 1)
 
 
-class _QuantileHuberPairs(torch.autograd.Function):
+def _huber_pairs(q: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Quantile Huber loss over all K x K pairs, which a compiler fuses into one pass without storing them."""
-
-    @staticmethod
-    def forward(ctx: Any, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
-        _, batch_size, n_quantiles = q.shape
-        n_targets = target.shape[1]
-        # Views by strides: the compiler then computes both once, and not once for every pair.
-        x = q.contiguous().as_strided(q.shape, (batch_size * n_quantiles, n_quantiles, 1)).unsqueeze(-1)
-        y = target.contiguous().as_strided(target.shape, (n_targets, 1))[:, None, :]
-        t = ((torch.arange(n_quantiles, device=q.device, dtype=q.dtype) + 0.5) / n_quantiles).unsqueeze(-1)
-        difference = x - y
-        clipped = difference.clamp(-1, 1)
-        weighted = torch.where(difference > 0, 1 - t, t) * clipped
-        scale = 1 / (n_targets * batch_size)
-        ctx.save_for_backward(weighted.sum(dim=-1) * scale)
-        # u^2 / 2 within the threshold and |u| - 1/2 beyond it are both c (u - c / 2), c being u clipped.
-        return (weighted * (difference - 0.5 * clipped)).sum(dim=-1).sum() * scale
-
-    @staticmethod
-    def backward(ctx: Any, grad_output: torch.Tensor) -> tuple[torch.Tensor, None]:  # type: ignore[override]
-        (grad,) = ctx.saved_tensors
-        return grad_output * grad, None
+    _, n_rows, n_quantiles = q.shape
+    n_targets = target.shape[1]
+    # Views by strides: the compiler then computes both once, and not once for every pair.
+    x = q.contiguous().as_strided(q.shape, (n_rows * n_quantiles, n_quantiles, 1)).unsqueeze(-1)
+    y = target.contiguous().as_strided(target.shape, (n_targets, 1))[:, None, :]
+    t = ((torch.arange(n_quantiles, device=q.device, dtype=q.dtype) + 0.5) / n_quantiles).unsqueeze(-1)
+    difference = x - y
+    clipped = difference.clamp(-1, 1)
+    weighted = torch.where(difference > 0, 1 - t, t) * clipped
+    # u^2 / 2 within the threshold and |u| - 1/2 beyond it are both c (u - c / 2), c being u clipped.
+    return (weighted * (difference - 0.5 * clipped)).sum(dim=-1).sum(dim=(0, 2)), weighted.sum(dim=-1)
 
 
 def quantile_huber(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -139,7 +164,9 @@ def quantile_huber(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """
     if isinstance(q, QValues):
         q = q.tensor  # An autograd Function would not take it for a tensor: no gradient.
-    return (_QuantileHuberPairs if torch.compiler.is_compiling() else _QuantileHuber).apply(q, target)
+    compute = _huber_pairs if is_tracing() else _huber_sorted
+    loss: torch.Tensor = _KnownGradient.apply(q, target, compute, 1)[0]
+    return loss.squeeze(0)
 
 
 def actor_loss(log_prob: torch.Tensor, value: torch.Tensor, alpha: torch.Tensor | float) -> torch.Tensor:
@@ -165,6 +192,46 @@ def temperature_loss(alpha: torch.Tensor, entropy: torch.Tensor, target_entropy:
     :return: scalar, or (B, 1), whose mean over the batch is the loss
     """
     return alpha * (entropy.detach() - target_entropy)
+
+
+def expectile_loss(difference: torch.Tensor, expectile: float) -> torch.Tensor:
+    """
+    Squared error whose minimum is an expectile, ``mean(|tau - 1(u < 0)| u^2)`` (Kostrikov et al. 2021, eq. 5); half the
+    squared error at 0.5.
+
+    :param difference: u, target less prediction, any shape
+    :param expectile: tau, in (0, 1)
+    :return: scalar
+    """
+    weight = torch.where(difference > 0, expectile, 1 - expectile)
+    return (weight * difference.square()).mean()
+
+
+def advantage_weights(advantage: torch.Tensor, inverse_temperature: float, most: float) -> torch.Tensor:
+    """
+    Compute the weights of actions in a regression on them, ``min(exp(beta * A), most)`` (Kostrikov et al. 2021, eq. 7).
+
+    :param advantage: A, any shape
+    :param inverse_temperature: beta
+    :param most: the largest weight
+    :return: of the same shape
+    """
+    return (inverse_temperature * advantage).exp().clamp(max=most)
+
+
+def cloned_value_loss(value: torch.Tensor, actions: torch.Tensor, cloned: torch.Tensor, weight: float) -> torch.Tensor:
+    """
+    Loss of an actor near given actions, ``mean((a - a*)^2) - lambda * mean(Q)`` with ``lambda = weight / mean(|Q|)``
+    without gradient (Fujimoto and Gu 2021, eqs. 3 and 5).
+
+    :param value: Q, value of the actor's actions, (B,)
+    :param actions: the actor's, (B, A)
+    :param cloned: a*, those to stay near to, (B, A)
+    :param weight: of the value
+    :return: scalar
+    """
+    scale = weight / value.detach().abs().mean()
+    return F.mse_loss(actions, cloned) - scale * value.mean()
 
 
 def optimistic_actor_loss(upper_value: torch.Tensor, kl: torch.Tensor, kl_weight: torch.Tensor) -> torch.Tensor:

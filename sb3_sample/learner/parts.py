@@ -28,6 +28,14 @@ class Rule(Protocol):
         :return: the weight in force, at least 0, a number or a scalar tensor without gradient
         """
 
+    def value(self, q: torch.Tensor) -> torch.Tensor:
+        """
+        Value of the ensemble.
+
+        :param q: (E, B, K)
+        :return: (B, K)
+        """
+
 
 class Learning(Protocol):
     """
@@ -59,6 +67,9 @@ class Learning(Protocol):
 
     @property
     def head(self) -> Any: ...
+
+    @property
+    def device(self) -> torch.device: ...
 
     @property
     def gamma(self) -> float: ...
@@ -118,6 +129,21 @@ class Learning(Protocol):
         Make an actor.
 
         :return: an actor like the learner's, with parameters of its own
+        """
+
+    def make_value(self) -> Any:
+        """
+        Make a value network.
+
+        :return: a network of the critics' kind that judges observations alone, (B, O) to (B, 1)
+        """
+
+    def actor_value(self, q: torch.Tensor) -> torch.Tensor:
+        """
+        Value of the ensemble in the actor's objective.
+
+        :param q: (E, B, K)
+        :return: (B, K)
         """
 
     def make_optimizer(self, parameters: Iterable[nn.Parameter]) -> Optimizer:
@@ -199,6 +225,8 @@ class Networks(Protocol):
     def encoded(self, obs: Any) -> Any: ...
 
     def make_actor(self) -> Any: ...
+
+    def make_value(self) -> Any: ...
 
     def make_optimizer(self, parameters: Any, learning_rate: float) -> Optimizer: ...
 

@@ -67,7 +67,7 @@ class Pessimism(Part):
     def __init__(self, beta: float):
         super().__init__()
         check_beta("pessimism", beta)
-        self._beta = float(beta)
+        self.constant = float(beta)
 
     def beta(self) -> torch.Tensor | float:
         """
@@ -75,7 +75,7 @@ class Pessimism(Part):
 
         :return: the weight in force, at least 0, a number or a scalar tensor without gradient
         """
-        return self._beta
+        return self.constant
 
     def value(self, q: torch.Tensor) -> torch.Tensor:
         """
@@ -241,7 +241,7 @@ class LearnedPessimism(Pessimism):
         loss = error.square().mean() if self.loss == "squared" else self.weight * error.detach().mean()
         learner.minimize(self.optimizer, loss)
         with torch.no_grad():
-            self.weight.clamp_(min=0)
+            self.weight.copy_(self.weight.clamp(min=0))
         return {**metrics, "pessimism/loss": loss, "pessimism/error": error.mean()}
 
     def _error(

@@ -1,12 +1,12 @@
-"""Rewards divided by a running measure of the return's size: the published rules."""
+"""Rewards divided by a running measure of the return's size: the published rules; and a fixed scale."""
 
 from abc import abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
-from sb3_sample.kinds import ABOVE_0, check_value, integer
+from sb3_sample.kinds import ABOVE_0, FINITE, check_value, integer
 from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.parts import Learning
 from sb3_sample.learner.transforms import BatchTransform
@@ -21,6 +21,18 @@ class RewardScale(BatchTransform):
 
     :param learner: the learner
     """
+
+    #: Whether the scale follows from steps in an environment, so that there is none without them.
+    needs_steps: ClassVar[bool] = True
+    #: Added to the rewards after the division.
+    shift: float = 0.0
+
+    def on_dataset(self, return_range: float) -> None:
+        """
+        Called when learning from a data set begins.
+
+        :param return_range: largest less smallest return of its episodes
+        """
 
     @abstractmethod
     def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
@@ -272,10 +284,60 @@ def _bound(learner: Learning, max_return: float | None, otherwise: float) -> flo
     return float(check_value("max_return", max_return, ABOVE_0))
 
 
-#: Rules by the name that ``reward_scale`` takes, that of the method which has published it.
+class LinearScale(RewardScale):
+    """
+    Rewards of offline learning: times a factor, plus a number. Implicit Q-learning (Kostrikov et al. 2021) has -1 added
+    on AntMaze, and on MuJoCo a factor that makes the returns of the data set span 1,000.
+
+    :param learner: the learner
+    :param factor: of the rewards
+    :param shift: added to the product
+    :param return_range: largest less smallest return of the data set after scaling, from which the factor follows when
+        the first data set is learned from; None: ``factor``
+    :raises ValueError: if an argument is out of range, or both ``factor`` and ``return_range`` are given
+    """
+
+    needs_steps: ClassVar[bool] = False
+    factor: torch.Tensor
+
+    def __init__(self, learner: Learning, factor: float = 1.0, shift: float = 0.0, return_range: float | None = None):
+        super().__init__(learner)
+        check_value("factor", factor, ABOVE_0)
+        check_value("shift", shift, FINITE)
+        check_value("return_range", return_range, ABOVE_0.or_none())
+        if return_range is not None and factor != 1:
+            raise ValueError(f"factor={factor} and return_range={return_range} are two scales: leave one out")
+        self.shift, self.return_range = float(shift), return_range
+        # 0 while the data set is not known.
+        self.register_buffer("factor", torch.tensor(float(factor) if return_range is None else 0.0))
+
+    @property
+    def waits_for_data(self) -> bool:
+        """Whether the factor is still to follow from a data set."""
+        return self.return_range is not None and not self.factor.item()
+
+    def on_dataset(self, return_range: float) -> None:
+        if self.waits_for_data:
+            if return_range <= 0:
+                raise ValueError(
+                    f"return_range={self.return_range} cannot be that of a data set whose episodes all have the same "
+                    "return: pass factor in its place"
+                )
+            assert self.return_range is not None
+            self.factor.fill_(self.return_range / return_range)
+
+    def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
+        return 1 / self.factor
+
+    def transform(self, batch: Batch, noise: torch.Tensor | None) -> Batch:
+        return batch._replace(rewards=batch.rewards * self.factor + self.shift)
+
+
+#: Rules by the name that ``reward_scale`` takes, that of the method which has published it, but for a fixed scale.
 REWARD_SCALES: dict[str, type[RewardScale]] = {
     "brc": TaskScale,
     "flashsac": Float32Scale,
+    "linear": LinearScale,
     "simbav2": StdOrMaxScale,
     "xqc": StdScale,
 }

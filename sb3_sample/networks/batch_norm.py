@@ -81,8 +81,9 @@ class BatchNorm(nn.Module):
             var = var * (n / (n - 1))
         elif self.unbiased and not self.running_unbiased:
             var = var * ((n - 1) / n)
-        self.running_mean.lerp_(mean.detach(), self.momentum)
-        self.running_var.lerp_(var.detach(), self.momentum)
+        # Not in place: torch.vmap, by which many learners are one, has a rule for this form.
+        for running, now in ((self.running_mean, mean), (self.running_var, var)):
+            running.copy_(running.lerp(now.detach().to(running.dtype), self.momentum))
 
     def extra_repr(self) -> str:
         return f"n_features={self.n_features}, n_copies={self.n_copies}, eps={self.eps}, momentum={self.momentum}"

@@ -10,6 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from sb3_sample.tracing import is_tracing
+
 
 class EnsembleLinear(nn.Module):
     """
@@ -44,7 +46,7 @@ class EnsembleLinear(nn.Module):
             x = x.expand(self.n_copies, -1, -1)
         if self.bias is None:
             return torch.bmm(x, weight)
-        if torch.compiler.is_compiling():
+        if is_tracing():
             # As two operations, of which the second is fused with what follows.
             return torch.bmm(x, weight) + self.bias
         return torch.baddbmm(self.bias, x, weight)

@@ -1,6 +1,9 @@
 """Fixed data sets of transitions as a source of batches."""
 
-from collections.abc import Callable, Mapping
+import os
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -8,50 +11,47 @@ import torch
 from gymnasium import spaces
 
 from sb3_sample.learner.batch import Batch, for_each
+from sb3_sample.replay.columns import samples_at
+from sb3_sample.replay.dataset_files import opened_hdf5, read_minari, write_minari
+from sb3_sample.replay.memory_map import check_folder, zeros
+from sb3_sample.replay.steps import CHUNK, Steps, check_action_space, check_actions, put, stored_dtype
 
 Arrays = np.ndarray | dict[str, np.ndarray]
 
 
 class Dataset:
     """
-    Fixed set of transitions, from which batches are drawn uniformly with replacement.
+    Fixed set of transitions, from which batches are drawn uniformly with replacement. It is made by one of the
+    functions ``from_...``.
 
-    :param observations: (N, O), or a dict of such arrays; floats as float32, integers as they are
-    :param actions: in [-1, 1], float32, (N, A)
-    :param next_observations: as the observations
-    :param rewards: float32, (N,)
-    :param terminations: 1 where the episode terminated (a time limit is 0), float32, (N,)
+    :param steps: the steps, floats of observations and rewards as float32, integers as they are
     :param observation_space: of the observations
     :param action_space: of the actions as an environment takes them
-    :param seed: of the generator that the batches are drawn from
-    :param columns: further columns of the batches by name, (N, ...) each
+    :param seed: of the generator that :meth:`sample` draws from
+    :param n_left_out: steps that the source had besides, whose next observation is not known
     """
 
     def __init__(
         self,
-        observations: Arrays,
-        actions: np.ndarray,
-        next_observations: Arrays,
-        rewards: np.ndarray,
-        terminations: np.ndarray,
+        steps: Steps,
         observation_space: spaces.Space,
         action_space: spaces.Box,
         seed: int = 0,
-        columns: Mapping[str, np.ndarray] | None = None,
+        n_left_out: int = 0,
     ):
-        self.observation_space, self.action_space = observation_space, action_space
-        self._rows = Batch(
-            for_each(torch.from_numpy, observations),
-            torch.from_numpy(actions),
-            for_each(torch.from_numpy, next_observations),
-            torch.from_numpy(terminations).unsqueeze(1),
-            torch.from_numpy(rewards).unsqueeze(1),
-            columns={
-                name: torch.from_numpy(values.reshape(len(values), -1) if values.ndim == 1 else values)
-                for name, values in (columns or {}).items()
-            },
-        )
+        self.observation_space, self.action_space, self.n_left_out = observation_space, action_space, n_left_out
+        self._steps = _map(torch.from_numpy, steps)
+        low, high = action_space.low, action_space.high
+        self._low, self._range = (torch.from_numpy(each.astype(np.float64)) for each in (low, high - low.astype(float)))
         self._generator = torch.Generator().manual_seed(seed)
+        self._fingerprint = ""
+        if n_left_out:
+            what = "its next observation is not known" if n_left_out == 1 else "their next observations are not known"
+            warnings.warn(
+                f"{n_left_out} of {n_left_out + len(self)} steps left out of the data set, the last of episodes that "
+                f"were cut off: {what}",
+                stacklevel=3,
+            )
 
     @classmethod
     def from_arrays(
@@ -67,15 +67,16 @@ class Dataset:
         action_space: spaces.Box | None = None,
         seed: int = 0,
         columns: Mapping[str, Any] | None = None,
+        memory_map: str | os.PathLike[str] | None = None,
     ) -> "Dataset":
         """
         Make a data set of N steps in the order in which they were taken, episode after episode.
 
         Without ``next_observations`` a step's next observation is the following step's. A truncated step, and the
-        last one, have none then and are left out, unless the episode terminated there.
+        last one, have none then and are left out with a warning, unless the episode terminated there.
 
-        :param observations: (N, O), or a dict of such arrays
-        :param actions: (N, A), within the bounds of ``action_space``
+        :param observations: (N, O), or a dict of such arrays; NumPy's, ``numpy.memmap`` included, or h5py's data sets
+        :param actions: (N, A), in the environment's units, within the bounds of ``action_space``
         :param rewards: (N,)
         :param terminations: whether the episode terminated with the step, (N,)
         :param truncations: whether it was cut off there, by a time limit for example, (N,)
@@ -84,24 +85,26 @@ class Dataset:
         :param action_space: of the actions; None: [-1, 1]
         :param seed: of the generator that the batches are drawn from
         :param columns: further columns of the batches by name, such as the number of a task: numbers, (N,) or (N, ...)
-        :return: the data set, its actions scaled to [-1, 1]
+        :param memory_map: folder whose disk holds the observations and actions, if they are larger than the memory; the
+            files are unnamed and vanish with the data set. None: memory
+        :return: the data set
         :raises ValueError: if the arrays are not of one length, not of the spaces, or not finite
         """
-        observations = _rows("observations", observations)
-        actions = np.asarray(actions, np.float32)
-        if actions.ndim < 2:
+        observations, actions = _arrays("observations", observations, 2), _arrays("actions", actions, 1)
+        if len(actions.shape) < 2:
             raise ValueError(f"actions must be of shape (N, A), not {actions.shape}")
         rewards = _column("rewards", rewards)
         flags = {"terminations": _column("terminations", terminations)}
         flags["truncations"] = _column("truncations", truncations)
         given = {}
         if next_observations is not None:
-            given["next_observations"] = _rows("next_observations", next_observations)
-        more = {name: _numbers(f"columns[{name!r}]", values, 1) for name, values in (columns or {}).items()}
+            given["next_observations"] = _arrays("next_observations", next_observations, 2)
+        more = {name: _arrays(f"columns[{name!r}]", values, 1) for name, values in (columns or {}).items()}
         n = len(rewards)
         if n == 0:
             raise ValueError("rewards must have at least one step, not 0")
-        for name, value in {"observations": observations, "actions": actions, **flags, **given, **more}.items():
+        named = {"observations": observations, "actions": actions, **flags, **given, **more}
+        for name, value in named.items():
             for part in value.values() if isinstance(value, dict) else (value,):
                 if len(part) != n:
                     raise ValueError(f"{name} must have as many steps as rewards, {n}, not {len(part)}")
@@ -110,39 +113,217 @@ class Dataset:
                 raise ValueError(f"{name} must be 0 or 1, not {flag[~np.isin(flag, (0, 1))][0]}")
         observation_space = observation_space or _space_of(observations)
         action_space = action_space or spaces.Box(-1, 1, actions.shape[1:], np.float32)
-        _check_shapes(observation_space, observations)
-        _check_shapes(observation_space, given.get("next_observations", observations))
-        low, high = action_space.low, action_space.high
-        if actions.shape[1:] != action_space.shape or not (np.isfinite(low).all() and np.isfinite(high).all()):
-            raise ValueError(f"actions of shape (N, {actions.shape[1:]}) are none of action_space={action_space}")
-        # float32 rounds a bound that float64 has.
-        margin = 1e-5 * (high - low)
-        if not ((actions >= low - margin) & (actions <= high + margin)).all():
-            raise ValueError(f"actions must lie within the bounds of action_space={action_space}")
-        scaled = np.clip(2 * (actions - low) / (high - low) - 1, -1, 1).astype(np.float32).reshape(n, -1)
-        kept = np.arange(n)
-        if next_observations is None:
-            # Those of a step that terminated are not bootstrapped from, whatever they are.
-            following = np.minimum(kept + 1, n - 1)
-            given["next_observations"] = _take(observations, following)
-            cut_off = (flags["truncations"] == 1) | (kept == n - 1)
-            kept = np.flatnonzero(~cut_off | (flags["terminations"] == 1))
+        check_action_space(actions.shape[1:], action_space)
+        _check_shapes("observations", observation_space, observations)
+        for name, value in given.items():
+            _check_shapes(name, observation_space, value)
+        folder = _folder(memory_map, [*_parts(observations), *_parts(given.get("next_observations", {})), actions])
+        terminated, truncated = flags["terminations"] == 1, flags["truncations"] == 1
+        steps = Steps(
+            _copied("observations", observations, folder),
+            np.arange(n),
+            None,
+            _copied("next_observations", given["next_observations"], folder) if given else None,
+            _copied("actions", actions, folder, keep_floats=True),
+            rewards,
+            terminated,
+            truncated,
+            {name: _copied(f"columns[{name!r}]", values, None) for name, values in more.items()},
+        )
+        check_actions(steps.actions, action_space)
+        n_left_out = 0
+        if given:
+            steps = steps._replace(truncations=truncated | (_breaks(steps) & ~terminated))
+        else:
+            # Those of a step that terminated are not bootstrapped from, whatever they are: its own observation.
+            cut_off = truncated | (steps.at == n - 1)
+            kept = np.flatnonzero(~cut_off | terminated)
+            n_left_out = n - len(kept)
             if not len(kept):
                 raise ValueError("next_observations must be given: every step is the last of an episode cut off")
-        return cls(
-            _take(observations, kept),
-            scaled[kept],
-            _take(given["next_observations"], kept),
-            rewards[kept],
-            flags["terminations"][kept],
-            observation_space,
-            action_space,
-            seed,
-            _take(more, kept),
+            # The step before one that is left out is the last of its episode.
+            truncated = truncated | (np.append(cut_off[1:] & ~terminated[1:], False) & ~terminated)
+            following = np.where(terminated, steps.at, steps.at + 1)
+            plain = _take((steps.actions, steps.rewards, terminated, truncated), kept) if n_left_out else None
+            steps = steps._replace(at=steps.at[kept], next_at=following[kept], columns=_take(steps.columns, kept))
+            if plain is None:
+                steps = steps._replace(truncations=truncated)
+            else:
+                names = ("actions", "rewards", "terminations", "truncations")
+                steps = steps._replace(**dict(zip(names, plain, strict=True)))
+        return cls(steps, observation_space, action_space, seed, n_left_out)
+
+    @classmethod
+    def from_minari(
+        cls, id_or_path: str | os.PathLike[str], *, seed: int = 0, memory_map: str | os.PathLike[str] | None = None
+    ) -> "Dataset":
+        """
+        Read a data set of Minari's from this computer; nothing is downloaded. Needs the extra ``[offline]``.
+
+        :param id_or_path: its folder, or its id among Minari's local data sets
+        :param seed: of the generator that the batches are drawn from
+        :param memory_map: as in :meth:`from_arrays`
+        :return: the data set
+        :raises ValueError: if there is none, its spaces are not supported, or its content is not what it must be
+        """
+        return cls(*read_minari(id_or_path, memory_map), seed)
+
+    @classmethod
+    def from_hdf5(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        observation_space: spaces.Space | None = None,
+        action_space: spaces.Box | None = None,
+        seed: int = 0,
+        memory_map: str | os.PathLike[str] | None = None,
+    ) -> "Dataset":
+        """
+        Read a file in D4RL's layout: ``observations``, ``actions``, ``rewards``, ``terminals``, ``timeouts``, and
+        ``next_observations`` if it has them. Dict observations are groups. Needs the extra ``[offline]``.
+
+        :param path: the file
+        :param observation_space: as in :meth:`from_arrays`
+        :param action_space: as in :meth:`from_arrays`
+        :param seed: of the generator that the batches are drawn from
+        :param memory_map: as in :meth:`from_arrays`
+        :return: the data set
+        :raises ValueError: if it is no such file, or its content is not what it must be
+        """
+        with opened_hdf5(path) as given:
+            return cls.from_arrays(
+                **given,
+                observation_space=observation_space,
+                action_space=action_space,
+                seed=seed,
+                memory_map=memory_map,
+            )
+
+    @classmethod
+    def from_replay_buffer(
+        cls, buffer: Any, *, seed: int = 0, memory_map: str | os.PathLike[str] | None = None
+    ) -> "Dataset":
+        """
+        Copy the transitions of a replay buffer, each one step and as stored: without normalisation, n-step returns or
+        relabelled goals.
+
+        :param buffer: Stable-Baselines3's replay buffer, or one of this package
+        :param seed: of the generator that the batches are drawn from
+        :param memory_map: as in :meth:`from_arrays`
+        :return: the data set, environment after environment
+        :raises ValueError: if the buffer is empty
+        """
+        size, first = buffer.size(), int(buffer.pos) if buffer.full else 0
+        if buffer.full and getattr(buffer, "optimize_memory_usage", False):
+            # The row's observation has made way for the newest next observation.
+            size, first = size - 1, first + 1
+        if size < 1:
+            raise ValueError("buffer must have at least one transition, not 0")
+        positions = np.tile((first + np.arange(size)) % buffer.buffer_size, buffer.n_envs)
+        env_indices = np.repeat(np.arange(buffer.n_envs), size)
+        samples = samples_at(buffer, positions, env_indices)
+        timeouts = buffer.timeouts[positions, env_indices]
+        columns = {name: _numpy(values) for name, values in getattr(samples, "columns", {}).items()}
+        truncations = _numpy(timeouts).astype(bool)
+        truncations[size - 1 :: size] |= _numpy(samples.dones)[size - 1 :: size, 0] == 0  # of each environment
+        space = buffer.action_space
+        low, high = space.low.astype(np.float64).ravel(), space.high.astype(np.float64).ravel()
+        actions = low + 0.5 * (_numpy(samples.actions).astype(np.float64) + 1) * (high - low)
+        return cls.from_arrays(
+            for_each(_numpy, samples.observations),
+            np.clip(actions, low, high).astype(np.float32).reshape(-1, *space.shape),
+            _numpy(samples.rewards),
+            _numpy(samples.dones),
+            truncations,
+            next_observations=for_each(_numpy, samples.next_observations),
+            observation_space=buffer.observation_space,
+            action_space=space,
+            seed=seed,
+            columns=columns,
+            memory_map=memory_map,
         )
 
+    def to_minari(self, id_or_path: str | os.PathLike[str], **metadata: Any) -> None:
+        """
+        Write a data set of Minari's, uncompressed. An end of an episode that is no termination is a truncation there.
+        Needs the extra ``[offline]``.
+
+        :param id_or_path: a new folder, or an id (``cartpole/swingup-v0``) among Minari's local data sets
+        :param metadata: what Minari keeps besides: ``author``, ``algorithm_name``, ``description``, ...
+        :raises ValueError: if there is one already, or the id is none
+        """
+        write_minari(self, id_or_path, metadata)
+
     def __len__(self) -> int:
-        return len(self._rows.actions)
+        return len(self._steps.actions)
+
+    def __repr__(self) -> str:
+        return f"Dataset({len(self):,} transitions, sha256 {self.fingerprint[:16]})"
+
+    @property
+    def n_episodes(self) -> int:
+        """Number of episodes, those that are cut off included."""
+        return int((self._steps.terminations | self._steps.truncations).sum())
+
+    @property
+    def return_range(self) -> float:
+        """Largest less smallest undiscounted return of the episodes, those that are cut off included."""
+        rewards = _numpy(self._steps.rewards).astype(np.float64)
+        returns = [rewards[rows].sum() for rows in self.episodes()]
+        return float(max(returns) - min(returns))
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the transitions, whatever the data set was made of; of their numbers, not of the spaces."""
+        if not self._fingerprint:
+            digest = sha256()
+            for first in range(0, len(self), CHUNK):
+                rows = slice(first, min(first + CHUNK, len(self)))
+                for name, values in self.rows(rows).items():
+                    inside = sorted(values.items()) if isinstance(values, dict) else [("", values)]
+                    for key, part in inside:
+                        digest.update(f"{name}/{key} {part.dtype} {part.shape} ".encode())
+                        digest.update(np.ascontiguousarray(part).data)
+            self._fingerprint = digest.hexdigest()
+        return self._fingerprint
+
+    def rows(self, rows: slice | np.ndarray) -> dict[str, Any]:
+        """
+        Read transitions as they are, in the environment's units.
+
+        :param rows: which of them
+        :return: ``observations``, ``actions``, ``rewards``, ``terminations``, ``truncations``, ``next_observations``
+            and the further columns by name, arrays
+        """
+        steps = self._steps
+        found = {
+            "observations": _take(steps.observations, steps.at[rows]),
+            **self.plain(rows),
+            "next_observations": self._next_observations(rows),
+            **_take(steps.columns, rows),
+        }
+        return {name: for_each(_numpy, values) for name, values in found.items()}
+
+    def plain(self, rows: slice | np.ndarray) -> dict[str, np.ndarray]:
+        """
+        Read transitions without their observations.
+
+        :param rows: which of them
+        :return: ``actions``, ``rewards``, ``terminations``, ``truncations``
+        """
+        names = ("actions", "rewards", "terminations", "truncations")
+        return {name: _numpy(getattr(self._steps, name)[rows]) for name in names}
+
+    def episodes(self) -> Iterator[slice]:
+        """
+        Go through the episodes.
+
+        :return: the rows of each
+        """
+        first = 0
+        for end in np.flatnonzero(_numpy(self._steps.terminations | self._steps.truncations)):
+            yield slice(first, int(end) + 1)
+            first = int(end) + 1
 
     def to(self, device: torch.device | str) -> "Dataset":
         """
@@ -151,57 +332,115 @@ class Dataset:
         :param device: device of the transitions, and so of the batches
         :return: the data set
         """
-        self._rows = self._rows_by(lambda tensor: tensor.to(device))
+        self._steps = _map(lambda tensor: tensor.to(device), self._steps)
+        self._low, self._range = self._low.to(device), self._range.to(device)
         return self
-
-    def _rows_by(self, function: Callable[[torch.Tensor], torch.Tensor]) -> Batch:
-        """The rows, their tensors changed by a function."""
-        changed: dict[str, Any] = {
-            name: None if value is None else for_each(function, value) for name, value in self._rows._asdict().items()
-        }
-        return Batch(**changed)
 
     def sample(self, batch_size: int) -> Batch:
         """
         Draw a batch.
 
         :param batch_size: B
-        :return: transitions, whose discount factor is the learner's
+        :return: transitions with actions in [-1, 1], whose discount factor is the learner's
         :raises ValueError: if the batch size is below 1
         """
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1, not {batch_size}")
-        rows = torch.randint(len(self), (batch_size,), generator=self._generator).to(self._rows.actions.device)
-        return self._rows_by(lambda tensor: tensor[rows])
+        return self.take(torch.randint(len(self), (batch_size,), generator=self._generator))
+
+    def take(self, rows: torch.Tensor) -> Batch:
+        """
+        Make a batch of given transitions.
+
+        :param rows: which of them, (B,)
+        :return: transitions with actions in [-1, 1], whose discount factor is the learner's
+        """
+        steps = self._steps
+        rows = rows.to(steps.actions.device)
+        actions = 2 * (steps.actions[rows].double() - self._low) / self._range - 1
+        return Batch(
+            _take(steps.observations, steps.at[rows]),
+            actions.clamp(-1, 1).float().flatten(1),
+            self._next_observations(rows),
+            steps.terminations[rows].float().unsqueeze(1),
+            steps.rewards[rows].unsqueeze(1),
+            columns={name: _as_column(values[rows]) for name, values in steps.columns.items()},
+        )
+
+    def _next_observations(self, rows: Any) -> Any:
+        steps = self._steps
+        if steps.next_observations is not None:
+            return _take(steps.next_observations, rows)
+        return _take(steps.observations, steps.next_at[rows])
+
+
+def _map(function: Callable[[Any], Any], steps: Steps) -> Steps:
+    changed: dict[str, Any] = {
+        name: None if value is None else for_each(function, value) for name, value in steps._asdict().items()
+    }
+    return Steps(**changed)
 
 
 def _take(columns: Any, rows: Any) -> Any:
+    if isinstance(columns, tuple):
+        return tuple(column[rows] for column in columns)
     return for_each(lambda column: column[rows], columns)
 
 
-def _rows(name: str, values: Any) -> Arrays:
-    """Convert arrays to their stored form: floats as float32."""
-    if isinstance(values, dict):
-        return {key: _rows(f"{name}[{key!r}]", value) for key, value in values.items()}  # type: ignore[misc]
-    return _numbers(name, values, 2)
+def _as_column(values: torch.Tensor) -> torch.Tensor:
+    return values.unsqueeze(1) if values.dim() == 1 else values
 
 
-def _numbers(name: str, values: Any, least_axes: int) -> np.ndarray:
-    array = np.asarray(values)
-    if array.dtype.kind not in "fiub" or array.ndim < least_axes:
+def _numpy(values: Any) -> np.ndarray:
+    return values.cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
+
+
+def _parts(arrays: Any) -> list[Any]:
+    return list(arrays.values()) if isinstance(arrays, dict) else [arrays]
+
+
+def _arrays(name: str, values: Any, least_axes: int) -> Any:
+    """Arrays, or what is read like them in pieces; nothing is copied."""
+    if isinstance(values, Mapping):
+        return {key: _arrays(f"{name}[{key!r}]", value, least_axes) for key, value in values.items()}
+    array = values if hasattr(values, "shape") and hasattr(values, "dtype") else np.asarray(values)
+    if isinstance(array, torch.Tensor):
+        array = _numpy(array)
+    if array.dtype.kind not in "fiub" or len(array.shape) < least_axes:
         raise ValueError(f"{name} must be numbers of shape (N, ...), not {array.dtype} of shape {array.shape}")
-    if array.dtype.kind != "f":
-        return array
-    with np.errstate(over="ignore"):
-        array = array.astype(np.float32)
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite, within float32")
     return array
+
+
+def _copied(name: str, values: Any, folder: str | None, keep_floats: bool = False) -> Any:
+    if isinstance(values, dict):
+        return {key: _copied(f"{name}[{key!r}]", value, folder, keep_floats) for key, value in values.items()}
+    out = zeros(folder, values.shape, stored_dtype(values.dtype, keep_floats))
+    put(name, values, out)
+    return out
+
+
+def _folder(memory_map: Any, arrays: list[Any]) -> str | None:
+    if memory_map is None:
+        return None
+    needed = sum(int(np.prod(each.shape)) * stored_dtype(each.dtype).itemsize for each in arrays)
+    return check_folder(memory_map, needed)
+
+
+def _breaks(steps: Steps) -> np.ndarray:
+    """Steps after which the data do not go on where they have ended, (N,)."""
+    n = len(steps.actions)
+    breaks = np.ones(n, bool)
+    for first in range(0, n - 1, CHUNK):
+        rows, last = slice(first, min(first + CHUNK, n - 1)), min(first + CHUNK, n - 1)
+        pairs = zip(_parts(steps.next_observations), _parts(steps.observations), strict=True)
+        same = [(ours[rows] == now[first + 1 : last + 1]).reshape(last - first, -1).all(1) for ours, now in pairs]
+        breaks[rows] = ~np.logical_and.reduce(same)
+    return breaks
 
 
 def _column(name: str, values: Any) -> np.ndarray:
     with np.errstate(over="ignore"):  # what float32 does not hold is refused below
-        array = np.asarray(values).astype(np.float32)
+        array = np.array(values).astype(np.float32)
     if array.ndim == 2 and array.shape[1] == 1:
         array = array[:, 0]
     if array.ndim != 1:
@@ -211,7 +450,7 @@ def _column(name: str, values: Any) -> np.ndarray:
     return array
 
 
-def _space_of(observations: Arrays) -> spaces.Space:
+def _space_of(observations: Any) -> spaces.Space:
     if isinstance(observations, dict):
         return spaces.Dict({key: _space_of(value) for key, value in observations.items()})
     if observations.dtype.kind == "f":
@@ -222,16 +461,15 @@ def _space_of(observations: Arrays) -> spaces.Space:
     return spaces.Box(np.iinfo(kind).min, np.iinfo(kind).max, observations.shape[1:], kind)
 
 
-def _check_shapes(space: spaces.Space, observations: Arrays) -> None:
+def _check_shapes(name: str, space: spaces.Space, observations: Any) -> None:
     if isinstance(space, spaces.Dict) != isinstance(observations, dict):
-        raise ValueError(f"observations must be arrays of observation_space={space}")
+        raise ValueError(f"{name} must be arrays of observation_space={space}")
     if isinstance(space, spaces.Dict):
-        assert isinstance(observations, dict)
         if space.spaces.keys() != observations.keys():
-            raise ValueError(f"observations must have the keys {sorted(space.spaces)}, not {sorted(observations)}")
+            raise ValueError(f"{name} must have the keys {sorted(space.spaces)}, not {sorted(observations)}")
         for key, part in space.spaces.items():
-            _check_shapes(part, observations[key])
+            _check_shapes(f"{name}[{key!r}]", part, observations[key])
         return
-    assert isinstance(observations, np.ndarray)
-    if observations.shape[1:] != space.shape:
-        raise ValueError(f"observations of shape {observations.shape} are none of observation_space={space}")
+    # The number of a Discrete space is a row of one.
+    if observations.shape[1:] != (space.shape or (1,)):
+        raise ValueError(f"{name} of shape {observations.shape} are none of observation_space={space}")

@@ -41,13 +41,21 @@ class Mixture:
             raise ValueError(f"batch_size must be at least 1, not {batch_size}")
         sizes = [round(share * batch_size) for share in self.shares[:-1]]
         sizes.append(batch_size - sum(sizes))
-        drawn = [source.sample(n) for source, n in zip(self.sources, sizes, strict=True) if n > 0]
-        columns = [sorted(batch.columns) for batch in drawn]
-        if any(names != columns[0] for names in columns):
-            raise ValueError(f"sources must have the same columns to be mixed, not {columns}")
-        names = [name for name in Batch._fields if name != "discounts"]
-        joined = {name: _joined([getattr(batch, name) for batch in drawn]) for name in names}
-        return Batch(**joined, discounts=_discounts(drawn))
+        return mixed([source.sample(n) for source, n in zip(self.sources, sizes, strict=True) if n > 0])
+
+
+def mixed(batches: list[Batch]) -> Batch:
+    """
+    :param batches: of several sources
+    :return: their rows, one after the other
+    :raises ValueError: if they have other columns each
+    """
+    columns = [sorted(batch.columns) for batch in batches]
+    if any(names != columns[0] for names in columns):
+        raise ValueError(f"sources must have the same columns to be mixed, not {columns}")
+    names = [name for name in Batch._fields if name != "discounts"]
+    joined = {name: _joined([getattr(batch, name) for batch in batches]) for name in names}
+    return Batch(**joined, discounts=_discounts(batches))
 
 
 def _joined(columns: list[Any]) -> Any:

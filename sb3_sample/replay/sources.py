@@ -1,18 +1,116 @@
-"""Sources of batches: the way from a model's replay buffer to its learner."""
+"""Sources of batches: the way from a model's replay buffer, or from a data set, to its learner."""
 
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+import torch
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_sample.learner.batch import Batch, Extra, Windows
+from sb3_sample.learner.batch import Batch, Extra, Windows, for_each
 from sb3_sample.replay.buffers import BatchMemory, ValidationSplit, latest, samples_as_its_class
+from sb3_sample.replay.dataset import Dataset
+from sb3_sample.replay.mixture import mixed
+
+
+class DatasetSource:
+    """
+    Source of batches from a data set, normalised as a model's environment is. Rows are drawn by NumPy's global
+    generator, as those of replay buffers.
+
+    :param model: the algorithm; its ``batch_size`` and normalisation are those in force when something is drawn
+    :param dataset: the data set, of which ``validation_proportion`` of the model are held out, always the same steps
+    """
+
+    def __init__(self, model: Any, dataset: Dataset):
+        self._model, self.dataset = model, dataset
+        self._training: np.ndarray | None = None
+        self._held_out = np.empty(0, np.int64)
+        if model.validation_proportion > 0:
+            order = np.random.default_rng(0).permutation(len(dataset))
+            n = min(round(model.validation_proportion * len(dataset)), len(dataset) - 1)
+            self._held_out, self._training = order[:n], order[n:]
+
+    def sample(self, batch_size: int) -> Batch:
+        """
+        :param batch_size: B
+        :return: transitions, with the learner's discount factor
+        """
+        (batch,) = self.batches(1, batch_size)
+        return batch
+
+    def batches(self, n_batches: int, batch_size: int) -> list[Batch]:
+        """
+        Draw the batches of several gradient steps.
+
+        :param n_batches: number of gradient steps
+        :param batch_size: transitions a step
+        :return: the batches
+        """
+        n = len(self.dataset) if self._training is None else len(self._training)
+        rows = np.random.randint(0, n, size=n_batches * batch_size)  # noqa: NPY002  # which checkpoints hold
+        return _cut(self._taken(rows if self._training is None else self._training[rows]), n_batches, batch_size)
+
+    def held_out(self) -> Batch | None:
+        """
+        Draw transitions of the validation side.
+
+        :return: as many as those of :meth:`ReplaySource.held_out`; None while there are fewer
+        """
+        n = _n_held_out(self._model)
+        return self.drawn_held_out(n) if len(self._held_out) >= n else None
+
+    def drawn_held_out(self, n: int) -> Batch:
+        """
+        :param n: how many, at least one and at most as many as there are
+        :return: transitions of the validation side
+        """
+        return self._taken(np.random.choice(self._held_out, n))  # noqa: NPY002
+
+    @property
+    def n_held_out(self) -> int:
+        """Number of transitions of the validation side."""
+        return len(self._held_out)
+
+    def observations(self) -> Iterator[Any]:
+        """
+        :return: those of all transitions, the held-out ones included, some thousand at a time, (n, O)
+        """
+        for rows in np.array_split(np.arange(len(self.dataset)), -(-len(self.dataset) // 10_000)):
+            yield self._taken(rows).observations
+
+    def latest(self, n_steps: int) -> Extra | None:
+        """
+        :param n_steps: T
+        :return: None: no steps are the newest ones
+        """
+        return None
+
+    def _taken(self, rows: np.ndarray) -> Batch:
+        batch, venv = self.dataset.take(torch.from_numpy(rows)), self._model.get_vec_normalize_env()
+        if venv is not None:
+
+            def normalized(observations: Any) -> Any:
+                return for_each(torch.from_numpy, venv.normalize_obs(for_each(lambda part: part.numpy(), observations)))
+
+            batch = batch._replace(
+                observations=normalized(batch.observations),
+                next_observations=normalized(batch.next_observations),
+                rewards=torch.from_numpy(venv.normalize_reward(batch.rewards.numpy()).astype(np.float32)),
+            )
+        device = self._model.device
+        moved: dict[str, Any] = {
+            name: None if value is None else for_each(lambda part: part.to(device), value)
+            for name, value in batch._asdict().items()
+        }
+        return Batch(**moved)
 
 
 class ReplaySource:
     """
-    Source of batches from a model's replay buffer, normalised as its environment is.
+    Source of batches from a model's replay buffer, normalised as its environment is, and from its prior data, if any:
+    the latter's rows come first.
 
     :param model: the algorithm; its ``replay_buffer``, ``gamma``, ``batch_size`` and ``validation_proportion`` are
         those in force when something is drawn
@@ -21,6 +119,7 @@ class ReplaySource:
     def __init__(self, model: Any):
         self._model = model
         self._memory = BatchMemory()
+        self._prior = None if model.prior_data is None else DatasetSource(model, model.prior_data)
 
     def sample(self, batch_size: int) -> Batch:
         """
@@ -38,10 +137,21 @@ class ReplaySource:
         :param batch_size: transitions a step
         :return: the batches, valid until the next call
         """
-        model = self._model
-        return draw_batches(
-            model.replay_buffer, n_batches, batch_size, model.gamma, model.get_vec_normalize_env(), self._memory
+        model, n_prior = self._model, 0
+        if self._prior is not None:
+            n_prior = round(model.prior_share * batch_size)
+        online = draw_batches(
+            model.replay_buffer,
+            n_batches,
+            batch_size - n_prior,
+            model.gamma,
+            model.get_vec_normalize_env(),
+            self._memory,
         )
+        if self._prior is None:
+            return online
+        pairs = zip(self._prior.batches(n_batches, n_prior), online, strict=True)
+        return [mixed([prior, replayed]) for prior, replayed in pairs]
 
     def held_out(self) -> Batch | None:
         """
@@ -52,10 +162,16 @@ class ReplaySource:
         """
         model, split = self._model, self._model.replay_buffer
         assert isinstance(split, ValidationSplit)
-        n = max(1, round(model.validation_proportion * model.batch_size))
-        if split.n_validation < n:
+        n, n_prior = _n_held_out(model), 0
+        if self._prior is not None:
+            n_prior = round(model.prior_share * n)
+        if split.n_validation < n - n_prior or (self._prior is not None and self._prior.n_held_out < n_prior):
             return None
-        return Batch.of(split.sample_validation(n, env=model.get_vec_normalize_env()), model.gamma)
+        theirs = [] if self._prior is None or n_prior == 0 else [self._prior.drawn_held_out(n_prior)]
+        if n > n_prior:
+            replayed = split.sample_validation(n - n_prior, env=model.get_vec_normalize_env())
+            theirs.append(Batch.of(replayed, model.gamma))
+        return theirs[0] if len(theirs) == 1 else mixed(theirs)
 
     def latest(self, n_steps: int) -> Extra | None:
         """
@@ -107,6 +223,10 @@ class WindowSource(ReplaySource):
         return found
 
 
+def _n_held_out(model: Any) -> int:
+    return max(1, round(model.validation_proportion * model.batch_size))
+
+
 def draw_batches(
     buffer: ReplayBuffer,
     n_batches: int,
@@ -135,9 +255,11 @@ def draw_batches(
 
 def _cut(data: Batch, n_batches: int, batch_size: int) -> list[Batch]:
     """Cut one large batch into several."""
+    if n_batches == 1:
+        return [data]
 
     def cut(x: Any) -> list[Any]:
-        if isinstance(x, (int, float)):
+        if x is None or isinstance(x, (int, float)):
             return [x] * n_batches
         if isinstance(x, dict):
             pieces = {key: value.split(batch_size) for key, value in x.items()}

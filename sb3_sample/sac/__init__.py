@@ -7,6 +7,7 @@ from sb3_sample.sac.crossq import CrossQ
 from sb3_sample.sac.dac import DAC
 from sb3_sample.sac.debiased_rq import DebiasedRQ
 from sb3_sample.sac.flash_sac import FlashSAC
+from sb3_sample.sac.offline import BC, IQL, TD3BC
 from sb3_sample.sac.regularized_sac import RegularizedSAC
 from sb3_sample.sac.rivals import GPLSAC, OAC, OPLSAC, SRSAC, TOPSAC
 from sb3_sample.sac.simba import SimBa, SimbaV2
@@ -14,15 +15,18 @@ from sb3_sample.sac.vpl_sac import VPLSAC
 from sb3_sample.sac.xqc import XQC
 
 __all__ = [
+    "BC",
     "BRC",
     "BRO",
     "BROTD3",
     "DAC",
     "GPLSAC",
+    "IQL",
     "OAC",
     "OPLSAC",
     "SAC",
     "SRSAC",
+    "TD3BC",
     "TOPSAC",
     "VPLSAC",
     "XQC",

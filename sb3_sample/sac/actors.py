@@ -19,15 +19,20 @@ from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
 from sb3_sample.networks import Network, RunningNorm, project_weights
 from sb3_sample.networks.modes import evaluated
+from sb3_sample.sac.features import TensorFeatures
 from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
 
 # The log standard deviation is squashed into this interval by a tanh.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
-#: Arguments of a Gaussian actor that say how.
+#: Where the likelihood of an action on a bound is taken (IQL's published code clips the data there).
+LARGEST_ACTION = 1 - 1e-5
+#: Arguments of a Gaussian actor that say how its standard deviation is bounded.
 LOG_STD_ARGUMENTS = ("log_std_min", "log_std_max", "clip_log_std")
+#: All of its own.
+GAUSSIAN_ARGUMENTS = (*LOG_STD_ARGUMENTS, "initial_std")
 
 
-class Actor(BasePolicy):
+class Actor(TensorFeatures, BasePolicy):
     """
     Tanh-Gaussian actor: ``a = tanh(mean + std * noise)``, the log standard deviation squashed by a tanh into
     [-10, 2] (BRO, section B.1; bounds and squashing as in the published code), or clipped.
@@ -42,6 +47,9 @@ class Actor(BasePolicy):
     :param log_std_min: lower bound of the log standard deviation
     :param log_std_max: upper bound
     :param clip_log_std: whether it is clipped to them, without a gradient outside, instead of squashed by a tanh
+    :param initial_std: standard deviation before the squashing at the start, about; None: that of the published code,
+        e^-4 between the usual bounds. A likelihood of given actions starts from a wide one, lest its first gradients be
+        thousands
     :raises ValueError: if an argument is out of range
     """
 
@@ -66,6 +74,7 @@ class Actor(BasePolicy):
         log_std_min: float = LOG_STD_MIN,
         log_std_max: float = LOG_STD_MAX,
         clip_log_std: bool = False,
+        initial_std: float | None = None,
     ):
         super().__init__(
             with_plain_sizes(observation_space),
@@ -77,21 +86,42 @@ class Actor(BasePolicy):
         check_value("log_std_min", log_std_min, FINITE)
         check_value("log_std_max", log_std_max, FINITE)
         check_value("clip_log_std", clip_log_std, TRUE_OR_FALSE)
+        check_value("initial_std", initial_std, ABOVE_0.or_none())
         if not log_std_min < log_std_max:
             raise ValueError(f"log_std_min must lie below log_std_max={log_std_max}, not be {log_std_min}")
         self.log_std_min, self.log_std_max, self.clip_log_std = log_std_min, log_std_max, clip_log_std
         self.shares_encoder = shares_encoder
         if shares_encoder:
             self.share(features_extractor)
-        self._network_args = {"network": network, "network_kwargs": network_kwargs}
+        self._network_args: dict[str, Any] = {"network": network, "network_kwargs": network_kwargs}
         self.features_dim = features_extractor.features_dim
         self.action_dim = get_action_dim(action_space)
         self.trunk = make_trunk("actor_network", network, self.features_dim, network_kwargs)
         self.mean = self.trunk.make_head(self.action_dim)
         self.log_std = self.trunk.make_head(self.action_dim, gain=1.0)
+        if initial_std is not None:
+            self._network_args["initial_std"] = initial_std
+            self._start_from(initial_std)
         #: Stable-Baselines3's distribution of the actions, for its own use: nothing here reads it.
         self.action_dist = SquashedDiagGaussianDistribution(self.action_dim)
         keep_at_rest(self)
+
+    def _start_from(self, initial_std: float) -> None:
+        """Have the head of the log standard deviation start nearly the same for all observations, of any size."""
+        if type(self.log_std) is not nn.Linear:
+            raise ValueError(
+                f"initial_std={initial_std} is set by a plain output layer, and that of actor_network="
+                f"{type(self.trunk).__name__} has a norm of its own: pass actor_kwargs={{'initial_std': None}}"
+            )
+        start, low, high = math.log(initial_std), self.log_std_min, self.log_std_max
+        if not low < start < high:
+            raise ValueError(
+                f"initial_std must lie between e^log_std_min and e^log_std_max, e^{low:g} and e^{high:g}, not be "
+                f"{initial_std}"
+            )
+        self.log_std.weight.data.mul_(0.01)
+        bias = start if self.clip_log_std else math.atanh(2 * (start - low) / (high - low) - 1)
+        nn.init.constant_(self.log_std.bias, bias)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         own = {"features_extractor": self.features_extractor, "shares_encoder": self.shares_encoder}
@@ -180,6 +210,18 @@ class Actor(BasePolicy):
         noise = torch.randn_like(mean) if noise is None else noise
         x = mean + log_std.exp() * noise
         return torch.tanh(x), tanh_gaussian_log_prob(x, noise, log_std)
+
+    def log_prob_of(self, obs: PyTorchObs | Encoded, actions: torch.Tensor) -> torch.Tensor:
+        """
+        Log-probability of given actions.
+
+        :param obs: observations, (B, O), or a dict of them, or their features
+        :param actions: in [-1, 1], (B, A); on a bound, where it is infinite, it is taken a little inside
+        :return: (B, 1)
+        """
+        mean, log_std = self.gaussian(self.features(obs))
+        x = torch.atanh(actions.clamp(-LARGEST_ACTION, LARGEST_ACTION))
+        return tanh_gaussian_log_prob(x, (x - mean) / log_std.exp(), log_std)
 
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
         """
@@ -300,6 +342,12 @@ class DeterministicActor(Actor):
     def action_log_prob(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor]:
         """
         :raises AttributeError: always; as with Stable-Baselines3's TD3, there is no distribution
+        """
+        raise AttributeError("a deterministic actor (backbone='td3') has no distribution of its actions")
+
+    def log_prob_of(self, obs: PyTorchObs | Encoded, actions: torch.Tensor) -> torch.Tensor:
+        """
+        :raises AttributeError: always; there is no distribution
         """
         raise AttributeError("a deterministic actor (backbone='td3') has no distribution of its actions")
 

@@ -4,24 +4,33 @@ The off-policy family as Stable-Baselines3's: acting, storing, when and how ofte
 The update is the learner's (``sb3_sample/learner/learner.py``).
 """
 
+import collections
+import contextlib
 import pathlib
+import time
+import warnings
+from collections.abc import Iterator
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.utils import configure_logger
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sample.arguments import check_program, default_of
+from sb3_sample.arguments import check_every, check_program, default_of
 from sb3_sample.constructor import Given
+from sb3_sample.envs.no_environment import NoEnvironment
 from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, not_finite
+from sb3_sample.kinds import check_value, instance, integer
 from sb3_sample.learner.batch import SLOTS, Batch, Noise
+from sb3_sample.learner.learner import Learner
 from sb3_sample.replay.buffers import (
     ValidationDictReplayBuffer,
     ValidationReplayBuffer,
@@ -30,9 +39,11 @@ from sb3_sample.replay.buffers import (
 )
 from sb3_sample.replay.columns import has_own_columns
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
-from sb3_sample.replay.sources import ReplaySource
+from sb3_sample.replay.dataset import Dataset
+from sb3_sample.replay.sources import DatasetSource, ReplaySource
 from sb3_sample.replay.weighted import PrioritizedReplay
 from sb3_sample.sac import checks
+from sb3_sample.sac.apart import ActsApart, Apart
 from sb3_sample.sac.arguments import SACArguments
 from sb3_sample.sac.metrics_log import MetricsLog
 from sb3_sample.sac.model_learner import check_action_space
@@ -54,7 +65,17 @@ Self = TypeVar("Self", bound="SAC")
 MAX_BATCHES_AT_ONCE = 64
 
 
-class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]  # actor
+class GradientStepBar(ProgressBarCallback):
+    """Progress bar of gradient steps, whatever the number of environments."""
+
+    def _on_step(self) -> bool:
+        self.pbar.update(1)
+        return True
+
+
+class SAC(  # type: ignore[misc]  # actor
+    ActsApart, UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
+):
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the
     SAC that the DAC, VPL and BRO papers and the regularization study (https://arxiv.org/abs/2403.00514) compare with:
@@ -74,10 +95,21 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
         "MultiInputPolicy": MultiInputPolicy,
     }
     policy_base: ClassVar[type[SACPolicy]] = SACPolicy
+    #: Whether there is ``learn_offline`` only.
+    learns_from_data_only: ClassVar[bool] = False
     _kept: ClassVar[dict[str, Kept]] = {
         # Saved by its parts.
         "_learner": Kept.NOWHERE,
         "_source": Kept.NOWHERE,
+        # Files name it by its fingerprint.
+        "prior_data": Kept.NOWHERE,
+        "_learns_from": Kept.NOWHERE,
+        # Of the present ``learn``.
+        "_apart": Kept.NOWHERE,
+        "_acts_at": Kept.NOWHERE,
+        # Attributes of Stable-Baselines3's, and arguments only of a model without an environment.
+        "observation_space": Kept.EVERYWHERE,
+        "action_space": Kept.EVERYWHERE,
         "_watch": Kept.NOWHERE,
         "_plain_attributes": Kept.NOWHERE,
         # For the log of a run that goes on.
@@ -101,8 +133,13 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
         for name in "train_freq", "gradient_steps":
             given[name] = 1 if given[name] is None else given[name]
         is_set_up = given.pop("_init_setup_model")
+        spaces_given = {name: given.pop(name) for name in ("observation_space", "action_space")}
         theirs = self._store(given, OffPolicyAlgorithm)
         OffPolicyAlgorithm.__init__(self, **theirs, sde_support=False, support_multi_env=True)
+        checks.check_spaces(**spaces_given, env=self.env)
+        if self.env is None and spaces_given["action_space"] is not None:
+            check_action_space(spaces_given["action_space"], "action_space")
+            vars(self).update(spaces_given, n_envs=1)
         #: Whether the gradient step is compiled; None while that is not decided. Saved: a loaded model goes on with it.
         self.compiled: bool | None = None
         #: A callback that wants gradients in ``.grad`` sets this: the last of the next gradient steps is run eagerly.
@@ -110,13 +147,24 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
         self._keeps_gradients = False
         #: Transitions stored over the model's life; unlike ``num_timesteps`` never zeroed by ``learn``.
         self.num_transitions = 0
+        #: Gradient steps of ``learn_offline`` over the model's life.
+        self._n_offline_updates = 0
+        # The data set of a ``learn_offline`` under way, and what a file names of the prior data.
+        self._learns_from: Dataset | None = None
+        # Whether a ``learn`` under way acts in a thread of its own, and how often a second; and that thread.
+        self._acts_at: tuple[bool, float | None] = (False, None)
+        self._apart: Apart | None = None
+        self._prior_of: dict[str, Any] | None = None
         #: Gradient steps planned, for ``learning_rate_schedule``; None while they are not known.
         self.planned_updates: int | None = self.schedule_steps
         # Gradient steps owed but not yet taken, the fraction that a replay ratio leaves over.
         self._updates_owed = 0.0
         self._metrics: dict[str, torch.Tensor] = {}
-        if is_set_up:
+        if is_set_up and hasattr(self, "observation_space"):
             self._setup_model()
+        elif is_set_up:
+            # A model that is to learn from data: its networks are made when the spaces are known.
+            check_every(self, needs_spaces=False)
 
     # ---------------------------------------------------------------- construction
 
@@ -126,11 +174,31 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
         store_float_actions(self.replay_buffer)
         if self.compile != "auto":
             self.compiled = bool(self.compile)
-        self._source = ReplaySource(self)
+        if self.prior_data is not None:
+            self._take_prior_data(self.prior_data)
+        self._source: ReplaySource | DatasetSource = ReplaySource(self)
         self.learner = self._make_learner(networks=self.policy, counts=self)
+        if self.prior_data is not None:
+            self._tell_of(self.prior_data)
         checks.check_rule(self)
         self._plain_attributes = plain_attributes(self)
         self._watch = MetricWatch(self.device)
+
+    def _take_prior_data(self, data: Dataset) -> None:
+        """Note which the prior data are; a loaded model may have had others."""
+        now = {"fingerprint": data.fingerprint, "size": len(data)}
+        if self._prior_of is not None and self._prior_of != now:
+            warnings.warn(
+                f"prior_data are other transitions than this model has learned from so far: {data!r}, not "
+                f"{checks.prior_words(self._prior_of)}",
+                stacklevel=6,
+            )
+        self._prior_of = now
+
+    def _tell_of(self, data: Dataset) -> None:
+        """Tell the rule that scales rewards, if any, of a data set."""
+        if self.learner.reward_scaler is not None:
+            self.learner.reward_scaler.on_dataset(data.return_range)
 
     def _check_arguments(self) -> None:
         checks.check(self)
@@ -174,6 +242,8 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
             implied["planned_updates"] = kwargs["schedule_steps"]
         if "train_freq" in kwargs or "gradient_steps" in kwargs:
             implied["replay_ratio"] = None
+        if "prior_data" in kwargs and kwargs["prior_data"] is None:
+            implied |= {"_prior_of": None, "prior_share": default_of(cls, "prior_share")}
         # One way to count resets replaces the file's other one.
         if kwargs.get("reset_gradient_steps") is not None:
             implied["resets"] = ()
@@ -181,10 +251,36 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
             implied["reset_gradient_steps"] = None
         return implied
 
+    @classmethod
+    def _made(cls, content: Any, attributes: dict[str, Any], kwargs: dict[str, Any], *args: Any) -> Any:
+        prior_of, (_, env, *_) = attributes.get("_prior_of"), args
+        if prior_of is not None and env is not None and "prior_data" not in kwargs:
+            checks.check_prior_of(prior_of)
+            raise ValueError(
+                f"prior_data: the model of {content.name} learned with {checks.prior_words(prior_of)}, which the file "
+                "does not hold: pass prior_data=, or prior_data=None to go on without"
+            )
+        return super()._made(content, attributes, kwargs, *args)
+
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         check_action_space(env.action_space)
         return Resumable._wrap_env(env, verbose, monitor_wrapper)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        Set another environment, as in Stable-Baselines3; for a model without spaces, its first.
+
+        :param env: the environment, of the same spaces and as many as the model was made with
+        :param force_reset: whether it is reset before training goes on
+        :raises ValueError: if its spaces or its number of environments differ
+        """
+        if not hasattr(self, "observation_space"):
+            venv = self._wrap_env(env, self.verbose)
+            self.observation_space, self.action_space, self.n_envs = venv.observation_space, venv.action_space, 1
+            self.n_envs = venv.num_envs
+            self._setup_model()
+        super().set_env(env, force_reset)
 
     # ---------------------------------------------------------------- acting
 
@@ -213,22 +309,40 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        assert isinstance(self.action_space, spaces.Box)
         self.learner.on_observations(self._last_obs)
-        if self._n_of_warm_up < learning_starts:
+        # A model that has learned from data acts by it from the beginning.
+        at_random = self._n_of_warm_up < learning_starts and self._n_offline_updates == 0
+        unscaled, scaled = self._choose(self.learner, self._last_obs, at_random, n_envs)
+        if action_noise is None:
+            return unscaled, scaled
+        scaled = np.clip(scaled + action_noise(), -1, 1)
+        return self.policy.unscale_action(scaled), scaled
+
+    def _choose(
+        self, learner: Learner, observations: Any, at_random: bool, n_envs: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Choose the actions of a step in training.
+
+        :param learner: whose networks act
+        :param observations: of all environments
+        :param at_random: whether the actions are uniformly random
+        :param n_envs: number of environments
+        :return: actions in the environment's units and in [-1, 1], (n_envs, A) each
+        """
+        assert isinstance(self.action_space, spaces.Box)
+        if at_random:
             unscaled = np.array([self.action_space.sample() for _ in range(n_envs)])
             scaled = self.policy.scale_action(unscaled)
         else:
-            assert self._last_obs is not None
+            assert observations is not None
             with torch.inference_mode():
-                observations, _ = self.policy.obs_to_tensor(self._last_obs)
-                actions = self.learner.explore(observations)
+                tensors, _ = self.policy.obs_to_tensor(observations)
+                actions = learner.explore(tensors)
             scaled = actions.cpu().numpy().reshape((n_envs, *self.action_space.shape))
             if not np.isfinite(scaled).all():
                 check_finite_parameters(self)
                 raise diverged(self, not_finite({"the policy's action": scaled.sum()}))
-        if action_noise is not None:
-            scaled = np.clip(scaled + action_noise(), -1, 1)
         return self.policy.unscale_action(scaled), scaled
 
     def _store_transition(
@@ -268,6 +382,8 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
         progress_bar: bool = False,
         checkpoint: str | pathlib.Path | None = None,
         checkpoint_freq: int = CHECKPOINT_FREQ,
+        asynchronous: bool = False,
+        control_frequency: float | None = None,
     ) -> Self:
         """
         Train, as in Stable-Baselines3; with ``checkpoint``, so that nothing is lost when the program ends before it is
@@ -282,21 +398,122 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
         :param checkpoint: folder of the run; None for no checkpoints. Each call of ``learn`` needs a folder of its own
         :param checkpoint_freq: environment steps between two checkpoints
+        :param asynchronous: whether a thread acts while gradient steps are taken, up to the replay ratio, for robots
+            and other environments that take their time (docs/asynchronous.md). The result is then not the same bit by
+            bit
+        :param control_frequency: steps a second of that thread; None: at the environment's own pace
         :return: the trained model
         :raises ValueError: if an argument is out of range, or the folder is of another run (the message names what
             differs) or of an earlier call of ``learn``, cannot be used, or has checkpoints that are all damaged
         :raises TrainingDiverged: if a loss, another metric or a parameter is NaN or infinite
         """
-        return self._learn(
-            total_timesteps,
-            callback,
-            log_interval,
-            tb_log_name,
-            reset_num_timesteps,
-            progress_bar,
-            checkpoint,
-            checkpoint_freq,
-        )
+        if self._prior_of is not None and self.prior_data is None:
+            raise ValueError(
+                f"prior_data: this model learned with {checks.prior_words(self._prior_of)}, which its file does not "
+                "hold: pass prior_data= to load, or prior_data=None to go on without"
+            )
+        with self._acting(asynchronous, control_frequency):
+            return self._learn(
+                total_timesteps,
+                callback,
+                log_interval,
+                tb_log_name,
+                reset_num_timesteps,
+                progress_bar,
+                checkpoint,
+                checkpoint_freq,
+            )
+
+    def learn_offline(
+        self: Self,
+        dataset: Dataset,
+        gradient_steps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1_000,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+        checkpoint: str | pathlib.Path | None = None,
+        checkpoint_freq: int = CHECKPOINT_FREQ,
+    ) -> Self:
+        """
+        Train on a data set. Steps are gradient steps here: ``num_timesteps`` counts them, callbacks are called after
+        each (``EvalCallback(eval_freq=1_000)`` evaluates every 1,000), checkpoints and log have them. The environment,
+        if there is one, is left alone. A ``learn`` that follows acts by what was learned from its first step on.
+
+        :param dataset: the transitions. They are drawn by NumPy's global generator, which the model's seed sets and
+            checkpoints hold
+        :param gradient_steps: gradient steps to take
+        :param callback: called after every gradient step
+        :param log_interval: gradient steps between two lines of the log
+        :param tb_log_name: name of the run in the TensorBoard log; the class's name if None
+        :param reset_num_timesteps: whether ``num_timesteps`` starts at zero again
+        :param progress_bar: whether to show a progress bar (needs tqdm and rich)
+        :param checkpoint: folder of the run, as in ``learn``; one of its own
+        :param checkpoint_freq: gradient steps between two checkpoints
+        :return: the trained model
+        :raises ValueError: if an argument is out of range, or the data set has other observations or actions than the
+            model; for ``checkpoint`` as in ``learn``
+        :raises TrainingDiverged: if a loss, another metric or a parameter is NaN or infinite
+        """
+        check_value("dataset", dataset, instance(Dataset))
+        check_value("gradient_steps", gradient_steps, integer(0))
+        with self._learning_from(dataset):
+            return self._learn(
+                gradient_steps,
+                callback,
+                log_interval,
+                tb_log_name,
+                reset_num_timesteps,
+                progress_bar,
+                checkpoint,
+                checkpoint_freq,
+                learns_from=repr(dataset),
+            )
+
+    @contextlib.contextmanager
+    def _learning_from(self, dataset: Dataset) -> Iterator[None]:
+        """Have a data set in the place of the replay buffer, and something in the place of an environment."""
+        if not hasattr(self, "observation_space"):
+            self.observation_space, self.action_space, self.n_envs = dataset.observation_space, dataset.action_space, 1
+            self._setup_model()
+        checks.check_dataset("dataset", dataset, self.observation_space, self.action_space)
+        env, source = self.env, self._source
+        checks.check_offline(self)
+        self._tell_of(dataset)
+        data = DatasetSource(self, dataset)
+        self._learns_from, self._source = dataset, data
+        norm = self.learner.observation_norm
+        if norm is not None and norm.count < 1:
+            # A model that has acted keeps its statistics.
+            for observations in data.observations():
+                norm.update(observations)
+        if env is None:
+            self.env = NoEnvironment(self.observation_space, self.action_space)
+        try:
+            yield
+        finally:
+            self._learns_from, self._source, self.env = None, source, env
+
+    def _set_up_training(
+        self, total_timesteps: int, callback: MaybeCallback, reset_num_timesteps: bool, name: str, progress_bar: bool
+    ) -> tuple[int, BaseCallback]:
+        if self._learns_from is None:
+            return super()._set_up_training(total_timesteps, callback, reset_num_timesteps, name, progress_bar)
+        # As Stable-Baselines3 sets up, without a reset of the environment.
+        self.start_time = time.time_ns()
+        if reset_num_timesteps:
+            self.num_timesteps = self._episode_num = 0
+        if self.ep_info_buffer is None or reset_num_timesteps:
+            self.ep_info_buffer = collections.deque(maxlen=self._stats_window_size)
+            self.ep_success_buffer = collections.deque(maxlen=self._stats_window_size)
+        self._total_timesteps = self.num_timesteps + total_timesteps
+        self._num_timesteps_at_start = self.num_timesteps
+        if not self._custom_logger:
+            self._logger = configure_logger(self.verbose, self.tensorboard_log, name, reset_num_timesteps)
+        bar = [GradientStepBar()] if progress_bar else []
+        callbacks = callback if isinstance(callback, list) else [] if callback is None else [callback]
+        return self._total_timesteps, self._init_callback([*callbacks, *bar] if bar else callback)
 
     def _described(self) -> Lenient:
         encoder = super()._described()
@@ -305,6 +522,10 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
         return encoder
 
     def _turn(self, callback: BaseCallback, log_interval: int) -> bool:
+        if self._learns_from is not None:
+            return self._offline_turn(callback, log_interval)
+        if self._acts_at[0]:
+            return self._turn_apart(callback, log_interval)
         assert self.env is not None and self.replay_buffer is not None
         rollout = self.collect_rollouts(
             self.env,
@@ -320,6 +541,19 @@ class SAC(UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers,
             if n_updates > 0:
                 self.train(n_updates, self.batch_size)
         return rollout.continue_training
+
+    def _offline_turn(self, callback: BaseCallback, log_interval: int) -> bool:
+        """One gradient step on the data set, and what follows a step."""
+        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        self.train(1)
+        self.num_timesteps += 1
+        self._n_offline_updates += 1
+        callback.update_locals(locals())
+        if not callback.on_step():
+            return False
+        if log_interval is not None and self.num_timesteps % log_interval == 0:
+            self.dump_logs()
+        return True
 
     def _on_environment_reset(self) -> None:
         self.learner.on_environment_reset()

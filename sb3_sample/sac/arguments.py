@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import Schedule
@@ -31,6 +32,7 @@ from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.learner.reward_scale import REWARD_SCALES, RewardScale
 from sb3_sample.learner.schedules import SCHEDULES
 from sb3_sample.learner.transforms import BatchTransform
+from sb3_sample.replay.dataset import Dataset
 from sb3_sample.sac.policies import SACPolicy
 from sb3_sample.training.resumable import Resumable
 
@@ -56,7 +58,8 @@ class SACArguments(Resumable):
     _policy: str | type[SACPolicy] = argument(alias="policy", kw_only=False, of_training=True)
     """"MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class"""
     _env: gym.Env[Any, Any] | VecEnv | str | None = argument(alias="env", kw_only=False, of_training=True)
-    """the environment, an id, or a vectorised environment; its action space a bounded Box"""
+    """the environment, an id, or a vectorised environment; its action space a bounded Box. None for a model that learns
+    from data: its spaces are those of the data set, unless they are arguments"""
     learning_rate: float | Schedule = argument(default=3e-4, kind=LEARNING_RATE, kw_only=False)
     """of all networks and the temperature; a number or a function of the remaining progress (from 1 to 0)"""
     buffer_size: int = argument(default=1_000_000, kind=integer(1), kw_only=False, of_training=True)
@@ -190,7 +193,7 @@ class SACArguments(Resumable):
         default=None, kind=one_of(REWARD_SCALES, RewardScale).or_none("rewards as they are")
     )
     """rule by which rewards are divided by a running measure of the return: "simbav2", "xqc", "flashsac", "brc", or a
-    class derived from ``RewardScale``"""
+    class derived from ``RewardScale``; or "linear": rewards times a factor, plus a number"""
     reward_scale_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
     """its arguments"""
     normalize_observations: bool = argument(default=False, kind=TRUE_OR_FALSE)
@@ -208,6 +211,17 @@ class SACArguments(Resumable):
     """as in Stable-Baselines3, without meaning where ``use_sde`` is False"""
     use_sde_at_warmup: bool = argument(default=False, of_training=True)
     """as in Stable-Baselines3, without meaning where ``use_sde`` is False"""
+    prior_data: Dataset | None = argument(default=None, kind=instance(Dataset).or_none(), of_training=True)
+    """transitions that are there already, of which ``learn`` takes a share of every batch (RLPD, Ball et al. 2023).
+    Files hold its fingerprint only; pass it to ``load`` too"""
+    prior_share: float = argument(
+        default=0.5, kind=number("lie in (0, 1)", lambda value: 0 < value < 1), of_training=True
+    )
+    """that share"""
+    _observation_space: spaces.Space | None = argument(alias="observation_space", default=None, of_training=True)
+    """of a model without an environment, with ``action_space``; None: the environment's, or the data set's"""
+    _action_space: spaces.Box | None = argument(alias="action_space", default=None, of_training=True)
+    """of a model without an environment, with ``observation_space``"""
     compile: bool | str = argument(default="auto")
-    """whether ``torch.compile`` makes one program of the gradient step; "auto": where that pays back within the run, on
+    """whether Inductor makes one program of the gradient step; "auto": where that pays back within the run, on
     a CPU or a GPU with a compiler at hand, see docs/performance.md"""

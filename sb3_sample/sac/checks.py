@@ -18,6 +18,7 @@ from sb3_sample.kinds import (
 )
 from sb3_sample.learner.exploration import EXPLORATIONS
 from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
+from sb3_sample.learner.reward_scale import LinearScale
 from sb3_sample.replay.buffers import DeviceReplayBuffer, ValidationSplit
 from sb3_sample.replay.columns import has_own_columns
 from sb3_sample.replay.compact import CompactReplay
@@ -58,6 +59,12 @@ def check(agent: Any) -> None:
     if agent.reward_scale is None:
         check_unused(agent, ["reward_scale_kwargs"], "reward_scale=None")
     check_one_reward_scale(agent)
+    shift = (agent.reward_scale_kwargs or {}).get("shift", 0)
+    if agent.reward_scale == "linear" and shift != 0 and agent.n_steps > 1:
+        raise ValueError(
+            f"shift={shift} of reward_scale_kwargs would be added once to the returns of "
+            f"n_steps={agent.n_steps} steps: pass n_steps=1, or no shift"
+        )
     _check_schedule(agent)
     _check_tasks(agent)
     of_policy = ["n_quantiles", "n_outputs", "backbone", "normalize_observations", "width_factor"]
@@ -74,6 +81,116 @@ def check(agent: Any) -> None:
     _check_memory_map(agent)
     _check_device_buffer(agent)
     _check_train_freq(agent)
+    _check_prior_data(agent)
+
+
+def check_spaces(observation_space: Any, action_space: Any, env: Any) -> None:
+    """
+    Check the spaces that are arguments.
+
+    :param observation_space: the argument
+    :param action_space: the argument
+    :param env: the environment, if there is one
+    :raises ValueError: if only one of them is there, or they are no spaces, or not the environment's
+    """
+    given = {"observation_space": observation_space, "action_space": action_space}
+    if len({value is None for value in given.values()}) > 1:
+        missing = next(name for name, value in given.items() if value is None)
+        raise ValueError(f"observation_space and action_space belong together: pass {missing}= too")
+    for name, value in given.items():
+        if value is not None and not isinstance(value, spaces.Space):
+            raise ValueError(f"{name} must be a space of Gymnasium's, or None, not {value!r}")
+        if value is not None and env is not None and value != getattr(env, name):
+            raise ValueError(f"{name} must be the environment's, {getattr(env, name)}, not {value}: leave it out")
+
+
+def check_dataset(name: str, dataset: Any, observation_space: Any, action_space: Any) -> None:
+    """
+    Check that a data set is one for a model.
+
+    :param name: the argument
+    :param dataset: the data set
+    :param observation_space: the model's
+    :param action_space: the model's
+    :raises ValueError: if its observations or actions are others
+    """
+    ours, theirs = _shapes(observation_space), _shapes(dataset.observation_space)
+    if ours != theirs:
+        raise ValueError(f"{name} must have observations of the model's shape, {ours}, not {theirs}")
+    own, other = action_space, dataset.action_space
+    same = own.shape == other.shape and np.allclose([own.low, own.high], [other.low, other.high])
+    if not same:
+        raise ValueError(
+            f"{name} must have actions in the units of the model, {own}, not {other}: pass action_space= where the "
+            "data set is made"
+        )
+
+
+def check_offline(agent: Any) -> None:
+    """
+    Check that an algorithm can learn from a data set alone.
+
+    :param agent: the algorithm
+    :raises ValueError: if it asks for steps of an environment
+    """
+    scaler = agent.learner.reward_scaler
+    if scaler is not None and scaler.needs_steps:
+        raise ValueError(
+            f"reward_scale={agent.reward_scale!r} divides by a measure of returns in an environment, and learn_offline "
+            "takes no steps there: pass reward_scale=None, or 'linear' for rewards of a size that suits the critics"
+        )
+
+
+def check_prior_of(value: Any) -> None:
+    """
+    Check what a file says of prior data.
+
+    :param value: it
+    :raises ValueError: if it is something else
+    """
+    kinds = {"fingerprint": str, "size": int}
+    if not isinstance(value, dict) or {name: type(each) for name, each in value.items()} != kinds:
+        raise ValueError(f"_prior_of cannot be {value!r:.100}")
+
+
+def prior_words(prior_of: dict[str, Any]) -> str:
+    """
+    :param prior_of: what a file says of prior data
+    :return: the same in words
+    """
+    return f"{prior_of['size']:,} transitions of prior data, sha256 {prior_of['fingerprint'][:16]}"
+
+
+def _shapes(space: Any) -> Any:
+    if isinstance(space, spaces.Dict):
+        return {key: part.shape for key, part in sorted(space.spaces.items())}
+    return space.shape
+
+
+def _check_prior_data(agent: Any) -> None:
+    """Whether batches can have their share of the prior data."""
+    if agent._prior_of is not None:
+        check_prior_of(agent._prior_of)
+    if agent.prior_data is None:
+        if agent._prior_of is None:
+            check_unused(agent, ["prior_share"], "prior_data=None")
+        return
+    check_dataset("prior_data", agent.prior_data, agent.observation_space, agent.action_space)
+    if not 0 < round(agent.prior_share * agent.batch_size) < agent.batch_size:
+        raise ValueError(
+            f"prior_share={agent.prior_share} of batch_size={agent.batch_size} leaves no transition of one of the two "
+            "sources: pass a larger batch_size or another share"
+        )
+    cls = agent.replay_buffer_class
+    if cls is not None and issubclass(cls, PrioritizedReplay):
+        raise ValueError(
+            f"prior_data have no priorities, by which replay_buffer_class={cls.__name__} draws: leave one of them out"
+        )
+    if agent.n_steps > 1:
+        raise ValueError(
+            f"prior_data has transitions of one step, which n_steps={agent.n_steps} would mix with returns of several: "
+            "pass n_steps=1"
+        )
 
 
 def check_one_reward_scale(agent: Any) -> None:
@@ -88,6 +205,21 @@ def check_one_reward_scale(agent: Any) -> None:
         raise ValueError(
             f"reward_scale={agent.reward_scale!r} scales rewards, and so does the VecNormalize of env: pass it "
             "norm_reward=False, or the model reward_scale=None"
+        )
+
+
+def check_scale_is_known(agent: Any) -> None:
+    """
+    Check that rewards can be scaled.
+
+    :param agent: an algorithm that is about to learn
+    :raises ValueError: if their scale is to follow from a data set that there has not been
+    """
+    scaler = agent.learner.reward_scaler
+    if isinstance(scaler, LinearScale) and scaler.waits_for_data:
+        raise ValueError(
+            f"return_range={scaler.return_range} of reward_scale_kwargs is that of a data set: call learn_offline "
+            "first, or pass prior_data=, or factor in its place"
         )
 
 

@@ -17,10 +17,11 @@ from torch import nn
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.q_values import QValues
 from sb3_sample.networks import Network, RunningNorm, project_weights
+from sb3_sample.sac.features import TensorFeatures
 from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
 
 
-class CriticEnsemble(BaseModel):
+class CriticEnsemble(TensorFeatures, BaseModel):
     """
     E critics with K outputs each, evaluated at once.
 
@@ -88,15 +89,14 @@ class CriticEnsemble(BaseModel):
         """
         return self.head(self.trunk(self.inputs(obs, actions)))
 
-    def forward(self, obs: PyTorchObs, actions: torch.Tensor) -> QValues | torch.Tensor:
+    def forward(self, obs: PyTorchObs, actions: torch.Tensor) -> QValues:
         """
         :param obs: observations, (B, O), or a dict of them
         :param actions: actions in [-1, 1], (B, A)
-        :return: Stable-Baselines3's tuple of E tensors, (B, K) each, that is a tensor (E, B, K) too; where it is being
-            compiled, the tensor alone
+        :return: Stable-Baselines3's tuple of E tensors, (B, K) each, that is a tensor (E, B, K) too
         """
         q = self.q_values(obs, actions)
-        return q if torch.compiler.is_compiling() else QValues(q)
+        return QValues(q)
 
     def q1_forward(self, obs: PyTorchObs, actions: torch.Tensor) -> torch.Tensor:
         """
@@ -137,3 +137,56 @@ class CriticEnsemble(BaseModel):
         :return: the parameters that each critic has a copy of, (E, ...) each: all but the features extractor's
         """
         return [*self.trunk.parameters(), *self.head.parameters()]
+
+
+class ValueNetwork(TensorFeatures, BaseModel):
+    """
+    Value of observations alone, by a network of the critics' kind.
+
+    :param observation_space: observation space
+    :param action_space: action space
+    :param network: class of the trunk
+    :param network_kwargs: its arguments
+    :param features_extractor: extractor of the observation's features
+    :param normalize_images: whether images are divided by 255
+    """
+
+    #: The policy's running normalisation of observations, None for none.
+    observation_norm: RunningNorm | None = None
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        network: type[Network],
+        network_kwargs: dict[str, Any],
+        features_extractor: BaseFeaturesExtractor,
+        normalize_images: bool = True,
+    ):
+        super().__init__(
+            with_plain_sizes(observation_space),
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+        )
+        self._network_args = {"network": network, "network_kwargs": network_kwargs}
+        self.trunk = make_trunk("critic_network", network, features_extractor.features_dim, network_kwargs)
+        self.head: Any = self.trunk.make_head(1)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = {**self._network_args, "features_extractor": self.features_extractor}
+        return {**super()._get_constructor_parameters(), **own}
+
+    def forward(self, obs: PyTorchObs) -> torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them
+        :return: their value, (B, 1)
+        """
+        assert isinstance(self.features_extractor, BaseFeaturesExtractor)
+        seen: PyTorchObs = obs if self.observation_norm is None else self.observation_norm(obs)
+        return self.head(self.trunk(self.extract_features(seen, self.features_extractor)))
+
+    def project(self) -> None:
+        """Called after every step of the optimizer: bring weights back to where they belong, in place."""
+        self.trunk.project()
+        project_weights(self.head)

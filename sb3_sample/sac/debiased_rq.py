@@ -50,6 +50,7 @@ _FIXED: dict[str, tuple[Any, str]] = {
     "normalize_observations": (False, "its encoder learns from observations as they are"),
     "learning_rate_schedule": (None, "its encoder takes gradient steps of its own, which no schedule counts"),
     "actor_first": (False, "its actor learns on the new critics"),
+    "prior_data": (None, "its encoder learns from windows of several steps, and a data set has single ones"),
     "redo_period": (None, "new weights in place of dormant ones are drawn as those of the other agents"),
 }
 
@@ -221,6 +222,14 @@ class DebiasedRQ(SAC):
             )
 
     # ---------------------------------------------------------------- learning
+
+    def learn_offline(self, *args: Any, **kwargs: Any) -> Any:
+        """
+        :raises ValueError: always
+        """
+        raise ValueError(
+            "learn_offline: DebiasedRQ learns from windows of several steps, and a data set has single ones: call learn"
+        )
 
     def _before_batches(self, batch_size: int) -> None:
         n_steps = self.learner.n_encoder_steps_due

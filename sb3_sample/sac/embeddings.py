@@ -28,6 +28,7 @@ from sb3_sample.networks.normed_mlp import NormedMLP, xavier_linear
 from sb3_sample.optim import AdamW
 from sb3_sample.sac.actors import DeterministicActor
 from sb3_sample.sac.critics import CriticEnsemble
+from sb3_sample.sac.features import TensorFeatures
 from sb3_sample.sac.policies import SACPolicy
 
 
@@ -138,8 +139,6 @@ class EmbeddedCritics(CriticEnsemble):
         """
         with torch.no_grad():
             states = obs.features if isinstance(obs, Encoded) else self.extract_features(obs, self._encoder)
-            if not actions.requires_grad:
-                return self._encoder.pair(states, actions)  # type: ignore[no-any-return]
         return self._encoder.pair(states, actions)  # type: ignore[no-any-return]
 
     def statistics(self) -> list[torch.Tensor]:
@@ -149,7 +148,7 @@ class EmbeddedCritics(CriticEnsemble):
         return []
 
 
-class DebiasedRQPolicy(SACPolicy):
+class DebiasedRQPolicy(TensorFeatures, SACPolicy):
     """
     The networks of DR.Q: encoder, actor and critics, and the targets of all three.
 

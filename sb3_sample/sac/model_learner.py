@@ -17,6 +17,7 @@ from sb3_sample.learner.categorical import VALUE_HEADS
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
 from sb3_sample.learner.heads import QuantileHead, ValueHead
 from sb3_sample.learner.learner import Counts, Learner
+from sb3_sample.learner.objectives import Objective
 from sb3_sample.learner.observation_statistics import ObservationStatistics
 from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
 from sb3_sample.learner.plasticity import ReDo, Resets
@@ -164,6 +165,8 @@ class HasLearner:
     """resets"""
     redo = OfLearner[ReDo | None]()
     """recycling of dormant neurons; None for none"""
+    objective = OfLearner[Objective]()
+    """what actor and critics learn from a batch"""
     head = OfLearner[nn.Module]()
     """value head of the critics"""
     transforms = OfLearner[nn.ModuleList]()
@@ -194,6 +197,7 @@ class HasLearner:
             plasticity=Resets(self.resets, self.reset_shrink, self.reset_gradient_steps),
             redo=None if self.redo_period is None else ReDo(self.redo_period, self.redo_threshold),
             make_transforms=[functools.partial(_make_transform, *each) for each in enumerate(self.batch_transforms)],
+            make_objective=self.make_objective,
             make_reward_scaler=None if self.reward_scale is None else self.make_reward_scaler,
             learning_rate=self.lr_schedule(1),
             schedule=self._make_schedule(),
@@ -336,6 +340,13 @@ class HasLearner:
         make = chosen("pessimism", self.pessimism, PESSIMISMS, Pessimism)
         kwargs = self._full_pessimism_kwargs()
         return own_classes.make("pessimism", self.pessimism, make, Pessimism, learner, kwargs=kwargs)  # type: ignore[no-any-return]
+
+    def make_objective(self: Any, learner: Learner) -> Objective:
+        """
+        :param learner: whose it is
+        :return: a freshly initialised objective
+        """
+        return Objective()
 
     def make_reward_scaler(self: Any, learner: Learner) -> RewardScale:
         """

@@ -25,8 +25,8 @@ from sb3_sample.learner.batch import Encoded
 from sb3_sample.networks import Network, RunningNorm
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.optim import AdamW
-from sb3_sample.sac.actors import BACKBONES, LOG_STD_ARGUMENTS, Actor, DeterministicActor
-from sb3_sample.sac.critics import CriticEnsemble
+from sb3_sample.sac.actors import BACKBONES, GAUSSIAN_ARGUMENTS, Actor, DeterministicActor
+from sb3_sample.sac.critics import CriticEnsemble, ValueNetwork
 from sb3_sample.sac.multi_task import TaskOneHot, reads_one_hot
 from sb3_sample.sac.trunks import network_args
 
@@ -52,8 +52,8 @@ class SACPolicy(BasePolicy):
     :param features_extractor_kwargs: its arguments
     :param normalize_images: whether images are divided by 255
     :param backbone: "sac" for a tanh-Gaussian actor, "td3" for a deterministic one with a target actor
-    :param actor_kwargs: arguments of the actor: with "sac" ``log_std_min``, ``log_std_max``, ``clip_log_std``, with
-        "td3" ``exploration_noise``, ``target_noise``, ``target_noise_clip``
+    :param actor_kwargs: arguments of the actor: with "sac" ``log_std_min``, ``log_std_max``, ``clip_log_std``,
+        ``initial_std``, with "td3" ``exploration_noise``, ``target_noise``, ``target_noise_clip``
     :param optimizer_class: optimizer of actor and critics
     :param optimizer_kwargs: its arguments, but for the learning rate
     :param critic_optimizer_kwargs: arguments of the critics' optimizer alone, over ``optimizer_kwargs``
@@ -146,11 +146,12 @@ class SACPolicy(BasePolicy):
         check_value("critic_optimizer_kwargs", critic_optimizer_kwargs, DICT)
         actor_kwargs = dict(actor_kwargs or {})
         of_noise = ("exploration_noise", "target_noise", "target_noise_clip")
-        allowed = of_noise if backbone == "td3" else LOG_STD_ARGUMENTS
+        allowed = of_noise if backbone == "td3" else GAUSSIAN_ARGUMENTS
         for name in actor_kwargs:
             if name not in allowed:
                 raise ValueError(f"actor_kwargs has {name!r}, but backbone={backbone!r} takes {allowed}")
         self._actor_class, self._actor_args = BACKBONES[backbone], (actor_args, actor_kwargs)
+        self._critic_args = critic_args
         self.share_features_extractor = share_features_extractor
         if share_features_extractor:
             self.critic = critics()
@@ -222,6 +223,20 @@ class SACPolicy(BasePolicy):
         )
         self._share_norm(actor)
         return actor
+
+    def make_value(self) -> ValueNetwork:
+        """
+        :return: a value network with the critics' settings, a features extractor of its own included
+        """
+        value = ValueNetwork(
+            self.observation_space,
+            self.action_space,
+            *self._critic_args,
+            features_extractor=self.make_features_extractor(),
+            normalize_images=self.normalize_images,
+        )
+        self._share_norm(value)
+        return value
 
     def make_optimizer(self, parameters: Any, learning_rate: float, **kwargs: Any) -> torch.optim.Optimizer:
         """

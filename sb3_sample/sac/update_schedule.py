@@ -27,6 +27,7 @@ class UpdateSchedule:
         the coming environment steps pay for compiling.
         """
         checks.check_one_reward_scale(self)
+        checks.check_scale_is_known(self)
         n_steps = self._total_timesteps - self.num_timesteps
         if self.learning_rate_schedule is not None and self.planned_updates is None:
             self.planned_updates = round(self._updates_in(n_steps)) or None
@@ -37,7 +38,8 @@ class UpdateSchedule:
                 )
         if self.compiled is not None:
             return
-        n_updates = self._updates_in(n_steps - max(self.learning_starts - self.num_transitions, 0))
+        n_of_warm_up = 0 if self._learns_from is not None else max(self.learning_starts - self.num_transitions, 0)
+        n_updates = self._updates_in(n_steps - n_of_warm_up)
         # Warn of reasons not to compile only where compiling was asked for, and of an old torch, which is easily
         # renewed.
         foreign = foreign_parts(self.learner) if n_updates >= PAYS_FROM else []
@@ -58,6 +60,8 @@ class UpdateSchedule:
 
     def _updates_in(self: Any, n_steps: int) -> float:
         """Gradient steps in as many environment steps after the warm-up; 0 where that is not known."""
+        if self._learns_from is not None:
+            return n_steps
         if self.replay_ratio is not None:
             return self.replay_ratio * n_steps / self._tasks_together
         assert isinstance(self.train_freq, TrainFreq)

@@ -25,8 +25,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.console import LossyLog
+from sb3_sample.envs.no_environment import NoEnvironment
 from sb3_sample.envs.workers import EnvironmentDied, end_with_this_process
 from sb3_sample.faults import HoldBack, check_finite_parameters
+from sb3_sample.lockstep import Seat, seat_of
 from sb3_sample.saving import container, run_folder, training_state, vec_envs
 from sb3_sample.saving.attributes import DoesNotFit
 from sb3_sample.saving.callbacks import CallbackStates, environments, walk, without_progress_bar
@@ -78,10 +80,19 @@ class Checkpointer:
     :param callback: its callback
     :param folder: the run's folder; None for no checkpoints
     :param every: environment steps between two checkpoints, each at the end of the first turn at or after a multiple
+    :param learns_from: what is learned from instead of the environment, in words; its steps are gradient steps, and
+        the environment's state, which they leave alone, is not saved
     :raises ValueError: ``every`` is out of range, the folder cannot be used, or the model cannot be saved
     """
 
-    def __init__(self, model: BaseAlgorithm, callback: BaseCallback, folder: str | Path | None, every: int):
+    def __init__(
+        self,
+        model: BaseAlgorithm,
+        callback: BaseCallback,
+        folder: str | Path | None,
+        every: int,
+        learns_from: str = "",
+    ):
         if isinstance(every, bool) or not isinstance(every, (int, np.integer)) or every < 1:
             raise ValueError(f"checkpoint_freq must be an integer of at least 1, in environment steps, not {every!r}")
         if folder is None and every != CHECKPOINT_FREQ:
@@ -90,12 +101,14 @@ class Checkpointer:
                 "leave checkpoint_freq out"
             )
         self._model, self._callback, self._every = model, callback, int(every)
-        self._name = folder
+        self._name, self._learns_from = folder, learns_from
         self._held: HoldBack | None = None
         if folder is not None:
             self._held = HoldBack(callback)
             self._held.model = model
         self._folder: RunFolder | None = None
+        #: Its place among trainings in lockstep, if it has one.
+        self._seat = seat_of(model)
         #: What was read of the checkpoint that the run goes on from.
         self._resumed: dict[str, Any] | None = None
         self._manifest: dict[str, Any] = {"segments": {}}
@@ -131,20 +144,41 @@ class Checkpointer:
         model = self._model
         assert model.env is not None
         self._env: VecEnv = model.env
+        if self._learns_from:
+            self._env = NoEnvironment(model.observation_space, model.action_space)
         self._rings = {"model": _ring_of(model)} if getattr(model, "replay_buffer", None) is not None else {}
         for path, each in self._callbacks():
             for name, ring in getattr(each, "checkpoint_rings", dict)().items():
                 self._rings[f"{path}.{name}"] = ring
         # The step count at which this call begins is part of what the run is: a further call begins at another one.
         begin = str(model.num_timesteps)
-        self._identity = {**identity_of(model), "num_timesteps": [begin, begin]}
-        found = self._folder.newest_good()
+        self._identity = {**identity_of(model, self._env), "num_timesteps": [begin, begin]}
+        if self._learns_from:
+            self._identity["dataset"] = [self._learns_from] * 2
+        found = self._folder.newest_good() if self._seat is None else self._start_of(self._seat)
         if found is not None:
             folder, self._manifest = found
             self._resumed = self._read(f"{folder.name}/{STATE}", KIND)
             _check_parts(self._resumed, folder / STATE)
             self._check_identity(self._resumed["identity"])
             self._resumed["path"] = folder
+
+    def _start_of(self, seat: Seat) -> tuple[Path, dict[str, Any]] | None:
+        """Where a run of a group goes on: all of them at the newest step that each has."""
+        assert self._folder is not None
+        seat.folder = self._folder.path
+        if not seat.aligned:
+            return self._folder.newest_good()
+        group = seat.group
+        if group.starts is None:
+            folders = [each.folder for each in group.seats if each.aligned and each.folder is not None]
+            group.starts = run_folder.common_starts(folders)
+        if self._folder.path in group.starts.paths:
+            path = group.starts.paths[self._folder.path]
+            return path, self._folder.manifest_of(path)
+        found = self._folder.newest_good()
+        seat.alone = found is not None or group.starts.steps > 0
+        return found
 
     def _callbacks(self) -> Iterator[tuple[str, BaseCallback]]:
         return walk(without_progress_bar(self._callback))
@@ -178,6 +212,12 @@ class Checkpointer:
 
     def _check_identity(self, theirs: dict[str, list[str]]) -> None:
         ours = self._identity
+        if ("dataset" in ours) != ("dataset" in theirs):
+            which = {True: "on a data set (learn_offline)", False: "in an environment (learn)"}
+            raise ValueError(
+                f"checkpoint={str(self._name)!r} is the folder of a training {which['dataset' in theirs]}, and this is "
+                f"one {which['dataset' in ours]}. Nothing was changed. Name another folder."
+            )
         # The class first, whose arguments have other defaults.
         # An argument that only one of the two has is one of another version, of which the circumstances tell.
         for name in sorted(ours.keys() & theirs.keys(), key=lambda name: (name != "class", name)):
@@ -224,12 +264,15 @@ class Checkpointer:
             check_counts(model, "the checkpoint")
             if model.num_timesteps != self._manifest["steps"]:
                 raise BadFile(f"its state is of step {model.num_timesteps}, its manifest of {self._manifest['steps']}")
-            check_last_observations(model)
+            check_last_observations(model, may_be_none=bool(self._learns_from))
             model.start_time = time.time_ns() - state["elapsed_ns"]
             for name, ring in self._rings.items():
                 if name in state["rings"]:
                     rows = [s for s in segments if s.ring == _file_name(name)]
                     ring.restore(state["rings"][name], self._pieces(rows))
+        if self._seat is not None:
+            # Some of those that are made together may have been a checkpoint ahead.
+            self._folder.go_back_to(model.num_timesteps)
         self._saved_at = self._whole_at = model.num_timesteps
 
     @contextlib.contextmanager
@@ -277,11 +320,13 @@ class Checkpointer:
         self._progress = ProgressFile(self._folder.path)
         for env in self._environments()[1:]:
             end_with_this_process(env)
-        self._interrupts = Interrupts(self._environments(), self._folder.path)
+        self._interrupts = Interrupts(self._environments(), self._folder.path, self._seat)
         self._console = LossyLog(model.logger)
         model.logger.output_formats.append(self._progress)
         self._period = model.num_timesteps // self._every
         self._warn_of_losses()
+        if self._seat is not None:
+            self._seat.saves, self._folder.beside = True, self._seat.folders_beside
         if self._resumed is not None:
             self._restore_rest(self._resumed)
             self._resumed = None
@@ -338,6 +383,16 @@ class Checkpointer:
 
     # ---------------------------------------------------------------- saving
 
+    def is_due(self) -> bool:
+        """
+        :return: whether a checkpoint is to be made after the turn
+        """
+        if self._folder is None:
+            return False
+        assert self._interrupts is not None and self._held is not None
+        due = self._model.num_timesteps // self._every > self._period
+        return due or self._interrupts.received is not None or self._held.has_raised()
+
     def after_turn(self) -> None:
         """
         Save if it is time to, or leave if the process was asked to.
@@ -346,12 +401,13 @@ class Checkpointer:
         :raises TrainingDiverged: something is not finite that would be saved
         :raises KeyboardInterrupt: after SIGINT
         :raises SystemExit: after SIGTERM
+        :raises LeftWithTheOthers: after the failure of another training in its group
         """
         if self._folder is None:
             return
         assert self._interrupts is not None and self._held is not None
         now = self._whole_at = self._model.num_timesteps
-        leaves = self._interrupts.received is not None
+        leaves = self._interrupts.leaves(now)
         due = now // self._every > self._period
         self._period = now // self._every
         try:
@@ -448,8 +504,10 @@ class Checkpointer:
         return needed
 
     def _environments(self) -> list[VecEnv]:
+        """Those of the training first; then the callbacks'."""
         theirs = [env for _, each in self._callbacks() for _, env in environments(each)]
-        return [self._env, *(env for env in theirs if isinstance(env, VecEnv))]
+        assert self._model.env is not None
+        return [self._model.env, *(env for env in theirs if isinstance(env, VecEnv))]
 
 
 def _ring_of(model: Any) -> Ring:

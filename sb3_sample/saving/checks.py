@@ -38,7 +38,7 @@ MAX_BUFFER_BYTES = 2**44
 #: Counts of what was done, and what is owed: less than a gradient step, but for rounding, at the end of each turn.
 _COUNTS = (
     "num_timesteps", "_num_timesteps_at_start", "_total_timesteps", "_episode_num", "_n_updates", "num_transitions",
-    "_iteration", "_n_new",
+    "_iteration", "_n_new", "_n_offline_updates",
 )  # fmt: skip
 _MAX_COUNT = 2**53
 _NUMBER = (int, float, np.integer, np.floating)
@@ -148,9 +148,10 @@ def check_counts(model: Any, name: str) -> None:
         raise BadFile(f"{name}: _updates_owed must lie in [-1, 1], not be {owed!r:.100}")
 
 
-def check_last_observations(model: Any) -> None:
+def check_last_observations(model: Any, may_be_none: bool = False) -> None:
     """
     :param model: a model with what a checkpoint sets: what its next step is stored with
+    :param may_be_none: whether its environments need not have been reset yet
     :raises BadFile: if it is not what its environments can have given
     """
     for name in ("_last_obs", "_last_original_obs"):
@@ -159,6 +160,8 @@ def check_last_observations(model: Any) -> None:
         arrays = value.values() if isinstance(value, dict) else [] if value is None else [value]
         if any(array.shape[:1] != (model.n_envs,) for array in arrays):
             raise BadFile(f"{name} is not one of each of {model.n_envs} environments")
+    if may_be_none and model._last_obs is None:
+        return
     if _shapes_of(model._last_obs) != _shapes_in(model.observation_space):
         raise BadFile(f"_last_obs is of shape {_shapes_of(model._last_obs)}, not of {model.observation_space}")
 

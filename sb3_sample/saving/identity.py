@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.saving import training_state, vec_envs
 from sb3_sample.saving.checks import library_class
@@ -32,13 +33,13 @@ class _Comparable(Encoder):
         return {"generator": path_of(type(value))} if isinstance(value, GENERATORS) else None
 
 
-def identity_of(model: BaseAlgorithm) -> dict[str, list[str]]:
+def identity_of(model: BaseAlgorithm, env: VecEnv) -> dict[str, list[str]]:
     """
     :param model: the algorithm, before its training
+    :param env: in which it is trained
     :return: by the argument's name: a digest to compare, and the value to show
     """
-    assert model.env is not None
-    values = {**training_state.arguments_of(model), "env": vec_envs.fingerprint(model.env)}
+    values = {**training_state.arguments_of(model), "env": vec_envs.fingerprint(env)}
     schedules = schedule_names(library_class(type(model)))
     identity = {}
     for name, value in values.items():

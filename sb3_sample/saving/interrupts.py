@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.console import tell
 from sb3_sample.envs.workers import EnvironmentDied
+from sb3_sample.lockstep import LeftWithTheOthers, Seat
 from sb3_sample.saving import vec_envs
 
 
@@ -25,19 +26,23 @@ class Interrupts:
     A handler runs in the midst of anything, so that the first signal raises nothing there, whatever the standard error
     answers.
 
+    A training in a group leaves with the others, after a signal that was noted for all of them, or when one of them has
+    failed.
+
     :param envs: whose workers shall ignore the SIGINT that a terminal sends to all processes
     :param folder: for the message
+    :param seat: place of the training in a group; None of one alone, and of the group itself
     """
 
-    def __init__(self, envs: list[VecEnv], folder: Path):
+    def __init__(self, envs: list[VecEnv], folder: Path, seat: Seat | None = None):
         self.received: int | None = None
-        self._process, self._folder = os.getpid(), folder
+        self._process, self._folder, self._seat = os.getpid(), folder, seat
         self._before: dict[int, Any] = {}
         self._envs: list[VecEnv] = []
-        if threading.current_thread() is not threading.main_thread():
+        if seat is None and threading.current_thread() is not threading.main_thread():
             return
         try:
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in (signal.SIGINT, signal.SIGTERM) if seat is None else ():
                 # None: a handler that is not Python's, which could not be given back.
                 if signal.getsignal(number) not in (signal.SIG_IGN, None):
                     self._before[number] = signal.signal(number, self._receive)
@@ -61,21 +66,31 @@ class Interrupts:
         name = signal.Signals(number).name
         tell(f"\n{name}: finishing the turn, to save it in {self._folder}; once more to leave at once\n")
 
+    def leaves(self, now: int) -> bool:
+        """
+        :param now: environment steps at the end of a turn
+        :return: whether the training is to be saved and to end
+        """
+        return self.received is not None if self._seat is None else self._seat.leaves(now)
+
     def leave(self, orderly: bool = True, saved_at: int | None = None) -> None:
         """
         :param orderly: whether this is between two turns
         :param saved_at: environment steps of the latest checkpoint, which is said; None: nothing is
         :raises KeyboardInterrupt: after SIGINT
         :raises SystemExit: after SIGTERM
+        :raises LeftWithTheOthers: after the failure of another training in the group
         """
-        number = self.received
-        assert number is not None
+        number = self.received if self._seat is None else self._seat.group.received()
         self.restore(orderly)
         if saved_at is not None:
+            why = "another training has failed" if number is None else signal.Signals(number).name
             tell(
-                f"{signal.Signals(number).name}: saved at {saved_at} steps in {self._folder}; the same program, "
-                "started again, goes on from there\n"
+                f"{why}: saved at {saved_at} steps in {self._folder}; the same program, started again, goes on from "
+                "there\n"
             )
+        if number is None:
+            raise LeftWithTheOthers
         if number == signal.SIGINT:
             raise KeyboardInterrupt
         raise SystemExit(128 + number)

@@ -395,7 +395,9 @@ class Content:
         :return: what to say if the file turns out not to fit: the arguments that it does not have, if any
         """
         names = (argument_names(type(model)) & vars(model).keys()) - self.tree["attributes"].keys()
-        names -= {"env", "device", *given}
+        names -= {"env", "device", *given, *model._excluded_save_params()}
+        # A model has its spaces from the file or from the environment, and never by default.
+        names -= {"observation_space", "action_space"}
         if not names:
             return ""
         wanted = " or ".join(f"{name}=" for name in sorted(names))

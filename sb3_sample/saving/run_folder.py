@@ -19,7 +19,7 @@ import re
 import secrets
 import stat
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -99,6 +99,9 @@ class RunFolder:
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"checkpoint must name a folder, but {self.path} is a file")
         self.path.mkdir(parents=True, exist_ok=True)
+        #: Tells the folders of runs that go on from the same step as this one, so that a checkpoint is kept until all
+        #: of them have a newer one.
+        self.beside: Callable[[], Sequence[Path]] = tuple
         #: What was warned of.
         self._told: set[str] = set()
         self._lock: Lock | None = None
@@ -171,8 +174,7 @@ class RunFolder:
         """
         :return: steps and folder of each checkpoint, the newest first, looked at from outside only
         """
-        with Folder.at(self.path) as root:
-            return [(steps, self.path / name) for steps, name in _checkpoints(root)]
+        return _paths(self.path)
 
     def newest_good(self) -> tuple[Path, dict[str, Any]] | None:
         """
@@ -208,20 +210,44 @@ class RunFolder:
                 except OSError as error:
                     self._warn(f"{self.path / name} is damaged and cannot be renamed ({error})")
 
-    def verify(self, path: Path) -> dict[str, Any]:
+    def manifest_of(self, path: Path) -> dict[str, Any]:
         """
-        :param path: folder of a checkpoint
+        :param path: folder of a checkpoint that was found to be whole
+        :return: its manifest
+        :raises Damaged: it is not what it was
+        :raises OSError: it cannot be read
+        """
+        with Folder.at(self.path) as root, root.inside(path.name) as folder:
+            return _read_manifest(folder)
+
+    def go_back_to(self, steps: int) -> None:
+        """
+        Remove checkpoints that are newer than the one that the run goes on from: it will come to their steps again.
+
+        :param steps: environment steps of that one
+        :raises OSError: one cannot be removed
+        """
+        with Folder.at(self.path) as root:
+            for there, name in _checkpoints(root):
+                if there > steps:
+                    self._remove(root, name)
+
+    @staticmethod
+    def verify(path: Path) -> dict[str, Any]:
+        """
+        :param path: folder of a checkpoint, in its run's
         :return: its manifest
         :raises Damaged: a file is missing or not as it was written; the message names it
         :raises OSError: it cannot be read
         """
-        with Folder.at(self.path) as root, root.inside(path.name) as folder:
+        with Folder.at(path.parent) as root, root.inside(path.name) as folder:
             manifest = _read_manifest(folder)
             for name, facts in manifest["files"].items():
                 _verify_file(folder, name, facts)
             if manifest["segments"]:
+                segments = RunFolder.segments(manifest)
                 with root.inside(SEGMENTS) as rows:
-                    for segment, facts in zip(self.segments(manifest), manifest["segments"].values(), strict=True):
+                    for segment, facts in zip(segments, manifest["segments"].values(), strict=True):
                         _verify_file(rows, segment.name, facts)
         return manifest
 
@@ -352,8 +378,16 @@ class RunFolder:
                     self._remove_file(folder, name)
 
     def _prune(self, root: Folder, steps: int) -> None:
-        """Remove all but the newest checkpoints up to that of ``steps``, and rows that no checkpoint needs."""
-        for name in [name for there, name in _checkpoints(root) if there <= steps][KEPT:]:
+        """
+        Remove all but the newest checkpoints up to that of ``steps`` and those from which the runs beside this one may
+        go on, and rows that no checkpoint needs.
+        """
+        made = _checkpoints(root)
+        kept = [name for there, name in made if there <= steps][:KEPT]
+        if others := [{there for there, _ in _paths(folder)} for folder in self.beside()]:
+            common = max((there for there, _ in made if all(there in theirs for theirs in others)), default=0)
+            kept += [name for there, name in made if there >= common]
+        for name in [name for there, name in made if there <= steps and name not in kept]:
             try:
                 self._remove(root, name)
             except OSError as error:
@@ -369,6 +403,53 @@ class RunFolder:
             folder.remove(name)
         except OSError as error:
             self._warn(f"{folder.path / name} cannot be removed ({error})")
+
+
+class Starts(NamedTuple):
+    """
+    Where runs go on that are made together.
+
+    :param steps: environment steps of the checkpoints; 0 if there is none
+    :param paths: folder of each run's checkpoint, by the run's folder
+    """
+
+    steps: int
+    paths: dict[Path, Path]
+
+
+def common_starts(folders: Iterable[Path]) -> Starts:
+    """
+    Find where runs go on that are made together: at the newest step of which every one has a checkpoint that is whole.
+    As long as they are made together there is one (:attr:`RunFolder.beside`), so that where there is none, the run that
+    is behind has left the others, and is none of them any more.
+
+    :param folders: the runs'
+    :return: where they go on, without runs that have no checkpoint or have left the others
+    """
+    there = {folder: dict(_paths(folder)) for folder in folders}
+    there = {folder: made for folder, made in there.items() if made}
+    reasons = []
+    while there:
+        for steps in sorted(set.intersection(*map(set, there.values())), reverse=True):
+            try:
+                for made in there.values():
+                    RunFolder.verify(made[steps])
+            except (Damaged, OSError) as error:
+                reasons.append(str(error))
+                continue
+            if reasons:
+                warnings.warn(f"{_some(reasons)}. The runs go on from {steps} steps instead.", stacklevel=3)
+            return Starts(steps, {folder: made[steps] for folder, made in there.items()})
+        del there[min(there, key=lambda folder: max(there[folder]))]
+    return Starts(0, {})
+
+
+def _paths(folder: Path) -> list[tuple[int, Path]]:
+    """Steps and folder of each checkpoint of a run, the newest first; none of a folder that is not there."""
+    if not folder.is_dir():
+        return []
+    with Folder.at(folder) as root:
+        return [(steps, folder / name) for steps, name in _checkpoints(root)]
 
 
 def _some(reasons: list[str]) -> str:

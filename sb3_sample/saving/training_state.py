@@ -21,6 +21,7 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 
+from sb3_sample.replay.dataset import Dataset
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Node, Opaque, Restorer, without_generators
 from sb3_sample.saving.classes import NotPortable
 from sb3_sample.saving.generators import check_python_state, set_numpy_state
@@ -149,8 +150,9 @@ def arguments_of(model: BaseAlgorithm) -> dict[str, Any]:
     for name in ("observation_space", "action_space"):
         values[name] = without_generators(getattr(model, name))
     for name in sorted(argument_names(type(model)) - {"env", "policy", *HARMLESS}):
-        if name in own:
-            values[name] = own[name]
+        if name in own and name not in values:
+            # Of a data set, what tells it from others.
+            values[name] = repr(own[name]) if isinstance(own[name], Dataset) else own[name]
     return values
 
 

@@ -21,8 +21,8 @@ from sb3_sample.extras import install
 from sb3_sample.kinds import check_value, number
 from sb3_sample.study.cores import free_cores, threads_of_libraries
 from sb3_sample.study.plan import Run
-from sb3_sample.study.runs import LIST, StudyError, StudyFolder
-from sb3_sample.study.worker import TAKEN, TERMINATED, attempt
+from sb3_sample.study.runs import LIST, Outcome, StudyError, StudyFolder
+from sb3_sample.study.worker import TAKEN, TERMINATED, attempt_all
 
 #: Seconds between two looks at how many machines there are.
 LOOK_EVERY = 2.0
@@ -140,40 +140,42 @@ class Cluster:
 
 class Slot:
     """
-    A place for one run at a time in a cluster, as a worker is one on this machine.
+    A place for one run at a time in a cluster, or for several together, as a worker is one on this machine.
 
-    :param task: makes a run, as Ray's remote function
+    :param task: makes runs, as Ray's remote function
     :param folder: the study's
     :param events: gets the answers, and None when a process has ended without one, each with the slot
     """
 
     def __init__(self, task: Any, folder: str, events: "queue.Queue[tuple[Any, Any]]"):
-        self.run: Run | None = None
+        self.runs: tuple[Run, ...] = ()
         self.kind = ""
         self._task, self._folder, self._events = task, folder, events
         self._order: Any = None
         self._listener: threading.Thread | None = None
         self._why = ""
 
-    def give(self, run: Run, options: list[str], threads: int) -> None:
+    def give(self, runs: tuple[Run, ...], options: list[str], threads: int) -> None:
         """
-        :param run: what is to be made
+        :param runs: what is to be made
         :param options: options of ``sb3-sample train``
-        :param threads: of the run
+        :param threads: of the task
         """
-        self.run, self.kind = run, run.kind
-        self._order = self._task.remote(self._folder, run.as_json(), options, threads)
+        self.runs, self.kind = runs, runs[0].kind
+        self._order = self._task.remote(self._folder, [run.as_json() for run in runs], options, threads)
         self._listener = threading.Thread(target=self._listen, args=(self._order,), daemon=True)
         self._listener.start()
 
     def _listen(self, order: Any) -> None:
         import ray
 
+        n = len(self.runs)
+
         answer = None
         try:
             answer = ray.get(order)
         except ray.exceptions.NodeDiedError:
-            answer = TAKEN  # the run is none the worse: it goes on elsewhere, when its lock is free
+            answer = [TAKEN] * n  # the runs are none the worse: they go on elsewhere, when their locks are free
         except Exception as error:
             self._why = f"the process that made the run has ended: {error}"
         self._events.put((self, answer))
@@ -189,7 +191,7 @@ class Slot:
     def _cancel(self, force: bool) -> None:
         import ray
 
-        if self.run is not None:
+        if self.runs:
             ray.cancel(self._order, force=force)
 
     def wait(self) -> None:
@@ -204,15 +206,16 @@ class Slot:
         return self._why
 
 
-def make(folder: str, run: dict[str, Any], options: list[str], threads: int) -> dict[str, Any]:
+def make(folder: str, runs: list[dict[str, Any]], options: list[str], threads: int) -> list[dict[str, Any]]:
     """
-    Make a run, in a process of the cluster. After Ray's cancel and SIGTERM a training finishes its turn and saves.
+    Make a run, or several together, in a process of the cluster. After Ray's cancel and SIGTERM a training finishes its
+    turn and saves.
 
     :param folder: the study's
-    :param run: the run, as JSON
+    :param runs: the runs, as JSON
     :param options: options of ``sb3-sample train``
     :param threads: of the process
-    :return: what became of it, or that it is to be looked at again
+    :return: what became of each, or that it is to be looked at again
     :raises FileNotFoundError: this machine does not see the folder
     """
     if not (Path(folder) / LIST).is_file():
@@ -220,12 +223,12 @@ def make(folder: str, run: dict[str, Any], options: list[str], threads: int) -> 
             f"{socket.gethostname()} does not see {folder}: the study's folder must be one that all machines of the "
             "cluster have under the same path"
         )
-    outcome = None
+    outcomes: list[Outcome | None] = [None] * len(runs)
     # In the place of Ray's, which an attempt would take for a failure of the run's.
     signal.signal(signal.SIGTERM, _terminate)
     with contextlib.suppress(KeyboardInterrupt, SystemExit):
-        outcome = attempt(StudyFolder(folder), Run.of_json(run), options, threads)
-    return TAKEN if outcome is None else outcome._asdict()
+        outcomes = attempt_all(StudyFolder(folder), [Run.of_json(run) for run in runs], options, threads)
+    return [TAKEN if outcome is None else outcome._asdict() for outcome in outcomes]
 
 
 def _terminate(number: int, frame: Any) -> None:

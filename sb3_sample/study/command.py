@@ -71,6 +71,11 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="how often a run that fails is tried again (default: 1)",
     )
+    parser.add_argument(
+        "--batch-seeds",
+        action="store_true",
+        help="make runs that differ in their seed alone together, in one process (docs/many_learners.md)",
+    )
     parser.add_argument("--device", default="auto", help="as of train (default: auto)")
     parser.add_argument(
         "--ray",
@@ -94,6 +99,8 @@ def _run(options: argparse.Namespace) -> None:
             raise ValueError(f"--gpus is for runs in a Ray cluster: give --ray too, not --gpus {options.gpus:g} alone")
         if options.ray is not None and options.dry_run:
             raise ValueError("--dry-run measures this machine: leave --ray out")
+        if options.batch_seeds and options.dry_run:
+            raise ValueError("--dry-run measures runs that are made one by one: leave --batch-seeds out")
     except (ValueError, ImportError) as error:
         refuse("study run", error)
     plan = read_plan(options.plan)
@@ -108,7 +115,10 @@ def _run(options: argparse.Namespace) -> None:
     print(f"{len(plan.runs)} runs in {folder}{at_once}", flush=True)
     try:
         with _showing() as show:
-            found = run(plan, folder, retries=options.retries, ray=options.ray, gpus=options.gpus, show=show, **shared)
+            found = run(
+                plan, folder, retries=options.retries, ray=options.ray, gpus=options.gpus, show=show,
+                batch_seeds=options.batch_seeds, **shared,
+            )  # fmt: skip
     except KeyboardInterrupt as error:
         raise KeyboardInterrupt(f"interrupted; the same command goes on with {folder}") from error
     except Stopped as error:

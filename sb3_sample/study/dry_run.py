@@ -108,10 +108,16 @@ def estimate(
     times = stored(threads, device)
     costs: dict[tuple[str, str], Cost] = {}
     seconds = n_bytes = 0.0
+    of_plan = {(run.variant, run.task): run for run in plan.runs}
     for run in left:
         base = left[0]
-        for probe in (base, dataclasses.replace(run, task=base.task), dataclasses.replace(base, task=run.task)):
-            if (probe.variant, probe.task) not in costs:
+        pairs = [(base.variant, base.task), (run.variant, base.task), (base.variant, run.task)]
+        if not all(pair in of_plan for pair in pairs):
+            # Agents that have data of some tasks only.
+            pairs = [(run.variant, run.task)] * 3
+        for pair in pairs:
+            if pair not in costs:
+                probe = of_plan[pair]
                 learning = None if times is None else seconds_of_learning(probe, times)
                 known = "" if learning is None else f", gradient steps of {cache_file()}"
                 say(f"measuring {probe.variant} on {probe.task}{known}")
@@ -121,12 +127,8 @@ def estimate(
                     arguments = {**probe.arguments, "replay_ratio": _HARDLY_ANY, "compile": False}
                     cost = measure(dataclasses.replace(probe, arguments=arguments), threads, device)
                     cost = cost._replace(seconds=cost.seconds + learning)
-                costs[probe.variant, probe.task] = cost
-        first, agent, task = (
-            costs[base.variant, base.task],
-            costs[run.variant, base.task],
-            costs[base.variant, run.task],
-        )
+                costs[pair] = cost
+        first, agent, task = (costs[pair] for pair in pairs)
         seconds += run.steps * agent.seconds * task.seconds / first.seconds
         # Networks are the agent's, observations the task's.
         n_bytes += agent.bytes_of_run * task.bytes_of_run / first.bytes_of_run
@@ -142,7 +144,7 @@ def seconds_of_learning(run: Run, times: StepTimes) -> float | None:
     :param times: of the machine
     :return: seconds of the gradient steps of an environment step; None where the times are not those of such a run
     """
-    if run.algo not in _TIMED or not set(run.arguments) <= _UNTIMED:
+    if run.algo not in _TIMED or not set(run.arguments) <= _UNTIMED or run.data:
         return None
     if run.task.partition("/")[0] not in SUITES:  # which alone have no settings of their own
         return None

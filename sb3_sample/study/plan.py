@@ -32,12 +32,20 @@ ENTRIES = (
     "groups", "factors", "measure",
 )  # fmt: skip
 REQUIRED = ENTRIES[:4]
+#: Entries of an agent besides its arguments: what it learns from, and how long.
+DATA = ("dataset", "offline_steps", "prior_data")
+OF_RUN = ("algo", "steps", *DATA)
+#: Stands in a data set's name for the task, as a part of a path.
+TASK = "{task}"
 #: The published curves' evaluation.
 EVERY, EPISODES = 25_000, 5
 #: Environment steps between two checkpoints, as of ``sb3-sample train``.
 CHECKPOINT_FREQ = 10_000
 #: Arguments of the constructors that are the run's, not the agent's.
-NOT_OF_AGENTS = {"_init_setup_model", "device", "env", "seed", "tensorboard_log", "verbose"}
+NOT_OF_AGENTS = {
+    "_init_setup_model", "action_space", "device", "env", "observation_space", "prior_data", "seed", "tensorboard_log",
+    "verbose",
+}  # fmt: skip
 #: Characters of a plan, and of one part of a folder's name.
 MAX_PLAN, MAX_NAME = 2**20, 120
 #: Values in one entry, where an alias counts as what it stands for.
@@ -68,6 +76,8 @@ class Run:
     :param env_kwargs: arguments of the environment
     :param gym_packages: modules that register environments
     :param measure: environment steps between two measurements of the noise scale and of overfitting, none if 0
+    :param data: data sets that it learns from, ``dataset`` and ``prior_data`` as ``train`` has them, and the
+        ``offline_steps``; those that there are
     """
 
     agent: str
@@ -83,6 +93,7 @@ class Run:
     env_kwargs: dict[str, Any] = dataclasses.field(default_factory=dict)
     gym_packages: tuple[str, ...] = ()
     measure: int = 0
+    data: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     @functools.cached_property
     def name(self) -> str:
@@ -103,7 +114,8 @@ class Run:
     @functools.cached_property
     def kind(self) -> str:
         """Equal for runs that differ in their seed alone."""
-        return json.dumps([self.algo, self.arguments, self.task, self.env_kwargs], sort_keys=True, default=str)
+        what = [self.algo, self.arguments, self.task, self.env_kwargs, self.data, self.steps]
+        return json.dumps(what, sort_keys=True, default=str)
 
     def command(self, folder: Path) -> list[str]:
         """
@@ -119,6 +131,9 @@ class Run:
             command += ["--gym-packages", *self.gym_packages]
         if self.env_kwargs:
             command += ["--env-kwargs", *(f"{name}:{value!r}" for name, value in self.env_kwargs.items())]
+        for name, value in self.data.items():
+            home = isinstance(value, str) and value.startswith("~")
+            command += [f"--{name.replace('_', '-')}", str(Path(value).expanduser() if home else value)]
         arguments = dict(self.arguments)
         if self.measure:
             arguments["callback"] = {"sb3_sample.diagnostics.NoiseScaleCallback": {"every": self.measure}}
@@ -131,8 +146,10 @@ class Run:
         :return: the run as JSON has it
         """
         found = {**dataclasses.asdict(self), "gym_packages": list(self.gym_packages)}
-        if not self.measure:
-            del found["measure"]  # as runs were written before there was one
+        # As runs were written before there were these.
+        for name in ("measure", "data"):
+            if not found[name]:
+                del found[name]
         return found
 
     @classmethod
@@ -142,7 +159,7 @@ class Run:
         :return: the run
         :raises ValueError: it is no such thing
         """
-        kinds = {"arguments": dict, "grid": dict, "env_kwargs": dict, "gym_packages": list}
+        kinds = {"arguments": dict, "grid": dict, "env_kwargs": dict, "gym_packages": list, "data": dict}
         kinds |= dict.fromkeys(("agent", "algo", "task"), str)
         names = {field.name for field in dataclasses.fields(cls)}
         needed = {field.name for field in dataclasses.fields(cls) if not _has_default(field)}
@@ -153,6 +170,8 @@ class Run:
                 raise ValueError(f"{name} of a run cannot be {found[name]!r:.100}")
         if not _AGENT.fullmatch(found["agent"]) or found["seed"] < 0 or found["steps"] < 1:
             raise ValueError(f"no run: {found!r:.200}")
+        if not found.get("data", {}).keys() <= set(DATA):
+            raise ValueError(f"data of a run cannot be {found['data']!r:.100}")
         return cls(**{**found, "gym_packages": tuple(found.get("gym_packages", ()))})
 
 
@@ -186,6 +205,19 @@ class Plan(NamedTuple):
     runs: tuple[Run, ...]
     text: str = ""
     comparison: Comparison = Comparison({}, {})
+
+
+def _has_data_on(data: Mapping[str, Any], task: str) -> bool:
+    """Whether there is a data set for a task wherever they are named by task."""
+    return all(task in value for value in data.values() if isinstance(value, dict))
+
+
+def _data_on(data: Mapping[str, Any], task: str) -> dict[str, Any]:
+    """The data of a task."""
+    chosen = {name: value[task] if isinstance(value, dict) else value for name, value in data.items()}
+    return {
+        name: value.replace(TASK, _plain(task)) if isinstance(value, str) else value for name, value in chosen.items()
+    }
 
 
 def _plain(name: str) -> str:
@@ -240,6 +272,8 @@ class _Agent(NamedTuple):
     name: str
     algo: str
     arguments: dict[str, Any]
+    data: dict[str, Any]
+    steps: int | None
     entries: dict[str, _Entry]
     node: yaml.Node
 
@@ -283,7 +317,7 @@ class _Reader:
         tasks = self._tasks(entries["tasks"].value)
         seeds = self._seeds(entries["seeds"].value)
         steps = self._count(entries["steps"].value, "steps")
-        every, episodes = self._evaluation(entries, steps)
+        every, episodes = self._evaluation(entries, min([steps, *(agent.steps for agent in agents if agent.steps)]))
         freq = CHECKPOINT_FREQ
         if "checkpoint_freq" in entries:
             freq = self._count(entries["checkpoint_freq"].value, "checkpoint_freq")
@@ -300,18 +334,22 @@ class _Reader:
                 point,
                 task,
                 seed,
-                steps,
+                agent.steps or steps,
                 every,
                 episodes,
                 freq,
                 env_kwargs,
                 packages,
                 measure,
+                _data_on(agent.data, task),
             )
             for seed in seeds
             for task in tasks
             for agent, arguments, point in variants
+            if _has_data_on(agent.data, task)
         )
+        for agent in agents:
+            self._check_data(agent, agent.steps or steps, tasks)
         comparison = Comparison(self._groups(entries, tasks), self._factors(entries, agents, grid))
         return Plan(self._path.stem, runs, text, comparison)
 
@@ -402,15 +440,50 @@ class _Reader:
             arguments = {
                 argument: self._argument(algo, argument, entry.key, entry.value, f"agent {name!r}")
                 for argument, entry in entries.items()
-                if argument != "algo"
+                if argument not in OF_RUN
             }
+            data = {each: self._source(entries[each].value, each) for each in DATA if each in entries}
+            own_steps = self._count(entries["steps"].value, "steps") if "steps" in entries else None
             same = [other for other in found if _plain(other.name).lower() == _plain(name).lower()]
             if same:
                 raise self._fail(key, f"agents {same[0].name!r} and {name!r} would have the same folder: rename one")
-            found.append(_Agent(name, algo, arguments, entries, key))
+            found.append(_Agent(name, algo, arguments, data, own_steps, entries, key))
         if not found:
             raise self._fail(node, "agents must be a mapping that is not empty: a name, then algo and arguments")
         return found
+
+    def _source(self, node: yaml.Node, name: str) -> Any:
+        """Data set of all tasks, by ``{task}`` in its name, or of each; or gradient steps on it."""
+        if name == "offline_steps":
+            return self._count(node, name)
+        value = self._plain(node)
+        sources = list(value.values()) if isinstance(value, dict) and value else [value]
+        if not all(isinstance(each, str) and each for each in sources):
+            raise self._fail(node, f"{name} must be a path or an id of Minari's, or such by task, not {value!r:.100}")
+        return value
+
+    def _check_data(self, agent: _Agent, steps: int, tasks: list[str]) -> None:
+        """Whether an agent can learn from its data so."""
+        data, entries = agent.data, agent.entries
+        for name in ("dataset", "prior_data"):
+            for task in data[name] if isinstance(data.get(name), dict) else ():
+                if task not in tasks:
+                    raise self._fail(entries[name].value, f"{name} has {task!r}, which is no task of the plan")
+        if not any(_has_data_on(data, task) for task in tasks):
+            raise self._fail(agent.node, f"agent {agent.name!r} has no task for which all of its data are named")
+        algorithm = _algorithms()[agent.algo].algorithm
+        if data and not hasattr(algorithm, "learn_offline"):
+            raise self._fail(entries[next(iter(data))].key, f"{next(iter(data))} is nothing for {agent.algo}")
+        if getattr(algorithm, "learns_from_data_only", False) and data.keys() != {"dataset"}:
+            raise self._fail(agent.node, f"agent {agent.name!r}: {agent.algo} learns from a dataset only, and needs it")
+        if "offline_steps" in data:
+            node = entries["offline_steps"].value
+            if "dataset" not in data:
+                raise self._fail(node, "offline_steps are gradient steps on a dataset, which the agent needs too")
+            if data["offline_steps"] >= steps:
+                raise self._fail(
+                    node, f"offline_steps must be fewer than the {steps} steps of all, not {data['offline_steps']}"
+                )
 
     def _argument(self, algo: str, name: str, key: yaml.Node, node: yaml.Node, where: str) -> Any:
         known = constructor_arguments(algo)
@@ -456,7 +529,7 @@ class _Reader:
             for values in itertools.product(*grid.values()):
                 point = dict(zip(grid, values, strict=True))
                 arguments = {**agent.arguments, **point}
-                first = seen.setdefault(_key([agent.algo, arguments]), agent)
+                first = seen.setdefault(_key([agent.algo, arguments, agent.data, agent.steps]), agent)
                 if first is not agent:
                     line = first.node.start_mark.line + 1
                     raise self._fail(
@@ -470,6 +543,9 @@ class _Reader:
     def _check_made(self, agent: _Agent, arguments: dict[str, Any], point: dict[str, Any]) -> None:
         if arguments.get("policy", "MlpPolicy") != "MlpPolicy":
             return  # which observations it is for is the task's to say
+        if "prior_data" in agent.data:
+            # They are read when a run begins; without them their share means nothing.
+            arguments = {name: value for name, value in arguments.items() if name != "prior_share"}
         try:
             _make(agent.algo, arguments)
         except (ValueError, TypeError, AssertionError) as error:

@@ -24,6 +24,8 @@ from sb3_sample.study.plan import Comparison, Plan, Run
 #: Content of a study's folder: its runs, the outcome of each, the list of them and the plan as it was read.
 RUNS, STATE, LIST, PLAN = "runs", "state", "study.json", "plan.yml"
 _LOG = "progress.jsonl"
+#: In a run's folder, the checkpoints of its steps on a data set where others follow.
+OFFLINE = "offline"
 #: Bytes of the list, of what is said of one run, and of the end of a log that is looked at.
 MAX_LIST, MAX_OUTCOME, TAIL = 2**28, 2**20, 2**14
 #: Characters of a traceback that are kept.
@@ -256,10 +258,12 @@ def _are_texts(value: Any) -> bool:
 def checkpointed(folder: Path) -> int:
     """
     :param folder: a run's
-    :return: environment steps of its newest checkpoint; 0 without one
+    :return: steps of its newest checkpoint, those on a data set included; 0 without one
     """
     try:
         names = os.listdir(folder)
+        if OFFLINE in names:
+            names += os.listdir(folder / OFFLINE)
     except OSError:
         return 0
     return max((int(m[1]) for name in names if (m := re.fullmatch(r"checkpoint-(\d{12,})", name))), default=0)

@@ -56,6 +56,7 @@ def run(
     device: str = "auto",
     ray: str | None = None,
     gpus: float | None = None,
+    batch_seeds: bool = False,
     show: Callable[[Status], None] | None = None,
     worker: Sequence[str] = WORKER,
 ) -> Status:
@@ -74,6 +75,8 @@ def run(
         machine is in, else its address; None for processes of this machine without Ray. The folder must be one that all
         its machines see
     :param gpus: GPUs of each run, or its share of one, with ``ray`` only
+    :param batch_seeds: whether runs that differ in their seed alone are made together, by one process, where their
+        algorithm can be (docs/many_learners.md); one that has failed is tried again by itself
     :param show: gets the status, at the beginning, every two seconds and at the end
     :param worker: command of a process that makes runs without Ray, before the study's folder
     :return: what became of the runs
@@ -103,7 +106,7 @@ def run(
     else:
         crew = cluster.Cluster(ray, place.path, workers, threads, gpus)
     with _signals(), crew:
-        return Scheduler(plan.runs, place, crew, retries, threads, device, show or (lambda _: None)).run()
+        return Scheduler(plan.runs, place, crew, retries, threads, device, show or (lambda _: None), batch_seeds).run()
 
 
 @contextlib.contextmanager
@@ -126,16 +129,16 @@ def _signals() -> Iterator[None]:
 
 
 class Worker(Protocol):
-    """Maker of one run at a time: a process of this machine, or a place in a cluster."""
+    """Maker of one run at a time, or of several together: a process of this machine, or a place in a cluster."""
 
-    #: The run that it makes at present.
-    run: Run | None
-    #: Of that run, or of the last one.
+    #: The runs that it makes at present; none while it is idle.
+    runs: tuple[Run, ...]
+    #: Of those runs, or of the last ones.
     kind: str
 
-    def give(self, run: Run, options: list[str], threads: int) -> None:
+    def give(self, runs: tuple[Run, ...], options: list[str], threads: int) -> None:
         """
-        :param run: what it is to make
+        :param runs: what it is to make
         :param options: options of ``sb3-sample train``
         :param threads: its threads
         """
@@ -155,7 +158,8 @@ class Worker(Protocol):
         """
 
 
-#: Answers of workers: what became of a run, or that it is to be looked at again; None when the worker has ended.
+#: Answers of workers: a list of what became of each run, or that it is to be looked at again; None when the worker has
+#: ended.
 Events = queue.Queue[tuple[Worker, Any]]
 
 
@@ -224,7 +228,7 @@ class Process:
             env={**os.environ, **threads_of_libraries(threads)},
             start_new_session=True,
         )
-        self.run: Run | None = None
+        self.runs: tuple[Run, ...] = ()
         self.kind = ""
         threading.Thread(target=self._listen, args=(self.process.stdout, events), daemon=True).start()
 
@@ -234,17 +238,17 @@ class Process:
                 events.put((self, json.loads(line)))
         events.put((self, None))
 
-    def give(self, run: Run, options: list[str], threads: int) -> None:
+    def give(self, runs: tuple[Run, ...], options: list[str], threads: int) -> None:
         """
-        :param run: what it is to make
+        :param runs: what it is to make
         :param options: options of ``sb3-sample train``
         :param threads: its threads
         """
-        self.run, self.kind = run, run.kind
+        self.runs, self.kind = runs, runs[0].kind
         assert self.process.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # it has died: its end is on the way
             print(
-                json.dumps({"run": run.as_json(), "options": options, "threads": threads}),
+                json.dumps({"runs": [run.as_json() for run in runs], "options": options, "threads": threads}),
                 file=self.process.stdin,
                 flush=True,
             )
@@ -273,6 +277,18 @@ class Process:
         return f"the process that made the run has ended with exit code {code}"
 
 
+def _batches(runs: Sequence[Run]) -> list[tuple[Run, ...]]:
+    """Runs that differ in their seed alone, together where that can be; in the order of the first of each."""
+    from sb3_sample.zoo.runs import can_train_together
+
+    found: dict[str, list[Run]] = {}
+    for run in runs:
+        alike = {name: value for name, value in run.as_json().items() if name != "seed"}
+        key = json.dumps(alike, sort_keys=True) if can_train_together(run.algo) else run.name
+        found.setdefault(key, []).append(run)
+    return [tuple(each) for each in found.values()]
+
+
 class Scheduler:
     """
     :param runs: in their order
@@ -282,6 +298,7 @@ class Scheduler:
     :param threads: of each run
     :param device: of each run
     :param show: gets the status
+    :param batch_seeds: whether runs that differ in their seed alone are made together
     """
 
     def __init__(
@@ -293,13 +310,14 @@ class Scheduler:
         threads: int,
         device: str,
         show: Callable[[Status], None],
+        batch_seeds: bool = False,
     ):
         self._runs, self._folder, self._crew, self._retries = runs, folder, crew, retries
         self._threads, self._options = threads, ["--num-threads", str(threads), "--device", device]
-        self._show = show
+        self._show, self._batch_seeds = show, batch_seeds
         self._events: Events = queue.Queue()
         self._workers: list[Worker] = []
-        self._pending: deque[Run] = deque()
+        self._pending: deque[tuple[Run, ...]] = deque()
         #: By run, when it is looked at again that another process has.
         self._elsewhere: dict[str, tuple[Run, float]] = {}
         #: Failed attempts that do not count, since they were made before.
@@ -312,18 +330,20 @@ class Scheduler:
         """
         :return: what became of the runs
         """
+        left = []
         for run in self._runs:
             outcome = self._folder.outcome(run)
             self._before[run.name] = outcome.attempts
             self._states[run.name] = RunStatus(run, DONE if outcome.done else WAITING, outcome)
             if not outcome.done:
-                self._pending.append(run)
+                left.append(run)
+        self._pending.extend(_batches(left) if self._batch_seeds else ((run,) for run in left))
         try:
             self._tell()
             while True:
                 self._look_elsewhere()
                 self._give_out()
-                if not (self._pending or self._elsewhere or any(worker.run for worker in self._workers)):
+                if not (self._pending or self._elsewhere or any(worker.runs for worker in self._workers)):
                     break
                 self._hear()
         finally:
@@ -334,9 +354,9 @@ class Scheduler:
 
     def _give_out(self) -> None:
         while self._pending:
-            run = self._pending[0]
-            idle = [worker for worker in self._workers if worker.run is None]
-            fitting = [worker for worker in idle if worker.kind == run.kind]
+            runs = self._pending[0]
+            idle = [worker for worker in self._workers if not worker.runs]
+            fitting = [worker for worker in idle if worker.kind == runs[0].kind]
             slots = self._crew.slots()
             if fitting and len(self._workers) <= slots:
                 worker = fitting[0]
@@ -350,8 +370,9 @@ class Scheduler:
                 worker = self._crew.hire(self._events)
                 self._workers.append(worker)
             self._pending.popleft()
-            worker.give(run, self._options, self._threads)
-            self._set(run, RUNNING)
+            worker.give(runs, self._options, self._threads)
+            for run in runs:
+                self._set(run, RUNNING)
 
     def _look_elsewhere(self) -> None:
         now = time.monotonic()
@@ -376,19 +397,21 @@ class Scheduler:
             worker, answer = self._events.get(timeout=wait)
         except queue.Empty:
             return
-        run, worker.run = worker.run, None
+        runs, worker.runs = worker.runs, ()
         if answer is None:
             if worker in self._workers:
                 self._workers.remove(worker)
-            if run is not None:
+            for run in runs:
                 self._judge(run, self._died(run, worker))
-        elif run is not None and answer.get("taken"):
-            self._elsewhere[run.name] = (run, time.monotonic() + ELSEWHERE)
-            self._set(run, RUNNING)
-        elif run is not None:
-            if not answer["done"] and worker in self._workers:
+            return
+        for run, said in zip(runs, answer, strict=True):
+            if said.get("taken"):
+                self._elsewhere[run.name] = (run, time.monotonic() + ELSEWHERE)
+                self._set(run, RUNNING)
+                continue
+            if not said["done"] and worker in self._workers:
                 self._workers.remove(worker)  # it ends by itself
-            self._judge(run, Outcome(**answer))
+            self._judge(run, Outcome(**said))
 
     def _died(self, run: Run, worker: Worker) -> Outcome:
         """Outcome of a run whose process has ended without an answer."""
@@ -408,7 +431,7 @@ class Scheduler:
         elif outcome.attempts - self._before[run.name] > self._retries:
             self._set(run, FAILED, outcome)
         else:
-            self._pending.append(run)
+            self._pending.append((run,))
             self._set(run, WAITING, outcome)
 
     def _set(self, run: Run, state: str, outcome: Outcome | None = None) -> None:

@@ -23,9 +23,14 @@ class Stopwatch(BaseCallback):
         super().__init__()
         self.path, self.seconds = path, seconds
         self._turns = 0
+        self._collects = False
         self._first: tuple[int, float] | None = None
 
     def _on_rollout_start(self) -> None:
+        self._collects = True
+        self._turn()
+
+    def _turn(self) -> None:
         now = time.monotonic()
         if self._first is None:
             if self.model._n_updates == 0:
@@ -40,4 +45,6 @@ class Stopwatch(BaseCallback):
             Path(self.path).write_text(json.dumps({"steps": steps, "seconds": seconds}))
 
     def _on_step(self) -> bool:
+        if not self._collects:  # on a data set, a turn is a step
+            self._turn()
         return not Path(self.path).exists()

@@ -1,12 +1,14 @@
 """
 The process that makes runs, started by the scheduler with the study's folder as its argument.
 
-It takes one run after the other, as lines of JSON on its standard input, and answers each with a line on its standard
-output. What the run prints goes to a file of its own. When the input ends, because the scheduler has nothing more or
-is gone, it stops: a training under way finishes its turn and writes a checkpoint, as after SIGTERM.
+It takes one order after the other, as lines of JSON on its standard input, and answers each with a line on its standard
+output. An order is of one run, or of several that are made together. What a run prints goes to a file of its own. When
+the input ends, because the scheduler has nothing more or is gone, it stops: a training under way finishes its turn and
+writes a checkpoint, as after SIGTERM.
 """
 
 import contextlib
+import functools
 import gc
 import json
 import os
@@ -16,10 +18,11 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
+from sb3_sample.lockstep import present
 from sb3_sample.study.plan import Run
 from sb3_sample.study.runs import Outcome, StudyFolder, checkpointed, this_process
 
@@ -40,17 +43,29 @@ def train(run: Run, folder: Path, options: list[str]) -> None:
     :param options: more options
     :raises Exception: whatever keeps the run from being made
     """
+    with training() as make:
+        make(run, folder, options)
+
+
+@contextlib.contextmanager
+def training() -> Iterator[Train]:
+    """
+    :return: makes a run as ``sb3-sample train`` does. Trainings in lockstep call it at the same time
+    """
     from sb3_sample import zoo
     from sb3_sample.zoo import runs
     from sb3_sample.zoo.patches import reading
 
     zoo.register()
-    given, rest = runs.train_parser().parse_known_args([*run.command(folder), *options])
-    with reading():
+
+    def make(run: Run, folder: Path, options: list[str]) -> None:
+        given, rest = runs.train_parser().parse_known_args([*run.command(folder), *options])
         start = runs.plan(given, rest)
         assert start is not None
-        sys.argv = ["sb3-sample train", *start.arguments]
-        runs.train(start)
+        train_in_zoo(start, start.arguments, runs.Data.of(given))
+
+    with reading(), runs.training() as train_in_zoo:
+        yield make
 
 
 def serve(make: Train = train) -> None:
@@ -78,10 +93,11 @@ def serve(make: Train = train) -> None:
                 gc.collect()
                 gc.freeze()
             n_made += 1
-            outcome = attempt(folder, Run.of_json(order["run"]), order["options"], order["threads"], make)
-            reply = TAKEN if outcome is None else outcome._asdict()
+            runs = [Run.of_json(run) for run in order["runs"]]
+            outcomes = attempt_all(folder, runs, order["options"], order["threads"], make)
+            reply = [TAKEN if outcome is None else outcome._asdict() for outcome in outcomes]
             print(json.dumps(reply), file=replies, flush=True)
-            if outcome is not None and outcome.traceback:
+            if any(outcome is not None and outcome.traceback for outcome in outcomes):
                 return  # what a failed run leaves in the process is not known
 
 
@@ -91,6 +107,43 @@ def _listen(file: IO[bytes], orders: "queue.Queue[dict[str, Any] | None]") -> No
     orders.put(None)
     # A training finishes its turn and saves; whatever else is under way ends here.
     os.kill(os.getpid(), signal.SIGTERM)
+
+
+def attempt_all(
+    folder: StudyFolder, runs: Sequence[Run], options: list[str], threads: int, make: Train = train
+) -> list[Outcome | None]:
+    """
+    Make runs in this process, several in lockstep; see :func:`attempt`.
+
+    :param folder: the study's
+    :param runs: some of its runs, which differ in their seeds
+    :param options: options of ``sb3-sample train``
+    :param threads: of this process, for the record
+    :param make: makes a run that is alone
+    :return: what became of each; None of those that another process has
+    :raises SystemExit: after SIGTERM, when the runs have written their checkpoints; a ``KeyboardInterrupt`` after
+        SIGINT
+    :raises OSError: if the folder cannot be written to, or has no locks
+    """
+    if len(runs) == 1:
+        return [attempt(folder, runs[0], options, threads, make)]
+    from sb3_sample.lockstep import Seat
+    from sb3_sample.sac.many import train_together
+
+    outcomes: dict[str, Outcome | None] = {}
+    with training() as make:
+
+        def body(run: Run) -> None:
+            outcomes[run.name] = attempt(folder, run, options, threads, make)
+
+        seats = [Seat(run.title, functools.partial(body, run), folder.place(run)) for run in runs]
+        try:
+            train_together(seats, folder.path)
+        except Exception:
+            # What keeps them from being made together is in the outcome of each.
+            if outcomes.keys() != {run.name for run in runs}:
+                raise
+    return [outcomes[run.name] for run in runs]
 
 
 def attempt(folder: StudyFolder, run: Run, options: list[str], threads: int, make: Train = train) -> Outcome | None:
@@ -140,18 +193,28 @@ def attempt(folder: StudyFolder, run: Run, options: list[str], threads: int, mak
 
 @contextlib.contextmanager
 def _printing_to(path: Path) -> Iterator[None]:
-    """Have a file take what this process and those that it starts print, after what it has."""
+    """
+    Have a file take what this process and those that it starts print, after what it has. Of trainings in lockstep each
+    has its own, whenever it is its turn.
+    """
     streams = (sys.stdout, sys.stderr)
     before = [os.dup(stream.fileno()) for stream in streams]
     file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    try:
-        for stream in streams:
-            stream.flush()
-            os.dup2(file, stream.fileno())
-        yield
-    finally:
-        for stream, descriptor in zip(streams, before, strict=True):
+    seat = present()
+
+    def switch(descriptors: Sequence[int]) -> None:
+        for stream, descriptor in zip(streams, descriptors, strict=True):
             stream.flush()
             os.dup2(descriptor, stream.fileno())
+
+    try:
+        switch([file, file])
+        if seat is not None:
+            seat.on_turn = lambda: switch([file, file])
+        yield
+    finally:
+        if seat is not None:
+            seat.on_turn = lambda: None
+        switch(before)
+        for descriptor in (*before, file):
             os.close(descriptor)
-        os.close(file)

@@ -22,6 +22,7 @@ from sb3_sample.saving.checkpoint import Checkpointer, refuse_second_call
 from sb3_sample.saving.encoding import Lenient
 from sb3_sample.saving.model_tree import Description
 from sb3_sample.saving.notice import say_once
+from sb3_sample.training.seats import begin, seated
 
 Self = TypeVar("Self", bound="Resumable")
 
@@ -144,27 +145,34 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
         progress_bar: bool,
         checkpoint: str | pathlib.Path | None,
         checkpoint_freq: int,
+        learns_from: str = "",
     ) -> Self:
         """
         Train. The arguments are those of ``learn``, by the same names, since callbacks read them in its variables.
+
+        :param learns_from: what is learned from instead of the environment, which is left alone; empty for the
+            environment
         """
         total_timesteps = check_learn(self, locals())
         refuse_second_call(self, checkpoint)
-        resets_environment = reset_num_timesteps or self._last_obs is None
-        total_timesteps, callback = self._setup_learn(
+        total_timesteps, callback = self._set_up_training(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
-        if resets_environment:
-            self._on_environment_reset()
         self._before_training()
         say_once(self, self._described(), stacklevel=4)
-        with Checkpointer(self, callback, checkpoint, checkpoint_freq) as checkpointer:
+        with (
+            seated(self) as seat,
+            Checkpointer(self, callback, checkpoint, checkpoint_freq, learns_from) as checkpointer,
+        ):
             checkpointer.resume(total_timesteps)
             self._before_turns()
             callback.on_training_start(locals(), globals())
             checkpointer.start()
+            begin(seat)
             while self.num_timesteps < total_timesteps:
                 if not self._turn(checkpointer.callback, log_interval):
+                    break
+                if checkpointer.is_due() and not self._rest(checkpointer.callback, log_interval):
                     break
                 checkpointer.after_turn()
             else:
@@ -172,6 +180,20 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
             check_finite_parameters(self)
             checkpointer.finish()
         return self
+
+    def _set_up_training(
+        self, total_timesteps: int, callback: MaybeCallback, reset_num_timesteps: bool, name: str, progress_bar: bool
+    ) -> tuple[int, BaseCallback]:
+        """
+        Set counters, log and callbacks up, and reset the environments where Stable-Baselines3 does.
+
+        :return: steps at the end of the training, and the callback
+        """
+        resets_environment = reset_num_timesteps or self._last_obs is None
+        set_up = self._setup_learn(total_timesteps, callback, reset_num_timesteps, name, progress_bar)
+        if resets_environment:
+            self._on_environment_reset()
+        return set_up
 
     def _described(self) -> Lenient:
         """
@@ -196,6 +218,16 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
         :return: False if the callback ended the training, in which case nothing is learned
         """
         raise NotImplementedError
+
+    def _rest(self, callback: BaseCallback, log_interval: int) -> bool:
+        """
+        Bring to an end whatever goes on beside the turns, before a checkpoint.
+
+        :param callback: as in :meth:`_turn`
+        :param log_interval: as in :meth:`_turn`
+        :return: False if the callback ended the training
+        """
+        return True
 
     def _after_turns(self) -> None:
         """Finish a training that no callback has ended."""

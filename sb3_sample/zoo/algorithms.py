@@ -11,15 +11,18 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.sac import (
+    BC,
     BRC,
     BRO,
     BROTD3,
     DAC,
     GPLSAC,
+    IQL,
     OAC,
     OPLSAC,
     SAC,
     SRSAC,
+    TD3BC,
     TOPSAC,
     VPLSAC,
     XQC,
@@ -56,6 +59,7 @@ class ZooAlgorithm(NamedTuple):
 #: The algorithms by their names in the zoo (``--algo``, log folders, ``hyperparams/<name>.yml``). "sac" is the zoo's
 #: own, Stable-Baselines3's.
 ALGORITHMS: dict[str, ZooAlgorithm] = {
+    "bc": ZooAlgorithm(BC, search.BC_SPACE),
     "brc": ZooAlgorithm(BRC, search.BRC_SPACE),
     "bro": ZooAlgorithm(BRO, search.BRO_SPACE),
     "bro_fast": ZooAlgorithm(BROFast, search.BRO_FAST_SPACE),
@@ -65,6 +69,7 @@ ALGORITHMS: dict[str, ZooAlgorithm] = {
     "dr_q": ZooAlgorithm(DebiasedRQ, search.DR_Q_SPACE),
     "flash_sac": ZooAlgorithm(FlashSAC, search.FLASH_SPACE),
     "gpl_sac": ZooAlgorithm(GPLSAC, search.GPL_SPACE),
+    "iql": ZooAlgorithm(IQL, search.IQL_SPACE),
     "mbma_ppo": ZooAlgorithm(MBMAPPO, search.MBMA_SPACE),
     "mbpo_ppo": ZooAlgorithm(MBPOPPO, search.MBPO_SPACE),
     "oac": ZooAlgorithm(OAC, search.OAC_SPACE),
@@ -75,6 +80,7 @@ ALGORITHMS: dict[str, ZooAlgorithm] = {
     "simba": ZooAlgorithm(SimBa, search.SIMBA_SPACE),
     "simbav2": ZooAlgorithm(SimbaV2, search.SIMBAV2_SPACE),
     "sr_sac": ZooAlgorithm(SRSAC, search.SR_SAC_SPACE),
+    "td3bc": ZooAlgorithm(TD3BC, search.TD3BC_SPACE),
     "top_sac": ZooAlgorithm(TOPSAC, search.TOP_SPACE),
     "vpl_sac": ZooAlgorithm(VPLSAC, search.VPL_SPACE),
     "xqc": ZooAlgorithm(XQC, search.XQC_SPACE),

@@ -1,7 +1,9 @@
 """
-Runs of ``sb3-sample train`` that go on where they were interrupted: ``--run-dir``, ``--checkpoint-freq``, ``--resume``.
+Runs of ``sb3-sample train`` that go on where they were interrupted (``--run-dir``, ``--checkpoint-freq``,
+``--resume``), and that learn from data (``--dataset``, ``--offline-steps``, ``--prior-data``).
 
-The folder of such a run has, besides the zoo's files and the checkpoints, a record ``run.json`` of how it was started.
+The folder of a run with checkpoints has, besides these and the zoo's files, a record ``run.json`` of how it was
+started. One that learns from data first and then in its environment has the checkpoints of the former in ``offline``.
 """
 
 import argparse
@@ -11,8 +13,10 @@ import functools
 import json
 import os
 import re
+import sys
+import traceback
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,15 +31,23 @@ from stable_baselines3.common.monitor import Monitor, get_monitor_files
 from stable_baselines3.common.utils import get_latest_run_id
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_sample.lockstep import Seat, present
+from sb3_sample.replay.dataset import Dataset
+from sb3_sample.replay.reading import read_dataset
 from sb3_sample.run_logs import monitor_files, monitor_head
+from sb3_sample.sac.algorithm import SAC
+from sb3_sample.sac.many import train_together
 from sb3_sample.saving.folders import Folder, is_plain
 from sb3_sample.saving.training_state import argument_names
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
+from sb3_sample.training.seats import all_made
 from sb3_sample.zoo.algorithms import ALGORITHMS
 from sb3_sample.zoo.files import RunError, add_trust
 from sb3_sample.zoo.patches import managed_by, monitors_go_on
 
 RECORD = "run.json"
+#: Folder of the checkpoints of the steps on a data set, where others follow.
+OFFLINE = "offline"
 #: Bytes of a record.
 MAX_RECORD = 2**18
 #: Endings of the files that a run writes.
@@ -134,6 +146,34 @@ _RECORDED: dict[str, Callable[[Any], bool]] = {
 }
 
 
+class Data(NamedTuple):
+    """
+    Data sets that a run learns from: paths or ids of Minari's, or HDF5 files.
+
+    :param dataset: of the gradient steps without an environment
+    :param offline_steps: how many of the run's steps are such; None: all
+    :param prior_data: of a share of every batch in the environment
+    """
+
+    dataset: str | None = None
+    offline_steps: int | None = None
+    prior_data: str | None = None
+
+    @classmethod
+    def of(cls, options: argparse.Namespace) -> "Data":
+        """
+        :param options: what ``train_parser`` has parsed
+        :return: what they say of data sets
+        :raises RunError: they say what cannot be
+        """
+        data = cls(*(getattr(options, name) for name in cls._fields))
+        if data.offline_steps is not None and data.dataset is None:
+            raise RunError(f"--offline-steps {data.offline_steps} means nothing without --dataset: give it too")
+        if data.offline_steps is not None and data.offline_steps < 1:
+            raise RunError(f"--offline-steps must be at least 1, in gradient steps, not {data.offline_steps}")
+        return data
+
+
 class Start(NamedTuple):
     """
     How a run starts or goes on.
@@ -187,6 +227,14 @@ def checkpoints(folder: Path) -> list[Path]:
     return sorted(path for path in folder.glob("checkpoint-*") if re.fullmatch(r"checkpoint-\d{12,}", path.name))
 
 
+def all_checkpoints(folder: Path) -> list[Path]:
+    """
+    :param folder: a run's
+    :return: as ``checkpoints``, those of the steps on a data set first
+    """
+    return [*checkpoints(folder / OFFLINE), *checkpoints(folder)]
+
+
 def train_parser() -> argparse.ArgumentParser:
     """
     :return: parser of what ``train`` takes besides the zoo's options
@@ -213,6 +261,33 @@ def train_parser() -> argparse.ArgumentParser:
         "and --env below the log folder that has "
         "the latest checkpoint; an error if there is none",
     )
+    group = parser.add_argument_group("many seeds in one process (our off-policy algorithms)")
+    group.add_argument(
+        "--seeds",
+        type=int,
+        nargs="+",
+        metavar="N",
+        help="How many seeds, from 0 on, or several seeds by name: a run of each, with a folder of its own, as by as "
+        "many commands with --seed; --run-dir then has the folders seed-0, seed-1 and so on (docs/many_learners.md)",
+    )
+    group = parser.add_argument_group("data that are there already (our algorithms, but those with PPO in their names)")
+    group.add_argument(
+        "--dataset",
+        metavar="PATH",
+        help="Learn from a data set, -n gradient steps: a folder or an id of Minari's, or an HDF5 file in D4RL's "
+        "layout. The environment is for evaluations then",
+    )
+    group.add_argument(
+        "--offline-steps",
+        type=int,
+        metavar="N",
+        help="With --dataset: so many of the -n steps are gradient steps on it, the rest is learned in the environment",
+    )
+    group.add_argument(
+        "--prior-data",
+        metavar="PATH",
+        help="Data set that a share of every batch is taken from while learning in the environment (prior_share, 0.5)",
+    )
     add_trust(parser.add_argument_group("files that run no code (our algorithms)"))
     return parser
 
@@ -235,8 +310,9 @@ def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
         if not options.resume:
             return Start(list(arguments), freq)
         folder = _latest(arguments)
-    check_entries(folder)
-    if not checkpoints(folder):
+    for each in folder, folder / OFFLINE:
+        check_entries(each)
+    if not all_checkpoints(folder):
         if options.resume:
             raise RunError(f"--resume: {folder} has no checkpoint to go on from")
         # A run that was interrupted before it had one has its record.
@@ -272,7 +348,7 @@ def _latest(arguments: Sequence[str]) -> Path:
         raise RunError("--resume needs --run-dir, or --algo and --env, to know which run to go on with")
     found = []
     for file in asked.log_folder.rglob(RECORD):
-        made = checkpoints(file.parent)
+        made = all_checkpoints(file.parent)
         with contextlib.suppress(RunError):  # some other program's file of that name
             record = Record.read(file.parent)
             if made and (record.algo, record.env) == (asked.algo, asked.env):
@@ -285,30 +361,161 @@ def _latest(arguments: Sequence[str]) -> Path:
     return max(found)[1]
 
 
-def train(start: Start | None) -> None:
+@contextlib.contextmanager
+def training() -> Iterator[Callable[[Start | None, Sequence[str], Data], None]]:
     """
-    The zoo's ``train``. It reads ``sys.argv``.
+    Have the zoo's ``train`` make our runs.
+
+    :return: makes a run of how it starts, None for one without checkpoints, the command line for the zoo, without our
+        options, and the data sets that it learns from. Trainings in lockstep call it at the same time
+    """
+    starts: dict[Seat | None, tuple[Start | None, Data]] = {}
+
+    def manager(*positional: Any, **named: Any) -> Manager:
+        start, data = starts[present()]
+        return Manager(data, *positional, **named) if start is None else RunManager(start, data, *positional, **named)
+
+    def train(start: Start | None, arguments: Sequence[str], data: Data) -> None:
+        starts[present()] = start, data
+        # The zoo reads it at once.
+        sys.argv = ["sb3-sample train", *arguments]
+        rl_zoo3.train.train()
+
+    with managed_by(manager, rl_zoo3.train):
+        yield train
+
+
+def train(start: Start | None, arguments: Sequence[str], data: Data = Data()) -> None:  # noqa: B008  # immutable
+    """
+    Make a run as the zoo's ``train`` does.
 
     :param start: how a run with checkpoints starts; None for one without
+    :param arguments: command line for the zoo, without our options, of a run without checkpoints
+    :param data: data sets that it learns from
     :raises RunError: if it cannot start or go on so
     :raises Refused: if an argument is no Python
     :raises KeyboardInterrupt: after Ctrl-C, when the zoo has saved the model
     """
-    manager = Manager if start is None else functools.partial(RunManager, start)
-    with managed_by(manager, rl_zoo3.train):
-        rl_zoo3.train.train()
+    with training() as make:
+        make(start, arguments if start is None else start.arguments, data)
+
+
+def train_seeds(options: argparse.Namespace, arguments: Sequence[str]) -> None:
+    """
+    Make a run of each seed, all in this process, as so many commands would.
+
+    :param options: what ``train_parser`` has parsed, with ``seeds``
+    :param arguments: the rest of the command line
+    :raises RunError: if they cannot start or go on so
+    :raises KeyboardInterrupt: after Ctrl-C, when the zoo has saved the models; a ``SystemExit`` after SIGTERM
+    :raises SystemExit: if a run has failed, after the end of the others
+    """
+    seeds, data = _seeds(options.seeds, arguments), Data.of(options)
+    if data.dataset is not None:
+        raise RunError(f"--dataset {data.dataset} does not go with --seeds: leave one of them out")
+    failed: dict[int, BaseException] = {}
+
+    def body(seed: int, start: Start | None, command: Sequence[str]) -> None:
+        try:
+            make(start, command, data)
+        except Exception as error:
+            seat = present()
+            assert seat is not None
+            if not seat.began:
+                raise
+            failed[seed] = error
+            print(f"The run of seed {seed} has failed, and the others go on:", file=sys.stderr)
+            traceback.print_exception(error)
+
+    seats = []
+    for seed in seeds:
+        folder = None if options.run_dir is None else options.run_dir / f"seed-{seed}"
+        command = [*arguments, "--seed", str(seed)]
+        start = plan(argparse.Namespace(**{**vars(options), "run_dir": folder}), command)
+        own = functools.partial(body, seed, start, command if start is None else start.arguments)
+        seats.append(Seat(f"the run of seed {seed}", own, folder))
+    saves = options.run_dir is not None or options.checkpoint_freq is not None
+    with training() as make:
+        try:
+            train_together(seats, (options.run_dir or Path("logs")) if saves else None)
+        except KeyboardInterrupt as error:
+            on = f"the same command with --run-dir {options.run_dir} goes on" if options.run_dir else "all were saved"
+            raise KeyboardInterrupt(f"interrupted; {on}") from error
+    if failed:
+        words = "; ".join(f"seed {seed}: {type(error).__name__}: {error}" for seed, error in failed.items())
+        print(f"sb3-sample train: {len(failed)} of {len(seeds)} runs have failed: {words}", file=sys.stderr)
+        raise SystemExit(1)
+
+
+def _seeds(given: Sequence[int], arguments: Sequence[str]) -> list[int]:
+    """The seeds that ``--seeds`` asks for, of a command line that can be one of many."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--algo", default="ppo")
+    for option in ("--seed", "-optimize", "--optimize-hyperparameters", "--progress", "-P", "--track"):
+        parser.add_argument(option, dest=option, nargs="?", const=True)
+    asked = vars(parser.parse_known_args(arguments)[0])
+    if not can_train_together(algo := asked.pop("algo")):
+        names = ", ".join(name for name in ALGORITHMS if can_train_together(name))
+        raise RunError(f"--seeds is for the off-policy algorithms of this package, {names}, not --algo {algo}")
+    for option, value in asked.items():
+        if value is not None:
+            raise RunError(f"{option} does not go with --seeds: leave one of them out")
+    if len(given) == 1:
+        if given[0] < 1:
+            raise RunError(f"--seeds must be at least 1, if it is how many, not {given[0]}")
+        return list(range(given[0]))
+    if wrong := [seed for seed in given if not 0 <= seed < 2**32]:
+        raise RunError(f"a seed of --seeds must be at least 0 and below {2**32}, not {wrong[0]}")
+    if len(set(given)) < len(given):
+        raise RunError(f"--seeds must differ, not {' '.join(map(str, given))}")
+    return list(given)
+
+
+def can_train_together(algo: str) -> bool:
+    """
+    :param algo: name of an algorithm
+    :return: whether runs of several seeds can be made in one process
+    """
+    return algo in ALGORITHMS and issubclass(ALGORITHMS[algo].algorithm, SAC)
 
 
 class Manager(ExperimentManager):
     """
-    The zoo's manager, which names hyperparameters that there are not, and does not take an interrupted run for a
-    finished one.
+    The zoo's manager, which names hyperparameters that there are not, does not take an interrupted run for a finished
+    one, and learns from data too.
+
+    :param data: data sets to learn from
+    :param args: what the zoo has parsed of the command line
+    :param positional: the zoo's
+    :param named: the zoo's
+    :raises RunError: if the run cannot learn from such data
     """
 
-    #: Arguments of ``learn`` that the zoo does not know.
-    _arguments: dict[str, Any] = {}
     #: What is said of an interrupted run.
     _interrupted = "interrupted; the model was saved as it was"
+
+    def __init__(self, data: Data, args: argparse.Namespace, *positional: Any, **named: Any):
+        _check_data(data, args)
+        super().__init__(args, *positional, **named)
+        self._data = data
+        self._dataset: Dataset | None = None
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        hyperparams, saved = super().read_hyperparameters()
+        self._sets: dict[str, Dataset] = {}
+        for name in "dataset", "prior_data":
+            source = getattr(self._data, name)
+            if source is not None:
+                same = source == self._data.dataset and self._sets
+                self._sets[name] = self._sets["dataset"] if same else self._read(name, source, hyperparams)
+        self._dataset = self._sets.get("dataset")
+        return hyperparams, saved
+
+    def _read(self, name: str, source: str, hyperparams: Mapping[str, Any]) -> Dataset:
+        try:
+            return read_dataset(source, self.env_name.gym_id, hyperparams.get("env_kwargs") or self.env_kwargs)
+        except (ValueError, OSError) as error:
+            raise RunError(f"--{name.replace('_', '-')} {source}: {error}") from error
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         try:
@@ -322,10 +529,37 @@ class Manager(ExperimentManager):
                 f"{name} is no hyperparameter of {self.algo}"
                 + (f", you maybe meant {near[0]}" if near else f", which has {', '.join(sorted(known))}")
             )
+        if "prior_data" in self._sets:
+            found[0]["prior_data"] = self._sets["prior_data"]
+        if self._dataset is not None and self.n_envs > 1:
+            raise RunError(f"--dataset: n_envs must be 1, not {self.n_envs}: the environment is for evaluations")
+        steps = self._data.offline_steps
+        if steps is not None and steps >= self.n_timesteps:
+            raise RunError(
+                f"--offline-steps must be fewer than all, -n {self.n_timesteps}, not {steps}: the rest is learned in "
+                "the environment"
+            )
         return found
 
+    def _train(self, model: Any, total_timesteps: int, **arguments: Any) -> BaseAlgorithm:
+        """As the zoo has it, ``learn``; or what takes its place."""
+        if self._dataset is None:
+            return model.learn(total_timesteps, **arguments)  # type: ignore[no-any-return]
+        n_offline = self._data.offline_steps
+        if n_offline is None:
+            return model.learn_offline(self._dataset, total_timesteps, **arguments)  # type: ignore[no-any-return]
+        self._learn_first(model, self._dataset, n_offline, **arguments)
+        if model.num_timesteps < n_offline:  # a callback has ended it
+            return model  # type: ignore[no-any-return]
+        return model.learn(total_timesteps - n_offline, reset_num_timesteps=False, **arguments)  # type: ignore[no-any-return]
+
+    def _learn_first(self, model: Any, dataset: Dataset, gradient_steps: int, **arguments: Any) -> None:
+        """Learn from data before others follow."""
+        model.learn_offline(dataset, gradient_steps, **arguments)
+
     def learn(self, model: BaseAlgorithm) -> None:
-        self._watched = _Watched(model, self._arguments)
+        all_made(model)
+        self._watched = _Watched(model, self._train)
         super().learn(self._watched)  # type: ignore[arg-type]  # all that the zoo's learn uses
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
@@ -339,13 +573,14 @@ class RunManager(Manager):
     The zoo's manager for a run with checkpoints.
 
     :param start: how the run starts
+    :param data: data sets to learn from
     :param args: what the zoo has parsed of the command line
     :param positional: the zoo's
     :param named: the zoo's
     :raises RunError: if there can be no checkpoints of such a run
     """
 
-    def __init__(self, start: Start, args: argparse.Namespace, *positional: Any, **named: Any):
+    def __init__(self, start: Start, data: Data, args: argparse.Namespace, *positional: Any, **named: Any):
         if args.algo not in ALGORITHMS:
             raise RunError(
                 f"--algo {args.algo} has no checkpoints to go on from: --run-dir, --checkpoint-freq and --resume are "
@@ -356,7 +591,7 @@ class RunManager(Manager):
                 "-optimize has no checkpoints: without --run-dir, --checkpoint-freq and --resume a search goes on with "
                 "the trials in its --storage"
             )
-        super().__init__(args, *positional, **named)
+        super().__init__(data, args, *positional, **named)
         if start.folder is not None:
             self.save_path = str(start.folder)
             self.params_path = f"{self.save_path}/{self.env_name}"
@@ -369,6 +604,9 @@ class RunManager(Manager):
         hyperparams, saved = super().read_hyperparameters()
         settings = {name: repr(getattr(self.args, name)) for name in COMPARED}
         settings |= {name: repr(value) for name, value in saved.items() if name != "n_timesteps"}
+        settings |= {name: repr(dataset) for name, dataset in self._sets.items()}
+        if self._data.offline_steps is not None:
+            settings["offline_steps"] = repr(self._data.offline_steps)
         before = self._start.record
         if before is not None:
             self._compare(settings, before.settings)
@@ -404,7 +642,10 @@ class RunManager(Manager):
         is_ours = before and re.fullmatch(rf"{name}_\d+", Path(before).name)
         if before and is_ours and Path(before).parent == Path(str(self.tensorboard_log)):
             return before
-        return f"{self.tensorboard_log}/{name}_{get_latest_run_id(str(self.tensorboard_log), name) + 1}"
+        new = f"{self.tensorboard_log}/{name}_{get_latest_run_id(str(self.tensorboard_log), name) + 1}"
+        # At once: another run that is made beside this one gets another.
+        os.makedirs(new, exist_ok=True)
+        return new
 
     def create_callbacks(self) -> None:
         super().create_callbacks()
@@ -419,31 +660,64 @@ class RunManager(Manager):
         if self._record.tensorboard is not None:
             formats = ["stdout", "tensorboard"] if self.verbose >= 1 else ["tensorboard"]
             model.set_logger(configure(self._record.tensorboard, formats))
-        self._arguments = {
+        self._interrupted = f"interrupted; the same command with --run-dir {self._folder} goes on"
+        super().learn(model)
+
+    def _train(self, model: Any, total_timesteps: int, **arguments: Any) -> BaseAlgorithm:
+        more = {
             "checkpoint": self._folder,
             "checkpoint_freq": self._start.checkpoint_freq,
             "progress_bar": self._progress_bar,
         }
-        self._interrupted = f"interrupted; the same command with --run-dir {self._folder} goes on"
-        super().learn(model)
+        return super()._train(model, total_timesteps, **arguments, **more)
+
+    def _learn_first(self, model: Any, dataset: Dataset, gradient_steps: int, **arguments: Any) -> None:
+        if checkpoints(self._folder):
+            # The checkpoint that follows has all that was learned.
+            model.num_timesteps = gradient_steps
+            return
+        with warnings.catch_warnings():
+            # Of a run that was interrupted between the two.
+            warnings.filterwarnings("ignore", "Nothing is left to train")
+            super()._learn_first(model, dataset, gradient_steps, **{**arguments, "checkpoint": self._folder / OFFLINE})
+
+
+def _check_data(data: Data, args: argparse.Namespace) -> None:
+    """Whether an algorithm learns from such data."""
+    entry = ALGORITHMS.get(args.algo)
+    algorithm: Any = None if entry is None else entry.algorithm
+    needs_data = getattr(algorithm, "learns_from_data_only", False)
+    if data == Data():
+        if needs_data:
+            raise RunError(f"--algo {args.algo} learns from data only: give --dataset")
+        return
+    option = "--dataset" if data.dataset is not None else "--prior-data"
+    if not hasattr(algorithm, "learn_offline"):
+        able = [name for name, each in ALGORITHMS.items() if hasattr(each.algorithm, "learn_offline")]
+        raise RunError(f"{option} is for {', '.join(able)}, not for {args.algo}")
+    if needs_data and data.dataset is None:
+        raise RunError(f"--algo {args.algo} learns from data only: give --dataset in the place of --prior-data")
+    if needs_data and data.offline_steps is not None:
+        raise RunError(f"--offline-steps: {args.algo} learns from data only, all of -n: leave it out")
+    if data.dataset is not None and args.optimize_hyperparameters:
+        raise RunError("-optimize searches by learning in the environment: --dataset cannot be given with it")
 
 
 class _Watched:
     """
-    A model whose ``learn`` has arguments that the zoo does not know, and tells whether it was interrupted, which the
-    zoo keeps to itself.
+    A model whose ``learn`` is another function, and tells whether it was interrupted, which the zoo keeps to itself.
 
     :param model: the model
-    :param arguments: the arguments
+    :param train: trains it, given the model and the zoo's arguments of ``learn``
     """
 
-    def __init__(self, model: Any, arguments: dict[str, Any]):
-        self._model, self._arguments = model, arguments
+    def __init__(self, model: Any, train: Callable[..., BaseAlgorithm]):
+        self._model, self._train = model, train
         self.interrupted = False
 
     def learn(self, *args: Any, **kwargs: Any) -> BaseAlgorithm:
         try:
-            return self._model.learn(*args, **kwargs, **self._arguments)
+            return self._train(self._model, *args, **kwargs)
         except KeyboardInterrupt:
             self.interrupted = True
             raise

@@ -161,6 +161,21 @@ DR_Q_SPACE: Space = {
     "infonce_weight": _float(0.01, 1.0, log=True),
     "weight_decay": _float(1e-4, 1e-1, log=True),
 }
+#: Agents that learn from data. A search learns in the environment, with ``--prior-data`` if given; BC, which does not
+#: learn there, is not searched, and has a space for whoever samples of it.
+BC_SPACE: Space = {name: OFF_POLICY_SPACE[name] for name in ("learning_rate", "batch_size_pow")}
+IQL_SPACE: Space = {
+    **OFF_POLICY_SPACE,
+    "expectile": _float(0.5, 0.95),
+    "inverse_temperature": _float(0.3, 10.0, log=True),
+    "replay_ratio": _int(1, 8, log=True),
+}
+TD3BC_SPACE: Space = {
+    **OFF_POLICY_SPACE,
+    "alpha": _float(0.5, 10.0, log=True),
+    "policy_delay": _int(1, 4),
+    "replay_ratio": _int(1, 8, log=True),
+}
 #: PPO with simulated samples. The share of the training in which there are some is not searched: a trial is shorter
 #: than the training that its parameters are for. A trial has to be longer than an iteration, of n_steps times the
 #: environments, since nothing is simulated in the first one.

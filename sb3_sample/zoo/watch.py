@@ -16,7 +16,7 @@ from sb3_sample.saving.checkpoint import MODEL
 from sb3_sample.zoo.algorithms import ALGORITHMS
 from sb3_sample.zoo.files import Refused, RunError, add_trust
 from sb3_sample.zoo.patches import make_answering_env, models_checked, reading, reading_settings, watched_with
-from sb3_sample.zoo.runs import Record, checkpoints
+from sb3_sample.zoo.runs import Record, all_checkpoints
 from sb3_sample.zoo.settings import check_settings
 
 
@@ -177,7 +177,7 @@ def model_path(
     :return: name for a video, the model's file, the run's folder
     :raises Refusal: (a ``SystemExit``) if there is no model yet
     """
-    made = checkpoints(run_dir)
+    made = all_checkpoints(run_dir)
     if load_last_checkpoint and made and not (load_best or load_checkpoint is not None):
         steps = int(made[-1].name.removeprefix("checkpoint-"))
         return f"checkpoint-{steps}-{algo}-{env_name}", str(made[-1] / MODEL), str(run_dir)

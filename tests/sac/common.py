@@ -20,10 +20,12 @@ from sb3_sample.sac import (
     BROTD3,
     DAC,
     GPLSAC,
+    IQL,
     OAC,
     OPLSAC,
     SAC,
     SRSAC,
+    TD3BC,
     TOPSAC,
     VPLSAC,
     XQC,
@@ -214,6 +216,8 @@ MAKERS: dict[str, Callable[..., Any]] = {
     "TOPSAC": _maker(sac, TOPSAC),
     "GPLSAC": _maker(sac, GPLSAC, pessimism_learning_rate=1e-2),
     "OPLSAC": _maker(sac, OPLSAC, pessimism_learning_rate=1e-2, segment_length=4),
+    "IQL": _maker(sac, IQL),
+    "TD3BC": _maker(sac, TD3BC),
     "SimBa": _maker(sac, SimBa, policy_kwargs=TINY_RESIDUAL),
     "SimbaV2": _maker(
         sac, SimbaV2, n_critics=2, value_head_kwargs={"n_atoms": 11}, policy_kwargs=TINY_RESIDUAL, learning_rate=1e-3

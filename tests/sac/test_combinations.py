@@ -13,10 +13,12 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample import (
+    BC,
     BRC,
     BRO,
     DAC,
     GPLSAC,
+    IQL,
     OAC,
     OPLSAC,
     SAC,
@@ -24,6 +26,8 @@ from sb3_sample import (
     VPLSAC,
     XQC,
     CrossQ,
+    Dataset,
+    DebiasedRQ,
     FadedReplayBuffer,
     PrioritizedReplayBuffer,
     RegularizedSAC,
@@ -35,6 +39,7 @@ from tests.sac.common import TINY_BRO, TINY_RESIDUAL, TINY_SAC, vec
 
 DOCS = Path(__file__).parents[2] / "docs" / "parts.md"
 NOISE = NormalActionNoise(np.zeros(2), np.ones(2))
+PRIOR = Dataset.from_arrays(np.zeros((9, 3), np.float32), np.zeros((9, 2)), np.zeros(9), np.ones(9), np.zeros(9))
 
 #: By the first cell of a row: classes with arguments that it speaks of, each with the names that the error must have.
 ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
@@ -137,12 +142,64 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
         (SAC, {"train_freq": (1, "episode"), "env": vec(2)}, ("train_freq=(1, 'episode')", "one environment")),
     ],
     "`use_sde=True`": [(SAC, {"use_sde": True}, ("use_sde=True",))],
+    "`prior_data` with `n_steps` above 1, `PrioritizedReplayBuffer` or `DebiasedRQ`": [
+        (SAC, {"prior_data": PRIOR, "n_steps": 3}, ("prior_data", "n_steps=3")),
+        (
+            SAC,
+            {"prior_data": PRIOR, "replay_buffer_class": PrioritizedReplayBuffer},
+            ("prior_data", "replay_buffer_class=PrioritizedReplayBuffer"),
+        ),
+        (DebiasedRQ, {"prior_data": PRIOR}, ("prior_data=None", "DebiasedRQ")),
+    ],
+    "`prior_share` without `prior_data`, or so that a batch lacks one of the two": [
+        (SAC, {"prior_share": 0.3}, ("prior_share=0.3", "prior_data=None")),
+        (SAC, {"prior_data": PRIOR, "prior_share": 0.01}, ("prior_share=0.01", "batch_size=8")),
+    ],
+    '`IQL` with a rule of pessimism, `sam_radius`, `target_subset`, `value_head`, `actor_pessimism`, `backbone="td3"`, '
+    '`share_features_extractor`, or critics whose network stacks rows (`"crossq"`, `"flash"`, `"xqc"`)': [
+        (IQL, {"pessimism": "gpl"}, ("pessimism='gpl'", "IQL")),
+        (IQL, {"sam_radius": 0.1}, ("sam_radius=0.1", "IQL")),
+        (IQL, {"target_subset": 1}, ("target_subset=1", "IQL")),
+        (IQL, {"value_head": "categorical"}, ("value_head='categorical'", "IQL")),
+        (IQL, {"actor_pessimism": 0.0}, ("actor_pessimism=0.0", "IQL")),
+        (IQL, {"backbone": "td3"}, ("backbone='td3'", "IQL")),
+        (IQL, {"policy_kwargs": {"share_features_extractor": True}}, ("share_features_extractor=True", "IQL")),
+        *(
+            (IQL, {"policy_kwargs": {"critic_network": network}}, ("critic_network", "IQL"))
+            for network in ("crossq", "flash", "xqc")
+        ),
+    ],
+    '`BC` with anything of critics, `reward_scale`, `actor_first`, or `exploration` other than `"actor"`': [
+        (BC, {"n_quantiles": 5}, ("n_quantiles=5", "BC")),
+        (BC, {"policy_kwargs": {"n_critics": 3}}, ("n_critics", "BC")),
+        (BC, {"reward_scale": "xqc"}, ("reward_scale='xqc'", "BC")),
+        (BC, {"actor_first": True}, ("actor_first=True", "BC")),
+        (BC, {"exploration": "oac"}, ("exploration='oac'", "BC")),
+    ],
+    "`ent_coef`, `target_entropy`, `task_temperatures` with `BC`, `IQL`": [
+        (cls, {name: value}, (f"{name}={value}", cls.__name__))
+        for cls in (BC, IQL)
+        for name, value in (("ent_coef", 0.1), ("target_entropy", -7.0))
+    ],
+    "`initial_std` (of `BC`, `IQL` without `actor_kwargs=dict(initial_std=None)`) with `actor_network` "
+    '`"flash"`, `"simbav2"`, `"xqc"`': [
+        (cls, {"policy_kwargs": {"actor_network": network}}, ("initial_std=1.0", "actor_network"))
+        for cls in (BC, IQL)
+        for network in ("flash", "simbav2", "xqc")
+    ],
     "`value_head` with `n_quantiles`, `value_head_kwargs` without `value_head`": [
         (SAC, {"value_head": ValueHead, "n_quantiles": 5}, ("value_head", "n_quantiles=None")),
         (SAC, {"value_head_kwargs": {"a": 1}}, ("value_head_kwargs", "value_head=None")),
     ],
     "`reward_scale_kwargs` without `reward_scale`": [
         (SAC, {"reward_scale_kwargs": {"max_return": 1}}, ("reward_scale_kwargs", "reward_scale=None")),
+    ],
+    '`shift` of `reward_scale="linear"` with `n_steps` above 1': [
+        (
+            SAC,
+            {"reward_scale": "linear", "reward_scale_kwargs": {"shift": -1}, "n_steps": 3},
+            ("shift=-1", "n_steps=3"),
+        ),
     ],
     "`reward_scale` with `VecNormalize(norm_reward=True)`": [
         (SAC, {"reward_scale": "xqc", "env": VecNormalize(vec())}, ("reward_scale='xqc'", "norm_reward=False")),

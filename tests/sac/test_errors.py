@@ -324,10 +324,12 @@ def test_arguments_of_one_class_of_another_kind(maker: str, name: str) -> None:
 
 
 def test_no_environment(tmp_path: Path) -> None:
-    refused(lambda: SAC("MlpPolicy", None), "env must be an environment, .* not None")
+    without = "env: the model was made or loaded without one: pass env= to it, or call set_env"
+    refused(lambda: SAC("MlpPolicy", None).learn(10), without)
+    refused(lambda: SAC("MlpPolicy", 1), "env must be an environment, .* not 1")
     sac().save(tmp_path / "m")
     refused(lambda: SAC.load(tmp_path / "m", env=1), "env must be an environment, .* not 1")
-    refused(lambda: SAC.load(tmp_path / "m").learn(10), "env: the model was loaded without one: pass env= to load")
+    refused(lambda: SAC.load(tmp_path / "m").learn(10), without)
 
 
 def test_use_sde() -> None:

@@ -60,7 +60,8 @@ class Recorder:
         self.n_recordings = self.n_repetitions = 0
 
     def _memory(self) -> list[torch.Tensor]:
-        modules = (self.model.policy, self.model.temperature, self.model.explorer, self.model.pessimism_rule)
+        parts = (self.model.explorer, self.model.pessimism_rule, self.model.objective)
+        modules = (self.model.policy, self.model.temperature, *parts)
         tensors = [t for module in modules for t in (*module.parameters(), *module.buffers())]
         for optimizer in self.model._optimizers().values():
             tensors += [t for s in optimizer.state.values() for t in s.values() if isinstance(t, torch.Tensor)]
@@ -100,9 +101,11 @@ def captured(model: SAC, warm_up: int = 3) -> Recorder:
 
 #: Of networks with batch norm: shifts that the next norm takes off again, whose gradients are rounding, and the means
 #: that follow them.
-WITHOUT_GRADIENT = re.compile(r"input_norm\.bias|running_mean")
+WITHOUT_GRADIENT = re.compile(r"input_norm\.bias|running_mean|critic\.trunk\.dense\.\d\.bias")
 #: Agents of whose gradients some elements are rounding, which Adam makes steps of.
-ROUNDING = ("DebiasedRQ", "FlashSAC", "XQC")
+ROUNDING = ("CrossQ+WN", "DebiasedRQ", "FlashSAC", "XQC")
+#: Gradient steps of those whose rounding grows fastest, through batch norm over eight rows; others take 50.
+FEW_STEPS = {"CrossQ+WN": 5, "XQC": 10}
 
 
 def largest_difference(a: SAC, b: SAC) -> float:
@@ -149,8 +152,9 @@ FAST = ["BRO", "VPLSAC"]
 )
 def test_compiled_is_eager(maker: str) -> None:
     model, compiled = pair(maker, compile=True)
-    updates(model, 50)
-    updates(compiled, 50)
+    n = FEW_STEPS.get(maker, 50)
+    updates(model, n)
+    updates(compiled, n)
     assert compiled.learner._execution is not None and compiled.learner._execution.compiled
     assert compiled.learner._execution.seconds_compiling > 0
     # The gradients of a tiny encoder are large, and so is the rounding of their moments.
@@ -163,8 +167,8 @@ def test_compiled_is_eager(maker: str) -> None:
 def test_captured_is_eager(maker: str) -> None:
     model, other = pair(maker)
     recorder = captured(other)
-    # Rounding grows fastest through batch norm over eight rows.
-    n = 15 if maker == "XQC" else 50
+    # More than are run as they are, of each kind.
+    n = max(FEW_STEPS.get(maker, 50), 10)
     updates(model, n)
     updates(other, n)
     # Learning rates are float32 there.
@@ -346,11 +350,11 @@ def test_a_copied_model_trains_on_and_a_file_holds_no_transitions(tmp_path: Path
 @COMPILES
 def test_learning_rates_of_a_schedule_compile_once() -> None:
     model, compiled = pair("SAC", compile=True)
-    calls = torch._dynamo.utils.counters["stats"]["unique_graphs"]
     for m in (model, compiled):
         rates = np.linspace(1e-2, 1e-4, 20)
         updates(m, 20, each=lambda i, m=m, rates=rates: setattr(m, "lr_schedule", lambda _: float(rates[i])))
-    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == calls + 1
+    assert len(compiled.learner._execution._compiled._programs) == 1
+    assert compiled.learner._execution._compiled.version == 0
     assert largest_difference(model, compiled) < 1e-3
 
 
@@ -442,7 +446,7 @@ def test_without_a_compiler_training_goes_on_uncompiled(compile: Any, monkeypatc
 
 
 @pytest.mark.parametrize("compile", [True, "auto"])
-@pytest.mark.parametrize("version", ["2.11.0+cu130", "2.4.1", "1.13.1"])
+@pytest.mark.parametrize("version", ["2.10.0+cu130", "2.4.1", "1.13.1"])
 def test_an_old_torch_is_told_of_once(compile: Any, version: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over several models, calls of ``learn`` and a file that says to go on compiled; and the numbers are eager's."""
     monkeypatch.setattr(update_schedule, "PAYS_FROM", 5)
@@ -464,15 +468,15 @@ def test_an_old_torch_is_told_of_once(compile: Any, version: str, monkeypatch: p
         models[3].learn(30)
     said = [str(w.message) for w in caught if "not compiled" in str(w.message)]
     assert said == [
-        f"The gradient step is not compiled: that needs torch 2.13 or newer, and this is {version}. It is run eagerly, "
+        f"The gradient step is not compiled: that needs torch 2.11 or newer, and this is {version}. It is run eagerly, "
         "on a GPU captured"
     ]
     assert not any(model.compiled or model.learner._execution.compiled for model in models)
     assert not differing(state(models[0]), state(eager))
 
 
-@pytest.mark.parametrize(("version", "old"), [("2.13.0", False), ("2.13.0a0+git1234", False), ("2.14.1+cpu", False),
-                                              ("3.0.0", False), ("2.12.1", True), ("2.4", True)])  # fmt: skip
+@pytest.mark.parametrize(("version", "old"), [("2.11.0", False), ("2.11.0a0+git1234", False), ("2.14.1+cpu", False),
+                                              ("3.0.0", False), ("2.10.1", True), ("2.4", True)])  # fmt: skip
 def test_which_torch_is_old(version: str, old: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "__version__", version)
     assert (old_torch() is not None) is old
@@ -514,17 +518,15 @@ def test_parts_of_ones_own_are_compiled_when_asked_for(monkeypatch: pytest.Monke
         """Not made to be compiled: its number changes at every step."""
 
         def before_updates(self, agent: SAC) -> None:
-            self._beta += 0.01
+            self.constant += 0.01
 
     monkeypatch.setattr(update_schedule, "PAYS_FROM", 5)
     monkeypatch.setitem(PESSIMISMS, "own", Own)
     monkeypatch.setitem(PESSIMISMS, "counting", Counting)
     assert sac(pessimism="own").learn(20).compiled is False
     assert sac(pessimism="own", compile=True).learn(20).learner._execution.compiled
-    with (
-        torch._dynamo.config.patch(recompile_limit=2),
-        pytest.raises(RuntimeError, match=r"compile=True, but .*compile=False"),
-    ):
+    monkeypatch.setattr(execution.Compiled, "MAX_PROGRAMS", 2)
+    with pytest.raises(RuntimeError, match=r"compile=True, but .*changes again and again.*compile=False"):
         sac(pessimism="counting", compile=True).learn(20)
 
 

@@ -153,6 +153,10 @@ SHARED_NAMES = {
 }
 
 
+#: Where the models compute.
+DEVICE = "cpu"
+
+
 class Updates:
     """
     The updates of one file, and a model that replays them. A method is a subclass: how its model is built from the
@@ -214,7 +218,7 @@ class Updates:
     # ---------------------------------------------------------------- of all
 
     def tensor(self, key: str) -> torch.Tensor:
-        return torch.as_tensor(self.data[key])
+        return torch.as_tensor(self.data[key]).to(DEVICE)
 
     def load(self) -> None:
         stored = {key.removeprefix("init/"): value for key, value in self.data.items() if key.startswith("init/")}
@@ -222,7 +226,7 @@ class Updates:
         with torch.no_grad():
             for name, value in stored.items():
                 assert self.named[name].shape == value.shape, name
-                self.named[name].copy_(torch.as_tensor(self.arranged(name, value)))
+                self.named[name].copy_(torch.as_tensor(self.arranged(name, value)).to(DEVICE))
 
     def run(self) -> int:
         """Replay the updates and compare; gives how many numbers were compared."""
@@ -269,7 +273,7 @@ class Updates:
 
     @staticmethod
     def check_numbers(key: str, ours: Any, theirs: Any, tolerance: float) -> None:
-        ours = ours.detach().numpy() if isinstance(ours, torch.Tensor) else np.asarray(ours)
+        ours = ours.detach().cpu().numpy() if isinstance(ours, torch.Tensor) else np.asarray(ours)
         assert ours.shape == theirs.shape, f"{key}: shape {ours.shape} instead of {theirs.shape}"
         ours, theirs = ours.astype(np.float64), theirs.astype(np.float64)
         with np.errstate(invalid="ignore"):
@@ -297,7 +301,7 @@ class Updates:
             limit = parameter_tolerance(n_updates)
             if name.startswith(self.learned_numbers):
                 limit = self.scalar_tolerances[n_updates >= 10]
-            error = np.abs(value.detach().double().numpy() - theirs).max()
+            error = np.abs(value.detach().double().cpu().numpy() - theirs).max()
             assert error <= limit, f"{prefix}{name}: off by {error:.2e}, allowed {limit:.0e}"
         self.check_more(prefix, n_updates)
 
@@ -307,7 +311,7 @@ class Updates:
         for name, value in self.named.items():
             if among(name):
                 theirs = self.arranged(name, self.data[prefix + name]).astype(np.float64)
-                dot += ((value.detach().double().numpy() - theirs) * theirs).sum()
+                dot += ((value.detach().double().cpu().numpy() - theirs) * theirs).sum()
                 square += (theirs**2).sum()
         return dot / square / (n_updates * self.model.learning_rate)
 
@@ -326,7 +330,7 @@ class BROUpdates(Updates):
             learning_rate=optimizers["critic"]["lr"],
             adjustment_learning_rate=optimizers["optimism"]["lr"],
             buffer_size=1,
-            device="cpu",
+            device=DEVICE,
             compile=compile,
         )
 
@@ -615,7 +619,7 @@ class SimbaV2Updates(Updates):
 
 
 def simbav2(obs_dim: int, act_dim: int, **kwargs: Any) -> SimbaV2:
-    return SimbaV2("MlpPolicy", Shapes(obs_dim, act_dim), buffer_size=1, device="cpu", **kwargs)
+    return SimbaV2("MlpPolicy", Shapes(obs_dim, act_dim), buffer_size=1, device=DEVICE, **kwargs)
 
 
 def normalizer_state(model: Any) -> dict[str, Any]:
@@ -697,7 +701,7 @@ class BRCUpdates(Updates):
                 "n_critics": dims["critics"],
             },
             buffer_size=1,
-            device="cpu",
+            device=DEVICE,
             compile=compile,
         )
 
@@ -845,7 +849,7 @@ def brc_sequence(data: dict[str, np.ndarray], name: str, meta: dict[str, Any]) -
         value_head_kwargs={"v_min": -meta["v_max"], "v_max": meta["v_max"]},
         critic_width=4,
         buffer_size=1,
-        device="cpu",
+        device=DEVICE,
     )
     get = lambda key: data[f"{name}/{key}"]  # noqa: E731
     rewards, tasks = torch.as_tensor(get("query_reward"))[:, None], torch.as_tensor(get("query_task"))[:, None]

@@ -56,7 +56,7 @@ def test_arguments_of_a_cluster_are_checked_at_the_door(tmp_path: Path, monkeypa
 
 def test_a_machine_that_does_not_see_the_folder_says_so(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="must be one that all machines of the cluster have"):
-        cluster.make(str(tmp_path / "elsewhere"), nothing.plan(1).runs[0].as_json(), [], 1)
+        cluster.make(str(tmp_path / "elsewhere"), [nothing.plan(1).runs[0].as_json()], [], 1)
     assert not (tmp_path / "elsewhere").exists()
 
 

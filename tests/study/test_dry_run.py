@@ -3,6 +3,8 @@
 import dataclasses
 import os
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -47,6 +49,25 @@ def test_a_pair_that_was_not_measured_is_the_product_of_two_ratios(tmp_path: Pat
     assert found.hours == pytest.approx(2 * (1 + 2 + 3 + 3 * 2))
     # Of each run all but the replay buffer, and its 20 rows.
     assert found.n_bytes == pytest.approx(2 * (100 + 200 + 400 + 800 + 20 * (10 + 50 + 10 + 50)))
+
+
+def test_agents_are_measured_on_the_data_that_they_have(tmp_path: Path, monkeypatch) -> None:
+    asked = []
+
+    def measure(run: Run, threads: int, device: str) -> Cost:
+        asked.append((run.agent, run.task, run.data))
+        return Cost({"A": 1.0, "B": 3.0}[run.agent], 1.0, 0.0)
+
+    monkeypatch.setattr(module, "measure", measure)
+    base = Run("A", "iql", {}, {}, "x", 0, 3600, data={"dataset": "of x"})
+    elsewhere = dataclasses.replace(base, task="y", data={"dataset": "of y"})
+    found = study.estimate(Plan("made up", (base, elsewhere, dataclasses.replace(elsewhere, agent="B"))), tmp_path)
+    assert asked == [(agent, task, {"dataset": f"of {task}"}) for agent, task in (("A", "x"), ("A", "y"), ("B", "y"))]
+    assert found.hours == pytest.approx(1 + 1 + 3)
+    timed = dataclasses.replace(base, algo="bro_fast", task="dmc/cheetah-run-v0", arguments={"model_size": "0.55M"})
+    times: Any = SimpleNamespace(gradient_step={"0.55M": 0.5}, how="eager")
+    assert module.seconds_of_learning(timed, times) is None
+    assert module.seconds_of_learning(dataclasses.replace(timed, data={}), times) == 1.0
 
 
 def test_what_cannot_be_measured_is_an_error(tmp_path: Path) -> None:

@@ -48,9 +48,12 @@ def checkout(tmp_path: Path) -> Path:
         if name.startswith(("sb3_sample/", "studies/", "hyperparams/", "setup")) and (ROOT / name).exists():
             (place / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / name, place / name)
-    for plan in (place / "studies" / "evidence").glob("*.yml"):
-        plan.unlink()
+    for each in (place / "studies" / "evidence").iterdir():
+        each.unlink()
     (place / "studies" / "evidence" / "small.yml").write_text(PLAN)
+    (place / "studies" / "evidence" / "small.py").write_text(
+        f"def main(argv):\n    open({str(tmp_path / 'prepared')!r}, 'a').write('x')\n"
+    )
     (place / "studies" / "evidence" / "QUEUE").write_text("# plan, seeds\nsmall 1\nsmall 2\n")
     git(place, "add", "-A")
     git(place, "commit", "-qm", "first")
@@ -106,6 +109,9 @@ def test_a_killed_run_goes_on_under_its_commit_and_new_ones_have_the_last(checko
         (seed, step) for seed in (0, 1) for step in (200, 400, 600)
     ]
     assert (table["metric"] == "hours").sum() == 6
+
+    # What a run reads is made before it, by the killed one's process, its successor's and the other seed's.
+    assert (checkout.parent / "prepared").read_text() == "xxx"
 
     # What is written down is not made again, also where the folder of the evidence is another machine's.
     shutil.rmtree(checkout.parent / "root")

@@ -116,8 +116,8 @@ BAD = [
     ("    learning_starts: 500", "    learning_starts: -1", 4, "learning_starts must be an integer of at least 0,"),
     ("0.55M", "0.56M", 5, "agent 'BRO Fast' with replay_ratio=1 of grid .*: model_size must be one of .*'0.55M'"),
     ("    learning_starts: 500", "    learning_starts: .inf", 4, "a number must be finite"),
-    ("sac_sample", "sac_simple", 3, "algo must be one of brc, .*, not 'sac_simple'; did you mean 'sac_sample'"),
-    ("    algo: sac_sample\n", "", 2, "agent 'SAC' needs algo, one of brc, "),
+    ("sac_sample", "sac_simple", 3, "algo must be one of bc, brc, .*, not 'sac_simple'; did you mean 'sac_sample'"),
+    ("    algo: sac_sample\n", "", 2, "agent 'SAC' needs algo, one of bc, brc, "),
     ("BRO Fast:", "SAC:", 5, "'SAC' is there twice: once on line 2"),
     ("BRO Fast:", "sac:", 5, "agents 'SAC' and 'sac' would have the same folder"),
     ("bro_fast\n    model_size: 0.55M", "sac_sample\n    learning_starts: 500", 5, "is agent 'SAC' of line 2"),
@@ -210,12 +210,14 @@ def test_groups_and_factors_come_with_the_folder(plan_of, tmp_path: Path) -> Non
 
 #: Plans with many agents or large critics, each of which is made once to have its arguments checked.
 MANY = {
-    "bro_ablation", "bro_scaling", "bro_scaling_small", "mbma", "mbma_small", "regularization", "regularization_small",
-    "scaling_dmc", "scaling_dmc_small", "scaling_gym", "scaling_gym_small",
+    "bro_ablation", "bro_offline_adroit", "bro_scaling", "bro_scaling_small", "mbma", "mbma_small", "regularization",
+    "regularization_small", "scaling_dmc", "scaling_dmc_small", "scaling_gym", "scaling_gym_small",
 }  # fmt: skip
 #: Runs of the papers' studies: agents, tasks and seeds as the papers state them.
 RUNS = {
     "bro": 5 * 40 * 10,
+    "bro_offline_adroit": 6 * 9 * 10,
+    "bro_offline_antmaze": 6 * 6 * 10,
     "bro_scaling": 5 * 5 * 40 * 10,
     "bro_ablation": 2 * 7 * 10 * 10,
     "dac": 2 * 6 * 30 * 10,
@@ -268,3 +270,67 @@ def test_the_regret_study_is_the_papers(name: str) -> None:
         assert agents[f"idle 1-{proportion}"] == ("sr_sac", held_out)
         assert agents[f"VPL 1-{proportion}"] == ("vpl_sac", held_out)
     assert {run.task for run in plan.runs} <= set(suites.VPL_ADDITIONAL)
+
+
+DATA = """\
+agents:
+  BC:
+    algo: bc
+    dataset: data/{task}/expert
+  IQL:
+    algo: iql
+    dataset: {Pendulum-v1: ~/pendulum}
+    prior_data: D4RL/pen/human-v2
+    prior_share: 0.25
+    offline_steps: 500
+    steps: 800
+  SAC:
+    algo: sac_sample
+tasks: [Pendulum-v1, dmc/cheetah-run-v0]
+seeds: 1
+steps: 1_000
+evaluation: {every: 200, episodes: 3}
+"""
+
+
+def test_agents_that_learn_from_data(plan_of) -> None:
+    plan = plan_of(DATA)
+    assert [(run.agent, run.task, run.steps) for run in plan.runs] == [
+        ("BC", "Pendulum-v1", 1_000), ("IQL", "Pendulum-v1", 800), ("SAC", "Pendulum-v1", 1_000),
+        ("BC", "dmc/cheetah-run-v0", 1_000), ("SAC", "dmc/cheetah-run-v0", 1_000),
+    ]  # fmt: skip
+    cloned, tuned, plain, elsewhere, _ = plan.runs
+    assert cloned.data == {"dataset": "data/Pendulum-v1/expert"} and not cloned.arguments
+    assert elsewhere.data == {"dataset": "data/dmc-cheetah-run-v0/expert"}
+    command = tuned.command(Path("x"))
+    at = command.index("--dataset")
+    assert command[at : at + 6] == [
+        "--dataset", str(Path.home() / "pendulum"), "--offline-steps", "500", "--prior-data", "D4RL/pen/human-v2",
+    ]  # fmt: skip
+    assert command[-2:] == ["-params", "prior_share:0.25"] and command[command.index("-n") + 1] == "800"
+    for run in plan.runs:
+        assert Run.of_json(run.as_json()) == run
+    # What was written before there were data sets is the same run.
+    assert "data" not in plain.as_json()
+    with pytest.raises(ValueError, match="data of a run cannot be"):
+        Run.of_json({**plain.as_json(), "data": {"x": 1}})
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "message"),
+    [
+        ("    dataset: data/{task}/expert\n", "", "agent 'BC': bc learns from a dataset only, and needs it"),
+        ("algo: sac_sample", "algo: mbma_ppo\n    dataset: x", "line 14: dataset is nothing for mbma_ppo"),
+        ("offline_steps: 500", "offline_steps: 800", "line 10: offline_steps must be fewer than the 800 steps of all"),
+        ("    dataset: {Pendulum-v1: ~/pendulum}\n", "", "line 9: offline_steps are gradient steps on a dataset"),
+        ("{Pendulum-v1: ~/pendulum}", "{Ant-v5: x}", "line 7: dataset has 'Ant-v5', which is no task of the plan"),
+        ("{Pendulum-v1: ~/pendulum}", "[a]", "line 7: dataset must be a path or an id of Minari's, or such by task"),
+        ("prior_share: 0.25", "prior_share: 2", r"line 9: prior_share must lie in \(0, 1\)"),
+        ("steps: 800", "steps: 0", "line 11: steps must be a whole number of at least 1"),
+        ("steps: 800", "steps: 150", "an evaluation every 200 steps is none in 150"),
+    ],
+)
+def test_data_of_a_plan_that_are_refused(plan_of, before: str, now: str, message: str) -> None:
+    assert before in DATA
+    with pytest.raises(PlanError, match=message):
+        plan_of(DATA.replace(before, now))

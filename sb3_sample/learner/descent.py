@@ -1,0 +1,118 @@
+"""Steps of optimizers and of targets within a gradient step: of one learner, or of many whose networks are stacked."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch.optim import Optimizer
+
+from sb3_sample.optim import AdamW
+from sb3_sample.tracing import is_tracing
+
+
+def minimize(optimizer: Optimizer, loss: torch.Tensor) -> None:
+    """
+    Take one step of an optimizer. Only its own parameters get a gradient, also where the loss depends on others.
+
+    :param optimizer: the optimizer
+    :param loss: scalar
+    """
+    descend(optimizer, torch.autograd.grad(loss, parameters_of(optimizer), allow_unused=True))
+
+
+def follow(target: Any, online: Any, tau: float) -> None:
+    """
+    Take one step of Polyak averaging of the parameters.
+
+    :param target: network that follows
+    :param online: network that is followed
+    :param tau: weight of the latter
+    """
+    with torch.no_grad():
+        torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), weight=tau)
+
+
+def parameters_of(optimizer: Optimizer) -> list[torch.Tensor]:
+    """
+    List the parameters of an optimizer.
+
+    :param optimizer: the optimizer
+    :return: its parameters, group by group
+    """
+    return [p for group in optimizer.param_groups for p in group["params"]]
+
+
+def descend(optimizer: Optimizer, gradients: Sequence[torch.Tensor | None]) -> None:
+    """
+    Take one step of an optimizer with given gradients.
+
+    :param optimizer: the optimizer
+    :param gradients: in the order of its parameters; None leaves one alone
+    """
+    if is_tracing():
+        assert isinstance(optimizer, AdamW)
+        optimizer.apply(gradients)
+        return
+    for parameter, gradient in zip(parameters_of(optimizer), gradients, strict=True):
+        parameter.grad = gradient
+    optimizer.step()
+
+
+class _Minimize(torch.autograd.Function):
+    """
+    Step of an optimizer of S learners inside of ``torch.vmap``, where the losses of all are at hand: their sum has each
+    learner's gradient, as nothing couples the learners.
+    """
+
+    @staticmethod
+    def forward(loss: torch.Tensor, optimizer: AdamW) -> torch.Tensor:
+        raise NotImplementedError("inside of torch.vmap only")
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        """Keep nothing: the result is never differentiated."""
+
+    @staticmethod
+    def vmap(info: Any, in_dims: Any, losses: torch.Tensor, optimizer: AdamW) -> tuple[torch.Tensor, int]:
+        gradients = torch.autograd.grad(losses.sum(), parameters_of(optimizer), allow_unused=True)
+        optimizer.apply(gradients)
+        return losses.detach(), 0
+
+
+class StackedDescent:
+    """
+    Steps of S learners' optimizers and targets, inside of ``torch.vmap`` over the learners.
+
+    :param optimizers: by identity of one learner's optimizer, the optimizer of the stacked parameters
+    :param parameters: by identity of one learner's network, its stacked parameters, (S, ...) each
+    """
+
+    def __init__(self, optimizers: Mapping[int, AdamW], parameters: Mapping[int, list[torch.Tensor]]):
+        self._optimizers, self._parameters = optimizers, parameters
+        #: Weights of the online networks, a number or (S,).
+        self.tau: float | torch.Tensor = 0.0
+
+    def minimize(self, optimizer: Optimizer, loss: torch.Tensor) -> None:
+        """
+        Take one step of each learner's optimizer.
+
+        :param optimizer: that of the learner by whose networks the loss was computed
+        :param loss: scalar
+        """
+        _Minimize.apply(loss, self._optimizers[id(optimizer)])
+
+    def follow(self, target: Any, online: Any, tau: Any) -> None:
+        """
+        Take one step of each learner's Polyak averaging.
+
+        :param target: network that follows, of the learner by whose networks the losses are computed
+        :param online: network that is followed
+        :param tau: without meaning here, see :attr:`tau`
+        """
+        ours, theirs = self._parameters[id(target)], self._parameters[id(online)]
+        with torch.no_grad():
+            if isinstance(self.tau, float):
+                torch._foreach_lerp_(ours, theirs, weight=self.tau)
+                return
+            for p, q in zip(ours, theirs, strict=True):
+                p.lerp_(q, self.tau.view(-1, *[1] * (p.dim() - 1)))

@@ -1,0 +1,375 @@
+"""
+Many learners in one gradient step: their networks, moments and statistics are stacked along a leading axis S, and the
+gradient step of one is mapped over it by ``torch.vmap``.
+"""
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import nn
+
+from sb3_sample.learner.descent import StackedDescent
+from sb3_sample.learner.execution import (
+    NO_SETTINGS,
+    Execution,
+    Metrics,
+    Settings,
+    cuda_graph,
+    inputs_like,
+    tensors_of,
+    why_not_compiled,
+)
+from sb3_sample.learner.learner import Learner
+from sb3_sample.optim import AdamW
+
+#: Numbers of a learner that its gradient step does not read, or reads from its inputs.
+_NOT_READ = {"learning_starts", "verbose", "compile", "learning_rate", "gamma", "training"} | NO_SETTINGS
+
+
+class _Networks(nn.Module):
+    """
+    All that one learner's gradient step reads and writes, as one module, which runs the step.
+
+    :param learner: the learner
+    :param method: name of its method that is run
+    """
+
+    def __init__(self, learner: Learner, method: str):
+        super().__init__()
+        self.parts = nn.ModuleList(learner.step_modules())
+        self._run = lambda inputs: getattr(type(learner), method)(learner, *inputs)
+
+    def forward(self, inputs: tuple[Any, ...]) -> Metrics:
+        result: Metrics = self._run(inputs)
+        return result
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """
+        :return: parameters and buffers by name, each once
+        """
+        return {**dict(self.named_parameters()), **dict(self.named_buffers())}
+
+
+class _Stacks(nn.Module):
+    """Parameters and buffers of S learners, (S, ...) each, by the names that they have in each."""
+
+    def __init__(self, tensors: dict[str, Sequence[torch.Tensor]]):
+        super().__init__()
+        self.names = {name: f"t{i}" for i, name in enumerate(tensors)}
+        for name, of in tensors.items():
+            stack = torch.stack([t.detach() for t in of])
+            if isinstance(of[0], nn.Parameter):
+                self.register_parameter(self.names[name], nn.Parameter(stack, requires_grad=of[0].requires_grad))
+            else:
+                self.register_buffer(self.names[name], stack)
+
+    def by_name(self) -> dict[str, torch.Tensor]:
+        """
+        :return: the stacks by the names that their parts have in a learner
+        """
+        return {name: getattr(self, own) for name, own in self.names.items()}
+
+
+class LearnerGroup:
+    """
+    Gradient steps of S learners that are one. Each learner's tensors become its rows of the stacks, so that whatever
+    acts on a learner alone (acting, resets, saving, loading in place) goes on as it is.
+
+    :param learners: learners of the same networks, parts and settings; learning rates and other numbers may differ
+    :param method: name of the method that is run
+    :raises ValueError: if they differ in more, or cannot be stacked, by name
+    """
+
+    def __init__(self, learners: Sequence[Learner], method: str = "gradient_step"):
+        self.learners, self.method = list(learners), method
+        self._first = self.learners[0]
+        self.device, self.verbose, self.compile = self._first.device, self._first.verbose, self._first.compile
+        #: Whether the gradient step is compiled.
+        self.compiled = bool(self._first.compiled)
+        _check_alike(self.learners)
+        self._networks = [_Networks(learner, method) for learner in self.learners]
+        self._stacks = _Stacks(_by_name([networks.tensors() for networks in self._networks]))
+        #: By the optimizers' names, those of the stacked parameters, and each learner's.
+        self._optimizers = self._stacked_optimizers()
+        self._of_each: dict[str, list[Any]] = {
+            path: [learner.optimizers()[path] for learner in self.learners] for path in self._optimizers
+        }
+        self._descent = StackedDescent(
+            {id(self._first.optimizers()[name]): optimizer for name, optimizer in self._optimizers.items()},
+            self._parameters_by_network(),
+        )
+        #: Numbers that differ between learners: object of the first learner, attribute, (S,).
+        self._differing: list[tuple[dict[str, Any], str, torch.Tensor]] = []
+        self._settings = [Settings(learner, private=False) for learner in self.learners]
+        self._versions: list[int] = []
+        self._execution: Execution | None = None
+        stacks = self._stacks.by_name()
+        self._take_settings()
+        for s, networks in enumerate(self._networks):
+            for name, tensor in networks.tensors().items():
+                tensor.data = stacks[name].data[s]
+
+    # ---------------------------------------------------------------- as an execution sees it
+
+    def step_modules(self) -> tuple[nn.Module, ...]:
+        """
+        List the modules of the gradient step.
+
+        :return: the one that holds the stacked tensors
+        """
+        return (self._stacks,)
+
+    def identities(self) -> tuple[int, ...]:
+        """
+        Identify what the gradient step is made for.
+
+        :return: the same of each learner, one after the other
+        """
+        return tuple(number for learner in self.learners for number in learner.identities())
+
+    def optimizers(self) -> dict[str, AdamW]:
+        """
+        List the optimizers of the stacked parameters.
+
+        :return: the optimizers by the names of each learner's
+        """
+        return self._optimizers
+
+    # ---------------------------------------------------------------- the step
+
+    @property
+    def seconds_compiling(self) -> float:
+        """Seconds spent on compiling the gradient step."""
+        return 0.0 if self._execution is None else self._execution.seconds_compiling
+
+    def step(self, inputs: Sequence[tuple[Any, ...]]) -> list[Metrics]:
+        """
+        Take one gradient step of each learner.
+
+        :param inputs: the arguments of each learner's ``gradient_step``, in the learners' order
+        :return: each learner's result, valid until the next step
+        """
+        self._prepare()
+        assert self._execution is not None
+        metrics = self._execution(self, *_stacked(inputs, self.device))
+        rows = {name: values.unbind() for name, values in metrics.items()}
+        return [{name: of[s] for name, of in rows.items()} for s in range(len(self.learners))]
+
+    def release(self) -> None:
+        """Give each learner tensors of its own again. The group cannot be used any more."""
+        for learner, networks in zip(self.learners, self._networks, strict=True):
+            for tensor in networks.tensors().values():
+                tensor.data = tensor.data.clone()
+            for optimizer in learner.optimizers().values():
+                for state in optimizer.state.values():
+                    state.update({name: value.clone() for name, value in state.items()})
+                # Made anew from them.
+                optimizer.__setstate__(optimizer.__dict__)
+
+    def _prepare(self) -> None:
+        """Bring the stacks up to date with what has happened to the learners since the last step."""
+        optimizers = [optimizer for of_each in self._of_each.values() for optimizer in of_each]
+        for optimizer in optimizers:
+            optimizer.prepare()
+        versions = [optimizer.version for optimizer in optimizers]
+        if versions != self._versions:
+            # Moments were cleared, or loaded.
+            self._take_moments()
+            self._versions = versions
+        self._take_rates()
+        # Each looks at its own.
+        changed = [settings.have_changed() for settings in self._settings]
+        if any(changed):
+            self._take_settings()
+            self._execution = None
+        if self._execution is None:
+            self._execution = self._made()
+        self._execution.prepare(self)
+
+    def _made(self) -> Execution:
+        if self.compiled:
+            reason = why_not_compiled(self)
+            if reason is not None:
+                warnings.warn(f"The gradient step is not compiled: {reason}", stacklevel=4)
+                self.compiled = False
+        captures = self.device.type == "cuda" and self.compile is not False
+        return Execution(self, self.compiled, self.compile == "auto", cuda_graph if captures else None, "mapped_step")
+
+    def mapped_step(self, *inputs: Any) -> Metrics:
+        """
+        Compute the gradient step of all learners, on tensors only: this function is compiled or captured.
+
+        :param inputs: the arguments of ``gradient_step``, tensors with an axis S in front
+        :return: each learner's result, by name, (S, ...)
+        """
+
+        def one(stacks: dict[str, torch.Tensor], numbers: list[torch.Tensor], values: list[torch.Tensor]) -> Metrics:
+            given = iter(values)
+            with self._in_force(numbers):
+                own = inputs_like(inputs, lambda _: next(given))
+                result: Metrics = torch.func.functional_call(self._networks[0], stacks, (own,))
+                return result
+
+        numbers = [number for _, _, number in self._differing]
+        mapped: Callable[..., Metrics] = torch.vmap(one)
+        return mapped(self._stacks.by_name(), numbers, tensors_of(inputs))
+
+    @contextmanager
+    def _in_force(self, numbers: Sequence[torch.Tensor]) -> Iterator[None]:
+        """Have the first learner's step be that of all."""
+        before = [(values, name, values[name]) for values, name, _ in self._differing]
+        first = vars(self._first)
+        first.update(minimize=self._descent.minimize, follow=self._descent.follow)
+        try:
+            for (values, name, _), number in zip(self._differing, numbers, strict=True):
+                values[name] = number
+            yield
+        finally:
+            del first["minimize"], first["follow"]
+            for values, name, value in before:
+                values[name] = value
+
+    # ---------------------------------------------------------------- what is stacked
+
+    def _stacked_optimizers(self) -> dict[str, AdamW]:
+        stacks = self._stacks.by_name()
+        names = {id(tensor): name for name, tensor in self._networks[0].tensors().items()}
+        made = {}
+        for path, optimizer in self._first.optimizers().items():
+            groups = [{**g, "params": [stacks[names[id(p)]] for p in g["params"]]} for g in optimizer.param_groups]
+            made[path] = AdamW([{"params": group["params"]} for group in groups])
+            for ours, theirs in zip(made[path].param_groups, groups, strict=True):
+                ours.update({name: value for name, value in theirs.items() if name != "params"})
+        return made
+
+    def _parameters_by_network(self) -> dict[int, list[torch.Tensor]]:
+        stacks = self._stacks.by_name()
+        names = {id(tensor): name for name, tensor in self._networks[0].tensors().items()}
+        modules = [module for part in self._first.step_modules() for module in part.modules()]
+        return {id(module): [stacks[names[id(p)]] for p in module.parameters()] for module in modules}
+
+    def _take_moments(self) -> None:
+        """Have each learner's moments and counts of steps be rows of stacks."""
+        for path, stacked in self._optimizers.items():
+            theirs = self._of_each[path]
+            stacked.state.clear()
+            stacked._steps = []
+            for i, group in enumerate(stacked.param_groups):
+                of_each = [optimizer.param_groups[i]["params"] for optimizer in theirs]
+                counts = torch.stack([optimizer._steps[i] for optimizer in theirs])  # type: ignore[attr-defined]
+                stacked._steps.append(counts)
+                for j, p in enumerate(group["params"]):
+                    for name in ("exp_avg", "exp_avg_sq"):
+                        states = [o.state[params[j]] for o, params in zip(theirs, of_each, strict=True)]
+                        stack = torch.stack([state[name] for state in states])
+                        stacked.state[p][name] = stack
+                        stacked.state[p]["step"] = counts[:, j]
+                        for s, state in enumerate(states):
+                            state[name] = stack[s]
+                for s, (optimizer, params) in enumerate(zip(theirs, of_each, strict=True)):
+                    optimizer._steps[i] = counts[s]  # type: ignore[attr-defined]
+                    for j, p in enumerate(params):
+                        optimizer.state[p]["step"] = counts[s, j]
+            stacked._n_prepared = len(stacked.state)
+            stacked.version += 1
+
+    def _take_rates(self) -> None:
+        """Pass the learning rates on: one for all where they are the same, else one for each."""
+        for path, stacked in self._optimizers.items():
+            rates = [[g["lr"] for g in optimizer.param_groups] for optimizer in self._of_each[path]]
+            same = all(of == rates[0] for of in rates)
+            for i, group in enumerate(stacked.param_groups):
+                group["lr"] = rates[0][i] if same else tuple(of[i] for of in rates)
+
+    def _take_settings(self) -> None:
+        """Find the numbers in which the learners differ, as tensors."""
+        rows = [_settings(learner) for learner in self.learners]
+        self._differing = []
+        self._descent.tau = self._first.tau
+        for i, (owner, name, value) in enumerate(rows[0]):
+            values = [row[i][2] for row in rows]
+            if all(other == value for other in values):
+                continue
+            number = torch.tensor(values, dtype=torch.float32, device=self.device)
+            self._differing.append((vars(owner), name, number))
+            if owner is self._first and name == "tau":
+                self._descent.tau = number
+        for path, stacked in self._optimizers.items():
+            for i, group in enumerate(stacked.param_groups):
+                decays = [optimizer.param_groups[i]["weight_decay"] for optimizer in self._of_each[path]]
+                same = all(decay == decays[0] for decay in decays)
+                group["weight_decay"] = decays[0] if same else torch.tensor(decays, device=self.device)
+
+
+def _by_name(rows: Sequence[dict[str, torch.Tensor]]) -> dict[str, Sequence[torch.Tensor]]:
+    return {name: [row[name] for row in rows] for name in rows[0]}
+
+
+def _stacked(inputs: Sequence[tuple[Any, ...]], device: torch.device) -> tuple[Any, ...]:
+    """Inputs of S learners as one, tensors with an axis S in front; a number that differs becomes a tensor (S,)."""
+
+    def stack(values: Sequence[Any]) -> Any:
+        first = values[0]
+        if isinstance(first, torch.Tensor):
+            return torch.stack(list(values))
+        if isinstance(first, dict):
+            return {key: stack([value[key] for value in values]) for key in first}
+        if isinstance(first, tuple):
+            fields = [stack(column) for column in zip(*values, strict=True)]
+            return type(first)(*fields) if hasattr(first, "_fields") else tuple(fields)
+        if all(value == first for value in values):
+            return first
+        if not all(isinstance(value, float) for value in values):
+            raise ValueError(f"the learners' gradient steps must be of one kind, not {list(values)!r}")
+        return torch.tensor(values, dtype=torch.float32, device=device)
+
+    result: tuple[Any, ...] = stack([tuple(each) for each in inputs])
+    return result
+
+
+def _settings(learner: Learner) -> list[tuple[Any, str, Any]]:
+    """Numbers and words of a learner that its gradient step may read: object, attribute, value."""
+    owners = [learner, *(module for part in learner.step_modules() for module in part.modules())]
+    return [
+        (owner, name, value)
+        for owner in owners
+        for name, value in vars(owner).items()
+        if isinstance(value, (int, float, str, type(None))) and not name.startswith("_") and name not in _NOT_READ
+    ]
+
+
+def _check_alike(learners: Sequence[Learner]) -> None:
+    """
+    Check that learners can take their gradient steps as one.
+
+    :param learners: the learners
+    :raises ValueError: if they cannot, with the reason
+    """
+    first = learners[0]
+    for learner in learners:
+        if type(learner) is not type(first):
+            raise ValueError(f"learners must be of one class, not {type(first).__name__} and {type(learner).__name__}")
+        if learner.sam_radius is not None:
+            raise ValueError(f"learners with sam_radius={learner.sam_radius!r} cannot be batched")
+        foreign = {type(o).__name__ for o in learner.optimizers().values() if type(o) is not AdamW}
+        if foreign:
+            raise ValueError(f"learners with optimizers other than sb3_sample.optim.AdamW cannot be batched: {foreign}")
+        if _shapes(learner) != _shapes(first):
+            raise ValueError("learners must have networks of the same shapes")
+        noisy = [m for part in learner.step_modules() for m in part.modules() if isinstance(m, nn.Dropout) and m.p > 0]
+        if noisy:
+            raise ValueError("learners whose networks have dropout cannot be batched: their noise is not given")
+        for (_, name, ours), (_, other, theirs) in zip(_settings(first), _settings(learner), strict=True):
+            if name != other or (ours != theirs and not (_is_number(ours) and _is_number(theirs))):
+                raise ValueError(f"learners must agree in {name}, not {ours!r} and {theirs!r}")
+
+
+def _shapes(learner: Learner) -> list[torch.Size]:
+    return [t.shape for part in learner.step_modules() for t in (*part.parameters(), *part.buffers())]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float)

@@ -1,0 +1,420 @@
+"""
+Trainings of one process in lockstep: each in a thread of its own, of which exactly one runs at any time.
+
+A training runs until it comes to a meeting; when all have come to one, what the meeting is for is done for all of them,
+and they go on one after the other, always in the same order. So callbacks, evaluations, logs and checkpoints are those
+of a training alone, and only what is done together knows that there are several. The generators of the process (torch,
+CUDA, NumPy, Python) are exchanged with the thread, so that each training draws what it draws alone with its seed.
+"""
+
+import copy
+import random
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from numpy.random import mtrand
+
+#: Meetings: all models are made; all trainings are about to begin; a gradient step; a step of the environments.
+MADE, BEGIN, GRADIENT_STEP, ENVIRONMENTS = "made", "begin", "gradient step", "environments"
+#: What else a training can be at.
+_READY, _ENDED = "ready", "ended"
+#: Seconds that trainings have to end by themselves when they are told to leave at once.
+PATIENCE = 30.0
+_HERE = threading.local()
+
+
+class LeftWithTheOthers(BaseException):
+    """Raised in a training that ends because another one of its group has failed."""
+
+
+class Joint(Protocol):
+    """Gradient steps of several learners as one."""
+
+    @property
+    def seconds_compiling(self) -> float:
+        """Seconds spent on compiling."""
+
+    def step(self, inputs: Sequence[tuple[Any, ...]]) -> list[dict[str, torch.Tensor]]:
+        """
+        Take one gradient step of each learner.
+
+        :param inputs: the arguments of ``Learner.gradient_step``, a tuple a learner, in their order
+        :return: its result, of each learner
+        """
+
+    def release(self) -> None:
+        """Give each learner tensors of its own again."""
+
+
+#: Makes gradient steps of several learners one; None where each takes its own.
+MakeJoint = Callable[[Sequence[Any]], Joint | None]
+
+
+def present() -> "Seat | None":
+    """
+    :return: place of the training that this thread makes in its group; None in any other thread
+    """
+    return getattr(_HERE, "seat", None)
+
+
+def seat_of(model: Any) -> "Seat | None":
+    """
+    :param model: a model
+    :return: its place in a group, where its ``learn`` is what this thread makes there; None for any other
+    """
+    seat = present()
+    return seat if seat is not None and seat.model is model else None
+
+
+class Seat:
+    """
+    Place of one training in a group.
+
+    :param name: names it in messages
+    :param body: makes the whole training
+    :param folder: of its run, if that is known beforehand
+    """
+
+    def __init__(self, name: str, body: Callable[[], None], folder: Path | None = None):
+        self.name, self.body, self.folder = name, body, folder
+        #: Called each time that it is this training's turn.
+        self.on_turn: Callable[[], None] = lambda: None
+        self.at = _READY
+        self.turn = threading.Lock()
+        self.turn.acquire()
+        self.generators = Generators()
+        self.group: Group
+        #: The model whose ``learn`` takes part, and its learner, when they are made.
+        self.model: Any = None
+        self.learner: Any = None
+        #: Whether its ``learn`` is under way, from the common beginning on.
+        self.takes_part = False
+        #: Whether it ever was.
+        self.began = False
+        #: Whether it saves checkpoints.
+        self.saves = False
+        #: Whether its checkpoints are at the same steps as the others'.
+        self.aligned = True
+        #: Whether it is elsewhere in its training than the others, and takes its gradient steps by itself.
+        self.alone = False
+        #: Environment steps at the end of its latest turn.
+        self.turned: int | None = None
+        self.inputs: tuple[Any, ...] | None = None
+        self.answer: dict[str, torch.Tensor] | None = None
+        self.error: BaseException | None = None
+
+    @property
+    def with_others(self) -> bool:
+        """Whether it takes gradient steps with others."""
+        return self.takes_part and not self.alone
+
+    def meet(self, meeting: str) -> None:
+        """
+        Wait until the others have come to a meeting too, and what it is for is done.
+
+        :param meeting: one of the four
+        :raises LeftWithTheOthers: another training has failed
+        :raises KeyboardInterrupt: the process is to end at once, as by a second Ctrl-C; a ``SystemExit`` likewise
+        """
+        self.at = meeting
+        self.group.pass_on(self)
+        stop = self.group.stop
+        if isinstance(stop, (KeyboardInterrupt, SystemExit)):
+            raise type(stop)(*stop.args)
+        if stop is not None or (self.group.failed and not (self.saves and self.takes_part)):
+            raise LeftWithTheOthers(f"ended with the others of its group: {stop!r}" if stop else "") from stop
+
+    def step(self, inputs: tuple[Any, ...]) -> dict[str, torch.Tensor] | None:
+        """
+        Take a gradient step with the others.
+
+        :param inputs: the arguments of ``Learner.gradient_step``
+        :return: its result; None where there are no others, or theirs is of another kind, so that it has still to be
+            taken
+        """
+        if len(self.group.stepping()) < 2:
+            return None
+        self.inputs = inputs
+        self.meet(GRADIENT_STEP)
+        self.inputs, answer, self.answer = None, self.answer, None
+        return answer
+
+    def folders_beside(self) -> list[Path]:
+        """
+        :return: folders of the runs that are to be continued from the same step as this one
+        """
+        if not (self.aligned and self.with_others):
+            return []
+        others = (seat for seat in self.group.seats if seat is not self and seat.aligned and seat.with_others)
+        return [seat.folder for seat in others if seat.folder is not None]
+
+    def leaves(self, now: int) -> bool:
+        """
+        Tell at the end of a turn whether the training is to be saved and to end. All that are equally far leave at the
+        end of the same turn, so that their checkpoints are of the same step.
+
+        :param now: environment steps
+        :return: whether it is
+        """
+        self.turned = now
+        group = self.group
+        if group.received() is None and not group.failed:
+            return False
+        if self.alone or not self.aligned:
+            return True
+        if group.leaves_at is None:
+            # Whoever has ended this turn already goes on to the end of the next one.
+            others = [seat.turned for seat in group.seats if seat is not self and seat.with_others and seat.aligned]
+            group.leaves_at = max([now, *(steps + 1 for steps in others if steps is not None)])
+        return now >= group.leaves_at
+
+
+class Group:
+    """
+    Trainings in lockstep.
+
+    :param seats: their places, in their order
+    :param make_joint: makes their gradient steps one
+    :param received: tells the signal by which the process was asked to end; None for none
+    """
+
+    def __init__(self, seats: Sequence[Seat], make_joint: MakeJoint, received: Callable[[], int | None] = lambda: None):
+        self.seats, self._make_joint, self.received = list(seats), make_joint, received
+        for seat in self.seats:
+            seat.group = self
+        #: What ends every training at its next meeting.
+        self.stop: BaseException | None = None
+        #: Trainings that have ended by an error, by which the others end as soon as they are saved.
+        self.failed: list[Seat] = []
+        #: Environment steps at which all leave.
+        self.leaves_at: int | None = None
+        #: Checkpoints from which the runs go on (``run_folder.Starts``); None before that is known.
+        self.starts: Any = None
+        self._joint: Joint | None = None
+        self._over = threading.Event()
+
+    # ---------------------------------------------------------------- the whole
+
+    def run(self) -> None:
+        """
+        Make the trainings. The errors by which they ended are at their places.
+
+        :raises BaseException: what is raised in this thread meanwhile, as by Ctrl-C; or what kept all of them from
+            being made together
+        """
+        before = Generators()
+        before.take()
+        threads = [threading.Thread(target=self._make, args=(seat,), daemon=True) for seat in self.seats]
+        for thread in threads:
+            thread.start()
+        try:
+            self.seats[0].turn.release()
+            while not self._over.wait(1.0):
+                pass
+        except BaseException as error:
+            self.stop = error
+            self._over.wait(PATIENCE)
+            raise
+        finally:
+            before.put_back()
+        if self.stop is not None:
+            raise self.stop
+
+    def _make(self, seat: Seat) -> None:
+        seat.turn.acquire()
+        _HERE.seat = seat
+        try:
+            seat.generators.put_back()
+            if self.stop is None and not self.failed:
+                seat.body()
+        except BaseException as error:
+            seat.error = error
+            if isinstance(error, Exception):
+                self.failed.append(seat)
+        seat.at = _ENDED
+        try:
+            self.leave(seat)
+        except Exception as error:
+            self.stop = error
+        following = self._following()
+        if following is None:
+            self._over.set()
+        else:
+            following.turn.release()
+
+    # ---------------------------------------------------------------- taking turns
+
+    def pass_on(self, seat: Seat) -> None:
+        """
+        Let the next training go on until it is another's turn, and so on.
+
+        :param seat: whose turn is over; it goes on when this returns
+        """
+        following = self._following()
+        assert following is not None
+        if following is seat:
+            return
+        seat.generators.take()
+        following.turn.release()
+        seat.turn.acquire()
+        seat.generators.put_back()
+        seat.on_turn()
+
+    def _following(self) -> Seat | None:
+        """Whose turn it is next; None when all have ended."""
+        while True:
+            there = [seat for seat in self.seats if seat.at is not _ENDED]
+            if not there:
+                return None
+            for seat in there:
+                if seat.at is _READY:
+                    return seat
+            self._hold(there)
+
+    def _hold(self, there: list[Seat]) -> None:
+        """Hold a meeting that everybody who has to has come to. All wait at one."""
+        try:
+            stepping = self.stepping()
+            if stepping and all(seat.at is GRADIENT_STEP for seat in stepping):
+                # Whoever is elsewhere goes on too, lest those steps wait for it for ever, or it for them.
+                self._step_together(stepping)
+                ready = there
+            elif any(seat.at is ENVIRONMENTS for seat in there):
+                # First: a learner that waits at a gradient step waits for those that have still to come to one.
+                ready = [seat for seat in there if seat.at is ENVIRONMENTS]
+            else:
+                ready = there
+                if all(seat.at is MADE for seat in there):
+                    joint = self._joint_of(there)
+                    if joint is not None:
+                        joint.release()
+                elif all(seat.at is BEGIN for seat in there):
+                    for seat in there:
+                        seat.takes_part = seat.began = True
+                    self._joint = self._joint_of(self.stepping())
+        except Exception as error:
+            self.stop, ready = error, there
+        for seat in ready:
+            seat.at = _READY
+
+    # ---------------------------------------------------------------- gradient steps
+
+    def stepping(self) -> list[Seat]:
+        """
+        :return: places of the trainings that take gradient steps together
+        """
+        return [seat for seat in self.seats if seat.with_others]
+
+    def _joint_of(self, seats: list[Seat]) -> Joint | None:
+        return self._make_joint([seat.learner for seat in seats]) if len(seats) > 1 else None
+
+    def _step_together(self, seats: list[Seat]) -> None:
+        if self._joint is None:
+            self._joint = self._joint_of(seats)
+        if self._joint is None:
+            return
+        inputs = [seat.inputs or () for seat in seats]
+        if not all(_are_alike(inputs[0], each) for each in inputs):
+            return
+        for seat, answer in zip(seats, self._joint.step(inputs), strict=True):
+            seat.answer = answer
+
+    @property
+    def steps_together(self) -> bool:
+        """Whether gradient steps are one at present."""
+        return self._joint is not None
+
+    @property
+    def seconds_compiling(self) -> float:
+        """Seconds spent on compiling the gradient steps of all."""
+        return 0.0 if self._joint is None else self._joint.seconds_compiling
+
+    def part(self) -> None:
+        """Give each learner tensors of its own again; the next gradient step together makes them common anew."""
+        joint, self._joint = self._joint, None
+        if joint is not None:
+            joint.release()
+
+    def leave(self, seat: Seat) -> None:
+        """
+        Let a training go on by itself.
+
+        :param seat: its place
+        """
+        if seat.with_others:
+            self.part()
+        seat.takes_part = False
+
+
+def _are_alike(a: Any, b: Any) -> bool:
+    """Whether two learners' inputs differ in numbers only: one may have further transitions, or update its targets."""
+    if isinstance(a, torch.Tensor):
+        return isinstance(b, torch.Tensor) and a.shape == b.shape
+    if isinstance(a, dict):
+        return isinstance(b, dict) and a.keys() == b.keys() and all(_are_alike(a[key], b[key]) for key in a)
+    if isinstance(a, tuple):
+        return isinstance(b, tuple) and len(a) == len(b) and all(map(_are_alike, a, b))
+    return type(a) is type(b) and (isinstance(a, float) or a == b)
+
+
+# ---------------------------------------------------------------- generators
+
+
+class Generators:
+    """States of the generators that a process has once, as they are when this is made: torch's, NumPy's, Python's."""
+
+    def __init__(self) -> None:
+        self._numpy = copy.deepcopy(mtrand.get_bit_generator())
+        self.take(numpy_too=False)
+
+    def take(self, numpy_too: bool = True) -> None:
+        """
+        Take the states as they are now.
+
+        :param numpy_too: whether NumPy's is among them, which is an object that stays as it is when it is exchanged
+        """
+        self._torch, self._python = torch.get_rng_state(), random.getstate()
+        self._cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else None
+        if numpy_too:
+            self._numpy = mtrand.get_bit_generator()
+        self._gauss = _spare_gauss()
+
+    def put_back(self) -> None:
+        """Put the states in force."""
+        torch.set_rng_state(self._torch)
+        random.setstate(self._python)
+        if self._cuda is not None:
+            torch.cuda.set_rng_state_all(self._cuda)
+        mtrand.set_bit_generator(self._numpy)
+        _set_spare_gauss(self._gauss)
+
+
+class _NoBits:
+    """
+    Bit generator without a state, in whose place NumPy's global generator tells what it keeps beside one, a normal
+    number to spare, in a microsecond: with the 624 words of its own that takes 200.
+    """
+
+    def __init__(self) -> None:
+        self.state = {"bit_generator": "MT19937", "state": {}}
+
+
+def _spare_gauss() -> dict[str, Any]:
+    generator: Any = mtrand._rand
+    bits, generator._bit_generator = generator._bit_generator, _NoBits()
+    try:
+        return generator.get_state(legacy=False)  # type: ignore[no-any-return]
+    finally:
+        generator._bit_generator = bits
+
+
+def _set_spare_gauss(state: dict[str, Any]) -> None:
+    generator: Any = mtrand._rand
+    bits, generator._bit_generator = generator._bit_generator, _NoBits()
+    try:
+        generator.set_state(state)
+    finally:
+        generator._bit_generator = bits

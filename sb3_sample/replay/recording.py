@@ -1,0 +1,88 @@
+"""Recording of data sets: a policy's episodes."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+
+from sb3_sample.kinds import check_value, integer
+from sb3_sample.learner.batch import for_each
+from sb3_sample.replay.dataset import Dataset
+
+
+def record(
+    model: Any, env: gym.Env | VecEnv | str, episodes: int, *, deterministic: bool = True, seed: int | None = None
+) -> Dataset:
+    """
+    Record episodes of a policy, as it acts in evaluation.
+
+    :param model: whatever has Stable-Baselines3's ``predict``
+    :param env: environment, vectorised environment or id. Of a ``VecNormalize`` the policy gets normalised
+        observations, by the statistics as they are, and the data set the original ones
+    :param episodes: number of episodes, whole ones; several environments share them evenly, as in
+        ``evaluate_policy``
+    :param deterministic: whether the policy's mean action is taken instead of a sample
+    :param seed: of the environment; None: as it is
+    :return: the data set
+    :raises ValueError: if ``episodes`` is no number above 0
+    """
+    check_value("episodes", episodes, integer(1))
+    venv: VecEnv = make_vec_env(env) if isinstance(env, str) else BaseAlgorithm._wrap_env(env)  # type: ignore[arg-type]
+    normalize = unwrap_vec_normalize(venv)
+    venv = _below(venv, normalize)
+    if seed is not None:
+        venv.seed(seed)
+    n_envs = venv.num_envs
+    wanted = (episodes + np.arange(n_envs)) // n_envs
+    done: list[list[dict[str, Any]]] = []
+    under_way: list[list[dict[str, Any]]] = [[] for _ in range(n_envs)]
+    counts = np.zeros(n_envs, int)
+    observations, state, starts = venv.reset(), None, np.ones(n_envs, bool)
+    while (counts < wanted).any():
+        seen = observations if normalize is None else normalize.normalize_obs(observations)  # type: ignore[arg-type]
+        actions, state = model.predict(seen, state=state, episode_start=starts, deterministic=deterministic)
+        following, rewards, starts, infos = venv.step(actions)
+        for i in range(n_envs):
+            ends, info = bool(starts[i]), infos[i]
+            step = {
+                "observations": for_each(lambda part, i=i: part[i].copy(), observations),  # type: ignore[misc]
+                "actions": np.array(actions[i]),
+                "rewards": rewards[i],
+                "terminations": ends and not info.get("TimeLimit.truncated", False),
+                "truncations": ends and info.get("TimeLimit.truncated", False),
+                "next_observations": info["terminal_observation"]
+                if ends
+                else for_each(lambda part, i=i: part[i].copy(), following),  # type: ignore[misc]
+            }
+            under_way[i].append(step)
+            if ends:
+                if counts[i] < wanted[i]:
+                    done.append(under_way[i])
+                counts[i], under_way[i] = counts[i] + 1, []
+        observations = following
+    steps = [step for episode in done for step in episode]
+    return Dataset.from_arrays(
+        **{name: _stacked([step[name] for step in steps]) for name in steps[0]},
+        observation_space=venv.observation_space,
+        action_space=venv.action_space,  # type: ignore[arg-type]
+    )
+
+
+def _below(venv: VecEnv, normalize: VecNormalize | None) -> VecEnv:
+    """The environments without a normalisation of theirs, which is their outermost wrapper."""
+    if normalize is None:
+        return venv
+    if venv is not normalize:
+        raise ValueError("env must have VecNormalize as its outermost wrapper, if it has one")
+    return normalize.venv
+
+
+def _stacked(values: list[Any]) -> Any:
+    if isinstance(values[0], dict):
+        return {key: _stacked([value[key] for value in values]) for key in values[0]}
+    array = np.stack([np.asarray(value) for value in values])
+    # The number of a Discrete space is a row of one, terminal observations included.
+    return array

@@ -1,0 +1,89 @@
+"""Steps of a data set, and the checks that they pass."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+
+#: Rows that are looked at or copied at once, so that data larger than the memory are never in it as a whole.
+CHUNK = 65_536
+
+
+class Steps(NamedTuple):
+    """
+    N steps as data sets hold them, and M >= N observations. ``at`` and ``next_at`` are the places of a step's
+    observation and next observation, (N,) each; without ``next_at``, ``next_observations`` has the latter, (N, O).
+
+    ``actions`` are in the environment's units, (N, A); ``terminations`` and ``truncations`` say whether the episode
+    ended with the step, (N,), the latter also where the data end or go on elsewhere.
+    """
+
+    observations: Any
+    at: Any
+    next_at: Any
+    next_observations: Any
+    actions: Any
+    rewards: Any
+    terminations: Any
+    truncations: Any
+    columns: dict[str, Any]
+
+
+def stored_dtype(dtype: Any, keep_floats: bool = False) -> Any:
+    """
+    :param dtype: of values
+    :param keep_floats: whether floats stay what they are
+    :return: the type that they are stored in
+    """
+    return np.dtype(np.float32) if dtype.kind == "f" and not keep_floats else dtype
+
+
+def put(name: str, values: Any, out: np.ndarray) -> None:
+    """
+    Convert values to what is stored.
+
+    :param name: what they are, for the error
+    :param values: an array, or what is read like one
+    :param out: of the same shape, which they are written to
+    :raises ValueError: if they are not finite in its type; of actions :func:`check_actions` says so
+    """
+    for first in range(0, len(out), CHUNK):
+        with np.errstate(over="ignore"):
+            piece = np.asarray(values[first : first + CHUNK]).astype(out.dtype)
+        if name != "actions" and piece.dtype.kind == "f" and not np.isfinite(piece).all():
+            raise ValueError(f"{name} must be finite, within {out.dtype}")
+        out[first : first + CHUNK] = piece
+
+
+def check_action_space(shape: tuple[int, ...], action_space: Any) -> None:
+    """
+    :param shape: of an action
+    :param action_space: the space
+    :raises ValueError: if it is no bounded Box of this shape
+    """
+    bounded = isinstance(action_space, spaces.Box) and np.isfinite([action_space.low, action_space.high]).all()
+    if not bounded or tuple(shape) != action_space.shape or not (action_space.low < action_space.high).all():
+        raise ValueError(
+            f"actions of shape (N, {', '.join(map(str, shape))}) are none of action_space={action_space}, which must "
+            "be a bounded Box of their shape"
+        )
+
+
+def check_actions(actions: np.ndarray, action_space: spaces.Box) -> None:
+    """
+    :param actions: (N, A)
+    :param action_space: their space
+    :raises ValueError: if one lies outside of it
+    """
+    low, high = (bound.astype(np.float64) for bound in (action_space.low, action_space.high))
+    # float32 rounds a bound that float64 has.
+    margin = 1e-5 * (high - low)
+    for first in range(0, len(actions), CHUNK):
+        piece = actions[first : first + CHUNK]
+        wrong = ~((piece >= low - margin) & (piece <= high + margin)).reshape(len(piece), -1).all(1)
+        if wrong.any():
+            step = first + int(np.flatnonzero(wrong)[0])
+            raise ValueError(
+                f"actions must lie within the bounds of action_space={action_space}, in the environment's units, not "
+                f"{actions[step]} as in step {step}"
+            )

@@ -1,0 +1,41 @@
+"""Features of observations, as Stable-Baselines3 makes them, by operations on tensors only."""
+
+from typing import Any
+
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import preprocess_obs
+
+
+class TensorFeatures:
+    """Part of actors, critics and policies, before Stable-Baselines3's class: their features of observations."""
+
+    observation_space: spaces.Space[Any]
+    normalize_images: bool
+
+    def extract_features(self, obs: Any, features_extractor: Any) -> torch.Tensor:
+        """
+        Extract features, as in Stable-Baselines3.
+
+        :param obs: (B, O), or a dict of them
+        :param features_extractor: features extractor
+        :return: features, (B, F)
+        """
+        found: torch.Tensor = features_extractor(_preprocessed(obs, self.observation_space, self.normalize_images))
+        return found
+
+
+def _preprocessed(observations: Any, space: spaces.Space[Any], normalize_images: bool) -> Any:
+    if isinstance(space, spaces.Dict):
+        return {key: _preprocessed(observations[key], part, normalize_images) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Discrete):
+        return _one_hot(observations, int(space.n))
+    if isinstance(space, spaces.MultiDiscrete):
+        columns = zip(observations.split(1, dim=1), space.nvec, strict=True)
+        return torch.cat([_one_hot(column.squeeze(1), int(n)) for column, n in columns], dim=-1)
+    return preprocess_obs(observations, space, normalize_images)
+
+
+def _one_hot(numbers: torch.Tensor, n: int) -> torch.Tensor:
+    """As ``torch.nn.functional.one_hot``, which looks at the largest number on the host."""
+    return (numbers.long().unsqueeze(-1) == torch.arange(n, device=numbers.device)).float()

@@ -1,0 +1,99 @@
+"""
+Tracing of a gradient step: a run that records tensor operations as a graph, gradients and optimizers' steps included.
+
+What is traced is compiled. Code that is quick as it stands and slow in a compiled graph, or the reverse, asks
+:func:`is_tracing` which of two equal forms is wanted.
+"""
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch.fx import GraphModule
+from torch.fx.experimental.proxy_tensor import make_fx
+from torch.overrides import TorchFunctionMode
+
+_local = threading.local()
+
+
+def is_tracing() -> bool:
+    """
+    Check whether a gradient step is being traced by this thread.
+
+    :return: whether operations are recorded, to be compiled
+    """
+    return getattr(_local, "on", False)
+
+
+class ReadsOnTheHost(RuntimeError):
+    """Error of a traced function that asks for the value of a tensor: the graph would repeat this one value."""
+
+
+class _HostReads(TorchFunctionMode):
+    """Refusal of everything that takes numbers out of tensors."""
+
+    NAMES = (
+        "item", "tolist", "numpy", "__array__", "__bool__", "__float__", "__int__", "__index__", "__complex__",
+        "__contains__", "data_ptr", "storage", "untyped_storage", "nonzero",
+    )  # fmt: skip
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = getattr(func, "__name__", "")
+        if name in self.NAMES:
+            raise ReadsOnTheHost(f"it reads the value of a tensor on the host (Tensor.{name})")
+        return func(*args, **(kwargs or {}))
+
+
+@contextmanager
+def undone(state: Sequence[torch.Tensor], device: torch.device) -> Iterator[None]:
+    """Take back what is done to tensors and to torch's generators."""
+    saved = [tensor.detach().clone() for tensor in state]
+    devices = [device] if device.type == "cuda" else []
+    try:
+        with torch.random.fork_rng(devices):
+            yield
+    finally:
+        with torch.no_grad():
+            for tensor, value in zip(state, saved, strict=True):
+                tensor.copy_(value)
+
+
+def trace(
+    run: Callable[..., Sequence[torch.Tensor]], state: Sequence[torch.Tensor], inputs: Sequence[torch.Tensor]
+) -> GraphModule:
+    """
+    Trace a function that changes tensors in place. It is run once, and what it does to them is undone.
+
+    :param run: takes the inputs, and gives tensors
+    :param state: tensors that it reads and changes besides, each once
+    :param inputs: its inputs, no two the same tensor
+    :return: the same as a graph of tensor operations, which takes the state and then the inputs
+    :raises ReadsOnTheHost: if it asks for the value of a tensor
+    """
+    with undone(state, inputs[0].device):
+        _local.on = True
+        try:
+            # The backward pass is recorded too, which another thread would run.
+            with torch.autograd.set_multithreading_enabled(False), _HostReads():
+                graph: GraphModule = make_fx(lambda *tensors: tuple(run(*tensors[len(state) :])))(*state, *inputs)
+        finally:
+            _local.on = False
+    return graph
+
+
+def compile_graph(graph: GraphModule, inputs: Sequence[torch.Tensor]) -> Callable[..., Sequence[torch.Tensor]]:
+    """
+    Compile a graph by Inductor.
+
+    :param graph: from :func:`trace`
+    :param inputs: the state and the inputs
+    :return: function of the same, which changes the state in place
+    """
+    from torch._inductor.compile_fx import compile_fx
+
+    # In torch 2.11 it fails on steps of many tensors at once, which the optimizers take.
+    patches = {"loop_ordering_after_fusion": False}
+    compiled: Any = compile_fx(graph, list(inputs), config_patches=patches)
+    return compiled  # type: ignore[no-any-return]

@@ -1,0 +1,239 @@
+"""Many learners in one gradient step: each is what it would be alone."""
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import pytest
+import torch
+
+from sb3_sample.learner.batch import Extra, Noise
+from sb3_sample.learner.execution import Execution
+from sb3_sample.learner.group import LearnerGroup
+from sb3_sample.learner.learner import Learner
+from sb3_sample.learner.pessimism import LearnedPessimism
+from tests.sac.common import COMPILES, MAKERS, random_batch, sac, state
+from tests.sac.test_execution import FEW_STEPS, ROUNDING, TOLERANCE, WITHOUT_GRADIENT, Recorder
+
+
+class Seat:
+    """In the place of a learner's execution: its gradient step waits for those of the others, and is one with them."""
+
+    compiled, leaves_gradients, seconds_compiling = False, False, 0.0
+
+    def __init__(self, group: LearnerGroup, index: int, inputs: list[Any], barrier: threading.Barrier):
+        self.group, self.index, self.inputs, self.barrier = group, index, inputs, barrier
+        self.results: list[Any] = []
+
+    def serves(self, learner: Learner) -> bool:
+        return True
+
+    def prepare(self, learner: Learner) -> None:
+        pass
+
+    def __call__(self, learner: Learner, *inputs: Any, eager: bool = False) -> Any:
+        self.inputs[self.index] = inputs
+        if self.barrier.wait() == 0:
+            self.inputs.append(self.group.step(self.inputs))
+        self.barrier.wait()
+        results = self.inputs[-1]
+        if self.barrier.wait() == 0:
+            self.inputs.pop()
+        self.barrier.wait()
+        return results[self.index]
+
+
+def together(
+    learners: Sequence[Learner], step: Callable[[int], None], group: LearnerGroup | None = None
+) -> LearnerGroup:
+    """Run a function of the index for every learner, in threads, so that their gradient steps are one."""
+    group = group or LearnerGroup(learners)
+    barrier, inputs = threading.Barrier(len(learners)), [None] * len(learners)
+    for i, learner in enumerate(learners):
+        learner._execution = Seat(group, i, inputs, barrier)
+    with ThreadPoolExecutor(len(learners)) as pool:
+
+        def run(i: int) -> None:
+            try:
+                step(i)
+            except BaseException:
+                barrier.abort()
+                raise
+
+        futures = [pool.submit(run, i) for i in range(len(learners))]
+    for error in filter(None, (future.exception() for future in futures)):
+        if not isinstance(error, threading.BrokenBarrierError):
+            raise error
+    return group
+
+
+class GroupRecorder(Recorder):
+    def _memory(self) -> list[torch.Tensor]:
+        group: Any = self.model
+        tensors = [t for module in group.step_modules() for t in (*module.parameters(), *module.buffers())]
+        return tensors + [t for o in group.optimizers().values() for s in o.state.values() for t in s.values()]
+
+
+def models_of(maker: str, n: int, **kwargs: Any) -> list[Any]:
+    """Models of the seeds 0, 1, ..., none with a gradient step taken."""
+    starts = 70 if maker == "DebiasedRQ" else 60
+    models = []
+    for seed in range(n):
+        model = MAKERS[maker](**{"learning_starts": starts, "compile": False, "seed": seed, **kwargs})
+        models.append(model.learn(60))
+        model.planned_updates = 50
+    return models
+
+
+def take(model: Any, n: int) -> None:
+    """Gradient steps on batches and noise of the model's seed."""
+    learner, shape = model.learner, (8, model.actor.action_dim)
+    for i in range(n):
+        seed = 1_000 * model.seed + i
+        generator = torch.Generator().manual_seed(seed)
+        noise = Noise(*(torch.randn(shape, generator=generator) for _ in range(3)))
+        extra = None
+        if isinstance(learner.pessimism_rule, LearnedPessimism):
+            extra = Extra(random_batch(model, seed=seed + 500), torch.zeros(8, 1))
+            noise = noise._replace(pessimism=torch.randn(shape, generator=generator))
+        learner.plasticity.before_gradient_steps(learner, 1)
+        learner.set_training_mode(True)
+        learner.step(random_batch(model, seed=seed), noise, extra)
+        learner.set_training_mode(False)
+
+
+def differences(a: Any, b: Any) -> tuple[float, float]:
+    """The largest of any parameter or learned number, and of the optimizers' moments, relative to their largest."""
+    ours, theirs = state(a), state(b)
+    assert ours.keys() == theirs.keys()
+    largest = {False: 0.0, True: 0.0}
+    for name, x in ours.items():
+        if x.numel() == 0 or WITHOUT_GRADIENT.search(name):
+            continue
+        x, y = x.double(), theirs[name].double()
+        of_optimizer = "optimizer/" in name
+        unit = max(float(y.abs().max()), 1.0) if of_optimizer else 1.0
+        largest[of_optimizer] = max(largest[of_optimizer], float((x - y).abs().max()) / unit)
+    return largest[False], largest[True]
+
+
+#: Of whose steps something cannot be batched.
+REFUSED = {"RegularizedSAC": "sam_radius"}
+
+
+def assert_alike(maker: str, ours: Sequence[Any], theirs: Sequence[Any]) -> None:
+    tolerance = 10 * TOLERANCE if maker in ROUNDING else TOLERANCE
+    for a, b in zip(ours, theirs, strict=True):
+        of_parameters, of_moments = differences(a, b)
+        assert of_parameters < tolerance and of_moments < 10 * tolerance
+
+
+@pytest.mark.parametrize("maker", [name for name in MAKERS if name not in REFUSED])
+def test_each_is_what_it_is_alone(maker: str) -> None:
+    alone, others = models_of(maker, 3), models_of(maker, 3)
+    n = FEW_STEPS.get(maker, 50)
+    for model in alone:
+        take(model, n)
+    group = together([model.learner for model in others], lambda i: take(others[i], n))
+    assert_alike(maker, alone, others)
+    group.release()
+    # Each goes on alone.
+    for model in (*alone, *others):
+        model.learner.forget_execution()
+        take(model, 3)
+    assert_alike(maker, alone, others)
+
+
+@pytest.mark.parametrize("how", [pytest.param("compiled", marks=COMPILES), "captured"])
+def test_compiled_and_captured_groups(how: str) -> None:
+    alone, others = models_of("SAC", 2), models_of("SAC", 2)
+    for model in alone:
+        take(model, 20)
+    learners = [model.learner for model in others]
+    for learner in learners:
+        learner.compiled = how == "compiled"
+    group = LearnerGroup(learners)
+    recorder = None
+    if how == "captured":
+        recorder = GroupRecorder(group)
+        group._execution = Execution(group, False, False, recorder, "mapped_step")
+    together(learners, lambda i: take(others[i], 20), group)
+    assert_alike("SAC", alone, others)
+    if recorder is not None:
+        assert recorder.n_recordings == 1 and recorder.n_repetitions == 17
+    else:
+        assert group.compiled and group.seconds_compiling > 0
+
+
+@pytest.mark.parametrize(
+    ("maker", "arguments"),
+    [
+        ("SAC", {"learning_rate": [1e-3, 1e-4]}),
+        ("SAC", {"tau": [0.1, 0.5], "gamma": [0.9, 0.99]}),
+        ("SAC", {"target_entropy": [-1.0, 1.0], "pessimism": [0.2, 0.7]}),
+        ("BRO", {"learning_rate": [1e-3, 1e-4], "tau": [0.1, 0.5], "gamma": [0.9, 0.99]}),
+        ("BRO", {"weight_decay": [1e-1, 1e-4]}),
+    ],
+)
+def test_numbers_may_differ(maker: str, arguments: dict[str, Sequence[Any]]) -> None:
+    def models() -> list[Any]:
+        made = []
+        for i in range(2):
+            own = {name: values[i] for name, values in arguments.items()}
+            (model,) = models_of(maker, 1, **own)
+            made.append(model)
+        return made
+
+    alone, others = models(), models()
+    for model in alone:
+        take(model, 20)
+    learners = [model.learner for model in others]
+    together(learners, lambda i: take(others[i], 20))
+    assert_alike(maker, alone, others)
+    assert differences(alone[0], alone[1])[0] > 1e-4
+
+
+@pytest.mark.parametrize("how", ["eager", "captured", pytest.param("compiled", marks=[COMPILES, pytest.mark.slow])])
+def test_groups_go_on_after_resets(how: str) -> None:
+    """Weights are drawn anew in place, and moments are cleared, which moves them."""
+    alone, others = models_of("BRO", 2), models_of("BRO", 2)
+    drawing = threading.Lock()
+
+    def train(model: Any) -> None:
+        take(model, 12)
+        with drawing:
+            torch.manual_seed(model.seed)
+            model.learner.reinitialize()
+        take(model, 12)
+
+    for model in alone:
+        train(model)
+    learners = [model.learner for model in others]
+    for learner in learners:
+        learner.compiled = how == "compiled"
+    group = LearnerGroup(learners)
+    if how == "captured":
+        group._execution = Execution(group, False, False, GroupRecorder(group), "mapped_step")
+    together(learners, lambda i: train(others[i]), group)
+    if how == "captured":
+        assert group._execution._captured._recorder.n_recordings == 2
+    for a, b in zip(alone, others, strict=True):
+        # The second twelve updates begin with those on which the gradients of a fresh network are large.
+        assert differences(a, b)[0] < 10 * TOLERANCE
+        assert all(int(state["step"]) == 12 for state in b.critic.optimizer.state.values())
+    assert differences(*others)[0] > 1e-2
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "reason"),
+    [
+        ([{}, {"policy_kwargs": {"net_arch": [8, 9]}}], "same shapes"),
+        ([{}, {"policy_delay": 2}], "policy_delay"),
+        ([{}, {"pessimism": "gpl"}], "learners must .*"),
+        ([{"policy_kwargs": {"net_arch": [8], "optimizer_class": torch.optim.RMSprop}}] * 2, "RMSprop"),
+    ],
+)
+def test_what_differs_is_named(kwargs: list[dict[str, Any]], reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        LearnerGroup([sac(compile=False, **of).learner for of in kwargs])

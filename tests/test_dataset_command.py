@@ -1,0 +1,78 @@
+"""``sb3-sample dataset``."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sb3_sample import Dataset
+from sb3_sample.cli import main
+from tests.sac.common import MAKERS, sac
+
+pytest.importorskip("minari", reason="needs the extra [offline]")
+
+
+def test_record_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = sac("Pendulum-v1")
+    model.save(tmp_path / "model")
+    main(["dataset", "record", str(tmp_path / "model.zip"), str(tmp_path / "set"), "--env", "Pendulum-v1",
+          "--episodes", "2"])  # fmt: skip
+    assert "400 transitions of 2 episodes written to" in capsys.readouterr().out
+    data = Dataset.from_minari(tmp_path / "set")
+    rows = data.rows(slice(None))
+    np.testing.assert_allclose(rows["actions"], model.predict(rows["observations"], deterministic=True)[0], atol=1e-5)
+    main(["dataset", "info", str(tmp_path / "set"), "--json"])
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["fingerprint"] == data.fingerprint and facts["episodes"] == facts["truncated"] == 2
+    assert facts["mean_return"] == pytest.approx(float(rows["rewards"].astype(float).sum()) / 2)
+    main(["dataset", "info", str(tmp_path / "set")])
+    assert "mean length            200.0" in capsys.readouterr().out
+
+
+def test_models_of_all_algorithms_are_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for maker in "CrossQ", "DebiasedRQ":
+        MAKERS[maker](env="Pendulum-v1").save(tmp_path / maker)
+        main(["dataset", "record", str(tmp_path / f"{maker}.zip"), str(tmp_path / f"{maker}-data"), "--env",
+              "Pendulum-v1", "--episodes", "1"])  # fmt: skip
+        assert "200 transitions of 1 episodes written to" in capsys.readouterr().out
+
+
+def test_convert(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    h5py = pytest.importorskip("h5py")
+    n, zeros = 12, np.zeros(12, bool)
+    ends = zeros.copy()
+    ends[5] = True
+    observations = np.arange(3 * n, dtype=np.float32).reshape(n, 3)
+    with h5py.File(tmp_path / "old.hdf5", "w") as file:
+        for name, values in {
+            "observations": observations, "actions": np.full((n, 1), 1.5, np.float32),
+            "rewards": np.arange(n, dtype=np.float32), "terminals": ends, "timeouts": zeros,
+        }.items():  # fmt: skip
+            file[name] = values
+    monkeypatch.chdir(tmp_path)
+    main(["dataset", "convert", "old.hdf5", "sets/new", "--env", "Pendulum-v1"])
+    assert "11 transitions of 2 episodes written to" in capsys.readouterr().out
+    rows = Dataset.from_minari("sets/new").rows(slice(None))
+    assert Dataset.from_minari(tmp_path / "sets" / "new").fingerprint == Dataset.from_minari("sets/new").fingerprint
+    assert rows["rewards"].tolist() == list(range(11)) and rows["actions"].ravel().tolist() == [1.5] * 11
+    assert np.flatnonzero(rows["terminations"]).tolist() == [5]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["info", "none"], "id_or_path='none' must be a data set of Minari's"),
+        (["info", "none.hdf5"], "path='none.hdf5' must be an HDF5 file"),
+        (["info", "none", "--env", "Pendulum-v1"], "env='Pendulum-v1' is for HDF5 files"),
+        (["record", "none.zip", "out", "--env", "Pendulum-v1"], "none.zip"),
+    ],
+)  # fmt: skip
+def test_what_is_refused(
+    arguments: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        main(["dataset", *arguments])
+    assert end.value.code == 2 and words in capsys.readouterr().err

@@ -1,0 +1,275 @@
+"""
+What holds on a CPU holds on a GPU: the same numbers, captured and compiled as well as eager. Skipped without CUDA.
+
+    pytest -m gpu            (make gpu)
+"""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sb3_sample import BRO, SAC, train_many
+from sb3_sample.faults import TrainingDiverged
+from sb3_sample.learner.batch import Batch, Extra, Noise
+from sb3_sample.learner.execution import Captured, inputs_like, old_torch, why_not_compiled
+from sb3_sample.learner.group import LearnerGroup
+from sb3_sample.learner.pessimism import LearnedPessimism
+from tests.learner.test_group import REFUSED, together
+from tests.sac import test_golden as golden
+from tests.sac.common import MAKERS, TINY_BRO, TINY_SAC, Toy, random_batch, state
+from tests.sac.test_execution import FEW_STEPS, ROUNDING, WITHOUT_GRADIENT
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"),
+]
+#: Largest difference of a parameter after 50 updates.
+TOLERANCE = 1e-4
+HOWS = ("eager", "captured", "compiled")
+#: Those whose step is compiled here; it takes the most time by far.
+COMPILED = ("SAC", "BRO")
+
+
+@pytest.fixture(autouse=True)
+def as_it_was() -> Iterator[None]:
+    torch.backends.cuda.matmul.allow_tf32 = False
+    yield
+    torch.cuda.set_sync_debug_mode("default")
+
+
+def model_on(device: str, maker: str, how: str = "eager", seed: int = 0, **kwargs: Any) -> Any:
+    """A model with a filled replay buffer, whose gradient steps are run in a given way."""
+    if maker == "RegularizedSAC":
+        # Weights that are redrawn come from the device's generator.
+        kwargs = {"redo_period": 1_000, **kwargs}
+    starts = 70 if maker == "DebiasedRQ" else 60
+    arguments = {"learning_starts": starts, "compile": how != "eager", "seed": seed, "device": device, **kwargs}
+    model = MAKERS[maker](**arguments)
+    model.compiled = how == "compiled"
+    model.learn(60)
+    model.planned_updates = 50
+    return model
+
+
+def take(model: Any, n: int, check: Any = None) -> None:
+    """Gradient steps on batches and noise of the model's seed, the same on every device."""
+    learner, shape, device = model.learner, (8, model.actor.action_dim), model.device
+    for i in range(n):
+        seed = 1_000 * (model.seed or 0) + i
+        generator = torch.Generator().manual_seed(seed)
+        noise = Noise(*(torch.randn(shape, generator=generator) for _ in range(3)))
+        extra = None
+        if isinstance(learner.pessimism_rule, LearnedPessimism):
+            extra = Extra(random_batch(model, seed=seed + 500), torch.zeros(8, 1))
+            noise = noise._replace(pessimism=torch.randn(shape, generator=generator))
+        inputs = inputs_like((random_batch(model, seed=seed), noise, extra), lambda x: x.to(device))
+        learner.plasticity.before_gradient_steps(learner, 1)
+        learner.set_training_mode(True)
+        if check is None:
+            learner.step(*inputs)
+        else:
+            check(lambda inputs=inputs: learner.step(*inputs), i)
+        learner.set_training_mode(False)
+
+
+def largest_difference(a: Any, b: Any) -> float:
+    ours, theirs = state(a), state(b)
+    assert ours.keys() == theirs.keys()
+    pairs = [
+        (x.double().cpu(), theirs[name].double().cpu())
+        for name, x in ours.items()
+        if x.numel() > 0 and "optimizer/" not in name and not WITHOUT_GRADIENT.search(name)
+    ]
+    return max(float((x - y).abs().max()) for x, y in pairs)
+
+
+@pytest.mark.parametrize(
+    ("maker", "how"),
+    [(maker, how) for maker in MAKERS for how in HOWS if how != "compiled" or maker in COMPILED],
+)
+def test_is_the_cpu(maker: str, how: str) -> None:
+    here, there = model_on("cpu", maker), model_on("cuda", maker, how)
+    # The first order's differences are those of the simulation alone.
+    n = FEW_STEPS.get(maker, 50)
+    for model in (here, there):
+        take(model, n)
+    execution = there.learner._execution
+    assert (execution._captured is not None) is (how != "eager")
+    assert execution.compiled is (how == "compiled")
+    if how != "eager" and n > 6:
+        assert execution._captured._recorded
+    assert largest_difference(here, there) < (10 * TOLERANCE if maker in ROUNDING else TOLERANCE)
+
+
+@pytest.mark.parametrize("how", HOWS)
+@pytest.mark.parametrize("name", ["bro_quantile_public", "dac_edge", "bro_scalar_public"])
+def test_golden(name: str, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if how == "compiled" and name != "bro_quantile_public":
+        pytest.skip("one file is compiled, for its time")
+    monkeypatch.setattr(golden, "DEVICE", "cuda")
+    if how == "captured":
+        monkeypatch.setattr(golden, "captured", _captured)
+    golden.replay(golden.OWN_FOLDER / f"{name}.npz", how)
+
+
+def _captured(model: Any, warm_up: int = 3) -> None:
+    """In the place of the test's recorder: steps are captured by graphs, after three that are run as they are."""
+    learner = model.learner
+    model.compile = learner.compile = True
+    model.compiled = False
+    learner.forget_execution()
+    assert learner.prepared_execution()._captured is not None
+
+
+@pytest.mark.parametrize("maker", ["SAC", "BRO", "DAC", "VPLSAC", "SimbaV2", "FlashSAC"])
+def test_groups_are_the_cpu(maker: str) -> None:
+    assert maker not in REFUSED
+    here = [model_on("cpu", maker, seed=seed) for seed in range(3)]
+    there = [model_on("cuda", maker, "captured", seed=seed) for seed in range(3)]
+    for model in here:
+        take(model, 30)
+    group = LearnerGroup([model.learner for model in there])
+    together(group.learners, lambda i: take(there[i], 30), group)
+    assert group._execution is not None and group._execution._captured is not None
+    for ours, theirs in zip(here, there, strict=True):
+        assert largest_difference(ours, theirs) < (10 * TOLERANCE if maker in ROUNDING else TOLERANCE)
+    group.release()
+    for ours, theirs in zip(here, there, strict=True):
+        theirs.learner.forget_execution()
+        for model in (ours, theirs):
+            take(model, 3)
+        assert largest_difference(ours, theirs) < (10 * TOLERANCE if maker in ROUNDING else TOLERANCE)
+
+
+def test_compiled_groups() -> None:
+    here = [model_on("cpu", "BRO", seed=seed) for seed in range(2)]
+    there = [model_on("cuda", "BRO", "compiled", seed=seed) for seed in range(2)]
+    for model in here:
+        take(model, 30)
+    group = LearnerGroup([model.learner for model in there])
+    together(group.learners, lambda i: take(there[i], 30), group)
+    assert group.compiled and group.seconds_compiling > 0
+    for ours, theirs in zip(here, there, strict=True):
+        assert largest_difference(ours, theirs) < TOLERANCE
+
+
+def test_groups_go_on_after_resets() -> None:
+    """Weights are drawn anew in place, and moments are cleared, which moves them."""
+    drawing = threading.Lock()
+
+    def train(model: Any) -> None:
+        take(model, 12)
+        with drawing:
+            torch.manual_seed(model.seed)
+            model.learner.reinitialize()
+        take(model, 12)
+
+    here, there = ([model_on("cuda", "BRO", how, seed=seed) for seed in range(2)] for how in ("eager", "captured"))
+    for model in here:
+        train(model)
+    group = LearnerGroup([model.learner for model in there])
+    together(group.learners, lambda i: train(there[i]), group)
+    assert group._execution is not None and group._execution._captured is not None
+    for ours, theirs in zip(here, there, strict=True):
+        assert largest_difference(ours, theirs) < 10 * TOLERANCE
+    assert largest_difference(*there) > 1e-2
+
+
+def test_resets_and_schedules_under_capture() -> None:
+    models = []
+    for compile in (False, True):
+        rates = lambda progress: 1e-3 * progress  # noqa: E731
+        kwargs = {"learning_rate": rates, "resets": (75,), "learning_starts": 20, "device": "cuda", "compile": compile}
+        model = MAKERS["BRO"](**kwargs)
+        model.compiled = False
+        model.learn(100)
+        model.tau, model.explorer.kl_target = 0.5, 0.2
+        model.learn(20, reset_num_timesteps=False)
+        models.append(model)
+    assert models[0].plasticity.n_done == models[1].plasticity.n_done == 1
+    assert models[1].learner._execution._captured is not None
+    assert largest_difference(*models) < 1e-3
+
+
+def test_training_is_resumed_with_the_generators_of_the_gpu(tmp_path: Path) -> None:
+    def made() -> BRO:
+        model = BRO("MlpPolicy", Toy(), **{**TINY_BRO, "device": "cuda"}, seed=0)
+        model.compiled = False
+        return model
+
+    whole = made().learn(80, checkpoint=tmp_path / "whole", checkpoint_freq=40)
+    made().learn(40, checkpoint=tmp_path / "parts", checkpoint_freq=40)
+    parts = made().learn(80, checkpoint=tmp_path / "parts", checkpoint_freq=40)
+    assert parts._n_updates == whole._n_updates
+    assert largest_difference(whole, parts) < TOLERANCE
+
+
+def test_train_many() -> None:
+    kwargs: dict[str, Any] = {**TINY_SAC, "device": "cuda", "compile": True, "learning_starts": 20}
+    models = train_many(SAC, "MlpPolicy", Toy, seeds=range(3), total_timesteps=60, **kwargs)
+    assert [model._n_updates for model in models] == [40] * 3
+    for seed, model in enumerate(models):
+        alone = SAC("MlpPolicy", Toy(), seed=seed, **kwargs)
+        alone.learn(60)
+        # Rounding goes through the environment.
+        assert largest_difference(alone, model) < 1e-2
+        model.learn(10, reset_num_timesteps=False)
+
+
+def test_divergence_is_noticed() -> None:
+    model = SAC("MlpPolicy", Toy(), **{**TINY_SAC, "device": "cuda"}, compile=True, seed=0)
+    model.compiled = False
+    model.learn(30)
+    with torch.no_grad():
+        model.critic.head.weight.fill_(float("nan"))
+    with pytest.raises(TrainingDiverged):
+        model.learn(200, reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("maker", ["SAC", "BRO", "DAC", "VPLSAC", "SimbaV2", "XQC"])
+def test_the_update_does_not_wait_for_the_gpu(maker: str) -> None:
+    model = model_on("cuda", maker, "captured")
+
+    def check(step: Any, i: int) -> None:
+        torch.cuda.set_sync_debug_mode("error" if i > 5 else "default")
+        step()
+        torch.cuda.set_sync_debug_mode("default")
+
+    take(model, 12, check)
+    assert model.learner._execution._captured._recorded
+
+
+@pytest.mark.parametrize("maker", ["SAC", "BRO", "DAC", "OAC", "BROTD3", "FlashSAC"])
+def test_captured_actions_are_the_explorers(maker: str) -> None:
+    model = model_on("cuda", maker, "captured")
+    learner = model.learner
+    assert maker == "OAC" or learner.explorer is not None
+    for i in range(8):
+        observations = torch.as_tensor(np.random.default_rng(i).normal(size=(1, 3)), dtype=torch.float32, device="cuda")
+        with torch.inference_mode():
+            torch.manual_seed(i)
+            extra = learner.explorer.get_extra_state() if maker == "FlashSAC" else None
+            expected = learner.explorer.act(learner, observations).clone()
+            torch.manual_seed(i)
+            if extra is not None:
+                learner.explorer.set_extra_state(extra)
+            found = learner.explore(observations)
+        assert torch.allclose(expected, found, atol=1e-6)
+        take(model, 1)
+    assert isinstance(learner._acting[1], Captured) and learner._acting[1]._recorded
+
+
+def test_compiles_here() -> None:
+    if old_torch() is None:
+        assert why_not_compiled(model_on("cuda", "SAC").learner) is None
+
+
+def test_a_batch_elsewhere_is_refused() -> None:
+    model = model_on("cuda", "SAC")
+    with pytest.raises((ValueError, RuntimeError), match="device"):
+        model.learner.step(Batch(*random_batch(model)))
