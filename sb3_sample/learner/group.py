@@ -18,6 +18,7 @@ from sb3_sample.learner.execution import (
     Metrics,
     Settings,
     cuda_graph,
+    foreign_parts,
     inputs_like,
     tensors_of,
     why_not_compiled,
@@ -195,7 +196,9 @@ class LearnerGroup:
             if reason is not None:
                 warnings.warn(f"The gradient step is not compiled: {reason}", stacklevel=4)
                 self.compiled = False
-        captures = self.device.type == "cuda" and self.compile is not False
+        # As for one learner: parts of one's own may look at values on the host.
+        asked = self.compile is True or (self.compile == "auto" and not foreign_parts(self._first))
+        captures = self.device.type == "cuda" and asked
         return Execution(self, self.compiled, self.compile == "auto", cuda_graph if captures else None, "mapped_step")
 
     def mapped_step(self, *inputs: Any) -> Metrics:
