@@ -3,22 +3,29 @@ Train one agent with the settings of the papers' comparison, evaluating as it le
 
     OMP_NUM_THREADS=1 python benchmarks/learning_curves.py --agent SAC --seed 0 --output runs
 
-Every off-policy agent has the papers' shared settings: two hidden layers of 256, batch 256, two gradient steps a
-transition, 10,000 random steps, target entropy -|A|/2, Adam 3e-4. SRSAC takes eight gradient steps and is reset every
-10,000 steps, the papers' 16 and 160,000 scaled to a short run.
+Every off-policy agent but CrossQ has the papers' shared settings: two hidden layers of 256, batch 256, two gradient
+steps a transition, 10,000 random steps, target entropy -|A|/2, Adam 3e-4. SRSAC takes eight gradient steps and is reset
+every 10,000 steps, the papers' 16 and 160,000 scaled to a short run.
 
     python benchmarks/learning_curves.py --agent MBMAPPO --action-repeat 4 --steps 40960 --eval-freq 2048
 
 The on-policy agents have the settings of the MBMA paper (https://arxiv.org/abs/2210.13011), and observations and
 rewards normalised by VecNormalize; "PPO" is MBMAPPO without simulated actions, which is stable_baselines3's PPO step
-for step. The run goes to ``OUTPUT/AGENT/seed_SEED`` (``evaluations.npz``, Monitor files), ``learning_summary.py`` makes
-a table and a picture of all of them.
+for step.
+
+    python benchmarks/learning_curves.py --agent "CrossQ (sb3_contrib)" --env HalfCheetah-v5 --steps 50000
+
+CrossQ and sb3_contrib's, with the published sizes and random steps.
+
+The run goes to ``OUTPUT/AGENT/seed_SEED`` (``evaluations.npz``, Monitor files), ``learning_summary.py`` makes a table
+and a picture of all of them.
 """
 
 import argparse
 from pathlib import Path
 from typing import Any
 
+import sb3_contrib
 import stable_baselines3
 import torch
 from stable_baselines3.common.callbacks import EvalCallback
@@ -38,6 +45,7 @@ AGENTS: dict[str, dict[str, Any]] = {
     "OPLSAC": {},
     "OAC": {},
     "SRSAC": {"replay_ratio": 8, "resets": 10_000},
+    "CrossQ": {},
 }
 #: Class and arguments of the on-policy agents.
 ON_POLICY: dict[str, tuple[str, dict[str, Any]]] = {
@@ -48,6 +56,8 @@ ON_POLICY: dict[str, tuple[str, dict[str, Any]]] = {
 }
 #: stable_baselines3.SAC with the same settings.
 SB3 = "SAC (stable_baselines3)"
+#: sb3_contrib.CrossQ with the published sizes and random steps, which CrossQ has by default.
+CONTRIB = "CrossQ (sb3_contrib)"
 
 
 def environment(args: argparse.Namespace, seed: int, training: bool) -> VecEnv:
@@ -65,12 +75,17 @@ def build(agent: str, env: VecEnv, seed: int) -> Any:
             "MlpPolicy", env, learning_starts=10_000, gradient_steps=2, target_entropy=-env.action_space.shape[0] / 2,
             seed=seed, device="cpu",
         )  # fmt: skip
+    if agent == CONTRIB:
+        sizes = {"pi": [256, 256], "qf": [2048, 2048]}
+        return sb3_contrib.CrossQ(
+            "MlpPolicy", env, learning_starts=5_000, policy_kwargs={"net_arch": sizes}, seed=seed, device="cpu"
+        )
     return getattr(sb3_sample, agent)("MlpPolicy", env, seed=seed, device="cpu", **AGENTS[agent])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--agent", required=True, choices=[SB3, *AGENTS, *ON_POLICY])
+    parser.add_argument("--agent", required=True, choices=[SB3, CONTRIB, *AGENTS, *ON_POLICY])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--env", default="dmc/cartpole-swingup-v0")
     parser.add_argument("--action-repeat", type=int, help="of dmc/ environments; steps are decisions")

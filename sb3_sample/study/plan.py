@@ -492,7 +492,7 @@ class _Reader:
         value, kind = self._plain(node), known[name].kind
         if kind is not None:
             try:
-                check_value(name, value, kind)
+                check_value(name, constructor_value(name, value), kind)
             except ValueError as error:
                 raise self._fail(node, f"{error} ({where})") from error
         return value
@@ -715,6 +715,17 @@ def constructor_arguments(algo: str) -> dict[str, Any]:
     return {name: argument for name, argument in declared.items() if name not in NOT_OF_AGENTS}
 
 
+def constructor_value(name: str, value: Any) -> Any:
+    """
+    :param name: of an argument
+    :param value: as a plan has it
+    :return: the value for the constructor: a replay buffer of this package by its name, all else as it is
+    """
+    from sb3_sample.zoo.algorithms import BUFFERS
+
+    return BUFFERS.get(value, value) if name == "replay_buffer_class" and isinstance(value, str) else value
+
+
 def _make(algo: str, arguments: dict[str, Any]) -> None:
     """
     Make an agent, on a small task and with the settings of ``hyperparams/<algo>.yml``, to have its arguments checked
@@ -726,6 +737,7 @@ def _make(algo: str, arguments: dict[str, Any]) -> None:
 
     from sb3_sample.zoo import HYPERPARAMS
 
+    arguments = {name: constructor_value(name, value) for name, value in arguments.items()}
     known = constructor_arguments(algo)
     default = yaml.safe_load((HYPERPARAMS / f"{algo}.yml").read_text())["default"]
     settings = {name: value for name, value in default.items() if name in known and not isinstance(value, str)}

@@ -8,8 +8,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
+from sb3_sample.replay.buffers import DeviceReplayBuffer
+from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
+from sb3_sample.replay.weighted import (
+    FadedDictReplayBuffer,
+    FadedReplayBuffer,
+    PrioritizedDictReplayBuffer,
+    PrioritizedReplayBuffer,
+    WindowDictReplayBuffer,
+    WindowReplayBuffer,
+)
 from sb3_sample.sac import (
     BC,
     BRC,
@@ -40,6 +51,24 @@ from sb3_sample.zoo.trials import check_params
 
 #: The files ``<algorithm>.yml``, read when ``--conf-file`` is not given.
 HYPERPARAMS = Path(__file__).parents[1] / "hyperparams"
+
+
+#: Replay buffers of this package that a file of hyperparameters, ``-params`` or a plan may name as
+#: ``replay_buffer_class``, as the zoo has it for ``HerReplayBuffer``.
+BUFFERS: dict[str, type[ReplayBuffer]] = {
+    cls.__name__: cls
+    for cls in (
+        CompactDictReplayBuffer,
+        CompactReplayBuffer,
+        DeviceReplayBuffer,
+        FadedDictReplayBuffer,
+        FadedReplayBuffer,
+        PrioritizedDictReplayBuffer,
+        PrioritizedReplayBuffer,
+        WindowDictReplayBuffer,
+        WindowReplayBuffer,
+    )
+}
 
 
 class ZooAlgorithm(NamedTuple):

@@ -32,7 +32,7 @@ from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.normalization import load_vec_normalize, save_vec_normalize
 from sb3_sample.saving.replay import SafeReplayBuffers
 from sb3_sample.saving.untrusted import BadFile
-from sb3_sample.zoo.algorithms import ALGORITHMS, HYPERPARAMS, stored_arguments
+from sb3_sample.zoo.algorithms import ALGORITHMS, BUFFERS, HYPERPARAMS, stored_arguments
 from sb3_sample.zoo.files import PlottedRuns, Refused
 from sb3_sample.zoo.search import HER_SPACE, sampler
 from sb3_sample.zoo.settings import read_settings
@@ -88,6 +88,8 @@ def register() -> None:
     module = importlib.import_module("rl_zoo3.exp_manager")
     if hasattr(module, "ExperimentManager") and not hasattr(module.ExperimentManager, "_adapted_by_sb3_sample"):
         module.ExperimentManager._adapted_by_sb3_sample = True
+        # The zoo evaluates ``replay_buffer_class`` with this module's names.
+        vars(module).update(BUFFERS)
         _adapt_experiment_manager(module)
         _adapt_statistics(module)
 

@@ -124,13 +124,17 @@ def successor(name: str) -> SAC:
         return XQC("MlpPolicy", "Pendulum-v1", final_learning_rate=1e-4, **layers, **kwargs)
     if name == "CrossQ":
         return CrossQ("MlpPolicy", "Pendulum-v1", **layers, **kwargs)
+    if name == "CrossQ+WN":
+        # Critics of unit norm get to Pendulum's values, below -100, by a learning rate a step: docs/crossq.md.
+        scaled = {"weight_norm": True, "reward_scale": "xqc", "final_learning_rate": 1e-4}
+        return CrossQ("MlpPolicy", "Pendulum-v1", **scaled, **layers, **kwargs)
     return SimBa("MlpPolicy", "Pendulum-v1", **both, **kwargs)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["BRC", "CrossQ", "FlashSAC", "SimBa", "SimbaV2", "XQC"])
+@pytest.mark.parametrize("name", ["BRC", "CrossQ", "CrossQ+WN", "FlashSAC", "SimBa", "SimbaV2", "XQC"])
 def test_the_successors_of_bro_learn_pendulum(name: str) -> None:
-    assert score(successor(name).learn(4_000)) > GOOD
+    assert score(successor(name).learn(5_000 if name == "CrossQ+WN" else 4_000)) > GOOD
 
 
 @pytest.mark.slow

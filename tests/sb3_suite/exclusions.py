@@ -147,7 +147,6 @@ _TQC = (
     *_excluded("The test", "IndexError: list index out of range", "test_save_load::test_save_load[*]"),
 )
 _CROSSQ = (
-    *_excluded("The test", "policy_kwargs has 'renorm_warmup_steps'", "test_run::test_crossq"),
     *_excluded("State-dependent exploration", "use_sde=True is not supported", "test_run::test_sde[*]"),
     *_excluded("The test", "IndexError: list index out of range", "test_save_load::test_save_load[*]"),
 )
@@ -158,5 +157,5 @@ SUITES: dict[Suite, tuple[Exclusion, ...]] = {
     Suite("stable_baselines3", "PPO", "MBMAPPO", SB3_FILES): _PPO + _MBMA,
     Suite("stable_baselines3", "PPO", "PlainMBMAPPO", SB3_FILES): _PPO + _PLAIN,
     Suite("sb3_contrib", "TQC", "QuantileSAC", CONTRIB_FILES): _TQC,
-    Suite("sb3_contrib", "CrossQ", "BRO", CONTRIB_FILES): _CROSSQ,
+    Suite("sb3_contrib", "CrossQ", "CrossQ", CONTRIB_FILES): _CROSSQ,
 }

@@ -36,6 +36,21 @@ class QuantileSAC(sb3_sample.SAC):
         super().__init__(*args, policy_kwargs=policy_kwargs, **kwargs)
 
 
+class CrossQ(sb3_sample.CrossQ):
+    """
+    CrossQ. The warm-up of its renormalisation is an argument of the networks here, under another name. SB3-contrib's
+    random steps, since a test that passes none has updates within 128 steps.
+    """
+
+    def __init__(self, *args: Any, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any):
+        policy_kwargs = dict(policy_kwargs or {})
+        if "renorm_warmup_steps" in policy_kwargs:
+            warm_up = {"renorm_warm_up": policy_kwargs.pop("renorm_warmup_steps")}
+            policy_kwargs |= {"critic_network_kwargs": warm_up, "actor_network_kwargs": warm_up}
+        kwargs.setdefault("learning_starts", 100)
+        super().__init__(*args, policy_kwargs=policy_kwargs, **kwargs)
+
+
 class MBMAPPO(sb3_sample.MBMAPPO):
     """MBMA that simulates from the first iteration on, a little, with a small model of the environment."""
 
