@@ -164,6 +164,7 @@ def test_in_the_actor_too() -> None:
 
 
 @COMPILES
+@pytest.mark.slow
 def test_compiled_as_eager() -> None:
     models = [crossq(compile=compile, learning_rate=1e-3) for compile in (False, True)]
     for model in models:

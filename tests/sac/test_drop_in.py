@@ -247,7 +247,7 @@ def test_target_entropy_is_a_number(tmp_path: Path) -> None:
     assert type(model).load(tmp_path / "td3").target_entropy == model.target_entropy == "auto"
 
 
-@pytest.mark.parametrize("how", ["eager", "compiled", "captured"])
+@pytest.mark.parametrize("how", ["eager", pytest.param("compiled", marks=pytest.mark.slow), "captured"])
 def test_target_entropy_set_on_the_way_counts(how: str) -> None:
     model = sac(learning_starts=60, compile=how == "compiled", learning_rate=1e-2).learn(60)
     if how == "captured":
@@ -288,7 +288,7 @@ def test_names_of_a_learned_temperature() -> None:
         model.ent_coef_tensor = 0.3
 
 
-@pytest.mark.parametrize("how", ["eager", "compiled", "captured"])
+@pytest.mark.parametrize("how", ["eager", pytest.param("compiled", marks=pytest.mark.slow), "captured"])
 def test_names_of_a_fixed_temperature(how: str, tmp_path: Path) -> None:
     model = sac(ent_coef=0.25, learning_starts=60, compile=how == "compiled").learn(60)
     if how == "captured":
@@ -461,7 +461,7 @@ def test_critics_one_by_one(make: Any) -> None:
         torch.testing.assert_close(network(inputs), expected)
 
 
-@pytest.mark.parametrize("maker", ["SAC", "BRO"])
+@pytest.mark.parametrize("maker", ["SAC", pytest.param("BRO", marks=pytest.mark.slow)])
 def test_own_parts_may_ask_critics_as_before(maker: str) -> None:
     """A part that calls ``agent.critic(...)`` as a tensor, run in each of the three ways."""
     states = []

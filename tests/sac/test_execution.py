@@ -278,7 +278,7 @@ class AbsoluteHead(ValueHead):
         return 3 * (q - target).abs().mean()
 
 
-@pytest.mark.parametrize("how", [pytest.param("compiled", marks=COMPILES), "captured"])
+@pytest.mark.parametrize("how", [pytest.param("compiled", marks=[COMPILES, pytest.mark.slow]), "captured"])
 @pytest.mark.parametrize(
     "change",
     [
@@ -369,6 +369,7 @@ def test_settings_changed_on_the_way_count_in_a_compiled_step() -> None:
 
 
 @COMPILES
+@pytest.mark.slow
 def test_compiled_models_do_not_share() -> None:
     """Two models of one class and one shape, which differ in a number that the compiled code holds."""
     eager = [sac(tau=tau, learning_starts=60, compile=False).learn(60) for tau in (0.1, 0.9)]

@@ -947,7 +947,7 @@ def test_files_are_there() -> None:
 
 
 #: Compiled here in the short tests too; the other files in the long ones.
-COMPILED_IN_SHORT = {"bro_quantile_public", "dac_edge"}
+COMPILED_IN_SHORT = {"bro_quantile_public"}
 
 
 @pytest.mark.parametrize(

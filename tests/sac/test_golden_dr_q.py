@@ -397,7 +397,7 @@ class Replay:
 
 EXECUTIONS = ("eager", "compiled", "captured")
 #: Compiled in the short tests too.
-COMPILED_IN_SHORT = {"dr_q_boundary"}
+COMPILED_IN_SHORT: set[str] = set()
 
 
 def marks(path: Path, execution: str) -> list[Any]:

@@ -221,7 +221,12 @@ def test_a_plan_is_one_that_study_takes(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.parametrize(
-    ("name", "n"), [("small/scaling", 45), ("papers/scaling_dmc", 5600), ("papers/scaling_gym", 1920)]
+    ("name", "n"),
+    [
+        ("small/scaling", 45),
+        pytest.param("papers/scaling_dmc", 5600, marks=pytest.mark.slow),
+        ("papers/scaling_gym", 1920),
+    ],
 )
 def test_the_plans_that_are_shipped(name: str, n: int) -> None:
     pytest.importorskip("rl_zoo3")
