@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parser().parse_args(argv)
     try:
         with warnings.catch_warnings():
-            # What was left out is among what is printed.
+            # Left out steps are among what is printed.
             warnings.filterwarnings("ignore", "[0-9]+ of [0-9]+ steps left out")
             _run(args)
     except PickledFile as error:

@@ -19,7 +19,7 @@ from numpy.random import mtrand
 
 #: Meetings: all models are made; all trainings are about to begin; a gradient step; a step of the environments.
 MADE, BEGIN, GRADIENT_STEP, ENVIRONMENTS = "made", "begin", "gradient step", "environments"
-#: What else a training can be at.
+#: Further states of a training.
 _READY, _ENDED = "ready", "ended"
 #: Seconds that trainings have to end by themselves when they are told to leave at once.
 PATIENCE = 30.0
@@ -185,7 +185,7 @@ class Group:
         self.seats, self._make_joint, self.received = list(seats), make_joint, received
         for seat in self.seats:
             seat.group = self
-        #: What ends every training at its next meeting.
+        #: Error that ends every training at its next meeting.
         self.stop: BaseException | None = None
         #: Trainings that have ended by an error, by which the others end as soon as they are saved.
         self.failed: list[Seat] = []

@@ -15,11 +15,10 @@ import torch
 
 from sb3_sample import BRO, SAC, train_many
 from sb3_sample.faults import TrainingDiverged
-from sb3_sample.learner.batch import Batch, Extra, Noise
-from sb3_sample.learner.execution import Captured, inputs_like, old_torch, why_not_compiled
+from sb3_sample.learner.batch import Batch
+from sb3_sample.learner.execution import Captured, old_torch, why_not_compiled
 from sb3_sample.learner.group import LearnerGroup
-from sb3_sample.learner.pessimism import LearnedPessimism
-from tests.learner.test_group import REFUSED, together
+from tests.learner.test_group import REFUSED, take, together
 from tests.sac import test_golden as golden
 from tests.sac.common import MAKERS, TINY_BRO, TINY_SAC, Toy, random_batch, state
 from tests.sac.test_execution import FEW_STEPS, ROUNDING, WITHOUT_GRADIENT
@@ -54,27 +53,6 @@ def model_on(device: str, maker: str, how: str = "eager", seed: int = 0, **kwarg
     model.learn(60)
     model.planned_updates = 50
     return model
-
-
-def take(model: Any, n: int, check: Any = None) -> None:
-    """Gradient steps on batches and noise of the model's seed, the same on every device."""
-    learner, shape, device = model.learner, (8, model.actor.action_dim), model.device
-    for i in range(n):
-        seed = 1_000 * (model.seed or 0) + i
-        generator = torch.Generator().manual_seed(seed)
-        noise = Noise(*(torch.randn(shape, generator=generator) for _ in range(3)))
-        extra = None
-        if isinstance(learner.pessimism_rule, LearnedPessimism):
-            extra = Extra(random_batch(model, seed=seed + 500), torch.zeros(8, 1))
-            noise = noise._replace(pessimism=torch.randn(shape, generator=generator))
-        inputs = inputs_like((random_batch(model, seed=seed), noise, extra), lambda x: x.to(device))
-        learner.plasticity.before_gradient_steps(learner, 1)
-        learner.set_training_mode(True)
-        if check is None:
-            learner.step(*inputs)
-        else:
-            check(lambda inputs=inputs: learner.step(*inputs), i)
-        learner.set_training_mode(False)
 
 
 def largest_difference(a: Any, b: Any) -> float:

@@ -11,11 +11,9 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_sample.console import say
 from sb3_sample.diagnostics.measures import (
     Rollout,
     average_value,
@@ -24,6 +22,7 @@ from sb3_sample.diagnostics.measures import (
     effective_rank,
     global_norm,
 )
+from sb3_sample.diagnostics.periodic import PeriodicMeasurement
 from sb3_sample.diagnostics.reading import batch_at, newest_overfitting, noise, targets, training_places, untouched
 from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.pessimism import epistemic_std
@@ -33,7 +32,7 @@ from sb3_sample.sac import SAC
 from sb3_sample.saving.rings import Ring
 
 
-class DiagnosticsCallback(BaseCallback):
+class DiagnosticsCallback(PeriodicMeasurement):
     """
     Measures, every ``every`` environment steps, how wrong the critics are, how much they overfit and how much
     plasticity the networks have left, and writes it to the logger under ``diagnostics/``.
@@ -85,7 +84,8 @@ class DiagnosticsCallback(BaseCallback):
     :raises ValueError: if an argument is out of range, or, when training starts, ``eval_env`` does not fit the model
     """
 
-    model: SAC
+    TITLE = "Diagnostics"
+    SHOWN = ("overestimation", "overfitting")
 
     def __init__(
         self,
@@ -100,7 +100,7 @@ class DiagnosticsCallback(BaseCallback):
         seed: int | None = None,
         verbose: int = 0,
     ):
-        super().__init__(verbose)
+        super().__init__(every, verbose)
         if not isinstance(eval_env, (gym.Env, VecEnv)):
             raise TypeError(f"eval_env must be a gymnasium.Env or a VecEnv, not {eval_env!r}")
         if isinstance(eval_env, VecEnv) and eval_env.num_envs != 1:
@@ -117,7 +117,6 @@ class DiagnosticsCallback(BaseCallback):
         if not 0 <= dormant_threshold < math.inf:
             raise ValueError(f"dormant_threshold must be at least 0 and finite, not {dormant_threshold}")
         self.eval_env = eval_env
-        self.every = every
         self.n_start_states = n_start_states
         self.rollout_length = rollout_length
         self.soft = soft
@@ -125,9 +124,6 @@ class DiagnosticsCallback(BaseCallback):
         self.dormant_threshold = dormant_threshold
         self.validation_size = validation_size
         self.seed = seed
-        #: What was measured last, by name, without the prefix ``diagnostics/``.
-        self.last_results: dict[str, float] = {}
-        self._next = every
         # The fewest steps after which an episode was cut by a time limit.
         self._time_limit: int | None = None
         # Transitions ever added to the store.
@@ -138,11 +134,8 @@ class DiagnosticsCallback(BaseCallback):
     # ---------------------------------------------------------------- construction
 
     def _init_callback(self) -> None:
+        super()._init_callback()
         model = self.model
-        if not isinstance(model, SAC):
-            raise TypeError(f"DiagnosticsCallback needs a model of sb3_sample.sac.SAC, not a {type(model).__name__}")
-        if model.n_tasks > 1:
-            raise ValueError(f"DiagnosticsCallback measures models of one task, and this one has {model.n_tasks}")
         if not model.gamma < 1:
             raise ValueError(f"gamma must be below 1 for the Monte-Carlo reference, not {model.gamma}")
         env = self._checked_env()
@@ -175,31 +168,11 @@ class DiagnosticsCallback(BaseCallback):
 
     # ---------------------------------------------------------------- when
 
-    def _on_training_start(self) -> None:
-        self._next = (self.num_timesteps // self.every + 1) * self.every
-
     def _on_step(self) -> bool:
         # The gradient step after this call may be the last before a measurement, which then finds its gradients.
         if self._next <= self.num_timesteps + self.model.n_envs * self._steps_between_updates():
             self.model.keep_next_gradients = True
-        if self.num_timesteps < self._next:
-            return True
-        self._next = (self.num_timesteps // self.every + 1) * self.every
-        # The transitions of the present step are stored after this call.
-        if self.model.num_transitions + self.model.n_envs < self.model.learning_starts:
-            return True
-        results = self.measure()
-        for name, value in results.items():
-            self.logger.record(f"diagnostics/{name}", value)
-        # Written at once, as by EvalCallback, so that the values stand at the step at which they were measured.
-        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        self.logger.dump(self.num_timesteps)
-        if self.verbose >= 1:
-            shown = ", ".join(
-                f"{name} {results[name]:.3g}" for name in ("overestimation", "overfitting") if name in results
-            )
-            say(f"Diagnostics at {self.num_timesteps} steps: {shown}")
-        return True
+        return super()._on_step()
 
     def _steps_between_updates(self) -> int:
         """Steps of all environments from one gradient step to the next, at most; 1 where only episodes tell."""

@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_sample.console import say
 from sb3_sample.diagnostics.measures import global_norm, noise_scale
+from sb3_sample.diagnostics.periodic import PeriodicMeasurement
 from sb3_sample.diagnostics.reading import batch_at, newest_overfitting, td_loss, training_places, untouched
 from sb3_sample.sac import SAC
 
@@ -16,7 +15,7 @@ SMALL, PARTS = 64, 16
 LARGE = SMALL * PARTS
 
 
-class NoiseScaleCallback(BaseCallback):
+class NoiseScaleCallback(PeriodicMeasurement):
     """
     Measures, every ``every`` environment steps, the noise scale of the critics' gradient and the critics' overfitting
     ("Value-Based Deep RL Scales Predictably", Rybkin et al. 2025, appendices F and B.1), and writes both to the logger
@@ -48,54 +47,27 @@ class NoiseScaleCallback(BaseCallback):
     :raises ValueError: if an argument is out of range, or the model has several tasks
     """
 
-    model: SAC
+    TITLE = "Noise scale"
+    SHOWN = ("critical_batch_size", "overfitting_newest")
 
     def __init__(
         self, every: int = 1_000, window: int = 10, batch_size: int = 256, seed: int | None = None, verbose: int = 0
     ):
-        super().__init__(verbose)
+        super().__init__(every, verbose)
         for name, value in (("every", every), ("window", window), ("batch_size", batch_size)):
             if not isinstance(value, (int, np.integer)) or value < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, not {value!r}")
-        self.every, self.window, self.batch_size, self.seed = every, window, batch_size, seed
-        #: What was measured last, by name, without the prefix ``diagnostics/``.
-        self.last_results: dict[str, float] = {}
-        self._next = every
+        self.window, self.batch_size, self.seed = window, batch_size, seed
         #: Squared norms of the last measurements: small, large.
         self._squares: list[tuple[float, float]] = []
         self._measured_model: SAC | None = None
 
     def _init_callback(self) -> None:
+        super()._init_callback()
         model = self.model
-        if not isinstance(model, SAC):
-            raise TypeError(f"NoiseScaleCallback needs a model of sb3_sample.sac.SAC, not a {type(model).__name__}")
-        if model.n_tasks > 1:
-            raise ValueError(f"NoiseScaleCallback measures models of one task, and this one has {model.n_tasks}")
         if model is not self._measured_model:  # else a second call of learn
             self._measured_model, self._squares = model, []
             self._rng = np.random.default_rng(model.seed if self.seed is None else self.seed)
-
-    def _on_training_start(self) -> None:
-        self._next = (self.num_timesteps // self.every + 1) * self.every
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps < self._next:
-            return True
-        self._next = (self.num_timesteps // self.every + 1) * self.every
-        # The transitions of the present step are stored after this call.
-        if self.model.num_transitions + self.model.n_envs < self.model.learning_starts:
-            return True
-        results = self.measure()
-        for name, value in results.items():
-            self.logger.record(f"diagnostics/{name}", value)
-        # Written at once, as by EvalCallback, so that the values stand at the step at which they were measured.
-        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        self.logger.dump(self.num_timesteps)
-        if self.verbose >= 1:
-            names = [name for name in ("critical_batch_size", "overfitting_newest") if name in results]
-            shown = ", ".join(f"{name} {results[name]:.3g}" for name in names)
-            say(f"Noise scale at {self.num_timesteps} steps: {shown}")
-        return True
 
     def state_dict(self) -> dict[str, Any]:
         """

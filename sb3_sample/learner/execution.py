@@ -268,7 +268,7 @@ class CannotCompile(Exception):
 class _Program(NamedTuple):
     """A compiled gradient step, for one kind of inputs."""
 
-    #: What was traced, in words, and the tensors beside the state that it reads.
+    #: Words of the trace, and the tensors beside the state that it reads.
     code: str
     further: list[torch.Tensor]
     function: Callable[..., Sequence[torch.Tensor]]
@@ -556,17 +556,18 @@ class Settings:
 
     def __init__(self, learner: Any, private: bool):
         modules = [module for root in learner.step_modules() for module in root.modules()]
-        self._held: list[tuple[dict[str, Any], str, Any]] = []
+        #: Attributes of the owner, or an optimizer's group; name; value at the last call of :meth:`have_changed`.
+        self.held: list[tuple[dict[str, Any], str, Any]] = []
         for owner in (learner, *modules):
             of_torch = type(owner).__module__.split(".")[0] == "torch"
             every = private and not of_torch and not _is_ours(type(owner))
             for name, value in vars(owner).items():
                 is_plain = isinstance(value, (int, float, str, type(None)))
                 if is_plain and (every or not name.startswith("_")) and name not in NO_SETTINGS:
-                    self._held.append((vars(owner), name, value))
+                    self.held.append((vars(owner), name, value))
         for optimizer in learner.optimizers().values():
             for group in optimizer.param_groups:
-                self._held += [(group, name, value) for name, value in group.items() if name not in ("params", "lr")]
+                self.held += [(group, name, value) for name, value in group.items() if name not in ("params", "lr")]
         #: Places of those that changed, and changed nothing in the step.
         self._unread: set[int] = set()
         self._changed: set[int] = set()
@@ -577,11 +578,11 @@ class Settings:
         """
         changed = [
             (i, values[name])
-            for i, (values, name, value) in enumerate(self._held)
+            for i, (values, name, value) in enumerate(self.held)
             if (now := values.get(name)) is not value and now != value
         ]
         for i, value in changed:
-            self._held[i] = (*self._held[i][:2], value)
+            self.held[i] = (*self.held[i][:2], value)
         self._changed.update({i for i, _ in changed} - self._unread)
         return any(i not in self._unread for i, _ in changed)
 

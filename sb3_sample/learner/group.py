@@ -6,6 +6,7 @@ gradient step of one is mapped over it by ``torch.vmap``.
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import zip_longest
 from typing import Any
 
 import torch
@@ -13,7 +14,6 @@ from torch import nn
 
 from sb3_sample.learner.descent import StackedDescent
 from sb3_sample.learner.execution import (
-    NO_SETTINGS,
     Execution,
     Metrics,
     Settings,
@@ -27,7 +27,7 @@ from sb3_sample.learner.learner import Learner
 from sb3_sample.optim import AdamW
 
 #: Numbers of a learner that its gradient step does not read, or reads from its inputs.
-_NOT_READ = {"learning_starts", "verbose", "compile", "learning_rate", "gamma", "training"} | NO_SETTINGS
+_NOT_READ = {"learning_starts", "verbose", "compile", "learning_rate", "gamma"}
 
 
 class _Networks(nn.Module):
@@ -35,13 +35,12 @@ class _Networks(nn.Module):
     All that one learner's gradient step reads and writes, as one module, which runs the step.
 
     :param learner: the learner
-    :param method: name of its method that is run
     """
 
-    def __init__(self, learner: Learner, method: str):
+    def __init__(self, learner: Learner):
         super().__init__()
         self.parts = nn.ModuleList(learner.step_modules())
-        self._run = lambda inputs: getattr(type(learner), method)(learner, *inputs)
+        self._run = lambda inputs: type(learner).gradient_step(learner, *inputs)
 
     def forward(self, inputs: tuple[Any, ...]) -> Metrics:
         result: Metrics = self._run(inputs)
@@ -80,18 +79,17 @@ class LearnerGroup:
     acts on a learner alone (acting, resets, saving, loading in place) goes on as it is.
 
     :param learners: learners of the same networks, parts and settings; learning rates and other numbers may differ
-    :param method: name of the method that is run
     :raises ValueError: if they differ in more, or cannot be stacked, by name
     """
 
-    def __init__(self, learners: Sequence[Learner], method: str = "gradient_step"):
-        self.learners, self.method = list(learners), method
+    def __init__(self, learners: Sequence[Learner]):
+        self.learners = list(learners)
         self._first = self.learners[0]
         self.device, self.verbose, self.compile = self._first.device, self._first.verbose, self._first.compile
         #: Whether the gradient step is compiled.
         self.compiled = bool(self._first.compiled)
         _check_alike(self.learners)
-        self._networks = [_Networks(learner, method) for learner in self.learners]
+        self._networks = [_Networks(learner) for learner in self.learners]
         self._stacks = _Stacks(_by_name([networks.tensors() for networks in self._networks]))
         #: By the optimizers' names, those of the stacked parameters, and each learner's.
         self._optimizers = self._stacked_optimizers()
@@ -288,23 +286,38 @@ class LearnerGroup:
                 group["lr"] = rates[0][i] if same else tuple(of[i] for of in rates)
 
     def _take_settings(self) -> None:
-        """Find the numbers in which the learners differ, as tensors."""
-        rows = [_settings(learner) for learner in self.learners]
+        """
+        Find the numbers in which the learners differ, as tensors.
+
+        :raises ValueError: if they differ in something else
+        """
         self._differing = []
         self._descent.tau = self._first.tau
-        for i, (owner, name, value) in enumerate(rows[0]):
-            values = [row[i][2] for row in rows]
-            if all(other == value for other in values):
+        # The stacked optimizers' groups, by those of the first learner.
+        groups = {
+            id(theirs): ours
+            for path, optimizer in self._optimizers.items()
+            for ours, theirs in zip(optimizer.param_groups, self._of_each[path][0].param_groups, strict=True)
+        }
+        for rows in zip(*(settings.held for settings in self._settings), strict=True):
+            values, name, first = rows[0]
+            of_each = [value for _, _, value in rows]
+            if any(other != name for _, other, _ in rows):
+                raise ValueError(f"learners must have the same settings, and not each has {name}")
+            group = groups.get(id(values))
+            if name in _NOT_READ:
                 continue
-            number = torch.tensor(values, dtype=torch.float32, device=self.device)
-            self._differing.append((vars(owner), name, number))
-            if owner is self._first and name == "tau":
-                self._descent.tau = number
-        for path, stacked in self._optimizers.items():
-            for i, group in enumerate(stacked.param_groups):
-                decays = [optimizer.param_groups[i]["weight_decay"] for optimizer in self._of_each[path]]
-                same = all(decay == decays[0] for decay in decays)
-                group["weight_decay"] = decays[0] if same else torch.tensor(decays, device=self.device)
+            differ = any(value != first for value in of_each)
+            may_differ = group is None or name == "weight_decay"
+            if differ and not (may_differ and all(isinstance(value, float) for value in of_each)):
+                raise ValueError(f"learners must agree in {name}, not {of_each!r}")
+            held = torch.tensor(of_each, dtype=torch.float32, device=self.device) if differ else first
+            if group is not None:
+                group[name] = held
+            elif differ:
+                self._differing.append((values, name, held))
+                if values is vars(self._first) and name == "tau":
+                    self._descent.tau = held
 
 
 def _by_name(rows: Sequence[dict[str, torch.Tensor]]) -> dict[str, Sequence[torch.Tensor]]:
@@ -333,17 +346,6 @@ def _stacked(inputs: Sequence[tuple[Any, ...]], device: torch.device) -> tuple[A
     return result
 
 
-def _settings(learner: Learner) -> list[tuple[Any, str, Any]]:
-    """Numbers and words of a learner that its gradient step may read: object, attribute, value."""
-    owners = [learner, *(module for part in learner.step_modules() for module in part.modules())]
-    return [
-        (owner, name, value)
-        for owner in owners
-        for name, value in vars(owner).items()
-        if isinstance(value, (int, float, str, type(None))) and not name.startswith("_") and name not in _NOT_READ
-    ]
-
-
 def _check_alike(learners: Sequence[Learner]) -> None:
     """
     Check that learners can take their gradient steps as one.
@@ -360,19 +362,27 @@ def _check_alike(learners: Sequence[Learner]) -> None:
         foreign = {type(o).__name__ for o in learner.optimizers().values() if type(o) is not AdamW}
         if foreign:
             raise ValueError(f"learners with optimizers other than sb3_sample.optim.AdamW cannot be batched: {foreign}")
+        for ours, theirs in zip_longest(_classes(first), _classes(learner)):
+            if ours is not theirs:
+                names = [None if cls is None else cls.__name__ for cls in (ours, theirs)]
+                raise ValueError(f"learners must have parts and networks of the same classes, not {names}")
         if _shapes(learner) != _shapes(first):
             raise ValueError("learners must have networks of the same shapes")
         noisy = [m for part in learner.step_modules() for m in part.modules() if isinstance(m, nn.Dropout) and m.p > 0]
+        targets = first.target_entropy, learner.target_entropy
+        if any(isinstance(target, torch.Tensor) for target in targets) and not _are_equal(*targets):
+            raise ValueError(f"learners must agree in target_entropy where each task has its own, not {targets}")
         if noisy:
             raise ValueError("learners whose networks have dropout cannot be batched: their noise is not given")
-        for (_, name, ours), (_, other, theirs) in zip(_settings(first), _settings(learner), strict=True):
-            if name != other or (ours != theirs and not (_is_number(ours) and _is_number(theirs))):
-                raise ValueError(f"learners must agree in {name}, not {ours!r} and {theirs!r}")
+
+
+def _classes(learner: Learner) -> list[type[nn.Module]]:
+    return [type(module) for part in learner.step_modules() for module in part.modules()]
+
+
+def _are_equal(ours: Any, theirs: Any) -> bool:
+    return all(isinstance(value, torch.Tensor) for value in (ours, theirs)) and torch.equal(ours, theirs)
 
 
 def _shapes(learner: Learner) -> list[torch.Size]:
     return [t.shape for part in learner.step_modules() for t in (*part.parameters(), *part.buffers())]
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, float)

@@ -148,7 +148,7 @@ class Apart:
 
 
 def _tensors(learner: Any) -> dict[str, torch.Tensor]:
-    """What acting depends on, by name; by several where it is shared."""
+    """Tensors that acting depends on, by name; by several where one is shared."""
     networks = learner.networks
     found = dict(networks.named_parameters("networks", remove_duplicate=False))
     found |= dict(networks.named_buffers("networks", remove_duplicate=False))

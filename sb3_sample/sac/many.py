@@ -233,7 +233,7 @@ _ELSEWHERE = {"seed": "pass seeds", "device": "all learners compute on the same 
 
 
 def _environment(env: Any, n_envs: int, vec_env_cls: type[VecEnv] | None) -> Any:
-    """What a learner's constructor gets as its environment."""
+    """Environment, or id of one, for a learner's constructor."""
     if isinstance(env, str):
         if n_envs == 1 and vec_env_cls is None:
             return env

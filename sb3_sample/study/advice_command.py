@@ -70,7 +70,7 @@ def _run(options: argparse.Namespace) -> None:
         environment = step_times.environment_seconds(env)
     episode = getattr(env.spec, "max_episode_steps", None) or 1_000
     times = _times(threads, options)
-    # What the times are of, the training is to have.
+    # Threads and device of the measured times, for the training to have too.
     given = [] if options.threads is None else [f"--num-threads {threads}"]
     given += [] if options.device == "auto" else [f"--device {options.device}"]
     found = advise(options.hours, times, environment, suite=suite, env=env_id, episode=episode, options=given)

@@ -140,7 +140,7 @@ def attempt_all(
         try:
             train_together(seats, folder.path)
         except Exception:
-            # What keeps them from being made together is in the outcome of each.
+            # Reasons not to make them together are in the outcome of each.
             if outcomes.keys() != {run.name for run in runs}:
                 raise
     return [outcomes[run.name] for run in runs]

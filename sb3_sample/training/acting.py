@@ -114,7 +114,7 @@ class ActingThread:
 
     def start(self) -> None:
         """Begin to act."""
-        # What computes in Python keeps the acting thread waiting for so long.
+        # Computations in Python keep the acting thread waiting for so long.
         sys.setswitchinterval(SWITCH_INTERVAL)
         self._thread.start()
 

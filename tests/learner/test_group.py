@@ -1,5 +1,6 @@
 """Many learners in one gradient step: each is what it would be alone."""
 
+import functools
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -9,7 +10,7 @@ import pytest
 import torch
 
 from sb3_sample.learner.batch import Extra, Noise
-from sb3_sample.learner.execution import Execution
+from sb3_sample.learner.execution import Execution, inputs_like
 from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.pessimism import LearnedPessimism
@@ -86,20 +87,21 @@ def models_of(maker: str, n: int, **kwargs: Any) -> list[Any]:
     return models
 
 
-def take(model: Any, n: int) -> None:
-    """Gradient steps on batches and noise of the model's seed."""
+def take(model: Any, n: int, around: Callable[[Callable[[], Any], int], Any] = lambda step, i: step()) -> None:
+    """Gradient steps on batches and noise of the model's seed, the same on every device, each by a function of it."""
     learner, shape = model.learner, (8, model.actor.action_dim)
     for i in range(n):
-        seed = 1_000 * model.seed + i
+        seed = 1_000 * (model.seed or 0) + i
         generator = torch.Generator().manual_seed(seed)
         noise = Noise(*(torch.randn(shape, generator=generator) for _ in range(3)))
         extra = None
         if isinstance(learner.pessimism_rule, LearnedPessimism):
             extra = Extra(random_batch(model, seed=seed + 500), torch.zeros(8, 1))
             noise = noise._replace(pessimism=torch.randn(shape, generator=generator))
+        inputs = inputs_like((random_batch(model, seed=seed), noise, extra), lambda x: x.to(model.device))
         learner.plasticity.before_gradient_steps(learner, 1)
         learner.set_training_mode(True)
-        learner.step(random_batch(model, seed=seed), noise, extra)
+        around(functools.partial(learner.step, *inputs), i)
         learner.set_training_mode(False)
 
 
@@ -232,6 +234,8 @@ def test_groups_go_on_after_resets(how: str) -> None:
         ([{}, {"policy_delay": 2}], "policy_delay"),
         ([{}, {"pessimism": "gpl"}], "learners must .*"),
         ([{"policy_kwargs": {"net_arch": [8], "optimizer_class": torch.optim.RMSprop}}] * 2, "RMSprop"),
+        ([{}, {"value_head": "half_squared"}], "same classes, not .*ValueHead.*HalfSquaredHead"),
+        ([{"policy_kwargs": {"net_arch": [8], "optimizer_kwargs": {"eps": eps}}} for eps in (1e-8, 1e-3)], "eps"),
     ],
 )
 def test_what_differs_is_named(kwargs: list[dict[str, Any]], reason: str) -> None:
