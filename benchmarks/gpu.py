@@ -7,8 +7,9 @@ Each part is a process, of which all compile at the same time and one measures; 
 that is not done after ``--seconds`` is left out, with a word. A gradient step includes drawing its batch of 128 (BRO)
 or 256 transitions with 17 observed numbers and 6 actions, as in ``update_speed.py``. "One a call" is ``train(1)``, as
 replay ratio 1 takes it, "many" ``train(100)``; "graph" the launch alone, on inputs that stay; "acting" an action of the
-explorer for one observation. Rows "x 10" are of ten learners in one update (``LearnerGroup``): updates of all together,
-on batches that lie on the device. "training" is ``train_many`` of ten learners on HalfCheetah-v5, in updates of all.
+explorer for one observation. Rows "x 10" are of ten learners in one update (``LearnerGroup``): updates, and actions, of
+all together, on batches and observations that lie on the device. "training" is ``train_many`` of ten learners on
+HalfCheetah-v5, in updates of all.
 """
 
 import argparse
@@ -186,9 +187,14 @@ def several(label: str, n: int, compiled: bool, device: str, turn: Turn) -> str:
         steps = n * rate(lambda: group.step(inputs), 50)
         graph = n * rate(graph_of(group._execution), 100)
         tf32 = n * with_tf32(lambda: recaptured(group, lambda: group.step(inputs)))
+        with torch.inference_mode():
+            observed = [(own[0].observations[:1], own[1].critic[:1]) for own in inputs]
+            for _ in range(5):
+                group.act(observed)
+            actions = n * rate(lambda: group.act(observed), 200)
     how = "compiled, captured" if compiled else "captured"
     memory, seconds = torch.cuda.max_memory_allocated() / 2**20, group.seconds_compiling
-    return row(how, steps, None, graph, tf32, None, memory, seconds)
+    return row(how, steps, None, graph, tf32, actions, memory, seconds)
 
 
 def peers(device: str, turn: Turn) -> str:

@@ -16,7 +16,7 @@ import torch
 from sb3_sample import BRO, SAC, train_many
 from sb3_sample.faults import TrainingDiverged
 from sb3_sample.learner.batch import Batch
-from sb3_sample.learner.execution import Captured, old_torch, why_not_compiled
+from sb3_sample.learner.execution import CapturedActing, old_torch, why_not_compiled
 from sb3_sample.learner.group import LearnerGroup
 from tests.learner.test_group import REFUSED, take, together
 from tests.sac import test_golden as golden
@@ -122,6 +122,23 @@ def test_groups_are_the_cpu(maker: str) -> None:
         for model in (ours, theirs):
             take(model, 3)
         assert largest_difference(ours, theirs) < (10 * TOLERANCE if maker in ROUNDING else TOLERANCE)
+
+
+@pytest.mark.parametrize("maker", ["SAC", "BRO", "DAC", "FlashSAC"])
+def test_actions_of_groups_are_those_of_each(maker: str) -> None:
+    there = [model_on("cuda", maker, "captured", seed=seed) for seed in range(3)]
+    group = LearnerGroup([model.learner for model in there])
+    for i in range(8):
+        generator = torch.Generator().manual_seed(i)
+        inputs = [
+            tuple(torch.randn((1, n), generator=generator).to("cuda") for n in (3, m.actor.action_dim)) for m in there
+        ]
+        with torch.inference_mode():
+            alone = [m.learner.action_step(*own)["actions"].clone() for m, own in zip(there, inputs, strict=True)]
+            found = [own["actions"].clone() for own in group.act(inputs)]
+        assert all(torch.allclose(*pair, atol=1e-5) for pair in zip(alone, found, strict=True))
+        together(group.learners, lambda i: take(there[i], 1), group)
+    assert isinstance(group._acting, CapturedActing) and group._acting.captured._recorded
 
 
 def test_compiled_groups() -> None:
@@ -239,7 +256,7 @@ def test_captured_actions_are_the_explorers(maker: str) -> None:
             found = learner.explore(observations)
         assert torch.allclose(expected, found, atol=1e-6)
         take(model, 1)
-    assert isinstance(learner._acting[1], Captured) and learner._acting[1]._recorded
+    assert isinstance(learner._acting[1], CapturedActing) and learner._acting[1].captured._recorded
 
 
 def test_compiles_here() -> None:

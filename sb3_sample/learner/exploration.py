@@ -2,7 +2,7 @@
 
 import math
 from abc import abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch.optim import Optimizer
@@ -24,6 +24,9 @@ class Exploration(Part):
 
     :param learner: the learner, whose networks exist already
     """
+
+    #: Whether ``torch.vmap`` can map :meth:`sampled` over learners: it takes no gradients itself.
+    can_be_mapped: ClassVar[bool] = True
 
     def __init__(self, learner: Learning):
         super().__init__()
@@ -477,6 +480,8 @@ class OptimisticGradient(Exploration):
     :param kl_radius: KL divergence to the actor's Gaussian, summed over the action's dimensions, at least 0
     :raises ValueError: if an argument is out of range, or if the actor is deterministic
     """
+
+    can_be_mapped = False
 
     def __init__(self, learner: Learning, optimism: float = 4.36, kl_radius: float = 3.69**2 / 2):
         super().__init__(learner)

@@ -16,7 +16,7 @@ from torch.optim import Optimizer
 from sb3_sample.learner import first_step, losses
 from sb3_sample.learner.batch import SLOTS, Batch, CriticStep, Extra, Noise
 from sb3_sample.learner.descent import descend, follow, minimize
-from sb3_sample.learner.execution import Captured, Execution, acting_of
+from sb3_sample.learner.execution import Acting, Execution, acting_of
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.objectives import Objective, Prepared
@@ -183,8 +183,10 @@ class Learner:
         self._execution: Execution | None = None
         #: Chooses how the gradient steps are run: takes the learner and the method's name.
         self.make_execution: Callable[[Any, str], Any] = Execution.of
-        # The explorer, and what captures its actions.
-        self._acting: tuple[Exploration, Captured | None] | None = None
+        #: Chooses how the explorer's actions are computed.
+        self.make_acting: Callable[[Any], Acting | None] = acting_of
+        # The explorer, and what computes its actions; None for its own ``act``.
+        self._acting: tuple[Exploration, Acting | None] | None = None
         #: Whether ``.grad`` holds the gradients of another gradient step than the last, as a compiled one leaves none.
         self.gradients_are_stale = False
         # Whether the shapes of a gradient step, and those of the explorer's actions, were checked.
@@ -563,16 +565,15 @@ class Learner:
         return actions
 
     def _actions(self, observations: Any) -> torch.Tensor:
-        """The explorer's actions, on a GPU by a captured graph."""
+        """The explorer's actions; on a GPU by a captured graph, with those of learners that act together."""
         if self._acting is None or self._acting[0] is not self.explorer:
-            self._acting = self.explorer, acting_of(self)
+            self._acting = self.explorer, self.make_acting(self)
         acting = self._acting[1]
         if acting is None:
             actions: torch.Tensor = self.explorer.act(self, observations)
             return actions
         noise = self.explorer.draw_noise(self, observations)
-        acting.forget_if_stale(self)
-        return acting(type(self).action_step, self, (observations, noise))["actions"]
+        return acting(self, (observations, noise))["actions"]
 
     def action_step(self, observations: Any, noise: torch.Tensor) -> dict[str, torch.Tensor]:
         """
