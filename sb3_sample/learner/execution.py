@@ -503,7 +503,8 @@ class Captured:
             own = inputs_like(inputs, torch.clone)
             self._recorded[kind] = (own, *self._recorder(lambda: step(learner, *own)))
         own, repeat, metrics = self._recorded[kind]
-        torch._foreach_copy_(tensors_of(own), tensors_of(inputs))
+        if given := tensors_of(inputs):
+            torch._foreach_copy_(tensors_of(own), given)
         repeat()
         # The caller adds to what it is given.
         return dict(metrics)

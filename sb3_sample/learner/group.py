@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.descent import StackedDescent
 from sb3_sample.learner.execution import (
     Acting,
@@ -102,11 +103,14 @@ class LearnerGroup:
             {id(self._first.optimizers()[name]): optimizer for name, optimizer in self._optimizers.items()},
             self._parameters_by_network(),
         )
+        # Discount factors, one or (S,).
+        self._discounts: float | torch.Tensor = 0.0
         #: Numbers that differ between learners: object of the first learner, attribute, (S,).
         self._differing: list[tuple[dict[str, Any], str, torch.Tensor]] = []
         self._settings = [Settings(learner, private=False) for learner in self.learners]
         self._versions: list[int] = []
         self._execution: Execution | None = None
+        self._drawing: Execution | None = None
         self._acting: Acting | None = None
         stacks = self._stacks.by_name()
         self._take_settings()
@@ -145,18 +149,24 @@ class LearnerGroup:
     @property
     def seconds_compiling(self) -> float:
         """Seconds spent on compiling the gradient step."""
-        return 0.0 if self._execution is None else self._execution.seconds_compiling
+        return sum(each.seconds_compiling for each in (self._execution, self._drawing) if each is not None)
 
     def step(self, inputs: Sequence[tuple[Any, ...]]) -> list[Metrics]:
         """
         Take one gradient step of each learner.
 
-        :param inputs: the arguments of each learner's ``gradient_step``, in the learners' order
+        :param inputs: the arguments of each learner's ``gradient_step`` or ``drawn_step``, in the learners' order
         :return: each learner's result, valid until the next step
         """
         self._prepare()
-        assert self._execution is not None
-        return self._of_each_learner(self._execution(self, *_stacked(inputs, self.device)))
+        if isinstance(inputs[0][0], Batch):
+            self._execution = self._execution or self._made("mapped_step")
+            execution = self._execution
+        else:
+            self._drawing = self._drawing or self._made("mapped_drawn_step")
+            execution = self._drawing
+        execution.prepare(self)
+        return self._of_each_learner(execution(self, *_stacked(inputs, self.device)))
 
     def act(self, inputs: Sequence[tuple[Any, ...]]) -> list[Metrics]:
         """
@@ -198,9 +208,6 @@ class LearnerGroup:
             self._versions = versions
         self._take_rates()
         self._take_changes()
-        if self._execution is None:
-            self._execution = self._made()
-        self._execution.prepare(self)
 
     def _take_changes(self) -> None:
         """Take over what was set in the learners."""
@@ -208,16 +215,16 @@ class LearnerGroup:
         changed = [settings.have_changed() for settings in self._settings]
         if any(changed):
             self._take_settings()
-            self._execution = self._acting = None
+            self._execution = self._drawing = self._acting = None
 
-    def _made(self) -> Execution:
+    def _made(self, method: str) -> Execution:
         if self.compiled:
             reason = why_not_compiled(self)
             if reason is not None:
                 warnings.warn(f"The gradient step is not compiled: {reason}", stacklevel=4)
                 self.compiled = False
         recorder = cuda_graph if captures(self, self._first) else None
-        return Execution(self, self.compiled, self.compile == "auto", recorder, "mapped_step")
+        return Execution(self, self.compiled, self.compile == "auto", recorder, method)
 
     def mapped_step(self, *inputs: Any) -> Metrics:
         """
@@ -227,6 +234,20 @@ class LearnerGroup:
         :return: each learner's result, by name, (S, ...)
         """
         return self._mapped("gradient_step", inputs)
+
+    def mapped_drawn_step(self, batch_size: int, moves_targets: bool, moves_actor: bool) -> Metrics:
+        """
+        Draw batches and compute the gradient step of all learners: this function is compiled or captured.
+
+        :param batch_size: B, of each
+        :param moves_targets: as of ``gradient_step``
+        :param moves_actor: as of ``gradient_step``
+        :return: each learner's result, by name, (S, ...)
+        """
+        inputs = [learner.drawn_inputs(batch_size) for learner in self.learners]
+        drawn = _stacked([(batch._replace(discounts=None), noise) for batch, noise in inputs], self.device)
+        batch = drawn[0]._replace(discounts=self._discounts)
+        return self._mapped("gradient_step", (batch, drawn[1], None, moves_targets, moves_actor))
 
     def mapped_actions(self, *inputs: Any) -> Metrics:
         """
@@ -324,6 +345,10 @@ class LearnerGroup:
         """
         self._differing = []
         self._descent.tau = self._first.tau
+        # Of batches that a step draws itself, where no tensor can come from the host.
+        gammas = [learner.gamma for learner in self.learners]
+        same = all(gamma == gammas[0] for gamma in gammas)
+        self._discounts = gammas[0] if same else torch.tensor(gammas, dtype=torch.float32, device=self.device)
         # The stacked optimizers' groups, by those of the first learner.
         groups = {
             id(theirs): ours

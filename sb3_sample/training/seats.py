@@ -32,7 +32,7 @@ class Member:
 
     :param seat: place of its training
     :param learner: the learner
-    :param method: name of its method that is run. Only the gradient step is taken together
+    :param method: name of its method that is run
     """
 
     def __init__(self, seat: Seat, learner: Learner, method: str = "gradient_step"):
@@ -48,9 +48,9 @@ class Member:
         :param method: name of its method that is run
         :return: what runs its steps
         """
-        if method != "gradient_step" or not seat.with_others:
+        if method not in ("gradient_step", "drawn_step") or not seat.with_others:
             return Execution.of(learner, method)
-        return cls(seat, learner)
+        return cls(seat, learner, method)
 
     @property
     def compiled(self) -> bool:
