@@ -19,6 +19,8 @@ from sb3_sample.saving.container import check_table
 from sb3_sample.saving.untrusted import BadFile, open_regular, parse_json
 
 EVALUATIONS = "evaluations.npz"
+#: In a run's folder, that of the checkpoints and the log of its steps on a data set, where others follow.
+OFFLINE = "offline"
 #: Arrays of the evaluations, and bytes of all of them: 400,000 evaluations of ten episodes.
 MAX_ARRAYS, MAX_BYTES = 16, 32 * 2**20
 #: Bytes of a header of NumPy, and of a line of Monitor's.

@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sb3_sample.run_logs import EVALUATIONS, read_evaluations
+from sb3_sample.run_logs import EVALUATIONS, OFFLINE, read_evaluations
 from sb3_sample.saving import temporary
 from sb3_sample.saving.locks import Lock, take
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
@@ -24,8 +24,6 @@ from sb3_sample.study.plan import Comparison, Plan, Run
 #: Content of a study's folder: its runs, the outcome of each, the list of them and the plan as it was read.
 RUNS, STATE, LIST, PLAN = "runs", "state", "study.json", "plan.yml"
 _LOG = "progress.jsonl"
-#: In a run's folder, the checkpoints of its steps on a data set where others follow.
-OFFLINE = "offline"
 #: Bytes of the list, of what is said of one run, and of the end of a log that is looked at.
 MAX_LIST, MAX_OUTCOME, TAIL = 2**28, 2**20, 2**14
 #: Characters of a traceback that are kept.

@@ -24,7 +24,7 @@ from sb3_sample.envs.registration import PACKAGE
 from sb3_sample.envs.suites import published_id, published_key
 from sb3_sample.extras import install
 from sb3_sample.plots import DATA, all_published_curves, find_runs, named_algorithms, run_env_id
-from sb3_sample.run_logs import EVALUATIONS, read_evaluations, read_monitors
+from sb3_sample.run_logs import EVALUATIONS, OFFLINE, read_evaluations, read_monitors
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 
 COLUMNS = ["agent", "arguments", "task", "seed", "step", "metric", "value"]
@@ -255,7 +255,14 @@ def _measured(folder: Path, run: _Run, metrics: Sequence[str]) -> dict[str, tupl
                 found[metric] = ended, monitored[column].to_numpy(float)
     if "episode_length" in found:
         found["episode_length"] = (steps, found["episode_length"][1] * run.repeat)
-    logged = _logged(folder / _LOG, run.repeat * run.skip, metrics)
+    # A run that learned from data first has their log apart, and a clock that began anew afterwards.
+    logged = _logged(folder / OFFLINE / _LOG, run.repeat * run.skip, metrics)
+    online = _logged(folder / _LOG, run.repeat * run.skip, metrics)
+    if _SECONDS in logged and _SECONDS in online:
+        online[_SECONDS] = online[_SECONDS][0], online[_SECONDS][1] + logged[_SECONDS][1][-1]
+    for name, (at, values) in online.items():
+        before = logged.get(name, (at[:0], values[:0]))
+        logged[name] = np.append(before[0], at), np.append(before[1], values)
     seconds = logged.pop(_SECONDS, None)
     if seconds is None and _matches("hours", metrics):
         monitored = read_monitors(folder) if monitored is None and any(folder.glob("*monitor.csv")) else monitored

@@ -34,7 +34,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_sample.lockstep import Seat, present
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.reading import read_dataset
-from sb3_sample.run_logs import monitor_files, monitor_head
+from sb3_sample.run_logs import OFFLINE, monitor_files, monitor_head
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.many import train_together
 from sb3_sample.saving.folders import Folder, is_plain
@@ -46,8 +46,6 @@ from sb3_sample.zoo.files import RunError, add_trust
 from sb3_sample.zoo.patches import managed_by, monitors_go_on
 
 RECORD = "run.json"
-#: Folder of the checkpoints of the steps on a data set, where others follow.
-OFFLINE = "offline"
 #: Bytes of a record.
 MAX_RECORD = 2**18
 #: Endings of the files that a run writes.

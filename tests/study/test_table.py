@@ -39,6 +39,24 @@ def test_a_run_of_the_train_command(tmp_path: Path) -> None:
     assert list(study.read(tmp_path, ["train/*"])["value"]) == [1.0]
 
 
+def test_a_run_that_learned_from_data_first(tmp_path: Path) -> None:
+    """Its steps on the data have a log of their own, and the clock of the others begins anew."""
+    online = [{"step": 2_500, "time/time_elapsed": 1_800, "train/critic_loss": 3.0}]
+    offline = [
+        {"step": 1_000, "time/time_elapsed": 3_600, "train/value_loss": 1.0},
+        {"step": 2_000, "time/time_elapsed": 7_200, "train/value_loss": 2.0, "train/critic_loss": 4.0},
+    ]
+    folder = write_run(tmp_path / "a", log=online)
+    (folder / "offline").mkdir()
+    (folder / "offline" / "progress.jsonl").write_text("".join(json.dumps(line) + "\n" for line in offline))
+    table = study.read(tmp_path, ["hours", "train/*"])
+    # After the last line at the mean speed.
+    np.testing.assert_allclose(only(table, "hours")["value"], [1, 2, 3])
+    assert list(only(table, "train/value_loss")["value"]) == [1.0, 2.0]
+    losses = only(table, "train/critic_loss")
+    assert list(losses["step"]) == [2_000, 2_500] and list(losses["value"]) == [4.0, 3.0]
+
+
 def test_steps_are_of_the_simulator(tmp_path: Path) -> None:
     write_run(tmp_path / "a", env_kwargs={"action_repeat": 4}, log=[{"step": 10, "diagnostics/x": 1}])
     table = study.read(tmp_path, ["return", "diagnostics/*", "episode_length", "hours"])
