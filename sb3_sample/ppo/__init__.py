@@ -3,7 +3,8 @@
 from sb3_sample.ppo.mbma import MBMAPPO
 from sb3_sample.ppo.mbpo import MBPOPPO
 from sb3_sample.ppo.qma import QMAPPO
+from sb3_sample.ppo.rewound import RewoundPPO
 from sb3_sample.ppo.samples import Rollout, SimulatedSamples
 from sb3_sample.ppo.simulated_ppo import SimulatedPPO
 
-__all__ = ["MBMAPPO", "MBPOPPO", "QMAPPO", "Rollout", "SimulatedPPO", "SimulatedSamples"]
+__all__ = ["MBMAPPO", "MBPOPPO", "QMAPPO", "RewoundPPO", "Rollout", "SimulatedPPO", "SimulatedSamples"]

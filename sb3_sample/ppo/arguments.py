@@ -124,7 +124,7 @@ def check(agent: Any) -> None:
     _check_buffer_class(agent)
     _check_schedule(agent)
     if agent.n_simulated == 0:
-        check_unused(agent, agent.simulation_arguments, "n_simulated=0")
+        check_unused(agent, agent.simulation_arguments, agent.plain)
     else:
         _check_simulation(agent)
 
@@ -176,7 +176,7 @@ def _check_simulation(agent: Any) -> None:
     if agent.use_sde:
         raise ValueError(
             "use_sde=True draws one noise for all actions at a state, so that simulated actions would be equal: "
-            "leave it out, or pass n_simulated=0"
+            f"leave it out, or pass {agent.plain}"
         )
     space = agent.action_space
     if isinstance(space, spaces.Discrete):
@@ -185,13 +185,13 @@ def _check_simulation(agent: Any) -> None:
     elif not isinstance(space, spaces.Box):
         raise ValueError(
             f"the action space must be a Box or Discrete, whose actions can be drawn or enumerated, not {space}: "
-            "pass n_simulated=0 for plain PPO"
+            f"pass {agent.plain} for plain PPO"
         )
     cls = agent.rollout_buffer_class
     if cls is not None and cls.get not in (RolloutBuffer.get, DictRolloutBuffer.get):
         raise ValueError(
             f"rollout_buffer_class={cls.__name__} draws its minibatches itself, but here they hold simulated "
-            "samples too: leave it out, or pass n_simulated=0"
+            f"samples too: leave it out, or pass {agent.plain}"
         )
 
 

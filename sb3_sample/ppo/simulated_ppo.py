@@ -64,6 +64,8 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         # Empty at the end of an iteration.
         "_seconds": Kept.NOWHERE,
     }
+    #: The argument that makes it plain PPO.
+    plain: ClassVar[str] = "n_simulated=0"
     #: Arguments that mean nothing without simulated samples.
     simulation_arguments: ClassVar[tuple[str, ...]] = ("anneal_until", "warm_up_until")
 
@@ -88,10 +90,13 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
     def _setup_model(self) -> None:
         super()._setup_model()
         if self.n_simulated > 0:
-            self.flat_observations = FlatObservations(self.observation_space)
+            self.flat_observations = self._make_flat_observations()
             self.model_actions = ModelActions(self.action_space, self.device)
             # After the policy, whose initial weights are thereby Stable-Baselines3's of the same seed.
             self._setup_models()
+
+    def _make_flat_observations(self) -> FlatObservations:
+        return FlatObservations(self.observation_space)
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         kwargs = dict(self.policy_kwargs)
@@ -133,7 +138,8 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
     @classmethod
     def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
         # The file's arguments of simulated samples contradict n_simulated=0.
-        is_plain = kwargs.get("n_simulated") == 0
+        name, value = cls.plain.split("=")
+        is_plain = kwargs.get(name) == int(value)
         return {name: default_of(cls, name) for name in cls.simulation_arguments} if is_plain else {}
 
     # ---------------------------------------------------------------- the iteration
@@ -330,7 +336,7 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
 
     def _check_simulates(self) -> None:
         if self.n_simulated == 0:
-            raise ValueError("n_simulated=0: this model has nothing to simulate with")
+            raise ValueError(f"{self.plain}: this model has nothing to simulate with")
 
     def _check_has_rollout(self) -> None:
         self._check_simulates()
