@@ -105,14 +105,9 @@ class Constructed:
         """
         return ""
 
-    def __init_subclass__(cls, without: Iterable[str] = (), **kwargs: Any) -> None:
-        """
-        Declare the arguments of a class.
-
-        :param without: inherited arguments that it has not
-        """
+    def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        cls.constructor_arguments = {name: each for name, each in _declared(cls).items() if name not in set(without)}
+        cls.constructor_arguments = _declared(cls)
         signature = _signature(cls)
         first = next(base for base in cls.__mro__ if "__init__" in vars(base))
         others = [base for base in cls.__mro__ if hasattr(vars(base).get("__init__"), "of_declarations")]

@@ -26,7 +26,7 @@ from rl_zoo3.utils import StoreDict
 
 from sb3_sample import BRO, DAC, MBMAPPO, SAC, BROFast, RegularizedSAC, zoo
 from sb3_sample.envs import suites
-from sb3_sample.ppo import SimulatedPPO
+from sb3_sample.ppo import ExtraSamplesPPO
 from sb3_sample.sac.bro import BRO_RESETS
 
 ROOT = Path(__file__).parent.parent
@@ -56,7 +56,7 @@ BUILT = [
     for name, env_id in ALL_ENTRIES
 ]
 #: Those of the MBMA paper.
-ON_POLICY = sorted(name for name, entry in zoo.ALGORITHMS.items() if issubclass(entry.algorithm, SimulatedPPO))
+ON_POLICY = sorted(name for name, entry in zoo.ALGORITHMS.items() if issubclass(entry.algorithm, ExtraSamplesPPO))
 #: What came after BRO, each with settings of its own.
 SUCCESSORS = ("brc", "crossq", "dr_q", "flash_sac", "simba", "simbav2", "xqc")
 #: What learns from data.
@@ -300,7 +300,7 @@ def test_the_commands_in_the_files_of_p1(name: str, tmp_path: Path) -> None:
         result = manager(name, given.env, tmp_path, hyperparams=given.params).setup_experiment()
         assert result is not None
         model: Any = result[0]
-        found.append((model.n_simulated, model.anneal_until))
+        found.append((model._n_extra, model.anneal_until))
     assert found == ([(1, None), (1, None)] if name == "rewound_ppo" else [(8, None), (8, 0.15)])
 
 

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_sample.envs.states import EnvState, restore_state
+from sb3_sample.envs.states import EnvState, is_simulator, layers_of, restore_state
 
 
 class Follower(Protocol):
@@ -150,7 +150,8 @@ def sibling_of(env: gym.Env) -> gym.Env:
     :param env: environment, wrapped or not
     :return: another one with the same wrappers, in no particular state. Stable-Baselines3's ``Monitor`` writes no file
         there
-    :raises ValueError: it is recorded as a video, as the other one would be
+    :raises ValueError: it is recorded as a video, as the other one would be, or a wrapper that can only be copied holds
+        on to the simulator
     """
     wrappers = []
     while isinstance(env, gym.Wrapper):
@@ -171,7 +172,14 @@ def _wrapped_like(wrapper: gym.Wrapper, env: gym.Env) -> gym.Env:
     recorded = getattr(wrapper, "_saved_kwargs", None)
     if recorded is not None:
         return make(env, **recorded)
-    # What its state is, restoring replaces; the rest describes it.
+    # What its state is, restoring replaces; the rest describes it, unless it leads to the environment itself.
+    inside = [value for layer in layers_of(wrapper.env) for value in vars(layer).values() if is_simulator(value)]
+    for name, value in vars(wrapper).items():
+        if name != "env" and (isinstance(value, gym.Env) or any(value is each for each in inside)):
+            raise ValueError(
+                f"{type(wrapper).__name__} holds on to the environment in its attribute {name!r}, and a copy would "
+                "too: derive it from gymnasium.utils.RecordConstructorArgs"
+            )
     like = copy.copy(wrapper)
     like.env = env
     return like

@@ -237,6 +237,14 @@ def _is_state(value: Any) -> bool:
     )
 
 
+def is_simulator(value: Any) -> bool:
+    """
+    :param value: of an attribute of an environment
+    :return: whether it may be what simulates it: neither a part of the state nor a description
+    """
+    return not _is_state(value) and not isinstance(value, _NOT_STATE)
+
+
 def _bit_generator(generator: Any, seed: int) -> Any:
     """A bit generator of the kind that the generator has."""
     if isinstance(generator, np.random.RandomState):

@@ -36,7 +36,7 @@ class PPOArguments(Resumable):
     """Arguments that every on-policy algorithm has, those of Stable-Baselines3 first and by position too."""
 
     _policy: str | type[ActorCriticPolicy] = argument(alias="policy", kw_only=False)
-    """"MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes"""
+    """"MlpPolicy", "MultiInputPolicy" or a policy class; without further samples any that PPO takes"""
     _env: gym.Env[Any, Any] | VecEnv | str | None = argument(alias="env", kw_only=False)
     """the environment, an id, or a vectorised environment"""
     learning_rate: float | Schedule = argument(default=3e-4, kind=LEARNING_RATE, kw_only=False)
@@ -86,9 +86,6 @@ class PPOArguments(Resumable):
     _policy_kwargs: dict[str, Any] | None = argument(alias="policy_kwargs", default=None)
     """arguments of the policy. Without ``net_arch``, "MlpPolicy" and "MultiInputPolicy" have the paper's two hidden
     layers of 512 (actor) and 1024 (critic)"""
-    n_simulated: int = argument(default=8, kind=integer(0))
-    """X, simulated samples for each real one, at the height of the schedule below; 0 for PPO. With a Discrete space:
-    see ``simulate``"""
     anneal_until: float | None = argument(
         default=None,
         kind=Kind(
@@ -123,7 +120,7 @@ def check(agent: Any) -> None:
         _check_net_arch(agent.policy_kwargs.get("net_arch"))
     _check_buffer_class(agent)
     _check_schedule(agent)
-    if agent.n_simulated == 0:
+    if agent._n_extra == 0:
         check_unused(agent, agent.simulation_arguments, agent.plain)
     else:
         _check_simulation(agent)

@@ -25,7 +25,7 @@ from sb3_sample.envs.rewinding import rewound_returns, sibling_of
 from sb3_sample.envs.states import EnvState, check_restorable, save_state
 from sb3_sample.kinds import Kind, integer
 from sb3_sample.ppo.samples import SimulatedSamples
-from sb3_sample.ppo.simulated_ppo import SimulatedPPO
+from sb3_sample.ppo.simulated_ppo import ExtraSamplesPPO
 from sb3_sample.ppo.spaces import FlatObservations
 from sb3_sample.saving.kept import Kept
 
@@ -33,7 +33,7 @@ from sb3_sample.saving.kept import Kept
 _TRANSPARENT = (VecCheckNan, VecMonitor)
 
 
-class RewoundPPO(SimulatedPPO, without=("n_simulated",)):
+class RewoundPPO(ExtraSamplesPPO):
     """
     PPO with many actions by the environment itself (MBMA, Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011,
     equation 3, figure 1 and table 1's last columns): at each real state ``n_actions - 1`` further actions are taken in
@@ -60,7 +60,7 @@ class RewoundPPO(SimulatedPPO, without=("n_simulated",)):
     }
     plain: ClassVar[str] = "n_actions=1"
     simulation_arguments: ClassVar[tuple[str, ...]] = (
-        *SimulatedPPO.simulation_arguments,
+        *ExtraSamplesPPO.simulation_arguments,
         "horizon",
         "sample_actions",
         "copies",
@@ -92,8 +92,7 @@ class RewoundPPO(SimulatedPPO, without=("n_simulated",)):
         super()._construct(given)
 
     @property
-    def n_simulated(self) -> int:  # type: ignore[misc]
-        """Further actions at each state."""
+    def _n_extra(self) -> int:
         return self.n_actions - 1
 
     def _check_arguments(self) -> None:
@@ -126,7 +125,7 @@ class RewoundPPO(SimulatedPPO, without=("n_simulated",)):
         :raises ValueError: if its spaces or its number of environments differ, or it cannot be rewound
         """
         super().set_env(env, force_reset)
-        if self.n_simulated > 0:
+        if self._n_extra > 0:
             self._states = []
             self._make_siblings()
 
@@ -140,7 +139,8 @@ class RewoundPPO(SimulatedPPO, without=("n_simulated",)):
         if base.envs[0].render_mode == "human":
             raise ValueError("env has render_mode='human', and its copies would be shown too: train without")
         try:
-            self._siblings = [sibling_of(base.envs[0]) for _ in range(self.copies)]
+            # The others are made when they are needed.
+            self._siblings = [sibling_of(base.envs[0]) for _ in range(min(self.copies, 2))]
         except Exception as error:  # whatever the constructors of an environment and its wrappers raise
             raise ValueError(
                 f"env must be one that can be made once more, to go back to its states, and {base.envs[0]} cannot "
@@ -184,7 +184,7 @@ class RewoundPPO(SimulatedPPO, without=("n_simulated",)):
     def _train(self) -> None:
         before = self.num_rewound_steps
         super()._train()
-        if self.n_simulated > 0:
+        if self._n_extra > 0:
             self.logger.record("rewound/steps", self.num_rewound_steps - before)
             self.logger.record("rewound/total_steps", self.num_rewound_steps)
 
@@ -208,6 +208,8 @@ class RewoundPPO(SimulatedPPO, without=("n_simulated",)):
         # As the buffer's rows: the steps of one environment after those of another.
         states = [self._states[t][index] for index in range(n_envs) for t in range(n_steps)]
         left = [n_steps - t if self.horizon is None else self.horizon for _ in range(n_envs) for t in range(n_steps)]
+        base = self._venv(self.env).envs[0]
+        self._siblings += [sibling_of(base) for _ in range(self.copies - len(self._siblings))]
         flat_actions = actions.flatten(0, 1).cpu().numpy()
         if isinstance(self.action_space, spaces.Box):
             flat_actions = flat_actions.reshape(-1, *self.action_space.shape)

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.logger import Logger
 
 from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO, RewoundPPO
-from sb3_sample.ppo import SimulatedPPO
+from sb3_sample.ppo import ExtraSamplesPPO
 from sb3_sample.ppo.dynamics import Prediction
 from tests.sac.common import vec
 
@@ -24,7 +24,7 @@ TINY: dict[str, Any] = dict(
     device="cpu",
     seed=0,
 )
-TINY_MODELS: dict[type[SimulatedPPO], dict[str, Any]] = {
+TINY_MODELS: dict[type[ExtraSamplesPPO], dict[str, Any]] = {
     MBMAPPO: dict(dynamics_kwargs={"width": 8, "depth": 1}, simulation_horizon=4, dynamics_buffer_size=100),
     MBPOPPO: dict(dynamics_kwargs={"width": 8, "depth": 1}, simulation_horizon=4, dynamics_buffer_size=100),
     QMAPPO: dict(q_kwargs={"width": 8, "depth": 1}),

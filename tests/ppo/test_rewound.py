@@ -449,6 +449,14 @@ class Hidden(gym.Env):
         return np.full(1, next(self._hidden) % 9, np.float32), 0.0, False, False, {}
 
 
+class HoldsOn(gym.Wrapper):
+    """Not made by recorded arguments, and with a way of its own to the environment."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        self.inner = env.unwrapped
+
+
 class NoCopy(Ends):
     def __deepcopy__(self, memo: Any) -> Any:
         raise TypeError("cannot be copied")
@@ -484,6 +492,7 @@ def test_n_simulated_is_no_argument() -> None:
     [
         (lambda: Hidden(), "state can be saved and restored.* n_actions=1 for plain PPO"),
         (lambda: NoCopy(3), "can be made once more.*cannot be copied.* n_actions=1 for plain PPO"),
+        (lambda: HoldsOn(Ends(3)), "HoldsOn holds on to the environment in its attribute 'inner'"),
         (lambda: VecFrameStack(vec(), 2), "VecFrameStack changes what the policy sees.*FrameStackObservation"),
         (lambda: gym.make("CartPole-v1", render_mode="human"), "render_mode='human'"),
         (
@@ -527,3 +536,11 @@ def test_rewards_that_are_not_finite() -> None:
     venv = DummyVecEnv([lambda: Toy(poison=lambda total, obs, r: (obs, np.inf if total > 40 else r))])
     with pytest.raises(ValueError, match="not finite"):
         rewound(venv, n_actions=9, copies=1).learn(64)
+
+
+@pytest.mark.slow
+def test_it_is_exported_as_the_others(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    from tests.test_export import check, shake
+
+    check(shake(rewound(n_actions=2)), tmp_path)

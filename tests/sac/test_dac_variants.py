@@ -359,3 +359,12 @@ def test_by_default_nothing_of_this() -> None:
     explorer = dac().explorer
     assert type(explorer) is OptimisticActor and not explorer.deterministic
     assert [group["lr"] for group in explorer.scalar_optimizer.param_groups] == [3e-5, 3e-5]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", ["DETERMINISTIC PESSIMISTIC", "ONLY OPTIMISTIC"])
+def test_rows_with_another_actor_are_exported(row: str, tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    from tests.test_export import check, shake
+
+    check(shake(dac(**ROWS[row])), tmp_path)
