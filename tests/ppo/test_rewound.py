@@ -113,7 +113,7 @@ def test_the_gradient_is_exact_and_its_variance_lemma_3_1s(n_batches: int, n_act
     # Four standard errors of it.
     spread = (np.square(found - found.mean(axis=0)).sum(axis=1)).std() / np.sqrt(n_batches)
     assert abs(measured - variances[n_actions]) < 4 * spread
-    assert n_batches < 10_000 or 4 * spread < 0.05 * measured
+    assert n_batches < 10_000 or 4 * spread < 0.1 * measured
 
 
 @pytest.mark.parametrize("n_batches", [150, pytest.param(10_000, marks=pytest.mark.slow)])
