@@ -3,7 +3,7 @@
 from sb3_sample.diagnostics import DiagnosticsCallback, NoiseScaleCallback
 from sb3_sample.envs import EnvironmentDied, SupervisedSubprocVecEnv, make_env, multi_task_env
 from sb3_sample.faults import TrainingDiverged
-from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
+from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO, RewoundPPO
 from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
 from sb3_sample.replay.dataset import Dataset
@@ -80,6 +80,7 @@ __all__ = [
     "PrioritizedDictReplayBuffer",
     "PrioritizedReplayBuffer",
     "RegularizedSAC",
+    "RewoundPPO",
     "SimBa",
     "SimbaV2",
     "SupervisedSubprocVecEnv",

@@ -278,10 +278,13 @@ ON_POLICY = {
     "mbma_ppo": "dynamics_kwargs:dict(width=8)",
     "mbpo_ppo": "dynamics_kwargs:dict(width=8)",
     "qma_ppo": "q_kwargs:dict(width=8)",
+    "rewound_ppo": "copies:4",
 }
 
 
-@pytest.mark.parametrize("name", ON_POLICY)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "rewound_ppo" else []) for name in ON_POLICY]
+)
 def test_p1s_algorithms_train_in_two_environments_go_on_and_are_shown(
     zoo_run, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
@@ -296,7 +299,7 @@ def test_p1s_algorithms_train_in_two_environments_go_on_and_are_shown(
 
     first, second = (ALGOS[name].load(file.replace("_1/", f"_{run_id}/"), device="cpu") for run_id in "12")
     assert second._n_updates > first._n_updates > 0
-    if name != "qma_ppo":
+    if name not in ("qma_ppo", "rewound_ppo"):
         assert (first.transitions.size, second.transitions.size) == (64, 96)
 
 

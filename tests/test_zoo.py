@@ -26,7 +26,7 @@ from rl_zoo3.utils import StoreDict
 
 from sb3_sample import BRO, DAC, MBMAPPO, SAC, BROFast, RegularizedSAC, zoo
 from sb3_sample.envs import suites
-from sb3_sample.ppo import SimulatedPPO
+from sb3_sample.ppo import ExtraSamplesPPO
 from sb3_sample.sac.bro import BRO_RESETS
 
 ROOT = Path(__file__).parent.parent
@@ -56,7 +56,7 @@ BUILT = [
     for name, env_id in ALL_ENTRIES
 ]
 #: Those of the MBMA paper.
-ON_POLICY = sorted(name for name, entry in zoo.ALGORITHMS.items() if issubclass(entry.algorithm, SimulatedPPO))
+ON_POLICY = sorted(name for name, entry in zoo.ALGORITHMS.items() if issubclass(entry.algorithm, ExtraSamplesPPO))
 #: What came after BRO, each with settings of its own.
 SUCCESSORS = ("brc", "crossq", "dr_q", "flash_sac", "simba", "simbav2", "xqc")
 #: What learns from data.
@@ -274,7 +274,7 @@ def test_the_tasks_of_p1_have_entries_with_its_settings(name: str) -> None:
     assert [steps[env_id] for env_id in suites.MBMA_HARD] == [3e6, 3e6, 6e6, 6e6]
     for env_id in suites.MBMA_HARD:
         assert (ours[env_id]["n_steps"], ours[env_id]["batch_size"]) == (4096, 128)
-        if name != "qma_ppo":
+        if name not in ("qma_ppo", "rewound_ppo"):
             assert ours[env_id]["dynamics_buffer_size"] == 2_000_000 and ours[env_id]["dynamics_batch_size"] == 256
 
 
@@ -300,8 +300,8 @@ def test_the_commands_in_the_files_of_p1(name: str, tmp_path: Path) -> None:
         result = manager(name, given.env, tmp_path, hyperparams=given.params).setup_experiment()
         assert result is not None
         model: Any = result[0]
-        found.append((model.n_simulated, model.anneal_until))
-    assert found == [(8, None), (8, 0.15)]
+        found.append((model._n_extra, model.anneal_until))
+    assert found == ([(1, None), (1, None)] if name == "rewound_ppo" else [(8, None), (8, 0.15)])
 
 
 def test_action_repeat_of_the_file_holds_for_evaluation_too(tmp_path: Path) -> None:

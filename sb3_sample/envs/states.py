@@ -2,14 +2,15 @@
 Saving the state of an environment and going back to it, so that other actions can be tried at a visited state.
 
 A saved state is all that decides what comes next: the simulator's (``mjData``, with what was derived from positions and
-velocities, and the numbers of the model, which some tasks draw anew for each episode), the task's, the counters of time
-limits and wrappers, and the random generators. It can be restored in the environment that it is of, any number of
-times, or in another one that was made in the same way.
+velocities, and the numbers of the model, which some tasks draw anew for each episode; or that of Atari's console), the
+task's, the counters of time limits and wrappers, and the random generators. It can be restored in the environment that
+it is of, any number of times, or in another one that was made in the same way.
 """
 
 import collections
 import copy
 import functools
+import io
 import types
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -25,7 +26,9 @@ _CONSTANTS = (type(None), bool, int, float, complex, str, bytes, np.generic)
 _CONTAINERS = (list, tuple, dict, set, collections.deque)
 _GENERATORS = (np.random.Generator, np.random.RandomState)
 #: What describes an environment or its interface: never a part of the state.
-_NOT_STATE = (gym.Env, gym.Space, gym.envs.registration.EnvSpec, type, types.ModuleType, types.FunctionType)
+_NOT_STATE = (
+    gym.Env, gym.Space, gym.envs.registration.EnvSpec, io.IOBase, type, types.ModuleType, types.FunctionType
+)  # fmt: skip
 
 
 class EnvState(NamedTuple):
@@ -36,17 +39,19 @@ class EnvState(NamedTuple):
         and control loop if it is one of dm_control
     :param data: copy of MuJoCo's data; None if it has no simulator
     :param model: arrays of MuJoCo's model, by name
+    :param console: of the Arcade Learning Environment, its generator included; None if it is not of it
     """
 
     layers: list[dict[str, Any]]
     data: Any
     model: dict[str, np.ndarray]
+    console: Any = None
 
 
 def save_state(env: gym.Env) -> EnvState:
     """
-    :param env: environment of this package's ``dmc/``, of Gymnasium's MuJoCo, or one whose state is in its Python
-        attributes (Gymnasium's classic control), wrapped or not
+    :param env: environment of this package's ``dmc/``, of Gymnasium's MuJoCo, of Atari's (``ale-py``), or one whose
+        state is in its Python attributes (Gymnasium's classic control), wrapped or not
     :return: its state
     :raises TypeError: ``env`` is not a ``gymnasium.Env``
     """
@@ -56,7 +61,9 @@ def save_state(env: gym.Env) -> EnvState:
         data = copy.copy(simulator[1])
         model = {name: getattr(simulator[0], name).copy() for name in model_arrays()}
     # Copied together, so that a generator that two of them share is shared in the copy.
-    return EnvState(copy.deepcopy([_attributes(layer) for layer in layers]), data, model)
+    attributes = copy.deepcopy([_attributes(layer) for layer in layers])
+    base: Any = env.unwrapped
+    return EnvState(attributes, data, model, base.clone_state(include_rng=True) if is_atari(env) else None)
 
 
 def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None = None) -> None:
@@ -66,7 +73,8 @@ def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None
     :param env: the environment that the state was saved of, or one made in the same way
     :param state: from :func:`save_state`; it stays as it is
     :param rng: if given, the environment's random generators are seeded anew from it, so that a task that is random
-        after its reset goes on at random from the state
+        after its reset goes on at random from the state. That of Atari's console, which draws sticky actions, cannot be
+        seeded and is restored
     :raises ValueError: ``state`` is of an environment with other wrappers, or of another model
     """
     layers, simulator = layers_of(env), simulator_of(env)
@@ -88,6 +96,11 @@ def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None
         for name, array in state.model.items():
             getattr(model, name)[...] = array
         mujoco.mj_copyData(data, model, state.data)
+    if is_atari(env) != (state.console is not None):
+        raise ValueError("state must be of an environment like env: only one of the two is Atari's")
+    if state.console is not None:
+        base: Any = env.unwrapped
+        base.restore_state(state.console)
     for layer, attributes in zip(layers, copy.deepcopy(state.layers), strict=True):
         for name, value in attributes.items():
             if rng is not None and isinstance(value, _GENERATORS):
@@ -117,7 +130,7 @@ def check_restorable(env: gym.Env, other: gym.Env | None = None, n_steps: int = 
     other = env if other is None else other
     message = (
         f"env must be an environment whose state can be saved and restored, as those of dmc/, Gymnasium's MuJoCo and "
-        f"classic control, not {env}: "
+        f"classic control, and Atari's, not {env}: "
     )
     restore_state(other, state)
     try:
@@ -177,6 +190,14 @@ def simulator_of(env: gym.Env) -> tuple[Any, Any] | None:
     return None
 
 
+def is_atari(env: gym.Env) -> bool:
+    """
+    :param env: an environment, wrapped or not
+    :return: whether it is simulated by the Arcade Learning Environment
+    """
+    return type(env.unwrapped).__module__.partition(".")[0] == "ale_py"
+
+
 @functools.cache
 def model_arrays() -> tuple[str, ...]:
     """
@@ -214,6 +235,14 @@ def _is_state(value: Any) -> bool:
     return not type(value).__module__.startswith(("mujoco", "dm_control", "gymnasium.envs")) and all(
         _is_state(item) for item in vars(value).values()
     )
+
+
+def is_simulator(value: Any) -> bool:
+    """
+    :param value: of an attribute of an environment
+    :return: whether it may be what simulates it: neither a part of the state nor a description
+    """
+    return not _is_state(value) and not isinstance(value, _NOT_STATE)
 
 
 def _bit_generator(generator: Any, seed: int) -> Any:

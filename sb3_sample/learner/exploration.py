@@ -7,12 +7,12 @@ from typing import Any, ClassVar
 import torch
 from torch.optim import Optimizer
 
-from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, check_value, integer
+from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, TRUE_OR_FALSE, check_value, integer
 from sb3_sample.learner import losses
 from sb3_sample.learner.batch import Batch, for_each
 from sb3_sample.learner.parts import Learning, Part
 from sb3_sample.learner.pessimism import epistemic_std
-from sb3_sample.learner.scalars import BoundedLogScalar, LogScalar
+from sb3_sample.learner.scalars import BoundedLogScalar, FixedScalar, LogScalar
 from sb3_sample.learner.target import values
 from sb3_sample.networks import NETWORKS, linear, widened
 from sb3_sample.optim import AdamW
@@ -76,6 +76,24 @@ class Exploration(Part):
         :return: what to log, by name, scalars
         """
         return {}
+
+
+class ScaledNoise(Exploration):
+    """
+    Exploration by the actor itself, its standard deviation multiplied.
+
+    :param learner: the learner, whose networks exist already
+    :param std_multiplier: factor on the standard deviation while exploring, above 0
+    :raises ValueError: if it is out of range
+    """
+
+    def __init__(self, learner: Learning, std_multiplier: float):
+        super().__init__(learner)
+        self.std_multiplier = check_value("std_multiplier", std_multiplier, ABOVE_0)
+
+    def sampled(self, learner: Learning, observations: Any, noise: torch.Tensor) -> torch.Tensor:
+        mean, log_std = learner.actor.gaussian(learner.actor.features(observations))
+        return learner.actor.act(mean, self.std_multiplier * log_std.exp(), noise)
 
 
 class HeldNoise(Exploration):
@@ -152,6 +170,23 @@ def spread(q: torch.Tensor, uncertainty: str) -> torch.Tensor:
     return aleatoric.clamp_min(1e-12).sqrt()
 
 
+def check_uncertainty(uncertainty: str, learner: Learning) -> None:
+    """
+    Check what is meant by the spread of the critics.
+
+    :param uncertainty: the argument
+    :param learner: the learner, whose critics it is of
+    :raises ValueError: if it is unknown, or one of quantiles that they have not
+    """
+    if uncertainty not in UNCERTAINTIES:
+        raise ValueError(f"uncertainty must be one of {UNCERTAINTIES}, not {uncertainty!r}")
+    if uncertainty != "epistemic" and (learner.head.n_quantiles or 1) < 2:
+        raise ValueError(
+            f"uncertainty={uncertainty!r} needs critics with at least two quantiles, "
+            f"not n_quantiles={learner.head.n_quantiles}"
+        )
+
+
 class OptimisticExploration(Exploration):
     """
     Base class of the optimistic actors, which only act while training. They maximise the optimistic value ``Q_mean +
@@ -181,24 +216,28 @@ class OptimisticExploration(Exploration):
         check_value("kl_target", kl_target, ABOVE_0)
         check_value("std_multiplier", std_multiplier, ABOVE_0)
         check_value("adjustment_learning_rate", adjustment_learning_rate, AT_LEAST_0)
-        if uncertainty not in UNCERTAINTIES:
-            raise ValueError(f"uncertainty must be one of {UNCERTAINTIES}, not {uncertainty!r}")
-        if uncertainty != "epistemic" and (learner.head.n_quantiles or 1) < 2:
-            raise ValueError(
-                f"uncertainty={uncertainty!r} needs critics with at least two quantiles, "
-                f"not n_quantiles={learner.head.n_quantiles}"
-            )
+        check_uncertainty(uncertainty, learner)
         self.kl_target = kl_target
         self.std_multiplier = std_multiplier
         self.uncertainty = uncertainty
         self._adjustment_learning_rate = adjustment_learning_rate
 
-    def _make_optimizers(self, learner: Learning, actor: Any, optimism: Any, kl_weight: Any) -> None:
-        """Make the optimizers of the optimistic actor and of optimism and weight."""
+    def _make_optimizers(self, learner: Learning, actor: Any, *scalars: tuple[Any, float | None]) -> None:
+        """
+        Make the optimizers of the optimistic actor and of optimism and weight.
+
+        :param learner: the learner
+        :param actor: parameters of the optimistic actor
+        :param scalars: parameters of optimism and weight, each with their learning rate; None for the common one
+        """
         self.actor_optimizer = learner.make_optimizer(actor)
-        # Their learning rate is their own, whatever the schedule of the others.
-        scalars = {"params": [*optimism, *kl_weight], "scheduled": False}
-        self.scalar_optimizer = AdamW([scalars], lr=self._adjustment_learning_rate, betas=(0.5, 0.999))
+        common = self._adjustment_learning_rate
+        # Their learning rates are their own, whatever the schedule of the others.
+        groups = [
+            {"params": list(parameters), "lr": common if rate is None else rate, "scheduled": False}
+            for parameters, rate in scalars
+        ]
+        self.scalar_optimizer = AdamW([group for group in groups if group["params"]], betas=(0.5, 0.999))
 
     def optimizers(self) -> dict[str, Optimizer]:
         return {"actor_optimizer": self.actor_optimizer, "scalar_optimizer": self.scalar_optimizer}
@@ -333,8 +372,7 @@ class OptimisticShift(OptimisticExploration):
         self._make_optimizers(
             learner,
             [*self.trunk.parameters(), *self.shift.parameters()],
-            self.optimism.parameters(),
-            self.kl_weight.parameters(),
+            ([*self.optimism.parameters(), *self.kl_weight.parameters()], None),
         )
 
     def _gaussian(
@@ -373,8 +411,12 @@ class OptimisticActor(OptimisticExploration):
     :param std_multiplier: m, factor on its standard deviation while exploring, above 0
     :param uncertainty: what Q_std is: "epistemic", "aleatoric" or "both"; see :func:`spread`
     :param initial_optimism: optimism at the start, above minus the pessimism; None: 0.5 above it
-    :param initial_kl_weight: weight of the divergence at the start, above 0
+    :param initial_kl_weight: weight of the divergence at the start; at 0 it stays 0, while optimism is still adjusted
     :param adjustment_learning_rate: of optimism and weight, by Adam with beta1 = 0.5
+    :param optimism_learning_rate: of optimism; None: ``adjustment_learning_rate``; 0: it stays at its start
+    :param kl_weight_learning_rate: the same of the weight
+    :param deterministic: whether it acts and learns by its mean; its standard deviation in the divergence is then the
+        pessimistic actor's
     :param kl_direction: "optimistic_to_pessimistic" or "pessimistic_to_optimistic"
     :param reinitialize_every: environment steps, counted in transitions over the model's life, of each task where there
         are several, after which it starts anew; None for never
@@ -396,6 +438,9 @@ class OptimisticActor(OptimisticExploration):
         adjustment_learning_rate: float = 3e-5,
         kl_direction: str = "optimistic_to_pessimistic",
         reinitialize_every: int | None = 25_000,
+        optimism_learning_rate: float | None = None,
+        kl_weight_learning_rate: float | None = None,
+        deterministic: bool = False,
     ):
         super().__init__(learner, kl_target, std_multiplier, uncertainty, adjustment_learning_rate)
         beta = float(learner.pessimism_rule.beta())
@@ -405,7 +450,10 @@ class OptimisticActor(OptimisticExploration):
             distance = max(distance, self.BARRIER)
         if not 0 < distance < math.inf:
             raise ValueError(f"initial_optimism must be above minus the pessimism, {-beta}, not {initial_optimism}")
-        check_value("initial_kl_weight", initial_kl_weight, ABOVE_0)
+        check_value("initial_kl_weight", initial_kl_weight, AT_LEAST_0)
+        check_value("optimism_learning_rate", optimism_learning_rate, AT_LEAST_0.or_none())
+        check_value("kl_weight_learning_rate", kl_weight_learning_rate, AT_LEAST_0.or_none())
+        check_value("deterministic", deterministic, TRUE_OR_FALSE)
         if kl_direction not in self.KL_DIRECTIONS:
             raise ValueError(f"kl_direction must be one of {self.KL_DIRECTIONS}, not {kl_direction!r}")
         check_value("reinitialize_every", reinitialize_every, integer(1).or_none("never"))
@@ -414,9 +462,15 @@ class OptimisticActor(OptimisticExploration):
         self.actor = learner.make_actor()
         #: How far optimism lies above minus the pessimism.
         self.optimism_distance = LogScalar(distance)
-        self.kl_weight = LogScalar(initial_kl_weight)
+        self.kl_weight = LogScalar(initial_kl_weight) if initial_kl_weight > 0 else FixedScalar(0.0)
+        self.deterministic = deterministic
+        if deterministic:
+            self.std_multiplier = 0.0
         self._make_optimizers(
-            learner, self.actor.parameters(), self.optimism_distance.parameters(), self.kl_weight.parameters()
+            learner,
+            self.actor.parameters(),
+            (self.optimism_distance.parameters(), optimism_learning_rate),
+            (self.kl_weight.parameters(), kl_weight_learning_rate),
         )
         self._reached = learner.environment_steps
 
@@ -436,13 +490,15 @@ class OptimisticActor(OptimisticExploration):
         self, observations: Any, features: torch.Tensor, mean: torch.Tensor, std: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         mean, log_std = self.actor.gaussian(self.actor.features(observations))
-        return mean, log_std.exp()
+        return (mean, std) if self.deterministic else (mean, log_std.exp())
 
     def sampled(self, learner: Learning, observations: Any, noise: torch.Tensor) -> torch.Tensor:
         mean, log_std = self.actor.gaussian(self.actor.features(observations))
         return self.actor.act(mean, self.std_multiplier * log_std.exp(), noise)
 
     def _kl(self, learner: Learning, optimistic: Any, pessimistic: Any) -> torch.Tensor:
+        if not learner.actor.has_std:
+            pessimistic = pessimistic[0], optimistic[1]
         if self.kl_direction == "pessimistic_to_optimistic":
             return learner.actor.kl(*pessimistic, *optimistic)
         return learner.actor.kl(*optimistic, *pessimistic)

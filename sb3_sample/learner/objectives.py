@@ -8,6 +8,7 @@ from torch.optim import Optimizer
 
 from sb3_sample.learner import losses
 from sb3_sample.learner.batch import Batch
+from sb3_sample.learner.exploration import spread
 from sb3_sample.learner.parts import Learning, Part
 from sb3_sample.learner.target import values
 
@@ -83,6 +84,34 @@ def sampled(
     if learner.actor.trunk.stacks_actor_rows:
         return learner.actor.sample(observations, noise, learner.encoded(batch.next_observations))  # type: ignore[no-any-return]
     return learner.actor.sample(observations, noise)  # type: ignore[no-any-return]
+
+
+class OptimisticValue(Objective):
+    """
+    Objective of one optimistic actor alone (DAC, table 1): it maximises ``Q_mean + optimism * Q_std`` of its actions.
+
+    :param optimism: weight of the critics' spread, which stays as it is
+    :param uncertainty: what Q_std is; see :func:`~sb3_sample.learner.exploration.spread`
+    :param entropy: whether the entropy is rewarded too
+    """
+
+    def __init__(self, optimism: float, uncertainty: str, entropy: bool):
+        super().__init__()
+        self.optimism, self.uncertainty, self.entropy = optimism, uncertainty, entropy
+
+    def actor_loss(
+        self,
+        learner: Learning,
+        batch: Batch,
+        observations: Any,
+        alpha: torch.Tensor,
+        noise: torch.Tensor | None,
+        prepared: Prepared,
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+        actions, log_prob = sampled(learner, batch, observations, noise)
+        q = values(learner, learner.critic, observations, actions)
+        upper_value = q.mean(dim=0) + self.optimism * spread(q, self.uncertainty)
+        return losses.actor_loss(log_prob, upper_value, alpha.detach() if self.entropy else 0.0), log_prob
 
 
 class Cloning(Objective):

@@ -36,7 +36,7 @@ class PPOArguments(Resumable):
     """Arguments that every on-policy algorithm has, those of Stable-Baselines3 first and by position too."""
 
     _policy: str | type[ActorCriticPolicy] = argument(alias="policy", kw_only=False)
-    """"MlpPolicy", "MultiInputPolicy" or a policy class; with ``n_simulated=0`` any that PPO takes"""
+    """"MlpPolicy", "MultiInputPolicy" or a policy class; without further samples any that PPO takes"""
     _env: gym.Env[Any, Any] | VecEnv | str | None = argument(alias="env", kw_only=False)
     """the environment, an id, or a vectorised environment"""
     learning_rate: float | Schedule = argument(default=3e-4, kind=LEARNING_RATE, kw_only=False)
@@ -86,9 +86,6 @@ class PPOArguments(Resumable):
     _policy_kwargs: dict[str, Any] | None = argument(alias="policy_kwargs", default=None)
     """arguments of the policy. Without ``net_arch``, "MlpPolicy" and "MultiInputPolicy" have the paper's two hidden
     layers of 512 (actor) and 1024 (critic)"""
-    n_simulated: int = argument(default=8, kind=integer(0))
-    """X, simulated samples for each real one, at the height of the schedule below; 0 for PPO. With a Discrete space:
-    see ``simulate``"""
     anneal_until: float | None = argument(
         default=None,
         kind=Kind(
@@ -123,8 +120,8 @@ def check(agent: Any) -> None:
         _check_net_arch(agent.policy_kwargs.get("net_arch"))
     _check_buffer_class(agent)
     _check_schedule(agent)
-    if agent.n_simulated == 0:
-        check_unused(agent, agent.simulation_arguments, "n_simulated=0")
+    if agent._n_extra == 0:
+        check_unused(agent, agent.simulation_arguments, agent.plain)
     else:
         _check_simulation(agent)
 
@@ -176,7 +173,7 @@ def _check_simulation(agent: Any) -> None:
     if agent.use_sde:
         raise ValueError(
             "use_sde=True draws one noise for all actions at a state, so that simulated actions would be equal: "
-            "leave it out, or pass n_simulated=0"
+            f"leave it out, or pass {agent.plain}"
         )
     space = agent.action_space
     if isinstance(space, spaces.Discrete):
@@ -185,13 +182,13 @@ def _check_simulation(agent: Any) -> None:
     elif not isinstance(space, spaces.Box):
         raise ValueError(
             f"the action space must be a Box or Discrete, whose actions can be drawn or enumerated, not {space}: "
-            "pass n_simulated=0 for plain PPO"
+            f"pass {agent.plain} for plain PPO"
         )
     cls = agent.rollout_buffer_class
     if cls is not None and cls.get not in (RolloutBuffer.get, DictRolloutBuffer.get):
         raise ValueError(
             f"rollout_buffer_class={cls.__name__} draws its minibatches itself, but here they hold simulated "
-            "samples too: leave it out, or pass n_simulated=0"
+            f"samples too: leave it out, or pass {agent.plain}"
         )
 
 

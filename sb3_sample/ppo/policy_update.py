@@ -28,7 +28,7 @@ class PolicyUpdate:
         if not isinstance(distribution, (DiagGaussianDistribution, CategoricalDistribution)):
             raise ValueError(
                 "policy must give a diagonal Gaussian or a categorical distribution for simulated samples, not "
-                f"{type(distribution).__name__}: pass n_simulated=0 for plain PPO"
+                f"{type(distribution).__name__}: pass {self.plain} for plain PPO"
             )
         check_parameters_of(distribution.distribution)
         return distribution

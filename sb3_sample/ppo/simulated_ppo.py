@@ -1,7 +1,7 @@
 """
-The on-policy family: PPO whose policy gradient also sees simulated samples, and the one class that carries the work.
+The on-policy family: PPO whose policy gradient also sees further samples, and the one class that carries the work.
 
-``SimulatedPPO.train`` is the whole iteration after the rollout, in the order of MBMA, algorithm 1. Where the extra
+``ExtraSamplesPPO.train`` is the whole iteration after the rollout, in the order of MBMA, algorithm 1. Where the extra
 samples come from is the business of its subclasses, in ``fit_models`` and ``_simulate``.
 """
 
@@ -24,7 +24,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import check_program, default_of
-from sb3_sample.constructor import Given
+from sb3_sample.constructor import Given, argument
 from sb3_sample.faults import TrainingDiverged, check_finite_parameters, diverged, not_finite
 from sb3_sample.kinds import check_value, integer
 from sb3_sample.ppo import arguments
@@ -36,7 +36,7 @@ from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
 from sb3_sample.saving.kept import Kept
 from sb3_sample.saving.model import SafeFiles
 
-Self = TypeVar("Self", bound="SimulatedPPO")
+Self = TypeVar("Self", bound="ExtraSamplesPPO")
 
 #: Hidden widths of actor and critic (MBMA, appendix B.2), of the policies that are given by these names.
 NET_ARCH: dict[str, list[int]] = {"pi": [512, 512], "vf": [1024, 1024]}
@@ -45,14 +45,14 @@ WARM_UP = 0.15
 NAMED_POLICIES = ("MlpPolicy", "MultiInputPolicy")
 
 
-class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
+class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
     """
-    PPO whose policy loss also sees simulated samples (MBMA, Nauman and Cygan 2023,
-    https://arxiv.org/abs/2210.13011, algorithm 1): what :class:`MBMAPPO`, :class:`QMAPPO` and :class:`MBPOPPO` share.
-    The critic learns from the real samples alone.
+    PPO whose policy loss also sees further samples (MBMA, Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011,
+    algorithm 1): what :class:`SimulatedPPO` and :class:`RewoundPPO` share. The critic learns from the real samples
+    alone.
 
-    The number of updates is PPO's: each takes ``batch_size`` real samples with the simulated ones that belong to them
-    for the policy, and the real ones for the value. Without simulated samples it *is* Stable-Baselines3's PPO.
+    The number of updates is PPO's: each takes ``batch_size`` real samples with the further ones that belong to them
+    for the policy, and the real ones for the value. Without further samples it *is* Stable-Baselines3's PPO.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -64,6 +64,8 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         # Empty at the end of an iteration.
         "_seconds": Kept.NOWHERE,
     }
+    #: The argument that makes it plain PPO.
+    plain: ClassVar[str] = ""
     #: Arguments that mean nothing without simulated samples.
     simulation_arguments: ClassVar[tuple[str, ...]] = ("anneal_until", "warm_up_until")
 
@@ -83,15 +85,23 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         if is_set_up:
             self._setup_model()
 
+    @property
+    def _n_extra(self) -> int:
+        """Further samples for each real one, at the height of the schedule; 0 for PPO."""
+        raise NotImplementedError
+
     # ---------------------------------------------------------------- construction
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        if self.n_simulated > 0:
-            self.flat_observations = FlatObservations(self.observation_space)
+        if self._n_extra > 0:
+            self.flat_observations = self._make_flat_observations()
             self.model_actions = ModelActions(self.action_space, self.device)
             # After the policy, whose initial weights are thereby Stable-Baselines3's of the same seed.
             self._setup_models()
+
+    def _make_flat_observations(self) -> FlatObservations:
+        return FlatObservations(self.observation_space)
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         kwargs = dict(self.policy_kwargs)
@@ -101,7 +111,7 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         # Without any, Stable-Baselines3's own, whose epsilon is the paper's too.
         given = kwargs.get("optimizer_kwargs") or {"eps": 1e-5}
         fusible = optimizer_class is torch.optim.Adam and self.device.type in ("cpu", "cuda")
-        if self.n_simulated > 0 and fusible and not {"foreach", "differentiable"} & given.keys():
+        if self._n_extra > 0 and fusible and not {"foreach", "differentiable"} & given.keys():
             # The fused kernel takes the same steps in a third of the time.
             kwargs["optimizer_kwargs"] = {"fused": True, **given}
         return kwargs
@@ -121,19 +131,20 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = "ActorCriticPolicy") -> None:
         # Simulation is what a GPU is for.
-        if self.n_simulated == 0:
+        if self._n_extra == 0:
             super()._maybe_recommend_cpu(mlp_class_name)
 
     # ---------------------------------------------------------------- saving and loading
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names, variables = super()._get_torch_save_params()
-        return [*names, *(self._model_names() if self.n_simulated > 0 else [])], variables
+        return [*names, *(self._model_names() if self._n_extra > 0 else [])], variables
 
     @classmethod
     def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
-        # The file's arguments of simulated samples contradict n_simulated=0.
-        is_plain = kwargs.get("n_simulated") == 0
+        # The file's arguments of further samples contradict plain PPO.
+        name, value = cls.plain.split("=")
+        is_plain = kwargs.get(name) == int(value)
         return {name: default_of(cls, name) for name in cls.simulation_arguments} if is_plain else {}
 
     # ---------------------------------------------------------------- the iteration
@@ -180,7 +191,7 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
 
     def _before_training(self) -> None:
         self._iteration = 0
-        starts_at_none = self.n_simulated > 0 and self._warm_up > 0 and self.num_timesteps == 0
+        starts_at_none = self._n_extra > 0 and self._warm_up > 0 and self.num_timesteps == 0
         if starts_at_none and self._total_timesteps <= self.n_steps * self.n_envs:
             warnings.warn(
                 f"{self._total_timesteps} steps are a single iteration (n_steps={self.n_steps} times {self.n_envs} "
@@ -238,7 +249,7 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         if self._warm_up > 0:
             share *= min(1.0, self._progress / self._warm_up)
         # The tolerance keeps 8 times 0.5 from being rounded up to 5 by rounding errors.
-        return math.ceil(self.n_simulated * share - 1e-9)
+        return math.ceil(self._n_extra * share - 1e-9)
 
     def train(self) -> None:
         """
@@ -282,7 +293,7 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
     def _train(self) -> None:
         n_simulated = self.current_n_simulated()
         # While X is still rising from 0 the models learn already.
-        if self.n_simulated > 0 and (self.anneal_until is None or self._progress < self.anneal_until):
+        if self._n_extra > 0 and (self.anneal_until is None or self._progress < self.anneal_until):
             with self._phase("dynamics"):
                 self.fit_models()
         if n_simulated == 0:
@@ -294,7 +305,7 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
                 samples = self.simulate(rollout.observations, rollout.values, n_simulated)
             with self._phase("policy"):
                 self._update_policy(rollout, samples)
-        if self.n_simulated > 0:
+        if self._n_extra > 0:
             self.logger.record("simulation/n_simulated", n_simulated)
             self.logger.record("simulation/share", n_simulated / (n_simulated + 1))
         for phase, seconds in self._seconds.items():
@@ -329,8 +340,8 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         )
 
     def _check_simulates(self) -> None:
-        if self.n_simulated == 0:
-            raise ValueError("n_simulated=0: this model has nothing to simulate with")
+        if self._n_extra == 0:
+            raise ValueError(f"{self.plain}: this model has nothing to simulate with")
 
     def _check_has_rollout(self) -> None:
         self._check_simulates()
@@ -418,3 +429,21 @@ class SimulatedPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
     def _synchronize(self) -> None:
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
+
+
+class SimulatedPPO(ExtraSamplesPPO):
+    """
+    PPO with simulated samples: what :class:`MBMAPPO`, :class:`QMAPPO` and :class:`MBPOPPO` share.
+
+    :raises ValueError: if an argument is out of range or contradicts another
+    """
+
+    plain: ClassVar[str] = "n_simulated=0"
+
+    n_simulated: int = argument(default=8, kind=integer(0))
+    """X, simulated samples for each real one, at the height of the schedule of ``warm_up_until`` and ``anneal_until``;
+    0 for PPO. With a Discrete space: see ``simulate``"""
+
+    @property
+    def _n_extra(self) -> int:
+        return self.n_simulated

@@ -16,19 +16,25 @@ class FlatObservations:
     Observations as vectors and back. The entries of a Dict follow one another in the order of its keys.
 
     :param space: a Box of floats, or a Dict of such Boxes
+    :param images: whether Boxes of integers, as images are, do too
+    :param plain: how plain PPO is asked for, for the error
     :raises ValueError: for any other space
     """
 
-    def __init__(self, space: spaces.Space):
+    def __init__(self, space: spaces.Space, images: bool = False, plain: str = "n_simulated=0"):
         self.keys = list(space.spaces) if isinstance(space, spaces.Dict) else None
         parts = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
         self.shapes: list[tuple[int, ...]] = []
         for part in parts:
-            if not isinstance(part, spaces.Box) or not np.issubdtype(part.dtype, np.floating) or is_image_space(part):
+            is_box = isinstance(part, spaces.Box)
+            if not is_box or (not images and (not np.issubdtype(part.dtype, np.floating) or is_image_space(part))):
+                kind = "Box" if images else "Box of floats"
+                why = "" if images else ", whose next values can be predicted"
                 raise ValueError(
-                    "the observation space must be a Box of floats or a Dict of such Boxes, whose next values can be "
-                    f"predicted, not {space}: pass n_simulated=0 for plain PPO"
+                    f"the observation space must be a {kind} or a Dict of such Boxes{why}, not {space}: pass {plain} "
+                    "for plain PPO"
                 )
+            assert isinstance(part, spaces.Box)
             self.shapes.append(part.shape)
         self.sizes = [int(np.prod(shape)) for shape in self.shapes]
         #: O, the length of a vector.

@@ -56,6 +56,8 @@ class Actor(TensorFeatures, BasePolicy):
     action_space: spaces.Box
     #: Whether the policy is a distribution, with an entropy that can be rewarded.
     has_entropy: ClassVar[bool] = True
+    #: Whether it explores with a standard deviation of its own.
+    has_std: ClassVar[bool] = True
     #: View in evaluation mode, for the actions of TD targets, if the trunk ``stacks_rows``.
     at_rest: Any = None
     #: The policy's running normalisation of observations, None for none.
@@ -295,7 +297,65 @@ class Actor(TensorFeatures, BasePolicy):
         return self(observation, deterministic)
 
 
-class DeterministicActor(Actor):
+class MeanActor(Actor):
+    """
+    Deterministic actor ``a = tanh(mean)``, without target actor, smoothing or exploration noise (DAC, table 1). The
+    head of its log standard deviation does not learn; it is there so that an optimistic actor made like it is a
+    Gaussian.
+    """
+
+    has_entropy: ClassVar[bool] = False
+    has_std: ClassVar[bool] = False
+    _kind: ClassVar[str] = "a deterministic actor"
+
+    def get_action_dist_params(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        """
+        :raises AttributeError: always; as with Stable-Baselines3's TD3, there is no distribution
+        """
+        raise AttributeError(f"{self._kind} has no distribution of its actions")
+
+    def action_log_prob(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        :raises AttributeError: always; as with Stable-Baselines3's TD3, there is no distribution
+        """
+        raise AttributeError(f"{self._kind} has no distribution of its actions")
+
+    def log_prob_of(self, obs: PyTorchObs | Encoded, actions: torch.Tensor) -> torch.Tensor:
+        """
+        :raises AttributeError: always; there is no distribution
+        """
+        raise AttributeError(f"{self._kind} has no distribution of its actions")
+
+    def sample(
+        self,
+        obs: PyTorchObs | Encoded,
+        noise: torch.Tensor | None = None,
+        following: PyTorchObs | Encoded | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        The action that the actor learns through: no noise, and 0 for the log-probability that it has not.
+
+        :param obs: observations, (B, O), or a dict of them, or their features
+        :param noise: ignored, there is none
+        :param following: further observations, stacked below these in the forward pass; None for none
+        :return: action in [-1, 1], (B, A), and zeros, (B, 1)
+        """
+        features = self.features(obs)
+        rows = features if following is None else torch.cat((features, self.features(following)))
+        action = torch.tanh(self.mean(self.trunk(rows)))
+        action = action if following is None else action[: len(features)]
+        return action, action.new_zeros(action.shape[0], 1)
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them
+        :param deterministic: without meaning, the actor always is, as in stable_baselines3's TD3
+        :return: actions in [-1, 1], (B, A)
+        """
+        return self.sample(obs)[0]
+
+
+class DeterministicActor(MeanActor):
     """
     Deterministic actor ``a = tanh(mean)`` of TD3 (Fujimoto et al. 2018): exploration adds Gaussian noise to the
     action, the TD target's action is smoothed by clipped noise, and there is no entropy.
@@ -306,7 +366,8 @@ class DeterministicActor(Actor):
     :raises ValueError: if one of them is out of range
     """
 
-    has_entropy: ClassVar[bool] = False
+    has_std: ClassVar[bool] = True
+    _kind: ClassVar[str] = "a deterministic actor (backbone='td3')"
 
     def __init__(
         self,
@@ -333,50 +394,12 @@ class DeterministicActor(Actor):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), **self._noise_args}
 
-    def get_action_dist_params(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
-        """
-        :raises AttributeError: always; as with Stable-Baselines3's TD3, there is no distribution
-        """
-        raise AttributeError("a deterministic actor (backbone='td3') has no distribution of its actions")
-
-    def action_log_prob(self, obs: PyTorchObs) -> tuple[torch.Tensor, torch.Tensor]:
-        """
-        :raises AttributeError: always; as with Stable-Baselines3's TD3, there is no distribution
-        """
-        raise AttributeError("a deterministic actor (backbone='td3') has no distribution of its actions")
-
-    def log_prob_of(self, obs: PyTorchObs | Encoded, actions: torch.Tensor) -> torch.Tensor:
-        """
-        :raises AttributeError: always; there is no distribution
-        """
-        raise AttributeError("a deterministic actor (backbone='td3') has no distribution of its actions")
-
     def _heads(self) -> tuple[nn.Module, ...]:
         return (self.mean,)
 
     def gaussian(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         mean = self.mean(self.trunk(features))
         return mean, torch.full_like(mean, self.log_exploration_noise)
-
-    def sample(
-        self,
-        obs: PyTorchObs | Encoded,
-        noise: torch.Tensor | None = None,
-        following: PyTorchObs | Encoded | None = None,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """
-        The action that the actor learns through: no noise, and 0 for the log-probability that it has not.
-
-        :param obs: observations, (B, O), or a dict of them
-        :param noise: ignored, there is none
-        :param following: further observations, stacked below these in the forward pass; None for none
-        :return: action in [-1, 1], (B, A), and zeros, (B, 1)
-        """
-        features = self.features(obs)
-        rows = features if following is None else torch.cat((features, self.features(following)))
-        action = torch.tanh(self.mean(self.trunk(rows)))
-        action = action if following is None else action[: len(features)]
-        return action, action.new_zeros(action.shape[0], 1)
 
     def smoothed(self, obs: PyTorchObs, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """
@@ -390,14 +413,6 @@ class DeterministicActor(Actor):
         noise = torch.randn_like(action) if noise is None else noise
         smoothing = (self.target_noise * noise).clamp(-self.target_noise_clip, self.target_noise_clip)
         return (action + smoothing).clamp(-1, 1), log_prob
-
-    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
-        """
-        :param obs: observations, (B, O), or a dict of them
-        :param deterministic: without meaning, the actor always is, as in stable_baselines3's TD3
-        :return: actions in [-1, 1], (B, A)
-        """
-        return self.sample(obs)[0]
 
     def act(self, mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         return (torch.tanh(mean) + std * noise).clamp(-1, 1)
@@ -420,5 +435,5 @@ class DeterministicActor(Actor):
         return gaussian_kl(torch.tanh(mean), std, torch.tanh(reference_mean), reference_std)
 
 
-#: The actor's class by the name that the policy's ``backbone`` takes.
-BACKBONES: dict[str, type[Actor]] = {"sac": Actor, "td3": DeterministicActor}
+#: The actor's class by the name that the policy's ``backbone`` takes; "mean" is for DAC alone.
+BACKBONES: dict[str, type[Actor]] = {"sac": Actor, "td3": DeterministicActor, "mean": MeanActor}

@@ -141,7 +141,10 @@ class SACArguments(Resumable):
     "optimistic_shift" (BRO), or a class derived from ``Exploration``"""
     exploration_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
     """its arguments"""
-    backbone: str = argument(default="sac")
+    backbone: str = argument(
+        default="sac",
+        kind=Kind("be one of ['sac', 'td3']", lambda value: isinstance(value, str) and value in ("sac", "td3")),
+    )
     """"sac", or "td3": a deterministic actor, without entropy"""
     policy_delay: int = argument(default=1, kind=integer(1))
     """gradient steps between two of the actors' and of the temperature"""

@@ -237,6 +237,11 @@ class HasLearner:
         """By which networks are wider than described: 2 with ``multitask`` and several tasks."""
         return 2 if self.multitask and self.n_tasks > 1 else 1
 
+    @property
+    def _has_entropy(self: Any) -> bool:
+        """Whether the actor is a distribution."""
+        return BACKBONES[self.backbone].has_entropy
+
     def _make_head(self: Any) -> ValueHead:
         if self.value_head is not None:
             cls = chosen("value_head", self.value_head, VALUE_HEADS, ValueHead)
@@ -267,7 +272,7 @@ class HasLearner:
             self._target_entropy = targets if self.n_tasks > 1 else targets[0]
         else:
             self._target_entropy = float(self.target_entropy)
-        if BACKBONES[self.backbone].has_entropy:
+        if self._has_entropy:
             self.target_entropy = self._target_entropy
 
     def _auto_target_entropy(self: Any, action_dim: int) -> float:

@@ -31,14 +31,15 @@ MAX_WIDTH = 1_000_000
 MOST = {
     "replay_ratio": 10_000, "gradient_steps": 1_000_000, "batch_size": 10_000_000, "n_steps": 10_000_000,
     "n_epochs": 100_000, "n_simulated": 1_000_000, "simulation_horizon": 100_000, "dynamics_batch_size": 10_000_000,
-    "dynamics_buffer_size": MAX_TRANSITIONS, "train_freq": 10_000_000,
+    "dynamics_buffer_size": MAX_TRANSITIONS, "train_freq": 10_000_000, "n_actions": 1_000_000, "horizon": 100_000,
+    "copies": 100_000,
 }  # fmt: skip
 #: Bytes of a replay buffer that no machine holds.
 MAX_BUFFER_BYTES = 2**44
 #: Counts of what was done, and what is owed: less than a gradient step, but for rounding, at the end of each turn.
 _COUNTS = (
     "num_timesteps", "_num_timesteps_at_start", "_total_timesteps", "_episode_num", "_n_updates", "num_transitions",
-    "_iteration", "_n_new", "_n_offline_updates",
+    "_iteration", "_n_new", "_n_offline_updates", "num_rewound_steps",
 )  # fmt: skip
 _MAX_COUNT = 2**53
 _NUMBER = (int, float, np.integer, np.floating)

@@ -10,7 +10,8 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_sample.envs.states import EnvState, restore_state
+from sb3_sample.envs.rewinding import rewound_returns
+from sb3_sample.envs.states import EnvState
 from sb3_sample.saving.normalization import lacks_vec_normalize
 from sb3_sample.variance.scores import check_policy
 
@@ -106,36 +107,4 @@ def sample_returns(
     :param rng: generator for what is random in the environments after the states
     :return: (B,)
     """
-    groups = [slice(start, start + len(envs)) for start in range(0, len(states), len(envs))]
-    returns = [_sample_group(agent, envs, states[group], actions[group], horizon, rng) for group in groups]
-    return np.concatenate(returns)
-
-
-def _sample_group(
-    agent: Agent,
-    envs: Sequence[gym.Env],
-    states: Sequence[EnvState],
-    actions: np.ndarray,
-    horizon: int,
-    rng: np.random.Generator,
-) -> np.ndarray:
-    for env, state in zip(envs, states, strict=False):
-        restore_state(env, state, rng)
-    returns, discount = np.zeros(len(states)), 1.0
-    running = np.arange(len(states))
-    for step in range(horizon):
-        results = [envs[int(i)].step(action) for i, action in zip(running, agent.to_env(actions), strict=True)]
-        returns[running] += discount * agent.normalize_rewards(np.array([float(result[1]) for result in results]))
-        discount *= agent.gamma
-        observations = np.stack([result[0] for result in results])
-        terminated = np.array([result[2] for result in results], dtype=bool)
-        # Only a termination ends the sum; a time limit stops the simulation, not the task.
-        stopped = ~terminated & (np.array([result[3] for result in results], dtype=bool) | (step == horizon - 1))
-        if stopped.any():
-            returns[running[stopped]] += discount * agent.values(observations[stopped])
-        going_on = ~(terminated | stopped)
-        running, observations = running[going_on], observations[going_on]
-        if not len(running):
-            break
-        actions = agent.sample(observations)
-    return returns
+    return rewound_returns(agent, envs, states, actions, [horizon] * len(states), rng)[0]

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
+from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO, RewoundPPO
 from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
 from sb3_sample.replay.weighted import (
@@ -105,6 +105,7 @@ ALGORITHMS: dict[str, ZooAlgorithm] = {
     "opl_sac": ZooAlgorithm(OPLSAC, search.OPL_SPACE),
     "qma_ppo": ZooAlgorithm(QMAPPO, search.ON_POLICY_SPACE),
     "regularized_sac": ZooAlgorithm(RegularizedSAC, search.REGULARIZED_SPACE, search.decode_regularized),
+    "rewound_ppo": ZooAlgorithm(RewoundPPO, search.REWOUND_SPACE),
     "sac_sample": ZooAlgorithm(SAC, search.SAC_SPACE),
     "simba": ZooAlgorithm(SimBa, search.SIMBA_SPACE),
     "simbav2": ZooAlgorithm(SimbaV2, search.SIMBAV2_SPACE),

@@ -192,6 +192,11 @@ ON_POLICY_SPACE: Space = {
 MBMA_SPACE: Space = {**ON_POLICY_SPACE, "simulation_horizon": _int(1, 24)}
 #: Its horizon lies above the number of simulated states: one rollout from each real state.
 MBPO_SPACE: Space = {**ON_POLICY_SPACE, "n_simulated": _int(1, 11, log=True), "simulation_horizon": _int(12, 24)}
+#: The horizon of its further actions is the hyperparameter file's.
+REWOUND_SPACE: Space = {
+    **{name: suggest for name, suggest in ON_POLICY_SPACE.items() if name != "n_simulated"},
+    "n_actions": _int(2, 9, log=True),
+}
 #: What each setting of a regularization belongs to, by its argument: the group, the regularization, and the range.
 REGULARIZATION_SETTINGS: dict[str, tuple[str, str, Suggest]] = {
     "weight_decay": ("network_regularization", "weight_decay", _float(1e-5, 1e-1, log=True)),

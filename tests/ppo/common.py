@@ -8,8 +8,8 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.logger import Logger
 
-from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO
-from sb3_sample.ppo import SimulatedPPO
+from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO, RewoundPPO
+from sb3_sample.ppo import ExtraSamplesPPO
 from sb3_sample.ppo.dynamics import Prediction
 from tests.sac.common import vec
 
@@ -24,17 +24,34 @@ TINY: dict[str, Any] = dict(
     device="cpu",
     seed=0,
 )
-TINY_MODELS: dict[type[SimulatedPPO], dict[str, Any]] = {
+TINY_MODELS: dict[type[ExtraSamplesPPO], dict[str, Any]] = {
     MBMAPPO: dict(dynamics_kwargs={"width": 8, "depth": 1}, simulation_horizon=4, dynamics_buffer_size=100),
     MBPOPPO: dict(dynamics_kwargs={"width": 8, "depth": 1}, simulation_horizon=4, dynamics_buffer_size=100),
     QMAPPO: dict(q_kwargs={"width": 8, "depth": 1}),
+    RewoundPPO: dict(copies=4),
 }
+#: Those that simulate by something learned, and with the one that takes the environment itself.
 ALGORITHMS: list[Any] = [MBMAPPO, QMAPPO, MBPOPPO]
+EVERY: list[Any] = [*ALGORITHMS, RewoundPPO]
+
+
+def arguments_of(cls: Any, arguments: dict[str, Any]) -> dict[str, Any]:
+    """Arguments with ``n_simulated`` as the class has it; those of the further actions only where there are some."""
+    if cls is not RewoundPPO:
+        return arguments
+    arguments = dict(arguments)
+    n_simulated = arguments.pop("n_simulated", None)
+    if n_simulated is not None:
+        arguments.setdefault("n_actions", n_simulated + 1)
+    if arguments.get("n_actions") == 1 and arguments.get("copies") == TINY_MODELS[RewoundPPO]["copies"]:
+        del arguments["copies"]
+    return arguments
 
 
 def tiny(cls: Any = MBMAPPO, env: Any = None, policy: str = "MlpPolicy", **kwargs: Any) -> Any:
     """A tiny model; arguments given replace the tiny ones."""
-    return cls(policy, vec() if env is None else env, **{**TINY, **TINY_MODELS[cls], **kwargs})
+    arguments = {**TINY, **TINY_MODELS[cls], **kwargs}
+    return cls(policy, vec() if env is None else env, **arguments_of(cls, arguments))
 
 
 def quiet(model: Any) -> Any:

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from torch import nn
 
 from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO
-from tests.ppo.common import ALGORITHMS, quiet, tiny
+from tests.ppo.common import ALGORITHMS, EVERY, arguments_of, quiet, tiny
 from tests.sac.common import WRONG_ARGUMENTS, WRONG_ARGUMENTS_OF_LEARN, Toy, vec
 
 
@@ -150,8 +150,8 @@ def test_numbers_of_numpy_and_schedules_will_do() -> None:
 @pytest.mark.parametrize(
     ("cls", "argument"),
     [
-        *((cls, {"anneal_until": 0.5}) for cls in ALGORITHMS),
-        *((cls, {"warm_up_until": 0.5}) for cls in ALGORITHMS),
+        *((cls, {"anneal_until": 0.5}) for cls in EVERY),
+        *((cls, {"warm_up_until": 0.5}) for cls in EVERY),
         (MBMAPPO, {"simulation_horizon": 5}),
         (MBMAPPO, {"dynamics_buffer_size": 5}),
         (MBPOPPO, {"dynamics_batch_size": 5}),
@@ -162,8 +162,8 @@ def test_numbers_of_numpy_and_schedules_will_do() -> None:
 )
 def test_without_simulated_samples_their_arguments_mean_nothing(cls: Any, argument: dict[str, Any]) -> None:
     name = next(iter(argument))
-    with pytest.raises(ValueError, match=f"{name}=.* means nothing with n_simulated=0: leave it out, or at "):
-        cls("MlpPolicy", vec(), n_simulated=0, **argument)
+    with pytest.raises(ValueError, match=f"{name}=.* means nothing with {cls.plain}: leave it out, or at "):
+        cls("MlpPolicy", vec(), **arguments_of(cls, {"n_simulated": 0}), **argument)
 
 
 @pytest.mark.parametrize("name", ["simulation_horizon", "dynamics_buffer_size", "dynamics_kwargs"])

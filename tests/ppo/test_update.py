@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_sample import MBMAPPO, MBPOPPO
 from sb3_sample.ppo import SimulatedSamples
-from tests.ppo.common import ALGORITHMS, collected, quiet, tiny
+from tests.ppo.common import ALGORITHMS, EVERY, arguments_of, collected, quiet, tiny
 from tests.sac.common import Toy, differing, state, vec
 
 PPO_ARGUMENTS: dict[str, Any] = dict(n_steps=16, batch_size=8, n_epochs=3, device="cpu", seed=3)
@@ -29,7 +29,7 @@ def same_parameters(a: Any, b: Any, **tolerance: float) -> None:
 # ---------------------------------------------------------------- without simulated samples
 
 
-@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("cls", EVERY)
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -45,7 +45,7 @@ def test_without_samples_it_is_stable_baselines3s_ppo_step_for_step(cls: Any, ar
         arguments_ = {"normalize_advantage": False, "policy_kwargs": policy_kwargs, **PPO_ARGUMENTS, **arguments}
         return algorithm("MlpPolicy", vec(2), **arguments_, **kwargs).learn(64)
 
-    ours, theirs = trained(cls, n_simulated=0), trained(PPO)
+    ours, theirs = trained(cls, **arguments_of(cls, {"n_simulated": 0})), trained(PPO)
     assert ours._n_updates == theirs._n_updates > 0
     same_parameters(ours, theirs)
     assert not differing(state(ours), state(theirs))
@@ -79,7 +79,7 @@ def no_models() -> dict[str, Any]:
     return dict(dynamics_kwargs=None, simulation_horizon=12, dynamics_buffer_size=25_000, warm_up_until=None)
 
 
-@pytest.mark.parametrize("cls", ALGORITHMS)
+@pytest.mark.parametrize("cls", EVERY)
 def test_the_policy_starts_as_ppos_of_the_same_seed(cls: Any) -> None:
     theirs = PPO("MlpPolicy", vec(), **PPO_ARGUMENTS, policy_kwargs={"net_arch": [8]})
     same_parameters(tiny(cls, seed=3), theirs)

@@ -85,6 +85,30 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
         (SAC, {"backbone": "td3", "target_entropy": -1.0}, ("target_entropy=-1.0", "td3")),
     ],
     "`initial_optimism` of DAC not above -β": [(DAC, {"initial_optimism": -1.0}, ("initial_optimism", "-1.0"))],
+    '`DAC` with `optimistic_actor="deterministic"` and a `pessimistic_actor` other than `"stochastic"`, a '
+    '`std_multiplier`, or `backbone="td3"`': [
+        (DAC, {"optimistic_actor": "deterministic", **more}, (name,))
+        for name, more in {
+            "pessimistic_actor=None": {"pessimistic_actor": None},
+            "pessimistic_actor='deterministic'": {"pessimistic_actor": "deterministic"},
+            "std_multiplier=2.0": {"std_multiplier": 2.0},
+            "backbone='td3'": {"backbone": "td3"},
+        }.items()
+    ],
+    '`DAC` with `pessimistic_actor="deterministic"` and `ent_coef`, `target_entropy` or `backbone="td3"`': [
+        (DAC, {"pessimistic_actor": "deterministic", "ent_coef": 0.1}, ("ent_coef=0.1", "pessimistic_actor")),
+        (DAC, {"pessimistic_actor": "deterministic", "target_entropy": -1.0}, ("target_entropy=-1.0",)),
+        (DAC, {"pessimistic_actor": "deterministic", "backbone": "td3"}, ("pessimistic_actor", "backbone='td3'")),
+    ],
+    "`DAC` with `pessimistic_actor=None` and settings of the divergence, or `actor_pessimism`; `optimistic_entropy` "
+    "without it": [
+        (DAC, {"pessimistic_actor": None, "kl_target": 0.1}, ("kl_target=0.1", "pessimistic_actor=None")),
+        (DAC, {"pessimistic_actor": None, "actor_pessimism": 0.0}, ("actor_pessimism=0.0", "pessimistic_actor=None")),
+        (DAC, {"optimistic_entropy": True}, ("optimistic_entropy=True", "pessimistic_actor='stochastic'")),
+    ],
+    "`kl_weight_learning_rate` of `DAC` with `initial_kl_weight=0`": [
+        (DAC, {"initial_kl_weight": 0, "kl_weight_learning_rate": 0.1}, ("kl_weight_learning_rate=0.1",)),
+    ],
     "`pessimism_kwargs`, or VPL-SAC's settings of its rule, with a number": [
         (SAC, {"pessimism_kwargs": {"arms": (0, 1)}}, ("pessimism_kwargs", "pessimism=1.0")),
         (VPLSAC, {"pessimism": 1.0, "pessimism_loss": "dual"}, ("pessimism_loss='dual'", "pessimism=1.0")),

@@ -37,7 +37,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
-from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO
+from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO, RewoundPPO
 from sb3_sample.diagnostics import DiagnosticsCallback, NoiseScaleCallback
 from sb3_sample.envs import make_env
 from sb3_sample.replay.buffers import DeviceReplayBuffer
@@ -46,10 +46,10 @@ from sb3_sample.replay.weighted import FadedReplayBuffer, PrioritizedReplayBuffe
 from sb3_sample.saving import training_state, vec_envs
 from sb3_sample.saving.callbacks import walk
 from sb3_sample.saving.folders import Folder
-from tests.ppo.common import TINY, TINY_MODELS
+from tests.ppo.common import TINY, TINY_MODELS, arguments_of
 from tests.sac.common import MAKERS
 
-PPOS = {"MBMA": MBMAPPO, "QMA": QMAPPO, "MBPO": MBPOPPO}
+PPOS = {"MBMA": MBMAPPO, "QMA": QMAPPO, "MBPO": MBPOPPO, "rewound": RewoundPPO}
 
 
 class Goal(gym.Env):
@@ -107,7 +107,7 @@ def model(algorithm: str, folder: str, env: dict[str, Any], **kwargs: Any) -> An
         arguments = {**TINY, **models, **kwargs}
         if kwargs.get("n_simulated") == 0:
             arguments.pop("warm_up_until")
-        return cls("MlpPolicy", venv, **arguments)
+        return cls("MlpPolicy", venv, **arguments_of(cls, arguments))
     if kwargs.pop("her", False):
         kwargs |= {"replay_buffer_class": HerReplayBuffer, "policy": "MultiInputPolicy", "learning_starts": 60}
     buffers = {"plain": ReplayBuffer, "device": DeviceReplayBuffer, "faded": FadedReplayBuffer,

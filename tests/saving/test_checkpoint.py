@@ -33,7 +33,7 @@ from sb3_sample.saving.encoding import NotPortable, decode, encode
 from sb3_sample.saving.kept import Kept, declared
 from sb3_sample.saving.model_tree import Description
 from sb3_sample.saving.run_folder import RunFolder
-from tests.ppo.common import ALGORITHMS, tiny
+from tests.ppo.common import EVERY, tiny
 from tests.sac.common import MAKERS, bro, differing, sac, state, vec
 from tests.saving.hostile_folders import facts_of, rewritten
 from tests.saving.program import Goal, outcome
@@ -52,7 +52,7 @@ def steps_of(folder: Path) -> list[int]:
     "maker",
     [
         pytest.param(maker, marks=[] if maker in ("BRO", "VPLSAC", MBMAPPO) else pytest.mark.slow)
-        for maker in (*MAKERS, *ALGORITHMS)
+        for maker in (*MAKERS, *EVERY)
     ],
 )
 def test_every_attribute_that_changes_is_held(maker: Any, tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ def test_an_attribute_is_declared_or_refused(tmp_path: Path) -> None:
 
 def test_what_is_declared_is_there() -> None:
     """No name in a declaration that no algorithm has any more."""
-    trained = [MAKERS["BRO"](vec(2)).learn(32), *(tiny(cls, vec(2)).learn(32) for cls in ALGORITHMS)]
+    trained = [MAKERS["BRO"](vec(2)).learn(32), *(tiny(cls, vec(2)).learn(32) for cls in EVERY)]
     names = {name for model in trained for name in declared(type(model))}
     assert [name for name in names if not any(hasattr(model, name) for model in trained)] == []
 

@@ -29,7 +29,7 @@ FAST: dict[str, dict[str, Any]] = {
 SLOW: dict[str, dict[str, Any]] = {
     **{name: {"algorithm": name} for name in (
         "SAC", "BROFast", "BROTD3", "DAC", "SRSAC", "OAC", "TOPSAC", "GPLSAC", "OPLSAC", "RegularizedSAC", "SimBa",
-        "SimbaV2", "BRC", "DebiasedRQ", "CrossQ", "CrossQ+WN", "XQC", "FlashSAC", "QMA", "MBPO",
+        "SimbaV2", "BRC", "DebiasedRQ", "CrossQ", "CrossQ+WN", "XQC", "FlashSAC", "QMA", "MBPO", "rewound",
     )},
     **{f"{name}, workers": {"algorithm": name, "env": WORKERS4} for name in ("BRO", "OPLSAC", "MBMA", "QMA", "MBPO")},
     **{f"{name}, {env}": {"algorithm": name, "env": {"env": env}} for name in ("BRO", "MBMA")
@@ -57,6 +57,7 @@ SLOW: dict[str, dict[str, Any]] = {
     "noise": {"algorithm": "BROTD3", "kwargs": {"noise": True}, "env": {"n": 2}},
     "episodes": {"algorithm": "SAC", "kwargs": {"train_freq": (1, "episode"), "gradient_steps": -1}},
     "fractions": {"algorithm": "SAC", "kwargs": {"replay_ratio": 0.3, "target_subset": 1}},
+    "rewound, normalized": {"algorithm": "rewound", "env": NORMALIZED, "evaluate": True},
     "PPO": {"algorithm": "MBMA", "kwargs": {"n_simulated": 0}, "evaluate": True},
 }  # fmt: skip
 
