@@ -5,7 +5,7 @@ from sb3_sample.envs import EnvironmentDied, SupervisedSubprocVecEnv, make_env, 
 from sb3_sample.faults import TrainingDiverged
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.replay.buffers import DeviceReplayBuffer
-from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
+from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactNStepReplayBuffer, CompactReplayBuffer
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.recording import record
 from sb3_sample.replay.weighted import (
@@ -35,6 +35,8 @@ from sb3_sample.sac import (
     BROFast,
     CrossQ,
     DebiasedRQ,
+    DrQ,
+    DrQv2,
     FlashSAC,
     RegularizedSAC,
     SimBa,
@@ -65,12 +67,15 @@ __all__ = [
     "XQC",
     "BROFast",
     "CompactDictReplayBuffer",
+    "CompactNStepReplayBuffer",
     "CompactReplayBuffer",
     "CrossQ",
     "Dataset",
     "DebiasedRQ",
     "DeviceReplayBuffer",
     "DiagnosticsCallback",
+    "DrQ",
+    "DrQv2",
     "EnvironmentDied",
     "FadedDictReplayBuffer",
     "FadedReplayBuffer",

@@ -38,7 +38,12 @@ from sb3_sample.replay.buffers import (
     store_float_actions,
 )
 from sb3_sample.replay.columns import has_own_columns
-from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
+from sb3_sample.replay.compact import (
+    CompactDictReplayBuffer,
+    CompactNStepReplayBuffer,
+    CompactReplay,
+    CompactReplayBuffer,
+)
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.sources import DatasetSource, ReplaySource
 from sb3_sample.replay.weighted import PrioritizedReplay
@@ -48,6 +53,7 @@ from sb3_sample.sac.arguments import SACArguments
 from sb3_sample.sac.metrics_log import MetricsLog
 from sb3_sample.sac.model_learner import check_action_space
 from sb3_sample.sac.multi_task import is_multi_task, told_task
+from sb3_sample.sac.pixels import stacked_frames
 from sb3_sample.sac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.sb3_names import SB3Names
 from sb3_sample.sac.update_schedule import UpdateSchedule
@@ -169,7 +175,11 @@ class SAC(  # type: ignore[misc]  # actor
     # ---------------------------------------------------------------- construction
 
     def _setup_model(self) -> None:
-        super()._setup_model()
+        with warnings.catch_warnings():
+            # Of Stable-Baselines3, which knows n-step returns of its own buffer only, where a buffer is told of them.
+            if self.replay_buffer_class is None or issubclass(self.replay_buffer_class, CompactNStepReplayBuffer):
+                warnings.filterwarnings("ignore", message="`n_steps=")
+            super()._setup_model()
         assert self.replay_buffer is not None
         store_float_actions(self.replay_buffer)
         if self.compile != "auto":
@@ -216,6 +226,16 @@ class SAC(  # type: ignore[misc]  # actor
         elif self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, ValidationSplit):
             # Loaded, with validation_proportion=0 instead of the saved one.
             self.replay_buffer_class = None
+        can_stack = self.replay_buffer_class is None or issubclass(self.replay_buffer_class, CompactReplay)
+        if can_stack and "frame_stack" not in self.replay_buffer_kwargs:
+            n_frames = stacked_frames(self.env, self.observation_space)
+            if n_frames is not None:
+                self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "frame_stack": n_frames}
+        if self.replay_buffer_class is None and self.n_steps > 1 and "frame_stack" in self.replay_buffer_kwargs:
+            self.replay_buffer_class = CompactNStepReplayBuffer
+        if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, CompactNStepReplayBuffer):
+            of_steps = {"n_steps": self.n_steps, "gamma": self.gamma}
+            self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, **of_steps}
         if self.replay_buffer_class is None and self.n_steps == 1:
             self.replay_buffer_class = CompactDictReplayBuffer if is_dict else CompactReplayBuffer
         if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, CompactReplay):
@@ -229,6 +249,8 @@ class SAC(  # type: ignore[misc]  # actor
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         kwargs = {**self.policy_kwargs, "n_outputs": self._make_head().n_outputs, "backbone": self.backbone}
+        if self.augmentation is not None:
+            kwargs.setdefault("share_features_extractor", True)
         if self._width_factor > 1:
             kwargs["width_factor"] = self._width_factor
         return {**kwargs, "normalize_observations": True} if self.normalize_observations else kwargs
