@@ -156,8 +156,8 @@ class ScheduledNoise(Exploration):
         check_value("schedule", schedule, NOISE_SCHEDULE)
         if not hasattr(learner.actor, "noise_std"):
             raise ValueError(
-                f"exploration='scheduled_noise' moves the noise_std of DrQv2's actor, and {type(learner.actor).__name__} "
-                "has none: use DrQv2, or another exploration"
+                "exploration='scheduled_noise' moves the noise_std of DrQv2's actor, and "
+                f"{type(learner.actor).__name__} has none: use DrQv2, or another exploration"
             )
         self._schedule = tuple(float(each) for each in schedule)
         self._set(learner)

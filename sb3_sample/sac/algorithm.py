@@ -163,6 +163,9 @@ class SAC(  # type: ignore[misc]  # actor
         self._prior_of: dict[str, Any] | None = None
         #: Gradient steps planned, for ``learning_rate_schedule``; None while they are not known.
         self.planned_updates: int | None = self.schedule_steps
+        #: Frames that the environment stacks in an observation, each of which the replay stores once; None for none.
+        #: Saved: a model loaded without an environment goes on with it.
+        self.frame_stack: int | None = None
         # Gradient steps owed but not yet taken, the fraction that a replay ratio leaves over.
         self._updates_owed = 0.0
         self._metrics: dict[str, torch.Tensor] = {}
@@ -228,9 +231,10 @@ class SAC(  # type: ignore[misc]  # actor
             self.replay_buffer_class = None
         can_stack = self.replay_buffer_class is None or issubclass(self.replay_buffer_class, CompactReplay)
         if can_stack and "frame_stack" not in self.replay_buffer_kwargs:
-            n_frames = stacked_frames(self.env, self.observation_space)
-            if n_frames is not None:
-                self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "frame_stack": n_frames}
+            if self.env is not None:
+                self.frame_stack = stacked_frames(self.env, self.observation_space)
+            if self.frame_stack is not None:
+                self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "frame_stack": self.frame_stack}
         if self.replay_buffer_class is None and self.n_steps > 1 and "frame_stack" in self.replay_buffer_kwargs:
             self.replay_buffer_class = CompactNStepReplayBuffer
         if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, CompactNStepReplayBuffer):

@@ -16,6 +16,7 @@ from sb3_sample.kinds import (
     integer,
     one_of,
 )
+from sb3_sample.learner.augmentation import AUGMENTATIONS
 from sb3_sample.learner.exploration import EXPLORATIONS
 from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
 from sb3_sample.learner.reward_scale import LinearScale
@@ -32,6 +33,9 @@ def check(agent: Any) -> None:
     :param agent: an algorithm whose arguments are stored and whose networks do not exist yet
     :raises ValueError: if an argument is out of range or contradicts another
     """
+    if agent.augmentation in AUGMENTATIONS and hasattr(agent, "observation_space"):
+        # Before a policy asks for less of them.
+        check_images(f"augmentation={agent.augmentation!r}", agent.observation_space)
     check_every(agent)
     n_critics = check_value("n_critics", agent._n_critics(), integer(1))
     check_target_entropy(agent)
@@ -271,8 +275,6 @@ def _check_augmentation(agent: Any) -> None:
     """Whether there are images to be augmented, and an encoder to be kept."""
     if agent.augmentation is None:
         check_unused(agent, ["augmentation_kwargs"], "augmentation=None")
-    else:
-        check_images(f"augmentation={agent.augmentation!r}", agent.observation_space)
     if not agent.resets_keep:
         return
     if agent.reset_gradient_steps is None and not has_resets(agent.resets):

@@ -21,7 +21,7 @@ def stacked_frames(env: Any, space: Any) -> int | None:
         return None
     n_frames, layer = None, env
     while isinstance(layer, VecEnvWrapper) and n_frames is None:
-        n_frames = layer.n_stack if isinstance(layer, VecFrameStack) else None
+        n_frames = layer.stacked_obs.n_stack if isinstance(layer, VecFrameStack) else None
         layer = layer.venv
     if n_frames is None:
         try:
