@@ -100,7 +100,10 @@ class Resets(Part):
         return min(n, self.gradient_steps - taken % self.gradient_steps)
 
     def _reset(self, learner: Learning, when: str) -> None:
-        learner.reinitialize(self.shrink, self.keep)
+        if self.keep:
+            learner.reinitialize(self.shrink, self.keep)
+        else:
+            learner.reinitialize(self.shrink)
         self.n_done += 1
         if learner.verbose >= 1:
             say(f"Reset of all parameters{' but the ' + ', '.join(self.keep) + ',' if self.keep else ''} {when}")
