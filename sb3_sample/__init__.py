@@ -42,6 +42,7 @@ from sb3_sample.sac import (
     SimBa,
     SimbaV2,
 )
+from sb3_sample.sac.encoders import ConvEncoder
 from sb3_sample.sac.many import train_many
 from sb3_sample.training.task_evaluation import MultiTaskEvalCallback, evaluate_tasks
 from sb3_sample.version import __version__
@@ -69,6 +70,7 @@ __all__ = [
     "CompactDictReplayBuffer",
     "CompactNStepReplayBuffer",
     "CompactReplayBuffer",
+    "ConvEncoder",
     "CrossQ",
     "Dataset",
     "DebiasedRQ",

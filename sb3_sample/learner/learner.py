@@ -170,10 +170,11 @@ class Learner:
             self.pessimism_rule = self.make_pessimism()
             self.explorer = self.make_explorer()
             self.reward_scaler = None if make_reward_scaler is None else make_reward_scaler(self).to(self.device)
-            self.transforms: Any = nn.ModuleList(make(self).to(self.device) for make in make_transforms)
+            made: list[Any] = [make(self).to(self.device) for make in make_transforms]
+            self.transforms: Any = nn.ModuleList(made)
             #: Copies of each transition in the TD target and in the critics' loss, by the transforms.
-            self.target_copies = math.prod(transform.target_copies for transform in self.transforms)
-            self.online_copies = math.prod(transform.online_copies for transform in self.transforms)
+            self.target_copies = math.prod(each.target_copies for each in made)
+            self.online_copies = math.prod(each.online_copies for each in made)
             self.objective = self._make_objective(self)
         self.observation_statistics = None if self.observation_norm is None else ObservationStatistics()
         self.plasticity, self.redo = plasticity, redo
@@ -923,9 +924,9 @@ class Learner:
         self.restart(self.pessimism_rule, self.make_pessimism(), shrink)
         self.restart(self.explorer, self.make_explorer(), shrink)
         self.restart(self.objective, self._make_objective(self), shrink)
-        kept = {parameter for encoder in encoders for parameter in encoder.parameters()}
+        kept: set[Any] = {parameter for encoder in encoders for parameter in encoder.parameters()}
         for optimizer in self.optimizers().values():
-            state = {parameter: optimizer.state[parameter] for parameter in kept & optimizer.state.keys()}
+            state = {parameter: values for parameter, values in optimizer.state.items() if parameter in kept}
             optimizer.state.clear()
             optimizer.state.update(state)
 

@@ -247,7 +247,9 @@ class SACPolicy(BasePolicy):
             projection_gain=projection_gain,
         )
 
-    def _projected(self, args: Any, extractor: BaseFeaturesExtractor) -> Any:
+    def _projected(
+        self, args: tuple[type[Network], dict[str, Any]], extractor: BaseFeaturesExtractor
+    ) -> tuple[type[Network], dict[str, Any]]:
         """Class and arguments of a trunk that reads an extractor's features, behind the projection if there is one."""
         width, gain = self._projection
         if width is None:

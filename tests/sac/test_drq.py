@@ -19,6 +19,7 @@ from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.sac.encoders import ConvEncoder
 from tests.sac.common import COMPILES, differing, sac, state
 from tests.sac.pixels import TINY, TINY_DRQ, Frames, drq, drqv2, frames
+from tests.sac.streams import same_bits
 
 IMAGE = spaces.Box(0, 255, (3, 8, 8), np.uint8)
 
@@ -434,6 +435,31 @@ def test_trains_as_with_stable_baselines3s_buffer(make: Any) -> None:
     models = [make(frames(2), buffer_size=24).learn(40)]
     models.append(make(frames(2), buffer_size=24, replay_buffer_class=theirs, replay_buffer_kwargs=kwargs).learn(40))
     assert not differing(*(state(model) for model in models))
+
+
+# ---------------------------------------------------------------- files
+
+
+@pytest.mark.parametrize("make", [drq, drqv2])
+def test_saved_loaded_exported_and_resumed(make: Any, tmp_path: Path) -> None:
+    kwargs: dict[str, Any] = {"buffer_size": 40}
+    if make is drqv2:
+        kwargs["noise_schedule"] = (1.0, 0.1, 30)
+    straight = make(frames(2), **kwargs).learn(60, checkpoint=tmp_path / "a", checkpoint_freq=100)
+    make(frames(2), **kwargs).learn(34, checkpoint=tmp_path / "b", checkpoint_freq=16)
+    resumed = make(frames(2), **kwargs).learn(60, checkpoint=tmp_path / "b", checkpoint_freq=16)
+    assert not differing(state(resumed), state(straight))
+    assert same_bits(resumed.replay_buffer.observations[:], straight.replay_buffer.observations[:])
+    straight.save(tmp_path / "m")
+    loaded = type(straight).load(tmp_path / "m", env=frames(2), device="cpu")
+    assert not differing(state(loaded), state(straight))
+    images = batch_of(5).observations.numpy()
+    expected = straight.predict(images, deterministic=True)[0]
+    np.testing.assert_array_equal(loaded.predict(images, deterministic=True)[0], expected)
+    # Skips where there is no ONNX.
+    from tests.test_export import check
+
+    check(straight, tmp_path)
 
 
 # ---------------------------------------------------------------- at the door
