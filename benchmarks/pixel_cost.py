@@ -97,7 +97,10 @@ def main() -> None:
     passes = {"DrQ": 2 * 2 + 3 * 2 + 0.5, "DrQv2": 1 + 3, "stable_baselines3.SAC": 1 + 1 + 3 + 3}
     for model in models.values():
         model.set_logger(Logger(None, []))
-        model.learn(150)
+        with warnings.catch_warnings():
+            # That nothing was learned.
+            warnings.simplefilter("ignore")
+            model.learn(150)
         model.train(2, size)  # compiles, and sets up what is set up once
 
     encoder = ConvEncoder(env().observation_space)
