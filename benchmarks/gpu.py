@@ -7,8 +7,10 @@ Each part is a process, of which all compile at the same time and one measures; 
 that is not done after ``--seconds`` is left out, with a word. A gradient step includes drawing its batch of 128 (BRO)
 or 256 transitions with 17 observed numbers and 6 actions, as in ``update_speed.py``. "One a call" is ``train(1)``, as
 replay ratio 1 takes it, "many" ``train(100)``; "graph" the launch alone, on inputs that stay; "acting" an action of the
-explorer for one observation. Rows "x 10" are of ten learners in one update (``LearnerGroup``): updates of all together,
-on batches that lie on the device. "training" is ``train_many`` of ten learners on HalfCheetah-v5, in updates of all.
+explorer for one observation. Rows "x 10" are of ten learners in one update (``LearnerGroup``): updates, and actions, of
+all together, on batches and observations that lie on the device; those of "drawn" draw them in the step, from a
+``DeviceReplayBuffer``. "training" is ``train_many`` of ten learners on
+HalfCheetah-v5, in updates of all.
 """
 
 import argparse
@@ -27,10 +29,26 @@ from typing import Any
 import torch
 from update_speed import ACTION, OBSERVATION, acting, build, training_step
 
-from sb3_sample import BRC, DAC, SAC, VPLSAC, XQC, BROFast, CrossQ, DebiasedRQ, FlashSAC, SimBa, SimbaV2, train_many
+from sb3_sample import (
+    BRC,
+    DAC,
+    SAC,
+    VPLSAC,
+    XQC,
+    BROFast,
+    CrossQ,
+    DebiasedRQ,
+    DeviceReplayBuffer,
+    FlashSAC,
+    SimBa,
+    SimbaV2,
+    train_many,
+)
 from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.learner.group import LearnerGroup
 
+#: Arguments of agents whose gradient step draws its batch itself.
+DRAWN: dict[str, Any] = {"replay_buffer_class": DeviceReplayBuffer, "replay_buffer_kwargs": {"sampling": "device"}}
 #: Agents by label: class, arguments.
 AGENTS: dict[str, tuple[type[SAC], dict[str, Any]]] = {
     "bro": (BROFast, {"model_size": "4.92M"}),
@@ -45,6 +63,8 @@ AGENTS: dict[str, tuple[type[SAC], dict[str, Any]]] = {
     "xqc": (XQC, {}),
     "flash": (FlashSAC, {}),
     "dr_q": (DebiasedRQ, {}),
+    "sac-drawn": (SAC, DRAWN),
+    "bro-drawn": (BROFast, {"model_size": "4.92M", **DRAWN}),
 }
 #: What is measured, in this order: label, number of learners, whether compiled.
 PARTS: dict[str, tuple[str, int, bool]] = {
@@ -52,6 +72,10 @@ PARTS: dict[str, tuple[str, int, bool]] = {
     "sac": ("sac", 1, True),
     "bro-x10": ("bro", 10, True),
     "sac-x10": ("sac", 10, True),
+    "sac-drawn": ("sac-drawn", 1, True),
+    "bro-drawn": ("bro-drawn", 1, True),
+    "sac-drawn-x10": ("sac-drawn", 10, True),
+    "bro-drawn-x10": ("bro-drawn", 10, True),
     "dac": ("dac", 1, True),
     "vpl": ("vpl", 1, True),
     "bro-small": ("bro-small", 1, True),
@@ -127,10 +151,14 @@ def inputs_of(model: Any) -> tuple[Any, ...]:
     return batch, Noise(*(normal(n, ACTION) for _ in range(3))), None, True, True
 
 
-def graph_of(execution: Any) -> Callable[[], None]:
+def recorded(owner: Any) -> dict[Any, Any]:
+    """The captured steps of a learner or a group."""
+    return (owner._drawing or owner._execution)._captured._recorded  # type: ignore[no-any-return]
+
+
+def graph_of(owner: Any) -> Callable[[], None]:
     """The launch of a captured step."""
-    recorded = list(execution._captured._recorded.values())
-    return recorded[0][1]  # type: ignore[no-any-return]
+    return next(iter(recorded(owner).values()))[1]  # type: ignore[no-any-return]
 
 
 def with_tf32(call: Callable[[], float]) -> float:
@@ -144,9 +172,9 @@ def with_tf32(call: Callable[[], float]) -> float:
 
 def recaptured(owner: Any, step: Callable[[], Any]) -> float:
     """Rate of the graph, captured anew."""
-    owner._execution._captured._recorded.clear()
+    recorded(owner).clear()
     step()
-    return rate(graph_of(owner._execution), 200)
+    return rate(graph_of(owner), 200)
 
 
 def one(label: str, compiled: bool, device: str, turn: Turn) -> str:
@@ -159,7 +187,7 @@ def one(label: str, compiled: bool, device: str, turn: Turn) -> str:
         torch.cuda.reset_peak_memory_stats()
         one_a_call, many = rate(step, 100), 100 * rate(lambda: model.train(100, model.batch_size), 1)
         learner = model.learner
-        graph = rate(graph_of(learner._execution), 200)
+        graph = rate(graph_of(learner), 200)
         tf32 = with_tf32(lambda: recaptured(learner, step))
         act = acting(model)
         for _ in range(5):
@@ -179,16 +207,23 @@ def several(label: str, n: int, compiled: bool, device: str, turn: Turn) -> str:
         model.learner.set_training_mode(True)
     group = LearnerGroup([model.learner for model in models])
     inputs = [inputs_of(model) for model in models]
+    observed = [(own[0].observations[:1], own[1].critic[:1]) for own in inputs]
+    if all(model._draws_in_steps() for model in models):
+        inputs = [(model.batch_size, True, True) for model in models]
     for _ in range(6):
         group.step(inputs)
     with turn:
         torch.cuda.reset_peak_memory_stats()
         steps = n * rate(lambda: group.step(inputs), 50)
-        graph = n * rate(graph_of(group._execution), 100)
+        graph = n * rate(graph_of(group), 100)
         tf32 = n * with_tf32(lambda: recaptured(group, lambda: group.step(inputs)))
+        with torch.inference_mode():
+            for _ in range(5):
+                group.act(observed)
+            actions = n * rate(lambda: group.act(observed), 200)
     how = "compiled, captured" if compiled else "captured"
     memory, seconds = torch.cuda.max_memory_allocated() / 2**20, group.seconds_compiling
-    return row(how, steps, None, graph, tf32, None, memory, seconds)
+    return row(how, steps, None, graph, tf32, actions, memory, seconds)
 
 
 def peers(device: str, turn: Turn) -> str:

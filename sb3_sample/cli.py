@@ -6,7 +6,9 @@ The command ``sb3-sample``: the zoo's commands with the algorithms of this packa
 import argparse
 import contextlib
 import importlib
+import os
 import runpy
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -33,6 +35,20 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     :param argv: command line without the program's name; this process's own if None
     """
+    try:
+        _run(argv)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        try:
+            sys.stdout.flush()
+        except BrokenPipeError:
+            # Whoever reads the output, such as `head`, has gone. Python would try once more at the end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise SystemExit(128 + signal.SIGPIPE) from None
+        raise  # another pipe, such as a worker's
+
+
+def _run(argv: Sequence[str] | None) -> None:
     arguments = list(sys.argv[1:] if argv is None else argv)
     name = arguments[0] if arguments else "--help"
     if name in ("-h", "--help"):

@@ -17,8 +17,9 @@ from typing import Any, Protocol
 import torch
 from numpy.random import mtrand
 
-#: Meetings: all models are made; all trainings are about to begin; a gradient step; a step of the environments.
-MADE, BEGIN, GRADIENT_STEP, ENVIRONMENTS = "made", "begin", "gradient step", "environments"
+#: Meetings: all models are made; all trainings are about to begin; then actions, a step of the environments, and
+#: gradient steps.
+MADE, BEGIN, ACTIONS, ENVIRONMENTS, GRADIENT_STEP = "made", "begin", "actions", "environments", "gradient step"
 #: Further states of a training.
 _READY, _ENDED = "ready", "ended"
 #: Seconds that trainings have to end by themselves when they are told to leave at once.
@@ -31,7 +32,7 @@ class LeftWithTheOthers(BaseException):
 
 
 class Joint(Protocol):
-    """Gradient steps of several learners as one."""
+    """Gradient steps, and actions, of several learners as one."""
 
     @property
     def seconds_compiling(self) -> float:
@@ -45,11 +46,19 @@ class Joint(Protocol):
         :return: its result, of each learner
         """
 
+    def act(self, inputs: Sequence[tuple[Any, ...]]) -> list[dict[str, torch.Tensor]]:
+        """
+        Compute the actions of each learner.
+
+        :param inputs: the arguments of ``Learner.action_step``, a tuple a learner, in their order
+        :return: its result, of each learner
+        """
+
     def release(self) -> None:
         """Give each learner tensors of its own again."""
 
 
-#: Makes gradient steps of several learners one; None where each takes its own.
+#: Makes gradient steps and actions of several learners one; None where each has its own.
 MakeJoint = Callable[[Sequence[Any]], Joint | None]
 
 
@@ -115,7 +124,7 @@ class Seat:
         """
         Wait until the others have come to a meeting too, and what it is for is done.
 
-        :param meeting: one of the four
+        :param meeting: one of the five
         :raises LeftWithTheOthers: another training has failed
         :raises KeyboardInterrupt: the process is to end at once, as by a second Ctrl-C; a ``SystemExit`` likewise
         """
@@ -127,18 +136,19 @@ class Seat:
         if stop is not None or (self.group.failed and not (self.saves and self.takes_part)):
             raise LeftWithTheOthers(f"ended with the others of its group: {stop!r}" if stop else "") from stop
 
-    def step(self, inputs: tuple[Any, ...]) -> dict[str, torch.Tensor] | None:
+    def together(self, meeting: str, inputs: tuple[Any, ...]) -> dict[str, torch.Tensor] | None:
         """
-        Take a gradient step with the others.
+        Take a gradient step, or compute actions, with the others.
 
-        :param inputs: the arguments of ``Learner.gradient_step``
+        :param meeting: which of the two
+        :param inputs: the arguments of ``Learner.gradient_step``, or ``action_step``
         :return: its result; None where there are no others, or theirs is of another kind, so that it has still to be
-            taken
+            done
         """
         if len(self.group.stepping()) < 2:
             return None
         self.inputs = inputs
-        self.meet(GRADIENT_STEP)
+        self.meet(meeting)
         self.inputs, answer, self.answer = None, self.answer, None
         return answer
 
@@ -280,8 +290,13 @@ class Group:
             stepping = self.stepping()
             if stepping and all(seat.at is GRADIENT_STEP for seat in stepping):
                 # Whoever is elsewhere goes on too, lest those steps wait for it for ever, or it for them.
-                self._step_together(stepping)
+                self._do_together(stepping, GRADIENT_STEP)
                 ready = there
+            elif acting := [seat for seat in there if seat.at is ACTIONS]:
+                # Before the environments' step. Where not all act, one at random, say, each does by itself.
+                if acting == stepping:
+                    self._do_together(stepping, ACTIONS)
+                ready = acting
             elif any(seat.at is ENVIRONMENTS for seat in there):
                 # First: a learner that waits at a gradient step waits for those that have still to come to one.
                 ready = [seat for seat in there if seat.at is ENVIRONMENTS]
@@ -300,7 +315,7 @@ class Group:
         for seat in ready:
             seat.at = _READY
 
-    # ---------------------------------------------------------------- gradient steps
+    # ---------------------------------------------------------------- gradient steps and actions
 
     def stepping(self) -> list[Seat]:
         """
@@ -311,7 +326,7 @@ class Group:
     def _joint_of(self, seats: list[Seat]) -> Joint | None:
         return self._make_joint([seat.learner for seat in seats]) if len(seats) > 1 else None
 
-    def _step_together(self, seats: list[Seat]) -> None:
+    def _do_together(self, seats: list[Seat], what: str) -> None:
         if self._joint is None:
             self._joint = self._joint_of(seats)
         if self._joint is None:
@@ -319,7 +334,8 @@ class Group:
         inputs = [seat.inputs or () for seat in seats]
         if not all(_are_alike(inputs[0], each) for each in inputs):
             return
-        for seat, answer in zip(seats, self._joint.step(inputs), strict=True):
+        answers = (self._joint.step if what is GRADIENT_STEP else self._joint.act)(inputs)
+        for seat, answer in zip(seats, answers, strict=True):
             seat.answer = answer
 
     @property

@@ -72,7 +72,7 @@ def trace(
     :return: the same as a graph of tensor operations, which takes the state and then the inputs
     :raises ReadsOnTheHost: if it asks for the value of a tensor
     """
-    with undone(state, inputs[0].device):
+    with undone(state, state[0].device):
         _local.on = True
         try:
             # The backward pass is recorded too, which another thread would run.

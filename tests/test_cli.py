@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -39,6 +40,19 @@ def test_help_lists_the_commands(run, capsys: pytest.CaptureFixture[str]) -> Non
     assert all(command in output for command in cli.COMMANDS)
     run("--version")
     assert capsys.readouterr().out.strip() == cli.__version__
+
+
+def test_a_reader_that_has_gone_ends_the_command(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w") as gone, monkeypatch.context() as patched:
+        patched.setattr("sys.stdout", gone)
+        with pytest.raises(SystemExit) as caught:
+            run("--help")
+        assert caught.value.code == 128 + signal.SIGPIPE
+    monkeypatch.setitem(cli.COMMANDS, "plot", cli.Command(lambda _: (_ for _ in ()).throw(BrokenPipeError()), ""))
+    with pytest.raises(BrokenPipeError):  # of another pipe
+        run("plot")
 
 
 def test_an_unknown_command_is_refused(run) -> None:

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import torch
 
-from sb3_sample import BRO, SAC, train_many
+from sb3_sample import BRO, SAC, DeviceReplayBuffer, train_many
 from sb3_sample.faults import TrainingDiverged
 from sb3_sample.learner.batch import Batch
-from sb3_sample.learner.execution import Captured, old_torch, why_not_compiled
+from sb3_sample.learner.execution import CapturedActing, old_torch, why_not_compiled
 from sb3_sample.learner.group import LearnerGroup
 from tests.learner.test_group import REFUSED, take, together
 from tests.sac import test_golden as golden
@@ -122,6 +122,50 @@ def test_groups_are_the_cpu(maker: str) -> None:
         for model in (ours, theirs):
             take(model, 3)
         assert largest_difference(ours, theirs) < (10 * TOLERANCE if maker in ROUNDING else TOLERANCE)
+
+
+@pytest.mark.parametrize("maker", ["SAC", "BRO", "DAC", "FlashSAC"])
+def test_actions_of_groups_are_those_of_each(maker: str) -> None:
+    there = [model_on("cuda", maker, "captured", seed=seed) for seed in range(3)]
+    group = LearnerGroup([model.learner for model in there])
+    for i in range(8):
+        generator = torch.Generator().manual_seed(i)
+        inputs = [
+            tuple(torch.randn((1, n), generator=generator).to("cuda") for n in (3, m.actor.action_dim)) for m in there
+        ]
+        with torch.inference_mode():
+            alone = [m.learner.action_step(*own)["actions"].clone() for m, own in zip(there, inputs, strict=True)]
+            found = [own["actions"].clone() for own in group.act(inputs)]
+        assert all(torch.allclose(*pair, atol=1e-5) for pair in zip(alone, found, strict=True))
+        together(group.learners, lambda i: take(there[i], 1), group)
+    assert isinstance(group._acting, CapturedActing) and group._acting.captured._recorded
+
+
+@pytest.mark.parametrize("maker", ["SAC", "BRO", "DAC"])
+@pytest.mark.parametrize("n", [1, 3])
+def test_steps_that_draw_their_batches(maker: str, n: int) -> None:
+    """Captured steps draw what those that are run as they are draw, and the counters of the generator go on alike."""
+    drawn = {"replay_buffer_class": DeviceReplayBuffer, "replay_buffer_kwargs": {"sampling": "device"}}
+    found = []
+    for how in ("eager", "captured"):
+        models = [model_on("cuda", maker, how, seed=seed, **drawn) for seed in range(n)]
+        for model in models:
+            assert model._draws_in_steps()
+            model.learner.set_training_mode(True)
+        group = LearnerGroup([model.learner for model in models]) if n > 1 else None
+        torch.manual_seed(0)
+        for _ in range(12):
+            if group is None:
+                models[0].learner.prepared_drawing()
+                models[0].learner.take_drawn_step(8)
+            else:
+                group.step([(8, True, True)] * n)
+        execution = models[0].learner._drawing if group is None else group._drawing
+        assert execution is not None and (execution._captured is not None) == (how == "captured")
+        found.append((models, float(torch.rand((), device="cuda"))))
+    (eager, after_eager), (captured, after_captured) = found
+    assert after_eager == after_captured
+    assert all(largest_difference(a, b) < TOLERANCE for a, b in zip(eager, captured, strict=True))
 
 
 def test_compiled_groups() -> None:
@@ -239,7 +283,7 @@ def test_captured_actions_are_the_explorers(maker: str) -> None:
             found = learner.explore(observations)
         assert torch.allclose(expected, found, atol=1e-6)
         take(model, 1)
-    assert isinstance(learner._acting[1], Captured) and learner._acting[1]._recorded
+    assert isinstance(learner._acting[1], CapturedActing) and learner._acting[1].captured._recorded
 
 
 def test_compiles_here() -> None:

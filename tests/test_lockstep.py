@@ -11,7 +11,17 @@ import numpy as np
 import pytest
 import torch
 
-from sb3_sample.lockstep import BEGIN, ENVIRONMENTS, MADE, Group, LeftWithTheOthers, Seat, present
+from sb3_sample.lockstep import (
+    ACTIONS,
+    BEGIN,
+    ENVIRONMENTS,
+    GRADIENT_STEP,
+    MADE,
+    Group,
+    LeftWithTheOthers,
+    Seat,
+    present,
+)
 
 
 class Sum:
@@ -23,6 +33,9 @@ class Sum:
 
     def step(self, inputs: Sequence[tuple[Any, ...]]) -> list[dict[str, Any]]:
         return [{"sum": sum(each[0] for each in inputs)} for _ in inputs]
+
+    def act(self, inputs: Sequence[tuple[Any, ...]]) -> list[dict[str, Any]]:
+        return [{"largest": max(each[0] for each in inputs)} for _ in inputs]
 
     def release(self) -> None:
         pass
@@ -103,7 +116,7 @@ def test_gradient_steps_of_unequal_numbers_wait_for_nobody_for_ever() -> None:
             for _ in range(2 * number + 1):
                 seat.meet(ENVIRONMENTS)
             for _ in range(3 - number):
-                answer = seat.step((10.0**number,))
+                answer = seat.together(GRADIENT_STEP, (10.0**number,))
                 sums[seat.name].append(None if answer is None else answer["sum"])
         seat.group.leave(seat)
 
@@ -120,13 +133,39 @@ def test_steps_of_another_kind_are_taken_by_oneself() -> None:
     def body(seat: Seat) -> None:
         seat.meet(BEGIN)
         first = seat.name == "0"
-        answers.append(seat.step((1.0, torch.zeros(2) if first else None)))
-        answers.append(seat.step((1.0, torch.zeros(2 if first else 3))))
-        answers.append(seat.step((1.0, first)))
-        answers.append(seat.step((1.0 if first else 2.0, {"a": (torch.zeros(2), None)})))
+        answers.append(seat.together(GRADIENT_STEP, (1.0, torch.zeros(2) if first else None)))
+        answers.append(seat.together(GRADIENT_STEP, (1.0, torch.zeros(2 if first else 3))))
+        answers.append(seat.together(GRADIENT_STEP, (1.0, first)))
+        answers.append(seat.together(GRADIENT_STEP, (1.0 if first else 2.0, {"a": (torch.zeros(2), None)})))
 
     group(body, body, joint=Sum).run()
     assert answers == [None] * 6 + [{"sum": 3.0}] * 2
+
+
+def test_actions_are_chosen_together_before_the_environments_step() -> None:
+    """Some act at random at first, or take more gradient steps; each then acts, or steps, by itself."""
+    answers: dict[str, list[Any]] = {"0": [], "1": [], "2": []}
+    steps: list[str] = []
+
+    def body(seat: Seat) -> None:
+        seat.meet(BEGIN)
+        number = int(seat.name)
+        for i in range(5):
+            if i >= number:
+                answer = seat.together(ACTIONS, (number + 10.0 * i,))
+                answers[seat.name].append(None if answer is None else answer["largest"])
+            steps.append(seat.name)
+            seat.meet(ENVIRONMENTS)
+            if i >= 2:
+                for _ in range(2 if seat.name == "0" and i == 3 else 1):
+                    seat.together(GRADIENT_STEP, (1.0,))
+        seat.group.leave(seat)
+
+    group(body, body, body, joint=Sum).run()
+    # Step 2 has all three; in step 3 the first one's second gradient step waits for the others' next one, so that it
+    # acts by itself from then on.
+    assert answers == {"0": [None, None, 22.0, 32.0, None], "1": [None, 22.0, 32.0, None], "2": [22.0, 32.0, None]}
+    assert [steps.count(name) for name in "012"] == [5, 5, 5]
 
 
 def test_a_failure_ends_the_others_at_their_next_meeting() -> None:

@@ -181,6 +181,18 @@ class Source(Protocol):
         """
 
 
+class Store(Protocol):
+    """Interface of a replay buffer on the learner's device, of which the gradient step itself draws its batches."""
+
+    def draw(self, n: int) -> Any:
+        """
+        Draw transitions, with operations on tensors alone, by torch's generator of the device.
+
+        :param n: how many
+        :return: transitions as Stable-Baselines3's buffers give them
+        """
+
+
 class Noise(NamedTuple):
     """
     Everything random of one gradient step: standard normal noise of its sampled actions, (B, A) each, and the critics

@@ -192,10 +192,8 @@ class Execution:
             if reason is not None:
                 warn_not_compiled(learner, reason)
                 learner.compiled = False
-        # Parts of one's own may look at values on the host: captured only when asked for.
-        asked = learner.compile is True or (learner.compile == "auto" and not foreign_parts(learner))
-        captures = learner.device.type == "cuda" and asked and not _foreign_optimizers(learner)
-        return cls(learner, bool(learner.compiled), learner.compile == "auto", cuda_graph if captures else None, method)
+        recorder = cuda_graph if captures(learner) and not _foreign_optimizers(learner) else None
+        return cls(learner, bool(learner.compiled), learner.compile == "auto", recorder, method)
 
     @property
     def leaves_gradients(self) -> bool:
@@ -247,7 +245,11 @@ class Execution:
             return self._step(learner, *inputs)
 
 
-def acting_of(learner: Any) -> "Captured | None":
+#: Computes the actions of a training: takes the learner and the arguments of ``Learner.action_step``.
+Acting = Callable[[Any, tuple[Any, ...]], Metrics]
+
+
+def acting_of(learner: Any) -> Acting | None:
     """
     Choose how actions of the training are computed.
 
@@ -255,10 +257,21 @@ def acting_of(learner: Any) -> "Captured | None":
     :return: what captures them; None where they are computed as they are: on a CPU, and for an explorer with an ``act``
         of its own
     """
-    if learner.device.type != "cuda" or type(learner.explorer).act is not Exploration.act:
+    if type(learner.explorer).act is not Exploration.act or not captures(learner):
         return None
-    asked = learner.compile is True or (learner.compile == "auto" and not foreign_parts(learner))
-    return Captured(learner, cuda_graph, optimizers=False) if asked else None
+    return CapturedActing(learner, "action_step", cuda_graph)
+
+
+def captures(learner: Any, of: Any = None) -> bool:
+    """
+    Decide whether what a learner computes is captured.
+
+    :param learner: the learner, or a group of some
+    :param of: learner whose parts count; None: its own
+    :return: whether it is: on a GPU, unless that is declined, or parts of one's own may look at values on the host
+    """
+    asked = learner.compile is True or (learner.compile == "auto" and not foreign_parts(of or learner))
+    return learner.device.type == "cuda" and asked
 
 
 class CannotCompile(Exception):
@@ -490,7 +503,8 @@ class Captured:
             own = inputs_like(inputs, torch.clone)
             self._recorded[kind] = (own, *self._recorder(lambda: step(learner, *own)))
         own, repeat, metrics = self._recorded[kind]
-        torch._foreach_copy_(tensors_of(own), tensors_of(inputs))
+        if given := tensors_of(inputs):
+            torch._foreach_copy_(tensors_of(own), given)
         repeat()
         # The caller adds to what it is given.
         return dict(metrics)
@@ -504,6 +518,30 @@ def _aside(run: Callable[[], Metrics]) -> Metrics:
         metrics = run()
     torch.cuda.current_stream().wait_stream(stream)
     return metrics
+
+
+class CapturedActing:
+    """
+    Actions captured as gradient steps are.
+
+    :param learner: the learner, or a group of some
+    :param method: name of its method that computes them
+    :param recorder: what captures
+    """
+
+    def __init__(self, learner: Any, method: str, recorder: Recorder):
+        self.captured, self._step = Captured(learner, recorder, optimizers=False), getattr(type(learner), method)
+
+    def __call__(self, learner: Any, inputs: tuple[Any, ...]) -> Metrics:
+        """
+        Compute actions.
+
+        :param learner: the learner, or the group
+        :param inputs: the method's arguments
+        :return: its result, valid until the next call
+        """
+        self.captured.forget_if_stale(learner)
+        return self.captured(self._step, learner, inputs)
 
 
 class _Tensors:

@@ -3,7 +3,7 @@
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -26,6 +26,9 @@ class Exploration(Part):
 
     :param learner: the learner, whose networks exist already
     """
+
+    #: Whether ``torch.vmap`` can map :meth:`sampled` over learners: it takes no gradients itself.
+    can_be_mapped: ClassVar[bool] = True
 
     def __init__(self, learner: Learning):
         super().__init__()
@@ -536,6 +539,8 @@ class OptimisticGradient(Exploration):
     :param kl_radius: KL divergence to the actor's Gaussian, summed over the action's dimensions, at least 0
     :raises ValueError: if an argument is out of range, or if the actor is deterministic
     """
+
+    can_be_mapped = False
 
     def __init__(self, learner: Learning, optimism: float = 4.36, kl_radius: float = 3.69**2 / 2):
         super().__init__(learner)

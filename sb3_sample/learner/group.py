@@ -12,13 +12,16 @@ from typing import Any
 import torch
 from torch import nn
 
+from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.descent import StackedDescent
 from sb3_sample.learner.execution import (
+    Acting,
+    CapturedActing,
     Execution,
     Metrics,
     Settings,
+    captures,
     cuda_graph,
-    foreign_parts,
     inputs_like,
     tensors_of,
     why_not_compiled,
@@ -32,7 +35,7 @@ _NOT_READ = {"learning_starts", "verbose", "compile", "learning_rate", "gamma"}
 
 class _Networks(nn.Module):
     """
-    All that one learner's gradient step reads and writes, as one module, which runs the step.
+    All that one learner's gradient step reads and writes, as one module, which runs that or another method of it.
 
     :param learner: the learner
     """
@@ -40,10 +43,10 @@ class _Networks(nn.Module):
     def __init__(self, learner: Learner):
         super().__init__()
         self.parts = nn.ModuleList(learner.step_modules())
-        self._run = lambda inputs: type(learner).gradient_step(learner, *inputs)
+        self._run = lambda method, inputs: getattr(type(learner), method)(learner, *inputs)
 
-    def forward(self, inputs: tuple[Any, ...]) -> Metrics:
-        result: Metrics = self._run(inputs)
+    def forward(self, method: str, inputs: tuple[Any, ...]) -> Metrics:
+        result: Metrics = self._run(method, inputs)
         return result
 
     def tensors(self) -> dict[str, torch.Tensor]:
@@ -75,8 +78,8 @@ class _Stacks(nn.Module):
 
 class LearnerGroup:
     """
-    Gradient steps of S learners that are one. Each learner's tensors become its rows of the stacks, so that whatever
-    acts on a learner alone (acting, resets, saving, loading in place) goes on as it is.
+    Gradient steps, and actions, of S learners that are one. Each learner's tensors become its rows of the stacks, so
+    that whatever acts on a learner alone (acting, resets, saving, loading in place) goes on as it is.
 
     :param learners: learners of the same networks, parts and settings; learning rates and other numbers may differ
     :raises ValueError: if they differ in more, or cannot be stacked, by name
@@ -100,11 +103,15 @@ class LearnerGroup:
             {id(self._first.optimizers()[name]): optimizer for name, optimizer in self._optimizers.items()},
             self._parameters_by_network(),
         )
+        # Discount factors, one or (S,).
+        self._discounts: float | torch.Tensor = 0.0
         #: Numbers that differ between learners: object of the first learner, attribute, (S,).
         self._differing: list[tuple[dict[str, Any], str, torch.Tensor]] = []
         self._settings = [Settings(learner, private=False) for learner in self.learners]
         self._versions: list[int] = []
         self._execution: Execution | None = None
+        self._drawing: Execution | None = None
+        self._acting: Acting | None = None
         stacks = self._stacks.by_name()
         self._take_settings()
         for s, networks in enumerate(self._networks):
@@ -142,18 +149,39 @@ class LearnerGroup:
     @property
     def seconds_compiling(self) -> float:
         """Seconds spent on compiling the gradient step."""
-        return 0.0 if self._execution is None else self._execution.seconds_compiling
+        return sum(each.seconds_compiling for each in (self._execution, self._drawing) if each is not None)
 
     def step(self, inputs: Sequence[tuple[Any, ...]]) -> list[Metrics]:
         """
         Take one gradient step of each learner.
 
-        :param inputs: the arguments of each learner's ``gradient_step``, in the learners' order
+        :param inputs: the arguments of each learner's ``gradient_step`` or ``drawn_step``, in the learners' order
         :return: each learner's result, valid until the next step
         """
         self._prepare()
-        assert self._execution is not None
-        metrics = self._execution(self, *_stacked(inputs, self.device))
+        if isinstance(inputs[0][0], Batch):
+            self._execution = self._execution or self._made("mapped_step")
+            execution = self._execution
+        else:
+            self._drawing = self._drawing or self._made("mapped_drawn_step")
+            execution = self._drawing
+        execution.prepare(self)
+        return self._of_each_learner(execution(self, *_stacked(inputs, self.device)))
+
+    def act(self, inputs: Sequence[tuple[Any, ...]]) -> list[Metrics]:
+        """
+        Compute the explorers' actions.
+
+        :param inputs: the arguments of each learner's ``action_step``, in the learners' order
+        :return: each learner's result, valid until the next call
+        """
+        self._take_changes()
+        if self._acting is None:
+            of_group = CapturedActing(self, "mapped_actions", cuda_graph) if captures(self, self._first) else None
+            self._acting = of_group or (lambda group, stacked: group.mapped_actions(*stacked))
+        return self._of_each_learner(self._acting(self, _stacked(inputs, self.device)))
+
+    def _of_each_learner(self, metrics: Metrics) -> list[Metrics]:
         rows = {name: values.unbind() for name, values in metrics.items()}
         return [{name: of[s] for name, of in rows.items()} for s in range(len(self.learners))]
 
@@ -179,25 +207,24 @@ class LearnerGroup:
             self._take_moments()
             self._versions = versions
         self._take_rates()
+        self._take_changes()
+
+    def _take_changes(self) -> None:
+        """Take over what was set in the learners."""
         # Each looks at its own.
         changed = [settings.have_changed() for settings in self._settings]
         if any(changed):
             self._take_settings()
-            self._execution = None
-        if self._execution is None:
-            self._execution = self._made()
-        self._execution.prepare(self)
+            self._execution = self._drawing = self._acting = None
 
-    def _made(self) -> Execution:
+    def _made(self, method: str) -> Execution:
         if self.compiled:
             reason = why_not_compiled(self)
             if reason is not None:
                 warnings.warn(f"The gradient step is not compiled: {reason}", stacklevel=4)
                 self.compiled = False
-        # As for one learner: parts of one's own may look at values on the host.
-        asked = self.compile is True or (self.compile == "auto" and not foreign_parts(self._first))
-        captures = self.device.type == "cuda" and asked
-        return Execution(self, self.compiled, self.compile == "auto", cuda_graph if captures else None, "mapped_step")
+        recorder = cuda_graph if captures(self, self._first) else None
+        return Execution(self, self.compiled, self.compile == "auto", recorder, method)
 
     def mapped_step(self, *inputs: Any) -> Metrics:
         """
@@ -206,12 +233,37 @@ class LearnerGroup:
         :param inputs: the arguments of ``gradient_step``, tensors with an axis S in front
         :return: each learner's result, by name, (S, ...)
         """
+        return self._mapped("gradient_step", inputs)
 
+    def mapped_drawn_step(self, batch_size: int, moves_targets: bool, moves_actor: bool) -> Metrics:
+        """
+        Draw batches and compute the gradient step of all learners: this function is compiled or captured.
+
+        :param batch_size: B, of each
+        :param moves_targets: as of ``gradient_step``
+        :param moves_actor: as of ``gradient_step``
+        :return: each learner's result, by name, (S, ...)
+        """
+        inputs = [learner.drawn_inputs(batch_size) for learner in self.learners]
+        drawn = _stacked([(batch._replace(discounts=None), noise) for batch, noise in inputs], self.device)
+        batch = drawn[0]._replace(discounts=self._discounts)
+        return self._mapped("gradient_step", (batch, drawn[1], None, moves_targets, moves_actor))
+
+    def mapped_actions(self, *inputs: Any) -> Metrics:
+        """
+        Compute the actions of all learners, on tensors only: this function is captured.
+
+        :param inputs: the arguments of ``action_step``, tensors with an axis S in front
+        :return: each learner's result, by name, (S, ...)
+        """
+        return self._mapped("action_step", inputs)
+
+    def _mapped(self, method: str, inputs: tuple[Any, ...]) -> Metrics:
         def one(stacks: dict[str, torch.Tensor], numbers: list[torch.Tensor], values: list[torch.Tensor]) -> Metrics:
             given = iter(values)
             with self._in_force(numbers):
                 own = inputs_like(inputs, lambda _: next(given))
-                result: Metrics = torch.func.functional_call(self._networks[0], stacks, (own,))
+                result: Metrics = torch.func.functional_call(self._networks[0], stacks, (method, own))
                 return result
 
         numbers = [number for _, _, number in self._differing]
@@ -293,6 +345,10 @@ class LearnerGroup:
         """
         self._differing = []
         self._descent.tau = self._first.tau
+        # Of batches that a step draws itself, where no tensor can come from the host.
+        gammas = [learner.gamma for learner in self.learners]
+        same = all(gamma == gammas[0] for gamma in gammas)
+        self._discounts = gammas[0] if same else torch.tensor(gammas, dtype=torch.float32, device=self.device)
         # The stacked optimizers' groups, by those of the first learner.
         groups = {
             id(theirs): ours

@@ -15,16 +15,16 @@ from torch import nn
 from torch.optim import Optimizer
 
 from sb3_sample.learner import first_step, losses
-from sb3_sample.learner.batch import SLOTS, Batch, CriticStep, Encoded, Extra, Noise, first_copy, widened
+from sb3_sample.learner.batch import SLOTS, Batch, CriticStep, Encoded, Extra, Noise, Store, first_copy, widened
 from sb3_sample.learner.descent import descend, follow, minimize
-from sb3_sample.learner.execution import Captured, Execution, acting_of
+from sb3_sample.learner.execution import Acting, Execution, acting_of
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.objectives import Objective, Prepared
 from sb3_sample.learner.observation_statistics import ObservationStatistics
 from sb3_sample.learner.observations import Observations
 from sb3_sample.learner.parts import Part, logged
-from sb3_sample.learner.pessimism import Pessimism, pessimistic_value
+from sb3_sample.learner.pessimism import LearnedPessimism, Pessimism, pessimistic_value
 from sb3_sample.learner.plasticity import ReDo, Resets
 from sb3_sample.learner.q_values import evaluate
 from sb3_sample.learner.randomness import OwnGenerators
@@ -186,10 +186,15 @@ class Learner:
             self.temperature_optimizer = AdamW(self.temperature.parameters(), lr=learning_rate, betas=betas)
         self._parts_mode = ModeSwitch(*self.parts().values())
         self._execution: Execution | None = None
+        # Where :meth:`drawn_step` draws its batches from; None: it cannot be taken.
+        self._store: Store | None = None
+        self._drawing: Execution | None = None
         #: Chooses how the gradient steps are run: takes the learner and the method's name.
         self.make_execution: Callable[[Any, str], Any] = Execution.of
-        # The explorer, and what captures its actions.
-        self._acting: tuple[Exploration, Captured | None] | None = None
+        #: Chooses how the explorer's actions are computed.
+        self.make_acting: Callable[[Any], Acting | None] = acting_of
+        # The explorer, and what computes its actions; None for its own ``act``.
+        self._acting: tuple[Exploration, Acting | None] | None = None
         #: Whether ``.grad`` holds the gradients of another gradient step than the last, as a compiled one leaves none.
         self.gradients_are_stale = False
         # Whether the shapes of a gradient step, and those of the explorer's actions, were checked.
@@ -488,16 +493,16 @@ class Learner:
         parts = (self.explorer, self.pessimism_rule, self.objective)
         objects = (self.actor, self.actor.trunk, *critics, self.temperature, *parts)
         sizes = (len(group["params"]) for optimizer in optimizers for group in optimizer.param_groups)
-        return (*map(id, (*objects, *optimizers, self.head)), *sizes)
+        return (*map(id, (*objects, *optimizers, self.head, self._store)), *sizes)
 
     @property
     def seconds_compiling(self) -> float:
         """Seconds spent on compiling the gradient step."""
-        return 0.0 if self._execution is None else self._execution.seconds_compiling
+        return sum(each.seconds_compiling for each in (self._execution, self._drawing) if each is not None)
 
     def forget_execution(self) -> None:
         """Drop the execution: how the gradient steps are run is decided anew before the next one."""
-        self._execution = self._acting = None
+        self._execution = self._drawing = self._acting = None
 
     def prepared_execution(self) -> Execution:
         """
@@ -509,6 +514,25 @@ class Learner:
             self._execution = self.make_execution(self, "gradient_step")
         self._execution.prepare(self)
         return self._execution
+
+    def draw_from(self, store: Store) -> None:
+        """
+        Set where :meth:`take_drawn_step` draws its batches from.
+
+        :param store: a replay buffer on the learner's device
+        """
+        self._store = store
+
+    def prepared_drawing(self) -> Execution:
+        """
+        Prepare the gradient steps that follow, by :meth:`take_drawn_step`.
+
+        :return: runner of these steps
+        """
+        if self._drawing is None or not self._drawing.serves(self):
+            self._drawing = self.make_execution(self, "drawn_step")
+        self._drawing.prepare(self)
+        return self._drawing
 
     def update(self, batch: Batch, noise: Noise | None = None, extra: Extra | None = None) -> dict[str, torch.Tensor]:
         """
@@ -568,16 +592,15 @@ class Learner:
         return actions
 
     def _actions(self, observations: Any) -> torch.Tensor:
-        """The explorer's actions, on a GPU by a captured graph."""
+        """The explorer's actions; on a GPU by a captured graph, with those of learners that act together."""
         if self._acting is None or self._acting[0] is not self.explorer:
-            self._acting = self.explorer, acting_of(self)
+            self._acting = self.explorer, self.make_acting(self)
         acting = self._acting[1]
         if acting is None:
             actions: torch.Tensor = self.explorer.act(self, observations)
             return actions
         noise = self.explorer.draw_noise(self, observations)
-        acting.forget_if_stale(self)
-        return acting(type(self).action_step, self, (observations, noise))["actions"]
+        return acting(self, (observations, noise))["actions"]
 
     def action_step(self, observations: Any, noise: torch.Tensor) -> dict[str, torch.Tensor]:
         """
@@ -603,6 +626,87 @@ class Learner:
             the update of the module in question
         """
         execution = self._execution or self.prepared_execution()
+        batch, noise, extra = self._inputs(batch, noise, extra)
+        self._count()
+        metrics = execution(self, batch, noise, extra, *self._what_moves(), eager=eager)
+        self._td_errors = metrics.pop(_TD_ERRORS, None)
+        self.gradients_are_stale = not (eager or execution.leaves_gradients)
+        batch = self._first_copy(batch)
+        for part in self.parts().values():
+            metrics.update(logged(part, "after_update", part.after_update(self, batch)))
+        return metrics
+
+    def take_drawn_step(self, batch_size: int) -> dict[str, torch.Tensor]:
+        """
+        Take one gradient step that draws its batch itself (:meth:`draw_from`), and count it: on a GPU one launch,
+        drawing included.
+
+        :param batch_size: B
+        :return: as of :meth:`step`
+        """
+        if not self._checked_step:
+            # A batch apart, so that a training that goes on draws what it would have drawn.
+            with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
+                batch = self._drawn(batch_size)
+            first_step.check_batch("batch", batch)
+            first_step.check(self, batch, None)
+            self._checked_step = True
+        execution = self._drawing or self.prepared_drawing()
+        self._count()
+        metrics = execution(self, batch_size, *self._what_moves())
+        self._td_errors = None
+        self.gradients_are_stale = not execution.leaves_gradients
+        return metrics
+
+    def _drawn(self, batch_size: int) -> Batch:
+        assert self._store is not None
+        return Batch.of(self._store.draw(batch_size), self.gamma)
+
+    def drawn_inputs(self, batch_size: int) -> tuple[Batch, Noise]:
+        """
+        Draw what a gradient step takes, with operations on tensors alone.
+
+        :param batch_size: B
+        :return: transitions and noise
+        """
+        batch = self._drawn(batch_size)
+        return batch, Noise().completed(batch, None, self._subset())
+
+    def drawn_step(self, batch_size: int, moves_targets: bool, moves_actor: bool) -> dict[str, torch.Tensor]:
+        """
+        Draw a batch and compute its gradient step: this function is compiled or captured.
+
+        :param batch_size: B
+        :param moves_targets: as of :meth:`gradient_step`
+        :param moves_actor: as of :meth:`gradient_step`
+        :return: as of :meth:`gradient_step`
+        """
+        batch, noise = self.drawn_inputs(batch_size)
+        return self.gradient_step(batch, noise, None, moves_targets, moves_actor)
+
+    def why_no_drawn_steps(self) -> str | None:
+        """
+        Check whether the gradient step can draw its batch itself.
+
+        :return: what needs the batch on the host, in words; None if nothing does
+        """
+        if self.transforms or self.reward_scaler is not None:
+            return "batches are transformed before the gradient step (batch_transforms, reward_scale)"
+        if isinstance(self.pessimism_rule, LearnedPessimism):
+            return f"pessimism={type(self.pessimism_rule).__name__} learns from further transitions"
+        after = [n for n, part in self.parts().items() if type(part).after_update is not Part.after_update]
+        return f"{', '.join(after)} looks at the batch after the gradient step" if after else None
+
+    def _subset(self) -> tuple[int, int] | None:
+        return None if self.target_subset is None else (self.target_subset, self.critic.n_critics)
+
+    def _count(self) -> None:
+        self._counts._n_updates += 1
+        if self.schedule is not None:
+            self._set_scheduled_rates(self.schedule)
+
+    def _inputs(self, batch: Batch, noise: Noise | None, extra: Extra | None) -> tuple[Batch, Noise, Extra | None]:
+        """The gradient step's inputs, transformed, complete and, the first time, checked."""
         if batch.discounts is None:
             batch = batch._replace(discounts=self.gamma)
         if extra is not None and extra.batch.discounts is None:
@@ -611,21 +715,11 @@ class Learner:
             first_step.check_batch("batch", batch)
         if self.transforms or self.reward_scaler is not None:
             batch, noise, extra = self._transformed(batch, noise, extra)
-        subset = None if self.target_subset is None else (self.target_subset, self.critic.n_critics)
-        noise = (noise or Noise()).completed(batch, extra, subset, (self.target_copies, self.online_copies))
-        narrow = self._first_copy(batch)
+        noise = (noise or Noise()).completed(batch, extra, self._subset(), (self.target_copies, self.online_copies))
         if not self._checked_step:
-            first_step.check(self, narrow, extra)
+            first_step.check(self, self._first_copy(batch), extra)
             self._checked_step = True
-        self._counts._n_updates += 1
-        if self.schedule is not None:
-            self._set_scheduled_rates(self.schedule)
-        metrics = execution(self, batch, noise, extra, *self._what_moves(), eager=eager)
-        self._td_errors = metrics.pop(_TD_ERRORS, None)
-        self.gradients_are_stale = not (eager or execution.leaves_gradients)
-        for part in self.parts().values():
-            metrics.update(logged(part, "after_update", part.after_update(self, narrow)))
-        return metrics
+        return batch, noise, extra
 
     def _what_moves(self) -> tuple[bool, bool]:
         """Whether the targets, and whether actors and temperature move in the gradient step that was just counted."""

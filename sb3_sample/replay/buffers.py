@@ -170,14 +170,22 @@ class DeviceReplayBuffer(HasColumns, ReplayBuffer):
     are gathered where they are needed. For a GPU; on a CPU it is the plain buffer with other arrays.
 
     Pass ``replay_buffer_class=DeviceReplayBuffer``. For one observation, not a dict of them. It draws the same
-    transitions as ``ReplayBuffer`` with the same seed.
+    transitions as ``ReplayBuffer`` with the same seed, unless the gradient step draws its batch itself.
 
     :param args: as in Stable-Baselines3
+    :param sampling: who draws the batches of gradient steps: "host", NumPy's generator, or "device", the gradient step
+        itself, by torch's generator of the device, so that on a GPU a step with its drawing is one launch
     :param kwargs: as in Stable-Baselines3; ``optimize_memory_usage`` and ``VecNormalize`` are refused by the algorithm
+    :raises ValueError: if ``sampling`` is something else
     """
 
-    def __init__(self, *args: Any, **kwargs: Any):
+    def __init__(self, *args: Any, sampling: str = "host", **kwargs: Any):
+        if sampling not in ("host", "device"):
+            raise ValueError(f"sampling must be 'host' or 'device', not {sampling!r}")
         super().__init__(*args, **kwargs)
+        self.sampling = sampling
+        # Number of places that can be drawn, on the device, where a captured step reads it.
+        self._drawable = torch.zeros((), dtype=torch.float64, device=self.device)
         store_float_actions(self)
         given = {column.name for column in OF_EVERY_BUFFER}
         for name, column in columns_of(self).items():
@@ -216,8 +224,25 @@ class DeviceReplayBuffer(HasColumns, ReplayBuffer):
         if env is not None:
             raise ValueError("VecNormalize normalises on the host: use ReplayBuffer with it, not DeviceReplayBuffer")
         env_indices = np.random.randint(0, high=self.n_envs, size=len(batch_inds))
-        places = torch.from_numpy(batch_inds * self.n_envs + env_indices).to(self.device)
+        return self._taken(torch.from_numpy(batch_inds * self.n_envs + env_indices).to(self.device))
 
+    def draw(self, n: int) -> Any:
+        """
+        Draw transitions uniformly with replacement, with operations on tensors alone, by torch's generator of the
+        device, from as many as there were at the last :meth:`prepare_draws`.
+
+        :param n: how many
+        :return: the transitions
+        """
+        # Uniform in [0, 1), to 53 digits, so that the product stays below.
+        uniform = torch.rand(n, dtype=torch.float64, device=self.device)
+        return self._taken((uniform * self._drawable).long())
+
+    def prepare_draws(self) -> None:
+        """Have :meth:`draw` draw from all transitions that are stored now."""
+        self._drawable.fill_(self.size() * self.n_envs)
+
+    def _taken(self, places: torch.Tensor) -> Any:
         def take(column: Column, array: Any, but: Any = None) -> torch.Tensor:
             rows = array.flatten(0, 1).index_select(0, places)
             if but is not None:

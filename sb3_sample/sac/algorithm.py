@@ -32,6 +32,7 @@ from sb3_sample.kinds import check_value, instance, integer
 from sb3_sample.learner.batch import SLOTS, Batch, Noise
 from sb3_sample.learner.learner import Learner
 from sb3_sample.replay.buffers import (
+    DeviceReplayBuffer,
     ValidationDictReplayBuffer,
     ValidationReplayBuffer,
     ValidationSplit,
@@ -194,6 +195,7 @@ class SAC(  # type: ignore[misc]  # actor
         if self.prior_data is not None:
             self._tell_of(self.prior_data)
         checks.check_rule(self)
+        checks.check_sampling(self, self.replay_buffer)
         self._plain_attributes = plain_attributes(self)
         self._watch = MetricWatch(self.device)
 
@@ -395,6 +397,7 @@ class SAC(  # type: ignore[misc]  # actor
                 f"the replay buffer of {path} holds out {share} of its transitions, but this model has "
                 f"validation_proportion={self.validation_proportion}"
             )
+        checks.check_sampling(self, buffer)
 
     # ---------------------------------------------------------------- learning
 
@@ -605,11 +608,16 @@ class SAC(  # type: ignore[misc]  # actor
         at_once = 1 if isinstance(self.replay_buffer, PrioritizedReplay) else MAX_BATCHES_AT_ONCE
         while taken < gradient_steps:
             n_batches = self.plasticity.before_gradient_steps(self.learner, min(at_once, gradient_steps - taken))
-            self.learner.prepared_execution()
+            draws_itself = self._draws_in_steps()
+            if draws_itself:
+                self.learner.prepared_drawing()
+            else:
+                self.learner.prepared_execution()
             self._before_batches(batch_size)
-            for i, batch in enumerate(self._source.batches(n_batches, batch_size), taken + 1):
-                self._keeps_gradients = self.keep_next_gradients and i == gradient_steps
-                metrics = self._update(batch)
+            given = None if draws_itself else self._source.batches(n_batches, batch_size)
+            for i in range(n_batches):
+                self._keeps_gradients = self.keep_next_gradients and taken + i + 1 == gradient_steps
+                metrics = self.learner.take_drawn_step(batch_size) if given is None else self._update(given[i])
                 self._watch.note(metrics, self._n_updates, self.num_timesteps)
                 self._metrics.update(metrics)
             taken += n_batches
@@ -617,6 +625,19 @@ class SAC(  # type: ignore[misc]  # actor
         if not self._metrics_wait:
             self._watch.check()
         self._record_metrics()
+
+    def _draws_in_steps(self) -> bool:
+        """Whether the gradient steps that follow draw their batches themselves, from all that is stored now."""
+        buffer = self.replay_buffer
+        draws = isinstance(buffer, DeviceReplayBuffer) and buffer.sampling == "device"
+        # An offline training has another source, and gradients are kept of steps on given batches only.
+        draws = draws and self._learns_from is None and not self.keep_next_gradients
+        if not draws:
+            return False
+        assert isinstance(buffer, DeviceReplayBuffer)
+        self.learner.draw_from(buffer)
+        buffer.prepare_draws()
+        return True
 
     def _before_batches(self, batch_size: int) -> None:
         """

@@ -21,6 +21,8 @@ MAX_AGE = 4
 LAPSE = 1.0
 #: Share of missed periods that is warned of, once there are enough of them.
 MISSED, ENOUGH = 0.01, 100
+#: Share of lapsed gradient steps that is warned of, after as many periods.
+LAPSED = 0.1
 #: Explorations that act without the critics, which then are not handed over.
 _WITHOUT_CRITICS = (Exploration, HeldNoise, OptimisticActor, OptimisticShift)
 
@@ -46,7 +48,7 @@ class Apart:
         self.n_due = 0
         self._n_lapsed = self._n_taken = self._n_stored = 0
         self._n_periods = self._n_missed = 0
-        self._has_warned = False
+        self._has_warned = self._has_warned_of_lapsed = False
         self._ages: list[int] = []
         self._latest = 0.0
         self._n_before = model._n_of_warm_up
@@ -131,6 +133,20 @@ class Apart:
                 "programs keep them waiting. Pass a smaller control_frequency",
                 stacklevel=2,
             )
+
+        self._warn_of_lapsed()
+
+    def _warn_of_lapsed(self) -> None:
+        n_due = self._n_taken + self.n_due + self._n_lapsed
+        if self._has_warned_of_lapsed or self._n_periods < ENOUGH or self._n_lapsed <= LAPSED * n_due:
+            return
+        self._has_warned_of_lapsed = True
+        warnings.warn(
+            f"{self._n_lapsed} of {n_due} gradient steps have lapsed: they take longer than the environment's steps, "
+            f"so that fewer are taken than replay_ratio={self._model.replay_ratio} a transition. Pass a smaller "
+            "replay_ratio or control_frequency, or choose smaller networks",
+            stacklevel=3,
+        )
 
     def record(self) -> None:
         """Put what was counted into the log."""

@@ -471,6 +471,24 @@ def _check_train_freq(agent: Any) -> None:
             )
 
 
+def check_sampling(agent: Any, buffer: Any) -> None:
+    """
+    :param agent: an algorithm with its learner
+    :param buffer: a replay buffer
+    :raises ValueError: if the gradient step is to draw its batches of the buffer itself, and cannot
+    """
+    if not (isinstance(buffer, DeviceReplayBuffer) and buffer.sampling == "device"):
+        return
+    reason = agent.learner.why_no_drawn_steps()
+    if agent.prior_data is not None:
+        reason = "a share of each batch is of prior_data"
+    if reason is not None:
+        raise ValueError(
+            f"replay_buffer_kwargs: sampling='device' has the gradient step draw its batch itself, but {reason}: pass "
+            "sampling='host'"
+        )
+
+
 def check_rule(agent: Any) -> None:
     """
     :param agent: an algorithm with its rule of pessimism

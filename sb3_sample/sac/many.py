@@ -171,7 +171,7 @@ def train_together(seats: Sequence[Seat], folder: str | Path | None) -> None:
 def _check_class(cls: Any) -> None:
     if isinstance(cls, type) and issubclass(cls, SAC):
         return
-    shown = cls.__name__ if isinstance(cls, type) else repr(cls)
+    shown = f"{cls.__module__}.{cls.__qualname__}" if isinstance(cls, type) else repr(cls)
     raise ValueError(
         f"cls must be an off-policy algorithm of this package, SAC or a class derived from it, not {shown}: the "
         "learners' gradient steps have to be alike, on batches of a replay buffer"

@@ -21,8 +21,8 @@ from sb3_sample.saving.untrusted import BadFile
 _OF_HINDSIGHT = ("ep_start",)
 #: What changes in rows that are there already, or is no row; written anew each time.
 _SMALL = ("ep_length", "_current_ep_start")
-#: Never used (infos, without copy_info_dict), or never changes; and what follows from the rows of a compact buffer.
-_DERIVED = ("infos", "obs_shape", "device", "observation_space", "action_space", "env", "slot", "_ring")
+#: Never used (infos, without copy_info_dict), or never changes; and what follows from the rows.
+_DERIVED = ("infos", "obs_shape", "device", "observation_space", "action_space", "env", "slot", "_ring", "_drawable")
 
 
 def check_values(columns: Mapping[str, Any], name: str, buffer: Any) -> None:

@@ -1,6 +1,7 @@
 """``sb3-sample advise``: which size of BRO and replay ratio gets furthest in some hours of this machine."""
 
 import argparse
+import itertools
 import json
 import sys
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ from sb3_sample.study.step_times import StepTimes
 #: Part of a core that others may use while steps are measured.
 BUSY = 0.3
 #: Where a suite's success rate takes the place of a return.
-_MEASURES = {"dmc": "return over 1,000", "metaworld": "success rate", "myosuite": "success rate"}
+_MEASURES = {"dmc": "return / 1,000", "metaworld": "success rate", "myosuite": "success rate"}
 
 
 def main(argv: Sequence[str]) -> None:
@@ -34,7 +35,13 @@ def main(argv: Sequence[str]) -> None:
         f"kept in {step_times.cache_file()}. See docs/scaling.md.",
     )
     parser.add_argument("--hours", type=float, required=True, help="of one training on this machine")
-    parser.add_argument("--env", metavar="ID", help="environment that is to be trained on")
+    parser.add_argument(
+        "--env",
+        metavar="ID",
+        help="environment that is to be trained on (default: one of the suite: "
+        + ", ".join(env_id for _, env_id in SUITES.values())
+        + ")",
+    )
     parser.add_argument(
         "--suite",
         choices=list(SUITES),
@@ -102,9 +109,10 @@ def _times(threads: int, options: argparse.Namespace) -> StepTimes:
     if kept is not None:
         return kept
     if get_device(options.device).type == "cpu" and idle_cores() < threads - BUSY:
+        again = "" if options.quick else " (--again)"  # quick ones are not kept
         say(
             f"fewer cores are free than the {threads} that steps are measured on: they will seem too long. Measure "
-            "again (--again) when nothing else runs"
+            f"again{again} when nothing else runs"
         )
     times = step_times.measure(threads, options.device, quick=options.quick, say=say)
     if not options.quick:
@@ -153,6 +161,13 @@ def page(found: Advice, times: StepTimes, environment: float) -> str:
     if times.how == "quick":
         lines.append(
             "- Step times are rough: from multiplications and eager steps. Without --quick compiled ones are measured."
+        )
+    steps = list(times.gradient_step.items())
+    if faster := [(small, large) for (small, a), (large, b) in itertools.pairwise(steps) if b < a]:
+        pairs = ", ".join(f"{large} than of {small}" for small, large in faster)
+        lines.append(
+            f"- Gradient steps were measured shorter of {pairs}: something else ran meanwhile. Measure again when "
+            "nothing does."
         )
     if len(few):
         lines.append(

@@ -12,7 +12,7 @@ from sb3_sample.exits import refuse
 from sb3_sample.study import analysis_command
 from sb3_sample.study.cluster import check
 from sb3_sample.study.cores import free_cores
-from sb3_sample.study.dry_run import estimate
+from sb3_sample.study.dry_run import MeasurementFailed, estimate
 from sb3_sample.study.plan import PlanError, read_plan
 from sb3_sample.study.reporting import command as report_command
 from sb3_sample.study.runs import StudyError
@@ -106,7 +106,11 @@ def _run(options: argparse.Namespace) -> None:
     plan = read_plan(options.plan)
     shared: dict[str, Any] = {"workers": options.workers, "threads": options.threads, "device": options.device}
     if options.dry_run:
-        print(estimate(plan, options.folder, say=lambda words: print(words, file=sys.stderr), **shared))
+        try:
+            print(estimate(plan, options.folder, say=lambda words: print(words, file=sys.stderr), **shared))
+        except MeasurementFailed as error:
+            print(error.output, file=sys.stderr)
+            refuse("study run", error)
         return
     folder = Path("runs") / plan.name if options.folder is None else options.folder
     if options.workers is None and options.ray is None:

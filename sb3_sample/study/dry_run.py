@@ -34,6 +34,19 @@ _HARDLY_ANY = 1e-3
 _PROBE = (sys.executable, "-c", "from sb3_sample.study.dry_run import probe; probe()")
 
 
+class MeasurementFailed(RuntimeError):
+    """
+    A training that was to be measured has failed.
+
+    :param title: the run in words
+    :param output: end of what it has printed, which ``output`` keeps; the message has its last line
+    """
+
+    def __init__(self, title: str, output: str):
+        self.output = output.strip()
+        super().__init__(f"{title} cannot be measured: {self.output.rpartition(chr(10))[2]}")
+
+
 class Cost(NamedTuple):
     """
     :param seconds: of an environment step, with what is learned from it
@@ -99,7 +112,7 @@ def estimate(
     :param say: gets what is being measured
     :return: the estimate
     :raises PlanError: the plan cannot be run as it stands
-    :raises RuntimeError: a training that was to be measured has failed; the message has its output
+    :raises MeasurementFailed: a training that was to be measured has failed
     """
     plan = plan if isinstance(plan, Plan) else read_plan(plan)
     place = StudyFolder(Path("runs") / plan.name if folder is None else folder)
@@ -171,7 +184,7 @@ def measure(run: Run, threads: int, device: str) -> Cost:
     :param threads: its threads
     :param device: its device
     :return: what it costs
-    :raises RuntimeError: it has failed, or ended before anything was learned
+    :raises MeasurementFailed: it has failed, or ended before anything was learned
     """
     with tempfile.TemporaryDirectory() as folder:
         times, place = Path(folder) / "times.json", Path(folder) / "run"
@@ -191,7 +204,7 @@ def measure(run: Run, threads: int, device: str) -> Cost:
         try:
             found = json.loads(times.read_text())
         except FileNotFoundError as error:
-            raise RuntimeError(f"{run.title} cannot be measured: {done.stdout[-2000:]}{done.stderr[-2000:]}") from error
+            raise MeasurementFailed(run.title, done.stdout[-2000:] + done.stderr[-2000:]) from error
         replay, rest = _bytes(place)
         return Cost(found["seconds"] / found["steps"], rest, replay / max(checkpointed(place), 1))
 

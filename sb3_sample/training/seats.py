@@ -7,10 +7,11 @@ from typing import Any
 import torch
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
-from sb3_sample.learner.execution import Execution
+from sb3_sample.learner.execution import Acting, Execution, Metrics, acting_of
+from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.learner.learner import Learner
-from sb3_sample.lockstep import BEGIN, ENVIRONMENTS, MADE, Joint, Seat, present, seat_of
+from sb3_sample.lockstep import ACTIONS, BEGIN, ENVIRONMENTS, GRADIENT_STEP, MADE, Joint, Seat, present, seat_of
 
 
 def joint_of(learners: Sequence[Learner]) -> Joint | None:
@@ -31,7 +32,7 @@ class Member:
 
     :param seat: place of its training
     :param learner: the learner
-    :param method: name of its method that is run. Only the gradient step is taken together
+    :param method: name of its method that is run
     """
 
     def __init__(self, seat: Seat, learner: Learner, method: str = "gradient_step"):
@@ -47,9 +48,9 @@ class Member:
         :param method: name of its method that is run
         :return: what runs its steps
         """
-        if method != "gradient_step" or not seat.with_others:
+        if method not in ("gradient_step", "drawn_step") or not seat.with_others:
             return Execution.of(learner, method)
-        return cls(seat, learner)
+        return cls(seat, learner, method)
 
     @property
     def compiled(self) -> bool:
@@ -96,11 +97,26 @@ class Member:
         :param eager: by itself, neither compiled nor captured this time, which leaves the gradients in ``.grad``
         :return: its result
         """
-        answer = None if eager else self._seat.step(inputs)
+        answer = None if eager else self._seat.together(GRADIENT_STEP, inputs)
         if answer is None:
             self._own.prepare(learner)
             answer = self._own(learner, *inputs, eager=eager)
         return answer
+
+
+def _acting_of(seat: Seat, learner: Learner) -> Acting | None:
+    """What computes the actions of a learner together with those of others; None for an explorer's own ``act``."""
+    explorer = learner.explorer
+    if type(explorer).act is not Exploration.act or not explorer.can_be_mapped or not seat.with_others:
+        return acting_of(learner)
+    own = acting_of(learner) or (lambda learner, inputs: learner.action_step(*inputs))
+
+    def act(learner: Learner, inputs: tuple[Any, ...]) -> Metrics:
+        # Those of steps that are taken apart are computed apart.
+        answer = seat.together(ACTIONS, inputs) if seat.group.steps_together else None
+        return own(learner, inputs) if answer is None else answer
+
+    return act
 
 
 def all_made(model: Any) -> None:
@@ -150,7 +166,7 @@ def seated(model: Any) -> Iterator[Seat | None]:
         innermost.step_wait = wait
         seat.group.leave(seat)
         if model.learner.make_execution != Execution.of:
-            model.learner.make_execution = Execution.of
+            model.learner.make_execution, model.learner.make_acting = Execution.of, acting_of
             model.learner.forget_execution()
 
 
@@ -165,4 +181,5 @@ def begin(seat: Seat | None) -> None:
     seat.meet(BEGIN)
     if seat.group.steps_together:
         seat.learner.make_execution = lambda learner, method: Member.of(seat, learner, method)
+        seat.learner.make_acting = lambda learner: _acting_of(seat, learner)
         seat.learner.forget_execution()

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from sb3_sample.learner.batch import Extra, Noise
-from sb3_sample.learner.execution import Execution, inputs_like
+from sb3_sample.learner.execution import CapturedActing, Execution, inputs_like
 from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.pessimism import LearnedPessimism
@@ -158,6 +158,55 @@ def test_each_is_what_it_is_alone(maker: str) -> None:
         model.learner.forget_execution()
         take(model, 3)
     assert_alike(maker, alone, others)
+
+
+@pytest.mark.parametrize("how", ["eager", "captured"])
+@pytest.mark.parametrize("maker", [name for name in MAKERS if name not in (*REFUSED, "OAC")])
+def test_actions_are_those_of_each(maker: str, how: str) -> None:
+    models = models_of(maker, 3)
+    learners = [model.learner for model in models]
+    generator = torch.Generator().manual_seed(0)
+    for learner in learners:
+        with torch.no_grad():
+            for p in learner.explorer.parameters():
+                p.add_(0.1 * torch.randn(p.shape, generator=generator))
+    inputs = []
+    for i, learner in enumerate(learners):
+        batch = random_batch(models[i], seed=i)
+        inputs.append((batch.observations, learner.explorer.draw_noise(learner, batch.observations)))
+    with torch.inference_mode():
+        alone = [learner.action_step(*own)["actions"].clone() for learner, own in zip(learners, inputs, strict=True)]
+    group = LearnerGroup(learners)
+    recorder = GroupRecorder(group) if how == "captured" else None
+    if recorder is not None:
+        group._acting = CapturedActing(group, "mapped_actions", recorder)
+    for _ in range(1 if recorder is None else 5):
+        with torch.inference_mode():
+            found = [each["actions"] for each in group.act(inputs)]
+        for ours, theirs in zip(found, alone, strict=True):
+            assert torch.allclose(ours, theirs, atol=1e-5)
+    assert not torch.allclose(alone[0], alone[1], atol=1e-2)
+    assert recorder is None or (recorder.n_recordings, recorder.n_repetitions) == (1, 2)
+
+
+def memory_of(owners: Sequence[Any]) -> int:
+    """Bytes of parameters, buffers and moments of learners or groups, each place once."""
+    tensors = [
+        t for each in owners for module in each.step_modules() for t in (*module.parameters(), *module.buffers())
+    ]
+    for optimizer in (o for each in owners for o in each.optimizers().values()):
+        tensors += [t for state in optimizer.state.values() for t in state.values()]
+    return sum({t.untyped_storage().data_ptr(): t.untyped_storage().nbytes() for t in tensors}.values())
+
+
+def test_memory_is_that_of_as_many_learners() -> None:
+    models = models_of("BRO", 4)
+    for model in models:
+        take(model, 2)
+    learners = [model.learner for model in models]
+    apart = memory_of(learners)
+    group = together(learners, lambda i: take(models[i], 2))
+    assert apart <= memory_of([*learners, group]) < 1.1 * apart
 
 
 @pytest.mark.parametrize("how", [pytest.param("compiled", marks=COMPILES), "captured"])

@@ -240,7 +240,8 @@ def test_an_environment_that_is_too_fast_does_not_wait_and_the_log_says_so(clock
         plain()
 
     model.dump_logs = dump
-    model.learn(800, log_interval=1, asynchronous=True, control_frequency=4)
+    with pytest.warns(UserWarning, match=r"\d+ of \d+ gradient steps have lapsed: .*than replay_ratio=5 a transition"):
+        model.learn(800, log_interval=1, asynchronous=True, control_frequency=4)
     assert env_of(model).n == 800 and model._n_updates < 5 * 795
     last = lines[-1]
     assert last["asynchronous/lapsed_updates"] > 0 and last["asynchronous/replay_ratio"] < 5

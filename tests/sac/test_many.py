@@ -58,13 +58,19 @@ class OneAfterTheOther:
     made: list["OneAfterTheOther"] = []
 
     def __init__(self, learners: Sequence[Any]):
-        self.learners, self.released, self.n_steps, self.seconds_compiling = list(learners), False, 0, 0.0
+        self.learners, self.released, self.seconds_compiling = list(learners), False, 0.0
+        self.n_steps = self.n_actions = 0
         self.made.append(self)
 
     def step(self, inputs: Sequence[tuple[Any, ...]]) -> list[dict[str, torch.Tensor]]:
         assert not self.released
         self.n_steps += 1
         return [Execution.of(each)(each, *own) for each, own in zip(self.learners, inputs, strict=True)]
+
+    def act(self, inputs: Sequence[tuple[Any, ...]]) -> list[dict[str, torch.Tensor]]:
+        assert not self.released
+        self.n_actions += 1
+        return [each.action_step(*own) for each, own in zip(self.learners, inputs, strict=True)]
 
     def release(self) -> None:
         assert not self.released
@@ -171,6 +177,8 @@ def test_each_learner_is_what_it_is_alone(name: str, joint: Any) -> None:
         assert noted.returns == by_itself.returns
     if joint is not None:
         assert sum(each.n_steps for each in joint.made) > 10
+        # With whole episodes they are at different steps.
+        assert sum(each.n_actions for each in joint.made) > (0 if name == "episodes" else 10)
         assert all(each.released for each in joint.made)
 
 
@@ -351,8 +359,8 @@ def test_a_learner_whose_callback_raises(joint: Any) -> None:
         ({"n_envs": 2, "env": lambda: DummyVecEnv([Toy])}, "n_envs=2 is for env=<a function that makes a single"),
         ({"vec_env_cls": "subproc"}, "vec_env_cls must be a class of vectorised environments"),
         ({"callback": Noting()}, "callback must be a function that makes a learner's callback from its index"),
-        ({"cls": MBMAPPO}, "cls must be an off-policy algorithm of this package, .*, not MBMAPPO"),
-        ({"cls": SB3SAC}, "cls must be an off-policy algorithm of this package, .*, not SAC"),
+        ({"cls": MBMAPPO}, r"cls must be an off-policy algorithm of this package, .*, not sb3_sample\..*MBMAPPO"),
+        ({"cls": SB3SAC}, r"cls must be an off-policy algorithm of this package, .*, not stable_baselines3\..*\.SAC"),
         ({"cls": "SAC"}, "cls must be an off-policy algorithm of this package, .*, not 'SAC'"),
         ({"checkpoint_freq": 5}, "checkpoint_freq=5 means nothing without checkpoint"),
     ],

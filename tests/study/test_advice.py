@@ -111,6 +111,16 @@ def test_the_hours_of_the_error_are_enough() -> None:
     assert found.best["steps"] >= 25_000
 
 
+def test_disturbed_step_times_are_named() -> None:
+    steps = dict(times().gradient_step)
+    sizes = list(steps)
+    assert "something else ran" not in advice_command.page(advise(4.0, times(), 0.002), times(), 0.002)
+    steps[sizes[1]] = steps[sizes[0]] / 2
+    disturbed = times(gradient_step=steps)
+    shown = advice_command.page(advise(4.0, disturbed, 0.002), disturbed, 0.002)
+    assert f"- Gradient steps were measured shorter of {sizes[1]} than of {sizes[0]}: something else ran" in shown
+
+
 def test_a_faster_machine_is_never_advised_worse() -> None:
     returns = [advise(6.0, times(scale), 0.002).best["iqm"] for scale in (2.0, 1.0, 0.3, 0.05)]
     assert returns == sorted(returns) and returns[0] < returns[-1]

@@ -1,0 +1,199 @@
+"""Gradient steps that draw their batches and noise themselves, from a buffer on the device."""
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from sb3_sample import DeviceReplayBuffer, train_many
+from sb3_sample.learner.execution import Execution
+from sb3_sample.learner.group import LearnerGroup
+from sb3_sample.replay.buffers import PLAIN_BUFFERS
+from sb3_sample.sac import SAC, many
+from tests.learner.test_group import GroupRecorder
+from tests.sac.common import COMPILES, MAKERS, TINY_SAC, Toy, sac, state, vec
+from tests.sac.test_execution import Recorder
+
+DRAWN: dict[str, Any] = {"replay_buffer_class": DeviceReplayBuffer, "replay_buffer_kwargs": {"sampling": "device"}}
+
+
+def model_of(maker: str, **kwargs: Any) -> Any:
+    """A model with 60 transitions, whose gradient steps have been taken."""
+    return MAKERS[maker](**{"compile": False, "seed": 0, "buffer_size": 500, **DRAWN, **kwargs}).learn(60)
+
+
+def refuses(maker: str) -> bool:
+    try:
+        MAKERS[maker](**DRAWN)
+    except ValueError:
+        return True
+    return False
+
+
+#: Without transforms of batches, further transitions, or looks at the batch after the step.
+ABLE = [name for name in MAKERS if not refuses(name)]
+
+
+def same(a: Any, b: Any) -> bool:
+    ours, theirs = state(a), state(b)
+    return ours.keys() == theirs.keys() and all(torch.equal(x, theirs[name]) for name, x in ours.items())
+
+
+def test_which_can() -> None:
+    assert {"SAC", "BRO", "DAC", "OAC", "TOPSAC", "SimBa", "CrossQ", "BROTD3"} <= set(ABLE)
+    assert not {"VPLSAC", "DebiasedRQ", "SimbaV2"} & set(ABLE)
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_every_stored_transition_is_drawn_equally_often(n_envs: int) -> None:
+    model = sac(vec(n_envs), buffer_size=20 * n_envs, compile=False, learning_starts=1_000, **DRAWN)
+    buffer = model.replay_buffer
+    for n_steps in (7, 13, 17):  # filling, full, overwritten
+        model.learn(n_steps * n_envs)
+        buffer.rewards.copy_(torch.arange(20 * n_envs).reshape(20, n_envs))  # each tells its place
+        buffer.prepare_draws()
+        torch.manual_seed(0)
+        drawn = buffer.draw(20_000)
+        n_places = buffer.size() * n_envs
+        counts = torch.bincount(drawn.rewards[:, 0].long(), minlength=n_places)
+        assert len(counts) == n_places
+        assert stats.chisquare(counts.numpy()).pvalue > 1e-3
+        places = drawn.rewards[:, 0].long()
+        for name in ("observations", "next_observations", "actions"):
+            assert torch.equal(getattr(drawn, name), getattr(buffer, name).flatten(0, 1)[places])
+    assert buffer.full
+
+
+@pytest.mark.parametrize("maker", ABLE)
+@pytest.mark.parametrize("how", ["eager", "captured"])
+def test_it_is_the_gradient_step_on_what_it_draws(maker: str, how: str) -> None:
+    ours, theirs = model_of(maker), model_of(maker)
+    learner, given = ours.learner, theirs.learner
+
+    class Drawing(Recorder):
+        def __call__(self, run: Callable[[], Any]) -> Any:
+            with torch.random.fork_rng([]):  # a capture draws nothing
+                return super().__call__(run)
+
+    recorder = Drawing(ours)
+    if how == "captured":
+        learner._drawing = Execution(learner, False, False, recorder, "drawn_step")
+    for model in (ours, theirs):
+        model.learner.set_training_mode(True)
+    theirs.replay_buffer.prepare_draws()
+    for i in range(8):
+        torch.manual_seed(i)
+        ours._draws_in_steps()
+        learner.prepared_drawing()
+        learner.take_drawn_step(8)
+        torch.manual_seed(i)
+        given.step(*given.drawn_inputs(8))
+    assert same(ours, theirs) if how == "eager" else not differing(ours, theirs)
+    # With a delay of the actors' steps there are two kinds.
+    assert recorder.n_repetitions == 0 if how == "eager" else recorder.n_repetitions in (2, 5)
+
+
+def differing(a: Any, b: Any) -> list[str]:
+    ours, theirs = state(a), state(b)
+    return [name for name, x in ours.items() if not torch.allclose(x.double(), theirs[name].double(), atol=1e-5)]
+
+
+@pytest.mark.parametrize("compiles", [False, pytest.param(True, marks=COMPILES)])
+def test_a_training_goes_on_bit_by_bit(compiles: bool, tmp_path: Path) -> None:
+    def model() -> SAC:
+        return SAC("MlpPolicy", Toy(), seed=3, compile=compiles, **{**TINY_SAC, **DRAWN})
+
+    whole = model().learn(80, checkpoint=tmp_path / "whole", checkpoint_freq=20)
+    stops = lambda local, _: local["self"].num_timesteps < 50  # noqa: E731
+    model().learn(80, stops, checkpoint=tmp_path / "parts", checkpoint_freq=20)
+    parts = model().learn(80, checkpoint=tmp_path / "parts", checkpoint_freq=20)
+    assert whole._n_updates == parts._n_updates == 70
+    assert same(whole, parts)
+    assert not same(whole, SAC("MlpPolicy", Toy(), seed=3, compile=False, **TINY_SAC).learn(80))
+
+
+@pytest.mark.parametrize("how", ["eager", "captured", pytest.param("compiled", marks=[COMPILES, pytest.mark.slow])])
+@pytest.mark.parametrize("gammas", [(0.9, 0.9, 0.9), (0.9, 0.99, 0.999)])
+def test_learners_draw_together(how: str, gammas: tuple[float, ...]) -> None:
+    ours, theirs = ([model_of("SAC", seed=s, gamma=gamma) for s, gamma in enumerate(gammas)] for _ in range(2))
+    for model in (*ours, *theirs):
+        model._draws_in_steps()
+        model.learner.set_training_mode(True)
+        model.learner.compiled = how == "compiled"
+    groups = [LearnerGroup([model.learner for model in models]) for models in (ours, theirs)]
+    if how == "captured":
+        groups[0]._drawing = Execution(groups[0], False, False, GroupRecorder(groups[0]), "mapped_drawn_step")
+    for i in range(6):
+        torch.manual_seed(i)
+        groups[0].step([(8, True, True)] * 3)
+        torch.manual_seed(i)
+        if how == "eager":
+            inputs = [(*model.learner.drawn_inputs(8), None, True, True) for model in theirs]
+            groups[1].step(inputs)
+    if how == "eager":
+        assert not any(differing(a, b) for a, b in zip(ours, theirs, strict=True))
+    changed = [differing(a, b) for a, b in zip(ours, theirs, strict=True)]
+    assert how == "eager" or all(changed)
+
+
+def test_train_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(many, "joint_of", LearnerGroup)
+    taken: list[Any] = []
+    step = LearnerGroup.step
+    monkeypatch.setattr(LearnerGroup, "step", lambda group, inputs: taken.append(inputs[0]) or step(group, inputs))
+    trained = [
+        train_many(SAC, "MlpPolicy", Toy, seeds=[0, 1], total_timesteps=60, compile=False, **TINY_SAC, **DRAWN)
+        for _ in range(2)
+    ]
+    assert [each[0] for each in taken] == [8] * 100
+    assert all(same(a, b) for a, b in zip(*trained, strict=True))
+    assert not same(*trained[0])
+
+
+def test_gradients_are_kept_of_a_given_batch() -> None:
+    model = model_of("SAC")
+    model.keep_next_gradients = True
+    assert not model._draws_in_steps()
+    model.train(2)
+    assert not model.learner.gradients_are_stale and not model.keep_next_gradients
+    assert model._draws_in_steps()
+
+
+def test_a_loaded_model_and_buffer_draw_too(tmp_path: Path) -> None:
+    model = model_of("SAC")
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = SAC.load(tmp_path / "model", env=vec(1))
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    for each in (model, loaded):
+        torch.manual_seed(0)
+        each.train(3)
+    assert loaded.replay_buffer.sampling == "device" and loaded.learner._store is loaded.replay_buffer
+    assert same(model, loaded)
+
+
+@pytest.mark.parametrize(
+    ("maker", "kwargs", "words"),
+    [
+        ("SAC", {"replay_buffer_kwargs": {"sampling": "gpu"}}, "sampling must be 'host' or 'device', not 'gpu'"),
+        ("VPLSAC", {}, "(DeviceReplayBuffer|further transitions)"),
+        ("GPLSAC", {}, "sampling='device' .* learns from further transitions: pass sampling='host'"),
+        ("SimbaV2", {}, r"sampling='device' .* transformed .*\(batch_transforms, reward_scale\): pass sampling='host'"),
+        ("SAC", {"redo_period": 5}, "sampling='device' .*redo looks at the batch after the gradient step: .*'host'"),
+    ],
+)
+def test_what_is_refused(maker: str, kwargs: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        MAKERS[maker](**{**DRAWN, **kwargs})
+
+
+def test_other_buffers_have_no_such_argument() -> None:
+    for cls, sampling in itertools.product(PLAIN_BUFFERS[:1], ("host", "device")):
+        with pytest.raises((TypeError, ValueError), match="sampling"):
+            sac(replay_buffer_class=cls, replay_buffer_kwargs={"sampling": sampling})
+    assert np.dtype(np.float32) == sac(**DRAWN).replay_buffer.observations.numpy().dtype
