@@ -5,7 +5,7 @@ from sb3_sample.envs import EnvironmentDied, SupervisedSubprocVecEnv, make_env, 
 from sb3_sample.faults import TrainingDiverged
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO, RewoundPPO
 from sb3_sample.replay.buffers import DeviceReplayBuffer
-from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
+from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactNStepReplayBuffer, CompactReplayBuffer
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.recording import record
 from sb3_sample.replay.weighted import (
@@ -35,11 +35,14 @@ from sb3_sample.sac import (
     BROFast,
     CrossQ,
     DebiasedRQ,
+    DrQ,
+    DrQv2,
     FlashSAC,
     RegularizedSAC,
     SimBa,
     SimbaV2,
 )
+from sb3_sample.sac.encoders import ConvEncoder
 from sb3_sample.sac.many import train_many
 from sb3_sample.training.task_evaluation import MultiTaskEvalCallback, evaluate_tasks
 from sb3_sample.version import __version__
@@ -65,12 +68,16 @@ __all__ = [
     "XQC",
     "BROFast",
     "CompactDictReplayBuffer",
+    "CompactNStepReplayBuffer",
     "CompactReplayBuffer",
+    "ConvEncoder",
     "CrossQ",
     "Dataset",
     "DebiasedRQ",
     "DeviceReplayBuffer",
     "DiagnosticsCallback",
+    "DrQ",
+    "DrQv2",
     "EnvironmentDied",
     "FadedDictReplayBuffer",
     "FadedReplayBuffer",

@@ -1,7 +1,7 @@
 """Kinds of values that arguments take, and the one check of a value against its kind."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from numbers import Integral, Real
 from typing import Any, NamedTuple, TypeGuard
 
@@ -124,17 +124,19 @@ def check_value(name: str, value: Any, kind: Kind) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def one_of(table: Mapping[str, Any], base: type) -> Kind:
+def one_of(table: Collection[str], base: type | None = None) -> Kind:
     """
-    :param table: choices by name
-    :param base: base class of the choices
+    :param table: choices by name, or their names
+    :param base: base class of the choices; None if there are their names only
     :return: the kind of their names, and of the classes derived from ``base``
     """
-    words = f"be one of {sorted(table)}, or a class derived from {base.__name__}"
+    names = sorted(table)
+    words = f"be one of {names}" + ("" if base is None else f", or a class derived from {base.__name__}")
     return Kind(
         words,
         lambda value: (
-            (isinstance(value, str) and value in table) or (isinstance(value, type) and issubclass(value, base))
+            (isinstance(value, str) and value in table)
+            or (base is not None and isinstance(value, type) and issubclass(value, base))
         ),
     )
 

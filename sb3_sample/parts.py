@@ -9,6 +9,7 @@ arguments by ``argument``. docs/parts.md says what each has to have.
 
 from sb3_sample import kinds
 from sb3_sample.constructor import argument
+from sb3_sample.learner.augmentation import RandomShift
 from sb3_sample.learner.batch import Batch, CriticStep, Extra, Noise
 from sb3_sample.learner.categorical import VALUE_HEADS, CategoricalHead
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration, OptimisticExploration
@@ -62,6 +63,7 @@ __all__ = [
     "Part",
     "Pessimism",
     "QuantileHead",
+    "RandomShift",
     "RewardScale",
     "Step",
     "UnitNorm",

@@ -16,6 +16,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 
 from sb3_sample.envs.base import (
     check_render_arguments,
@@ -26,6 +27,12 @@ from sb3_sample.envs.base import (
 )
 
 EPISODE_STEPS = 1000
+#: Cameras of observations where the model's first one does not show enough: the quadruped's follows it (DrQ's code).
+PIXEL_CAMERAS = {"quadruped": 2}
+#: Weights of red, green and blue in a gray picture, in thousandths (luma of ITU-R BT.601).
+_GRAY = np.array([299, 587, 114], np.uint32)
+#: Pictures of an observation, unless another number is asked for.
+FRAME_STACK = 3
 #: dm-control asks for labmaze, which has no wheel after Python 3.12 and which the suite never imports. There the extra
 #: has everything but dm-control itself (setup.cfg).
 _THEN = "pip install --no-deps dm-control" if sys.version_info >= (3, 13) else ""
@@ -35,10 +42,12 @@ class DMCEnv(gym.Env[np.ndarray, np.ndarray]):
     """
     One task of the DeepMind Control suite.
 
-    Observation: float32, shape (O,), the entries of the suite's observation in the order of its spec. Action: float32
-    in [-1, 1], shape (A,), rescaled to the bounds of the suite's action spec where these differ (the quadruped). An
-    episode has 1,000 control steps and then is ``truncated``; a task that ended itself with discount 0 would be
-    ``terminated``, no task of the suite does.
+    Observation: float32, shape (O,), the entries of the suite's observation in the order of its spec. With ``pixels``
+    it is the latest pictures instead, uint8, channels first, the newest picture's channels last: (9, 84, 84) with
+    ``pixels=84`` and ``frame_stack=3``. At a reset the first picture fills the stack. Action: float32 in [-1, 1], shape
+    (A,), rescaled to the bounds of the suite's action spec where these differ (the quadruped). An episode has 1,000
+    control steps and then is ``truncated``; a task that ended itself with discount 0 would be ``terminated``, no task
+    of the suite does.
 
     ``reset(seed=s)`` fixes this and all following episodes: with ``s < 2**32`` they are those of
     ``suite.load(domain, task, task_kwargs={"random": s})``.
@@ -51,8 +60,11 @@ class DMCEnv(gym.Env[np.ndarray, np.ndarray]):
     :param render_mode: ``None`` or ``"rgb_array"``.
     :param width: Width of a picture in pixels.
     :param height: Height of a picture in pixels.
-    :param camera: Number or name of the camera; default: the first of the model.
-    :raises ImportError: dm_control is not installed.
+    :param camera: Number or name of the camera; default: the first of the model, for observations of the quadruped 2.
+    :param pixels: Height and width of the pictures that are observed; ``None``: the suite's own observation.
+    :param frame_stack: Pictures of an observation, one of each of the latest decisions; with ``pixels`` only.
+    :param gray: Whether these pictures have one channel, the luma, and not three; with ``pixels`` only.
+    :raises ImportError: dm_control is not installed; or ``pixels`` are asked for, and no OpenGL can draw them.
     :raises ValueError: An argument is out of range, or the suite has no such task.
     """
 
@@ -69,8 +81,12 @@ class DMCEnv(gym.Env[np.ndarray, np.ndarray]):
         width: int = 480,
         height: int = 480,
         camera: int | str | None = None,
+        pixels: int | None = None,
+        frame_stack: int | None = None,
+        gray: bool = False,
     ) -> None:
         check_render_arguments(render_mode, width, height)
+        _check_pixels(pixels, frame_stack, gray)
         if (
             isinstance(action_repeat, bool)
             or not isinstance(action_repeat, int)
@@ -86,8 +102,24 @@ class DMCEnv(gym.Env[np.ndarray, np.ndarray]):
         decision_seconds = self.dm_env.control_timestep() * action_repeat
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": max(1, round(1.0 / decision_seconds))}
 
-        observation_spec = self.dm_env.observation_spec()
-        self.observation_space = unbounded_box(sum(int(np.prod(spec.shape)) for spec in observation_spec.values()))
+        self.pixels, self.gray = pixels, gray
+        #: Pictures that an observation consists of, along its first axis; ``None`` if it is none. Replay buffers that
+        #: store a picture once ask for it.
+        self.stacked_frames = None if pixels is None else FRAME_STACK if frame_stack is None else frame_stack
+        self.observation_space: spaces.Box
+        if pixels is None:
+            observation_spec = self.dm_env.observation_spec()
+            self.observation_space = unbounded_box(sum(int(np.prod(spec.shape)) for spec in observation_spec.values()))
+        else:
+            assert self.stacked_frames is not None
+            if camera is None:
+                self.camera = PIXEL_CAMERAS.get(domain, 0)
+            self.observation_space = spaces.Box(
+                0, 255, (self.stacked_frames * (1 if gray else 3), pixels, pixels), np.uint8
+            )
+            self._check_renders()
+        # The latest pictures, the oldest first.
+        self._stack: np.ndarray | None = None
         action_spec = self.dm_env.action_spec()
         self.action_space = unit_box(action_spec.shape[0])
         low = np.broadcast_to(action_spec.minimum, action_spec.shape)
@@ -100,18 +132,20 @@ class DMCEnv(gym.Env[np.ndarray, np.ndarray]):
         """
         :param seed: Restarts the stream of episodes; ``None`` goes on with it.
         :param options: Not used.
-        :return: Observation, float32 of shape (O,), and an empty dict.
+        :return: Observation and an empty dict.
         """
         super().reset(seed=seed)
         if seed is not None:
             # The suite's tasks draw from one legacy generator, which takes 32 bits.
             self.dm_env.task.random.seed(seed % 2**32)
-        return _flatten(self.dm_env.reset().observation), {}
+        time_step = self.dm_env.reset()
+        self._stack = None
+        return self._observed(time_step.observation), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """
         :param action: Float array of shape (A,) in [-1, 1].
-        :return: Observation of shape (O,), reward summed over the repeated steps, terminated, truncated, empty dict.
+        :return: Observation, reward summed over the repeated steps, terminated, truncated, empty dict.
         :raises RuntimeError: The episode is over; ``reset`` starts the next one.
         """
         if self._rescales_actions:
@@ -125,8 +159,41 @@ class DMCEnv(gym.Env[np.ndarray, np.ndarray]):
             reward += float(time_step.reward)
             if time_step.last():
                 terminated = time_step.discount == 0.0
-                return _flatten(time_step.observation), reward, terminated, not terminated, {}
-        return _flatten(time_step.observation), reward, False, False, {}
+                return self._observed(time_step.observation), reward, terminated, not terminated, {}
+        return self._observed(time_step.observation), reward, False, False, {}
+
+    def _observed(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """The observation: the suite's, flat, or the stack with a new picture."""
+        if self.stacked_frames is None:
+            return _flatten(observation)
+        picture = self._picture()
+        older = [picture] * (self.stacked_frames - 1) if self._stack is None else [self._stack[len(picture) :]]
+        self._stack = np.concatenate([*older, picture])
+        # The stack is not the caller's.
+        return self._stack.copy()
+
+    def _picture(self) -> np.ndarray:
+        """The picture of the present state, uint8, (C, pixels, pixels)."""
+        picture = self.dm_env.physics.render(height=self.pixels, width=self.pixels, camera_id=self.camera)
+        if not self.gray:
+            return np.ascontiguousarray(picture.transpose(2, 0, 1))
+        return ((picture @ _GRAY + 500) // 1000).astype(np.uint8)[None]
+
+    def _check_renders(self) -> None:
+        """Draw a picture, so that what is missing for it is said where the environment is made."""
+        try:
+            self._picture()
+        except ValueError as error:
+            raise ValueError(
+                f"pixels={self.pixels!r} and camera={self.camera!r} must fit the model: {error}"
+            ) from error
+        except Exception as error:  # whatever dm_control and the OpenGL libraries raise
+            raise ImportError(
+                f"pixels={self.pixels!r} needs an OpenGL that draws without a screen, and with MUJOCO_GL="
+                f"{os.environ.get('MUJOCO_GL', '')!r} there is none ({error}). Install one (apt-get install libegl1 "
+                "libgl1-mesa-dri, or libosmesa6), and set the environment variable MUJOCO_GL=egl, or osmesa, before "
+                "Python imports dm_control or mujoco"
+            ) from error
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """
@@ -151,6 +218,19 @@ def make(**kwargs: Any) -> DMCEnv:
     :return: The environment.
     """
     return DMCEnv(**kwargs)
+
+
+def _check_pixels(pixels: Any, frame_stack: Any, gray: Any) -> None:
+    for name, value in (("pixels", pixels), ("frame_stack", frame_stack)):
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+            raise ValueError(f"{name} must be a positive int, or None, got {value!r}")
+    if not isinstance(gray, bool):
+        raise ValueError(f"gray must be True or False, got {gray!r}")
+    if pixels is None and (frame_stack is not None or gray):
+        raise ValueError(
+            f"frame_stack={frame_stack!r} and gray={gray!r} are of pictures that are observed: pass pixels=84 too, or "
+            "leave them out"
+        )
 
 
 def _flatten(observation: dict[str, np.ndarray]) -> np.ndarray:

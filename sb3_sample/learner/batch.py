@@ -89,7 +89,7 @@ class Windows(NamedTuple):
 class Encoded(NamedTuple):
     """
     Observations in the form of the features that a shared encoder made of them, which actors and critics take in the
-    place of observations: ``features`` is (B, F), without gradient.
+    place of observations: ``features`` is (B, F), with a gradient to the encoder in the critics' own step only.
     """
 
     features: torch.Tensor
@@ -104,6 +104,50 @@ def for_each(function: Callable[[Any], Any], values: Any) -> Any:
     :return: its result, or a dict of them
     """
     return {key: function(value) for key, value in values.items()} if isinstance(values, dict) else function(values)
+
+
+def widened(batch: Batch, target_copies: int, online_copies: int) -> Batch:
+    """
+    Repeat a batch for augmentation by several copies, one copy of all transitions after the other.
+
+    :param batch: B transitions
+    :param target_copies: K
+    :param online_copies: M
+    :return: observations and actions M times, (M * B, ...), what makes the TD target K times, (K * B, ...); columns
+        stay as they are
+    """
+
+    def repeated(values: Any, n: int) -> Any:
+        if not isinstance(values, torch.Tensor) or values.dim() == 0:
+            return values
+        return values.repeat(n, *[1] * (values.dim() - 1))
+
+    return Batch(
+        for_each(lambda part: repeated(part, online_copies), batch.observations),
+        repeated(batch.actions, online_copies),
+        for_each(lambda part: repeated(part, target_copies), batch.next_observations),
+        repeated(batch.dones, target_copies),
+        repeated(batch.rewards, target_copies),
+        repeated(batch.discounts, target_copies),
+        batch.columns,
+    )
+
+
+def first_copy(batch: Batch, n: int) -> Batch:
+    """
+    Take the first copy of each transition.
+
+    :param batch: from :func:`widened`
+    :param n: B
+    :return: B transitions
+    """
+
+    def first(values: Any) -> Any:
+        if isinstance(values, Encoded):
+            return Encoded(values.features[:n])
+        return values[:n] if isinstance(values, torch.Tensor) and values.dim() > 0 else values
+
+    return Batch(*(for_each(first, value) for value in batch))
 
 
 class Extra(NamedTuple):
@@ -163,17 +207,22 @@ class Noise(NamedTuple):
     subset: torch.Tensor | None = None
     transforms: tuple[torch.Tensor | None, ...] | None = None
 
-    def completed(self, batch: Batch, extra: Extra | None, subset: tuple[int, int] | None) -> "Noise":
+    def completed(
+        self, batch: Batch, extra: Extra | None, subset: tuple[int, int] | None, copies: tuple[int, int] = (1, 1)
+    ) -> "Noise":
         """
         Draw what is missing.
 
         :param batch: the step's transitions
         :param extra: those that the rule of pessimism learns from besides, if any
         :param subset: how many critics are drawn for the TD target, and from how many; None: no drawing
+        :param copies: copies of the transitions in the TD target, K, and in the critics' loss, M (:func:`widened`). The
+            critics' noise is then (K * B, A)
         :return: the same noise, with what was None drawn
         """
-        like = batch.actions
-        rows = {name: len(like) for name in ("critic", "actor", "exploration")}
+        like, (k, m) = batch.actions, copies
+        n = len(like) // m
+        rows = {"critic": k * n, "actor": n, "exploration": n}
         if extra is not None:
             rows["pessimism"] = len(extra.batch.actions)
         missing = {name: n for name, n in rows.items() if getattr(self, name) is None}

@@ -25,11 +25,13 @@ def follow(target: Any, online: Any, tau: float) -> None:
     Take one step of Polyak averaging of the parameters.
 
     :param target: network that follows
-    :param online: network that is followed
+    :param online: network that is followed; what it has at its beginning and the target has not is left out, the
+        encoder of critics whose targets have none
     :param tau: weight of the latter
     """
+    ours, theirs = list(target.parameters()), list(online.parameters())
     with torch.no_grad():
-        torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), weight=tau)
+        torch._foreach_lerp_(ours, theirs[len(theirs) - len(ours) :], weight=tau)
 
 
 def parameters_of(optimizer: Optimizer) -> list[torch.Tensor]:
@@ -110,6 +112,7 @@ class StackedDescent:
         :param tau: without meaning here, see :attr:`tau`
         """
         ours, theirs = self._parameters[id(target)], self._parameters[id(online)]
+        theirs = theirs[len(theirs) - len(ours) :]
         with torch.no_grad():
             if isinstance(self.tau, float):
                 torch._foreach_lerp_(ours, theirs, weight=self.tau)

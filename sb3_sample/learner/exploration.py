@@ -2,19 +2,21 @@
 
 import math
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch.optim import Optimizer
 
-from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, TRUE_OR_FALSE, check_value, integer
+from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, TRUE_OR_FALSE, Kind, check_value, integer, is_number
 from sb3_sample.learner import losses
 from sb3_sample.learner.batch import Batch, for_each
 from sb3_sample.learner.parts import Learning, Part
 from sb3_sample.learner.pessimism import epistemic_std
 from sb3_sample.learner.scalars import BoundedLogScalar, FixedScalar, LogScalar
 from sb3_sample.learner.target import values
-from sb3_sample.networks import NETWORKS, linear, widened
+from sb3_sample.networks import NETWORKS, Projected, linear, widened
 from sb3_sample.optim import AdamW
 
 
@@ -144,6 +146,58 @@ class HeldNoise(Exploration):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self._held = None if state["held"] is None else torch.tensor(state["held"])
         self._length, self._n_held = int(state["length"]), int(state["n_held"])
+
+
+#: Kind of a schedule of the noise.
+NOISE_SCHEDULE = Kind(
+    "be (first standard deviation, last one, transitions in between), finite and above 0",
+    lambda value: (
+        isinstance(value, Sequence)
+        and len(value) == 3
+        and all(is_number(each) and 0 < each < math.inf for each in value)
+    ),
+)
+
+
+class ScheduledNoise(Exploration):
+    """
+    Exploration by a deterministic actor with Gaussian noise, whose standard deviation goes linearly from its first to
+    its last value over the transitions of the learner's life, and stays there (DrQ-v2, Yarats et al. 2022). It is the
+    actor's ``noise_std``, which the TD target and the actor's loss read too.
+
+    :param learner: the learner, whose networks exist already
+    :param schedule: first and last standard deviation, in actions of [-1, 1], and the transitions in between
+    :raises ValueError: if the schedule is none, or the actor's noise cannot be moved
+    """
+
+    has_state = False
+
+    def __init__(self, learner: Learning, schedule: Sequence[float] = (1.0, 0.1, 500_000)):
+        super().__init__(learner)
+        check_value("schedule", schedule, NOISE_SCHEDULE)
+        if not hasattr(learner.actor, "noise_std"):
+            raise ValueError(
+                "exploration='scheduled_noise' moves the noise_std of DrQv2's actor, and "
+                f"{type(learner.actor).__name__} has none: use DrQv2, or another exploration"
+            )
+        self._schedule = tuple(float(each) for each in schedule)
+        self._set(learner)
+
+    def std(self, n_transitions: int) -> float:
+        """
+        Compute the standard deviation.
+
+        :param n_transitions: transitions so far
+        :return: the standard deviation of the noise
+        """
+        first, last, n = self._schedule
+        return first + (last - first) * min(n_transitions / n, 1.0)
+
+    def _set(self, learner: Learning) -> None:
+        learner.actor.noise_std.fill_(self.std(learner.num_transitions))
+
+    def on_step(self, learner: Learning, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        self._set(learner)
 
 
 #: What may be meant by the spread of the critics.
@@ -364,7 +418,12 @@ class OptimisticShift(OptimisticExploration):
         if network_kwargs is None:
             network_kwargs = {"width": 256, "n_blocks": 1} if network == "bronet" else {}
         made = NETWORKS[network]
-        self.trunk = made(actor.features_dim + action_dim, **widened(made, network_kwargs, width_factor))
+        network_kwargs = widened(made, network_kwargs, width_factor)
+        if isinstance(actor.trunk, Projected):
+            # A projection of its own, like the actor's.
+            behind = {"network": made, "network_kwargs": network_kwargs}
+            made, network_kwargs = Projected, {**actor.trunk.of_projection, **behind}
+        self.trunk = made(actor.features_dim + action_dim, **network_kwargs)
         # Without bias and nearly zero, so that the optimistic actor starts as the pessimistic one.
         self.shift = linear(self.trunk.out_features, action_dim, None, bias=False, gain=0.01)
         self.optimism = BoundedLogScalar("initial_optimism", initial_optimism)
@@ -581,4 +640,5 @@ EXPLORATIONS: dict[str, type[Exploration]] = {
     "oac": OptimisticGradient,
     "optimistic_actor": OptimisticActor,
     "optimistic_shift": OptimisticShift,
+    "scheduled_noise": ScheduledNoise,
 }

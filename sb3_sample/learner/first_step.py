@@ -40,9 +40,10 @@ def check_batch(who: str, batch: Any, like: Batch | None = None) -> None:
         if not isinstance(batch.actions, torch.Tensor) or batch.actions.dim() != 2 or len(batch.actions) == 0:
             raise ValueError(f"{who} must have actions of shape (B, A), not {_shown(batch.actions)}")
         like = batch
-    n = len(like.actions)
     for name in ("observations", "next_observations"):
         stored, found = getattr(like, name), getattr(batch, name)
+        # Of several copies of each transition there may be others in the TD target than elsewhere.
+        n = len(like.actions) if like is batch or name == "observations" else len(like.rewards)
         if isinstance(stored, dict):
             if not isinstance(found, dict) or found.keys() != stored.keys():
                 words = sorted(found) if isinstance(found, dict) else _shown(found)

@@ -4,6 +4,7 @@ Learner of the off-policy family: networks, targets, learned numbers, optimizers
 ``Learner.gradient_step`` is the whole gradient step, in the order of BRO's pseudo-code (BRO, algorithm 2).
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
@@ -14,7 +15,7 @@ from torch import nn
 from torch.optim import Optimizer
 
 from sb3_sample.learner import first_step, losses
-from sb3_sample.learner.batch import SLOTS, Batch, CriticStep, Extra, Noise, Store
+from sb3_sample.learner.batch import SLOTS, Batch, CriticStep, Encoded, Extra, Noise, Store, first_copy, widened
 from sb3_sample.learner.descent import descend, follow, minimize
 from sb3_sample.learner.execution import Acting, Execution, acting_of
 from sb3_sample.learner.exploration import Exploration
@@ -169,7 +170,11 @@ class Learner:
             self.pessimism_rule = self.make_pessimism()
             self.explorer = self.make_explorer()
             self.reward_scaler = None if make_reward_scaler is None else make_reward_scaler(self).to(self.device)
-            self.transforms: Any = nn.ModuleList(make(self).to(self.device) for make in make_transforms)
+            made: list[Any] = [make(self).to(self.device) for make in make_transforms]
+            self.transforms: Any = nn.ModuleList(made)
+            #: Copies of each transition in the TD target and in the critics' loss, by the transforms.
+            self.target_copies = math.prod(each.target_copies for each in made)
+            self.online_copies = math.prod(each.online_copies for each in made)
             self.objective = self._make_objective(self)
         self.observation_statistics = None if self.observation_norm is None else ObservationStatistics()
         self.plasticity, self.redo = plasticity, redo
@@ -626,6 +631,7 @@ class Learner:
         metrics = execution(self, batch, noise, extra, *self._what_moves(), eager=eager)
         self._td_errors = metrics.pop(_TD_ERRORS, None)
         self.gradients_are_stale = not (eager or execution.leaves_gradients)
+        batch = self._first_copy(batch)
         for part in self.parts().values():
             metrics.update(logged(part, "after_update", part.after_update(self, batch)))
         return metrics
@@ -709,9 +715,9 @@ class Learner:
             first_step.check_batch("batch", batch)
         if self.transforms or self.reward_scaler is not None:
             batch, noise, extra = self._transformed(batch, noise, extra)
-        noise = (noise or Noise()).completed(batch, extra, self._subset())
+        noise = (noise or Noise()).completed(batch, extra, self._subset(), (self.target_copies, self.online_copies))
         if not self._checked_step:
-            first_step.check(self, batch, extra)
+            first_step.check(self, self._first_copy(batch), extra)
             self._checked_step = True
         return batch, noise, extra
 
@@ -726,6 +732,8 @@ class Learner:
             batch = self.reward_scaler.transform(batch, None)
             if extra is not None:
                 extra = extra._replace(batch=self.reward_scaler.transform(extra.batch, None))
+        if self._has_copies:
+            batch = widened(batch, self.target_copies, self.online_copies)
         drawn = noise.transforms or tuple(transform.draw(batch) for transform in self.transforms)
         for transform, numbers in zip(self.transforms, drawn, strict=True):
             before, batch = batch, transform.transform(batch, numbers)
@@ -735,19 +743,40 @@ class Learner:
                 extra = extra._replace(batch=transform.transform(extra.batch, transform.draw(extra.batch)))
         return batch, noise._replace(transforms=None), extra
 
+    @property
+    def _has_copies(self) -> bool:
+        """Whether there are several copies of each transition in the critics' step."""
+        return self.target_copies > 1 or self.online_copies > 1
+
+    def _first_copy(self, batch: Batch) -> Batch:
+        """The transitions in the place of their copies."""
+        return first_copy(batch, len(batch.actions) // self.online_copies) if self._has_copies else batch
+
+    def _encoded_once(self, batch: Batch) -> Batch:
+        """The batch with features in the place of observations that several networks read of the online encoder."""
+        networks = self.networks
+        if networks.encodes_once:
+            batch = batch._replace(observations=Encoded(networks.features(batch.observations)))
+        if networks.encodes_next_once:
+            with torch.no_grad():
+                batch = batch._replace(next_observations=Encoded(networks.features(batch.next_observations)))
+        return batch
+
     def gradient_step(
         self, batch: Batch, noise: Noise, extra: Extra | None, moves_targets: bool, moves_actor: bool
     ) -> dict[str, torch.Tensor]:
         """
         Compute the gradient step (BRO, algorithm 2), on tensors only: this function is compiled or captured.
 
-        :param batch: transitions
+        :param batch: transitions, or several copies of each
         :param noise: all that is random
         :param extra: further transitions for the rule of pessimism
         :param moves_targets: whether the target critics are updated in this step
         :param moves_actor: whether actors and temperature learn in this step
         :return: what to log, by name, scalars
         """
+        copies = self._encoded_once(batch)
+        batch = self._first_copy(copies)
         alpha = self.temperature_of(batch)
         metrics, prepared = self.objective.prepare(self, batch)
         if self.actor_first and moves_actor:
@@ -755,7 +784,7 @@ class Learner:
             alpha = self.temperature_of(batch)
         step: CriticStep | None = None
         if self.objective.learns_critics:
-            step, of_critics = self._learn_critics(batch, noise, alpha, moves_targets, prepared)
+            step, of_critics = self._learn_critics(batch, copies, noise, alpha, moves_targets, prepared)
             metrics.update(of_critics)
         if moves_actor and not self.actor_first:
             metrics.update(self._learn_actors(batch, noise, alpha, prepared))
@@ -770,25 +799,36 @@ class Learner:
         return {name: value.detach() for name, value in metrics.items()}
 
     def _learn_critics(
-        self, batch: Batch, noise: Noise, alpha: torch.Tensor, moves_targets: bool, prepared: Prepared
+        self, batch: Batch, copies: Batch, noise: Noise, alpha: torch.Tensor, moves_targets: bool, prepared: Prepared
     ) -> tuple[CriticStep | None, dict[str, torch.Tensor]]:
-        """Take the critics' step, and that of their targets; None for what the rule of pessimism judges, if nothing."""
+        """
+        Take the critics' step on all copies of the transitions, and that of their targets; None for what the rule of
+        pessimism judges, if nothing.
+        """
         # Critics, towards the targets' value of the actor's next action, unless the objective has another target.
         step: CriticStep | None = None
         if prepared.target is None:
-            next_actions, entropy_bonus = next_step(self, batch, alpha, noise.critic)
-            q, next_q = step_outputs(self, batch, next_actions, noise.subset)
+            next_actions, entropy_bonus = next_step(self, copies, alpha, noise.critic)
+            q, next_q = step_outputs(self, copies, next_actions, noise.subset)
             with torch.no_grad():
-                target = self.head.target(batch, next_q, self.pessimism_rule.value, entropy_bonus)
+                target = self.head.target(copies, next_q, self.pessimism_rule.value, entropy_bonus)
         else:
-            q, target = evaluate(self.critic, batch.observations, batch.actions), prepared.target
-        critic_loss = self.head.loss(q, target)
+            q, target = evaluate(self.critic, copies.observations, copies.actions), prepared.target
+        if self._has_copies:
+            n = len(batch.actions)
+            # The mean over the copies, for each of them.
+            target = target.reshape(-1, n, target.shape[-1]).mean(dim=0).repeat(self.online_copies, 1)
+        critic_loss = self._critic_loss(q, target)
         if self.sam_radius is None:
             self.minimize(self.critic.optimizer, critic_loss)
         else:
-            self._sharpness_aware_step(critic_loss, batch, next_actions, target)
+            self._sharpness_aware_step(critic_loss, copies, next_actions, target)
         self.critic.project()
         q = self.head.values(q)
+        if self._has_copies:
+            q, target = q[:, :n], target[:n]
+            if prepared.target is None:
+                next_q, entropy_bonus = next_q[:, :n], entropy_bonus[:n]
         metrics = {"train/critic_loss": critic_loss, "train/q_mean": q.mean()}
         if prepared.target is None:
             step = CriticStep(q.detach(), self.head.values(next_q), entropy_bonus, noise.subset)
@@ -799,6 +839,11 @@ class Learner:
         if moves_targets:
             self._follow(self.critic_target, self.critic)
         return step, metrics
+
+    def _critic_loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """The critics' loss, the sum over copies of transitions, if there are several."""
+        loss: torch.Tensor = self.head.loss(q, target)
+        return loss if self.online_copies == 1 else loss * self.online_copies
 
     def _learn_actors(
         self, batch: Batch, noise: Noise, alpha: torch.Tensor, prepared: Prepared
@@ -856,10 +901,10 @@ class Learner:
         """Take one step of Polyak averaging; with ``tau=1`` the target is the online network."""
         self.follow(target, online, self.tau)
         with torch.no_grad():
-            # Running statistics, as in Stable-Baselines3.
-            statistics = zip(target.statistics(), online.statistics(), strict=True)
-            for ours, theirs in statistics:
-                ours.copy_(theirs)
+            # Running statistics, as in Stable-Baselines3; a target without an encoder of its own has none of it.
+            ours, theirs = target.statistics(), online.statistics()
+            for own, other in zip(ours, theirs[len(theirs) - len(ours) :], strict=True):
+                own.copy_(other)
 
     def _sharpness_aware_step(
         self, loss: torch.Tensor, batch: Batch, next_actions: torch.Tensor, target: torch.Tensor
@@ -870,7 +915,7 @@ class Learner:
         copied = {id(p) for p in self.critic.copied_parameters()}
         gradients = sharpness_aware_gradients(
             loss,
-            lambda: self.head.loss(online_outputs(self, batch, next_actions)[0], target),
+            lambda: self._critic_loss(online_outputs(self, batch, next_actions)[0], target),
             parameters,
             self.sam_radius,
             [len(p) if id(p) in copied else None for p in parameters],
@@ -951,13 +996,19 @@ class Learner:
 
     # ---------------------------------------------------------------- starting anew
 
-    def reinitialize(self, shrink: float = 0.0) -> None:
+    def reinitialize(self, shrink: float = 0.0, keep: Sequence[str] = ()) -> None:
         """
         Start every network, optimizer and learned number anew, in place.
 
         :param shrink: share of the old parameters that stays
+        :param keep: what stays as it is: "encoder" for the critics' encoder, that of their targets, and their moments
+            and counts of steps in the optimizer
         """
         fresh = self._make_networks()
+        encoders: list[nn.Module] = self.networks.encoders() if "encoder" in keep else []
+        if encoders:
+            for own, other in zip(encoders, fresh.encoders(), strict=True):
+                other.load_state_dict(own.state_dict())
         if self.observation_norm is not None:
             # They describe the replay, which stays.
             fresh.observation_norm.load_state_dict(self.observation_norm.state_dict())
@@ -967,8 +1018,11 @@ class Learner:
         self.restart(self.pessimism_rule, self.make_pessimism(), shrink)
         self.restart(self.explorer, self.make_explorer(), shrink)
         self.restart(self.objective, self._make_objective(self), shrink)
+        kept: set[Any] = {parameter for encoder in encoders for parameter in encoder.parameters()}
         for optimizer in self.optimizers().values():
+            state = {parameter: values for parameter, values in optimizer.state.items() if parameter in kept}
             optimizer.state.clear()
+            optimizer.state.update(state)
 
     @staticmethod
     def restart(module: Any, fresh: Any, shrink: float = 0.0) -> None:

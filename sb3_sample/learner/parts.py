@@ -7,7 +7,7 @@ calls the methods of :class:`Part` at the steps of the environment and at the gr
 class (``Pessimism.update``, ``Exploration.update``).
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -178,11 +178,12 @@ class Learning(Protocol):
         :param shrink: share of the old parameters that stays
         """
 
-    def reinitialize(self, shrink: float = 0.0) -> None:
+    def reinitialize(self, shrink: float = 0.0, keep: Sequence[str] = ()) -> None:
         """
         Start every network, optimizer and learned number anew, in place.
 
         :param shrink: share of the old parameters that stays
+        :param keep: what stays as it is, "encoder" for the critics' encoder and that of their targets
         """
 
 
@@ -210,8 +211,12 @@ class Networks(Protocol):
     Actor, critics and their targets, an ``nn.Module``.
 
     ``actor.optimizer`` and ``critic.optimizer`` are theirs; ``actor_target`` is the actor of the TD targets if it is
-    not the actor itself.
+    not the actor itself. ``encodes_once`` and ``encodes_next_once`` say whether observations and next observations are
+    encoded once for the whole gradient step, by ``features``.
     """
+
+    encodes_once: bool
+    encodes_next_once: bool
 
     observation_space: Any
     actor: Any
@@ -223,6 +228,10 @@ class Networks(Protocol):
     def next_actions(self, obs: Any, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]: ...
 
     def encoded(self, obs: Any) -> Any: ...
+
+    def features(self, obs: Any) -> torch.Tensor: ...
+
+    def encoders(self) -> Sequence[nn.Module]: ...
 
     def make_actor(self) -> Any: ...
 

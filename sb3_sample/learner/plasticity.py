@@ -35,10 +35,18 @@ class Resets(Part):
         default
     :param shrink: share of the old parameters that stays, in [0, 1)
     :param gradient_steps: gradient steps between two resets; None for none
+    :param keep: what stays as it is, "encoder" for an encoder that the critics share with the actors (Nikishin et al.
+        2022, whose resets from pixels leave the convolutions)
     :raises ValueError: if the steps are not positive integers in ascending order, or another argument is out of range
     """
 
-    def __init__(self, steps: Sequence[int] | int = (), shrink: float = 0.0, gradient_steps: int | None = None):
+    def __init__(
+        self,
+        steps: Sequence[int] | int = (),
+        shrink: float = 0.0,
+        gradient_steps: int | None = None,
+        keep: Sequence[str] = (),
+    ):
         super().__init__()
         if not 0 <= shrink < 1:
             raise ValueError(f"reset_shrink must lie in [0, 1), not {shrink}")
@@ -47,7 +55,7 @@ class Resets(Part):
                 f"reset_gradient_steps must be an integer of at least 1, or None for no such resets, not "
                 f"{gradient_steps!r}"
             )
-        self.shrink, self.gradient_steps = shrink, gradient_steps
+        self.shrink, self.gradient_steps, self.keep = shrink, gradient_steps, tuple(keep)
         self.period: int | None = None
         self.steps: tuple[int, ...] = ()
         self.n_done = 0
@@ -92,10 +100,13 @@ class Resets(Part):
         return min(n, self.gradient_steps - taken % self.gradient_steps)
 
     def _reset(self, learner: Learning, when: str) -> None:
-        learner.reinitialize(self.shrink)
+        if self.keep:
+            learner.reinitialize(self.shrink, self.keep)
+        else:
+            learner.reinitialize(self.shrink)
         self.n_done += 1
         if learner.verbose >= 1:
-            say(f"Reset of all parameters {when}")
+            say(f"Reset of all parameters{' but the ' + ', '.join(self.keep) + ',' if self.keep else ''} {when}")
 
     def get_extra_state(self) -> dict[str, Any]:
         return {"reached": self._reached, "n_done": self.n_done}

@@ -109,7 +109,8 @@ def _stacked(critics: Any, batch: Batch, next_actions: torch.Tensor) -> tuple[to
         rows: Any = {key: torch.cat((now[key], following[key])) for key in now}
     else:
         rows = torch.cat((now, following))
-    q, next_q = evaluate(critics, rows, torch.cat((batch.actions, next_actions))).chunk(2, dim=1)
+    sizes = [len(batch.actions), len(next_actions)]
+    q, next_q = evaluate(critics, rows, torch.cat((batch.actions, next_actions))).split(sizes, dim=1)
     return q, next_q
 
 

@@ -17,6 +17,12 @@ class BatchTransform(Part):
     :param learner: the learner, whose networks exist already
     """
 
+    #: Copies of each transition that it asks for in the TD target, whose mean the target is.
+    target_copies: int = 1
+    #: Copies that it asks for in the critics' loss, whose sum the loss is. The critics' step has the copies beneath
+    #: each other (``batch.widened``); all other steps take the first.
+    online_copies: int = 1
+
     def __init__(self, learner: Learning):
         super().__init__()
 

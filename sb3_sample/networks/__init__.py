@@ -11,6 +11,7 @@ from sb3_sample.networks.initialization import init_orthogonal, linear
 from sb3_sample.networks.mlp import MLP
 from sb3_sample.networks.network import HiddenUnits, Network, widened
 from sb3_sample.networks.normalization import RunningMoments, RunningNorm
+from sb3_sample.networks.projected import Projected
 from sb3_sample.networks.simba import SimbaNet
 from sb3_sample.networks.simbav2 import SimbaV2Net
 from sb3_sample.networks.spectral_net import SpectralNet
@@ -42,6 +43,7 @@ __all__ = [
     "FlashNet",
     "HiddenUnits",
     "Network",
+    "Projected",
     "RunningMoments",
     "RunningNorm",
     "SimbaNet",

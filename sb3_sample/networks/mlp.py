@@ -8,7 +8,7 @@ from torch import nn
 from sb3_sample.networks.activations import width_factor
 from sb3_sample.networks.ensemble import Dense, Norm
 from sb3_sample.networks.ensemble import layer_norm as make_layer_norm
-from sb3_sample.networks.initialization import linear
+from sb3_sample.networks.initialization import DEFAULT_GAIN, linear
 from sb3_sample.networks.network import HiddenUnits, Network
 
 
@@ -24,6 +24,7 @@ class MLP(Network):
     :param n_copies: E for E independent networks, None for one
     :param spectral_norm: whether the last hidden layer's kernel is divided by its largest singular value
     :param dropout: probability of dropping a neuron in training mode, each copy its own (DroQ, Hiraoka et al. 2021)
+    :param gain: factor on the orthogonal kernels, the output layer's included unless its owner asks for another
     :raises ValueError: if a width is below 1, the dropout is out of range, or there is no layer for the spectral norm
     """
 
@@ -36,8 +37,10 @@ class MLP(Network):
         n_copies: int | None = None,
         spectral_norm: bool = False,
         dropout: float = 0.0,
+        gain: float = DEFAULT_GAIN,
     ):
         super().__init__()
+        self.head_gain = gain
         if any(width < 1 for width in hidden_sizes):
             raise ValueError(f"the widths in hidden_sizes must be at least 1, not {list(hidden_sizes)}")
         if spectral_norm and not hidden_sizes:
@@ -48,7 +51,7 @@ class MLP(Network):
         self._hidden: list[tuple[str, Dense, Norm | None, nn.Module]] = []
         for i, width in enumerate(hidden_sizes):
             is_last = i == len(hidden_sizes) - 1
-            dense = linear(in_features, width, n_copies, spectral_norm=spectral_norm and is_last)
+            dense = linear(in_features, width, n_copies, gain=gain, spectral_norm=spectral_norm and is_last)
             norm = make_layer_norm(width, n_copies) if layer_norm else None
             activation = activation_fn()
             self._hidden.append((f"layers.{len(layers)}", dense, norm, activation))

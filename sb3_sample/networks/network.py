@@ -42,7 +42,7 @@ class Network(nn.Module):
     compilable: ClassVar[bool] = True
     #: Whether the copy of it in the target critics is in training mode during gradient steps, as dropout needs (DroQ).
     #: Batch norm is not: False has the targets use the running statistics.
-    trains_in_target: ClassVar[bool] = True
+    trains_in_target: bool = True
     #: Whether the critics' step stacks the current and the next rows for one forward pass of 2B rows, so that batch
     #: statistics are of both: "online" takes the next values from that pass (CrossQ, Bhatt et al. 2024, which has no
     #: targets), "target" from the target critics' own pass over the same rows; None: a pass each. Where rows are
@@ -55,7 +55,7 @@ class Network(nn.Module):
     statistics_every_step: bool = False
 
     #: Gain of the output layer's kernel, unless its owner asks for another.
-    head_gain: ClassVar[float] = DEFAULT_GAIN
+    head_gain: float = DEFAULT_GAIN
 
     @abstractmethod
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -94,6 +94,12 @@ class Network(nn.Module):
         for layer in self.modules():
             if isinstance(layer, SpectralNorm):
                 layer.find_direction()
+
+    def copied_parameters(self) -> list[nn.Parameter]:
+        """
+        :return: the parameters that each copy has of its own, (E, ...) each; here all
+        """
+        return list(self.parameters())
 
     def statistics(self) -> list[torch.Tensor]:
         """

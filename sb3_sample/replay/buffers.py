@@ -21,10 +21,11 @@ from sb3_sample.replay.columns import (
 )
 from sb3_sample.replay.compact import (
     CompactDictReplayBuffer,
+    CompactNStepReplayBuffer,
     CompactReplay,
     CompactReplayBuffer,
 )
-from sb3_sample.replay.next_observations import ONLY, NextObservations
+from sb3_sample.replay.next_observations import ONLY, taken
 from sb3_sample.replay.rows import action_dtype
 from sb3_sample.replay.weighted import FadedDictReplayBuffer, FadedReplay, FadedReplayBuffer
 
@@ -287,7 +288,7 @@ PLAIN_BUFFERS = (
 )
 #: Buffers whose every transition is drawn independently, so that one large draw can be cut into batches. Others compose
 #: each batch (HerReplayBuffer: so many real, so many relabelled transitions) and are asked once a gradient step.
-INDEPENDENT_BUFFERS = (*PLAIN_BUFFERS, NStepReplayBuffer, DeviceReplayBuffer)
+INDEPENDENT_BUFFERS = (*PLAIN_BUFFERS, NStepReplayBuffer, CompactNStepReplayBuffer, DeviceReplayBuffer)
 #: Methods that make a buffer's samples.
 _SAMPLING = ("sample", "_get_samples", "_at", "training_places", "to_torch", "_normalize_obs", "_normalize_reward")
 _OWN_SAMPLING = {cls: [getattr(cls, name, None) for name in _SAMPLING] for cls in INDEPENDENT_BUFFERS}
@@ -359,10 +360,7 @@ class BatchMemory:
                 self._columns[name] = torch.empty((n, *shape), dtype=dtype, pin_memory=to_cuda)
             column = self._columns[name][:n]
             out = column.numpy()
-            if isinstance(array, NextObservations):
-                array.take(places, out)
-            else:
-                array.reshape(-1, *shape).take(places, axis=0, out=out, mode="clip")
+            taken(array, places, out)
             if but is not None:
                 out *= 1 - but.reshape(-1, 1).take(places, axis=0)
             return column.to(buffer.device, non_blocking=True) if to_cuda else column

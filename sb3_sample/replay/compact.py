@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 
+from sb3_sample.kinds import check_value, integer
 from sb3_sample.replay import memory_map as files
 from sb3_sample.replay.columns import NEXT_OBSERVATIONS, OBSERVATIONS, HasColumns, samples_at
+from sb3_sample.replay.frames import OLDER, OLDER_FRAMES, StackedFrames
 from sb3_sample.replay.next_observations import NEXT_ROW, ONLY, NextObservations, SideStore
 
 try:  # As in Stable-Baselines3: without it the free memory is not checked.
@@ -50,7 +52,10 @@ class CompactReplay(HasColumns):
     :param handle_timeout_termination: whether a time limit is no termination
     :param memory_map: a folder, made if it is not there, whose files hold the buffer instead of the memory. They have
         no names and go with the buffer: runs cannot meet in them, and nothing is left to delete. None for the memory
-    :raises ValueError: if ``memory_map`` cannot be written to or has not the space
+    :param frame_stack: frames that an observation consists of along its first axis, the newest last. Each is then
+        stored once, and they are stacked when they are read. 1 or None: observations are stored as they are
+    :raises ValueError: if ``memory_map`` cannot be written to or has not the space, or observations do not consist of
+        so many frames
     """
 
     buffer_size: int
@@ -74,6 +79,7 @@ class CompactReplay(HasColumns):
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
         memory_map: str | os.PathLike[str] | None = None,
+        frame_stack: int | None = None,
     ):
         assert isinstance(self, ReplayBuffer)
         # The constructors in between make arrays for two observations a step.
@@ -84,12 +90,19 @@ class CompactReplay(HasColumns):
         self.handle_timeout_termination = handle_timeout_termination
         rows = (self.buffer_size, self.n_envs)
         one = OBSERVATIONS.layout(self)
+        #: Frames that an observation consists of; None for none.
+        self.frame_stack = _n_frames(frame_stack, observation_space)
         layout = {key: ((*rows, *shape), dtype) for key, (shape, dtype) in one.items()}
         plain = {column.name: column.layout(self)[ONLY] for column in self.plain_columns}
         columns = {name: ((*rows, *shape), dtype) for name, (shape, dtype) in plain.items()} | {
             "slot": (rows, np.int32)
         }
-        needed = sum(files.n_bytes(*array) for array in [*layout.values(), *columns.values()])
+        n_frames = self.frame_stack
+        stored_as = {
+            key: (shape if n_frames is None else StackedFrames.layout(shape, n_frames), dtype)
+            for key, (shape, dtype) in layout.items()
+        }
+        needed = sum(files.n_bytes(*array) for array in [*stored_as.values(), *columns.values()])
         #: The folder that holds the arrays; None if the memory does.
         self.memory_map = None if memory_map is None else files.check_folder(memory_map, needed)
         if memory_map is None and psutil is not None and needed > (available := psutil.virtual_memory().available):
@@ -99,7 +112,10 @@ class CompactReplay(HasColumns):
                 stacklevel=2,
             )
         zeros = functools.partial(files.zeros, self.memory_map)
-        stored = {key: zeros(*array) for key, array in layout.items()}
+        stored: dict[str, Any] = {
+            key: zeros(*array) if n_frames is None else StackedFrames(*array, n_frames, self.memory_map)
+            for key, array in layout.items()
+        }
         self.observations = stored if isinstance(observation_space, spaces.Dict) else stored[ONLY]
         for name, array in columns.items():
             if name in vars(self):
@@ -114,8 +130,12 @@ class CompactReplay(HasColumns):
             return
         # What is copied or unpickled is in the memory.
         self.memory_map = files.check_folder(self.memory_map, sum(array.nbytes for array in self.stored().values()))
-        stored = {key: files.moved(self.memory_map, array) for key, array in self.stored().items()}
-        self.observations = stored if isinstance(self.observations, dict) else stored[ONLY]
+        frames = self._frames
+        if frames is not None:
+            frames.to_files(self.memory_map)
+        else:
+            stored = {key: files.moved(self.memory_map, array) for key, array in self.stored().items()}
+            self.observations = stored if isinstance(self.observations, dict) else stored[ONLY]
         for name in (*(column.name for column in self.plain_columns), "slot"):
             setattr(self, name, files.moved(self.memory_map, getattr(self, name)))
         self.aside.arrays = {key: files.moved(self.memory_map, array) for key, array in self.aside.arrays.items()}
@@ -127,6 +147,11 @@ class CompactReplay(HasColumns):
         :return: the observations by key, (buffer_size, n_envs, O) each
         """
         return self.observations if isinstance(self.observations, dict) else {ONLY: self.observations}
+
+    @property
+    def _frames(self) -> StackedFrames | None:
+        """The observations, if their frames are stored once."""
+        return self.observations if isinstance(self.observations, StackedFrames) else None
 
     @property
     def next_observations(self) -> Any:
@@ -202,6 +227,8 @@ class CompactReplay(HasColumns):
         super().reset()  # type: ignore[misc]  # the buffer's
         self.slot[...] = NEXT_ROW
         self.aside.clear()
+        if self._frames is not None:
+            self._frames.clear()
 
     def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> Any:
         if not self.more_in_batch:
@@ -217,16 +244,22 @@ class CompactReplay(HasColumns):
         List the arrays of the rows.
 
         :return: the columns of a row but its next observation, by name, (buffer_size, n_envs, ...) each; the
-            observations are ``observations``, or ``observations/<key>``
+            observations are ``observations``, or ``observations/<key>``; of stacked frames the newest ones
         """
         assert isinstance(self, ReplayBuffer)
-        columns = {_file_name(OBSERVATIONS.name, key): array for key, array in self.stored().items()}
+        frames = self._frames
+        stored = self.stored() if frames is None else {ONLY: frames.frames[:-1]}
+        columns = {_file_name(OBSERVATIONS.name, key): array for key, array in stored.items()}
         return columns | {column.name: getattr(self, column.name) for column in self.plain_columns}
 
     def _apart(self, index: np.ndarray, places: np.ndarray) -> dict[str, np.ndarray]:
         """Next observations that are not the next row's, by ``index``, in the layout of files."""
         values = self._following(places)
         return {"next_index": index} | {_file_name(NEXT_OBSERVATIONS.name, key): value for key, value in values.items()}
+
+    def _older(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        """Older frames of rows, in the layout of files."""
+        return {} if self._frames is None else self._frames.described(rows)
 
     def new_rows(self, n: int) -> dict[str, np.ndarray]:
         """
@@ -235,7 +268,8 @@ class CompactReplay(HasColumns):
         :param n: how many
         :return: copies of the :meth:`columns`, oldest step first, (n, n_envs, ...) each; ``next_index``, (M,), the
             places (step * n_envs + environment) whose next observation is not the observation of the next step, among
-            them the whole last step; ``next_observations`` (or ``next_observations/<key>``), (M, O), what it is there
+            them the whole last step; ``next_observations`` (or ``next_observations/<key>``), (M, O), what it is there;
+            of stacked frames also what ``StackedFrames.described`` gives
         :raises ValueError: if the buffer holds fewer
         """
         assert isinstance(self, ReplayBuffer)
@@ -245,7 +279,7 @@ class CompactReplay(HasColumns):
         index = np.flatnonzero(self.slot[rows] != NEXT_ROW)
         steps, envs = np.divmod(index, self.n_envs)
         copies = {name: np.array(array[rows]) for name, array in self.columns().items()}
-        return copies | self._apart(index, rows[steps] * self.n_envs + envs)
+        return copies | self._apart(index, rows[steps] * self.n_envs + envs) | self._older(rows)
 
     def restore_rows(self, pieces: Iterable[tuple[int, dict[str, np.ndarray]]]) -> None:
         """
@@ -287,9 +321,22 @@ class CompactReplay(HasColumns):
             following = self._following(before * self.n_envs + np.arange(self.n_envs))
             self.aside.free(self.slot[before])
             self._set_newest(before, following)
-            self._settle(before, {key: piece[_file_name(OBSERVATIONS.name, key)][0] for key in self.stored()})
+            self._settle(before, self._first_of(piece))
         self.aside.free(self.slot[rows].reshape(-1))
         self._put(rows, piece, len(rows) - 1)
+
+    def _first_of(self, piece: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Observations of the first step from a file, whose older frames are none of other steps of the file."""
+        newest = {key: piece[_file_name(OBSERVATIONS.name, key)][0] for key in self.stored()}
+        frames = self._frames
+        if frames is None:
+            return newest
+        alone = StackedFrames((1, *frames.shape[1:]), frames.dtype, frames.n_frames, None)
+        n_apart = int((piece[OLDER][0] < -1).sum())
+        alone.put(
+            np.arange(1), newest[ONLY][None], {OLDER: piece[OLDER][:1], OLDER_FRAMES: piece[OLDER_FRAMES][:n_apart]}
+        )
+        return {ONLY: alone[0]}
 
     def _put(self, rows: np.ndarray, piece: dict[str, np.ndarray], newest: int) -> None:
         """
@@ -299,6 +346,8 @@ class CompactReplay(HasColumns):
         :param piece: the steps
         :param newest: which of them is the newest
         """
+        if self._frames is not None:
+            self._frames.put(rows, piece[OBSERVATIONS.name], piece)
         for name, array in self.columns().items():
             array[rows] = piece[name]
         self.slot[rows] = NEXT_ROW
@@ -324,8 +373,9 @@ class CompactReplay(HasColumns):
             _file_name(NEXT_OBSERVATIONS.name, key): ((len(index), *array.shape[2:]), array.dtype)
             for key, array in self.stored().items()
         }
-        if piece.keys() != {*shapes, "next_index"}:
-            raise ValueError(f"this buffer's columns are {sorted({*shapes, 'next_index'})}, the saved {sorted(piece)}")
+        names = {*shapes, "next_index", *(() if self._frames is None else (OLDER, OLDER_FRAMES))}
+        if piece.keys() != names:
+            raise ValueError(f"this buffer's columns are {sorted(names)}, the saved {sorted(piece)}")
         for name, (shape, dtype) in shapes.items():
             if (piece[name].shape, piece[name].dtype) != (shape, dtype):
                 raise ValueError(
@@ -342,6 +392,8 @@ class CompactReplay(HasColumns):
             or (len(index) and not 0 <= index[0] <= index[-1] < n * self.n_envs)
         ):
             raise ValueError("next_index must be rising places of the saved steps, among them all of the newest step")
+        if self._frames is not None:
+            self._frames.check(piece, n, newest)
 
     def state_dict(self) -> dict[str, Any]:
         """
@@ -357,7 +409,7 @@ class CompactReplay(HasColumns):
         numbers = {name: getattr(self, name) for name in ("pos", "full", "buffer_size", "n_envs")}
         changing = {f"{_CHANGING}{name}": value for name, value in self.changing_state().items()}
         rows = {name: array[:size] for name, array in self.columns().items()}
-        return numbers | rows | self._apart(index, index) | changing
+        return numbers | rows | self._apart(index, index) | self._older(np.arange(size)) | changing
 
     def changing_state(self) -> dict[str, Any]:
         """
@@ -409,9 +461,38 @@ class CompactReplay(HasColumns):
         """Called when the rows have been restored."""
 
 
+def _n_frames(frame_stack: Any, space: spaces.Space) -> int | None:
+    """Frames of an observation, checked; None for one."""
+    check_value("frame_stack", frame_stack, integer(1).or_none())
+    if frame_stack is None or frame_stack == 1:
+        return None
+    if not isinstance(space, spaces.Box) or len(space.shape) < 1 or space.shape[0] % frame_stack:
+        raise ValueError(
+            f"frame_stack={frame_stack} must divide the first axis of observations, which are a Box, not {space}"
+        )
+    return int(frame_stack)
+
+
 class CompactReplayBuffer(CompactReplay, ReplayBuffer):  # type: ignore[misc, override]  # next_observations is a view
     __doc__ = CompactReplay.__doc__
 
 
 class CompactDictReplayBuffer(CompactReplay, DictReplayBuffer):  # type: ignore[misc, override]  # next_observations is a view
     """Replay buffer for dict observations that stores one observation a step."""
+
+
+class CompactNStepReplayBuffer(CompactReplay, NStepReplayBuffer):  # type: ignore[misc, override]  # next_observations is a view
+    """
+    Replay buffer for n-step returns, as Stable-Baselines3's, that stores one observation a step.
+
+    :param args: as of ``CompactReplayBuffer``
+    :param kwargs: as of ``CompactReplayBuffer``
+    :param n_steps: steps whose rewards are summed
+    :param gamma: discount factor
+    """
+
+    def __init__(self, *args: Any, n_steps: int = 3, gamma: float = 0.99, **kwargs: Any):
+        if self.more_in_batch:
+            raise ValueError(f"more_columns of {type(self).__name__}: n-step returns are of no single transition")
+        super().__init__(*args, **kwargs)
+        self.n_steps, self.gamma = n_steps, gamma

@@ -12,6 +12,20 @@ NEXT_ROW = -1
 ONLY = ""
 
 
+def taken(array: Any, places: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+    """
+    Gather rows of one environment each.
+
+    :param array: (rows, n_envs, ...), or what is read like one and has a ``take`` of its own
+    :param places: row * n_envs + environment of each, (N,)
+    :param out: memory for the result, (N, ...), (N, 1) if it is one number; None for new one
+    :return: the rows
+    """
+    if isinstance(array, np.ndarray):
+        return array.reshape(-1, *(array.shape[2:] or (1,))).take(places, axis=0, out=out, mode="clip")
+    return array.take(places, out)  # type: ignore[no-any-return]
+
+
 class SideStore:
     """
     Store of the next observations that no row holds, by a number, their slot. Slots 0 to ``n_envs - 1`` are those of
@@ -109,8 +123,7 @@ class NextObservations:
         n_envs, n = self.shape[1], self.shape[0] * self.shape[1]
         following = places + n_envs
         following[following >= n] -= n  # the row after the last one is the first
-        stored = self._buffer.stored()[self._key].reshape(n, *(self.shape[2:] or (1,)))
-        rows = stored.take(following, axis=0, out=out, mode="clip")
+        rows = taken(self._buffer.stored()[self._key], following, out)
         slots = self._buffer.slot.reshape(n).take(places)
         apart = np.flatnonzero(slots != NEXT_ROW)
         if len(apart):

@@ -15,7 +15,7 @@ from sb3_sample.kinds import AT_LEAST_0, UNIT, check_value, integer, number
 from sb3_sample.learner.batch import SLOTS, Windows, for_each
 from sb3_sample.replay.columns import Samples, samples_at
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
-from sb3_sample.replay.next_observations import ONLY
+from sb3_sample.replay.next_observations import ONLY, taken
 from sb3_sample.replay.weights import DrawWeights
 
 _FADE = number("lie in (0, 1]", lambda value: 0 < value <= 1)
@@ -329,7 +329,7 @@ class WindowReplay(PrioritizedReplay):
 
         rewards = self._normalize_reward(flat(self.rewards)[places], env)
         return Windows(
-            observations({key: flat(array)[first] for key, array in self.stored().items()}, len(slots)),
+            observations({key: taken(array, first) for key, array in self.stored().items()}, len(slots)),
             self.to_torch(flat(self.actions)[places]).reshape(*steps, -1),
             observations(self._following(places), *steps),
             # A time limit does not end the bootstrap.

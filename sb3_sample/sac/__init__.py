@@ -6,6 +6,7 @@ from sb3_sample.sac.bro import BRO, BROTD3, BROFast
 from sb3_sample.sac.crossq import CrossQ
 from sb3_sample.sac.dac import DAC
 from sb3_sample.sac.debiased_rq import DebiasedRQ
+from sb3_sample.sac.drq import DrQ, DrQv2
 from sb3_sample.sac.flash_sac import FlashSAC
 from sb3_sample.sac.offline import BC, IQL, TD3BC
 from sb3_sample.sac.regularized_sac import RegularizedSAC
@@ -33,6 +34,8 @@ __all__ = [
     "BROFast",
     "CrossQ",
     "DebiasedRQ",
+    "DrQ",
+    "DrQv2",
     "FlashSAC",
     "RegularizedSAC",
     "SimBa",

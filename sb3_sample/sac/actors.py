@@ -18,14 +18,15 @@ from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, FINITE, TRUE_OR_FALSE, check_v
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
 from sb3_sample.networks import Network, RunningNorm, project_weights
-from sb3_sample.networks.modes import evaluated
-from sb3_sample.sac.features import TensorFeatures
+from sb3_sample.sac.features import TensorFeatures, share
 from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
 
 # The log standard deviation is squashed into this interval by a tanh.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
 #: Where the likelihood of an action on a bound is taken (IQL's published code clips the data there).
 LARGEST_ACTION = 1 - 1e-5
+#: Largest action of DrQ-v2.
+INSIDE = 1 - 1e-6
 #: Arguments of a Gaussian actor that say how its standard deviation is bounded.
 LOG_STD_ARGUMENTS = ("log_std_min", "log_std_max", "clip_log_std")
 #: All of its own.
@@ -58,6 +59,8 @@ class Actor(TensorFeatures, BasePolicy):
     has_entropy: ClassVar[bool] = True
     #: Whether it explores with a standard deviation of its own.
     has_std: ClassVar[bool] = True
+    #: Arguments that ``actor_kwargs`` of a policy takes.
+    ARGUMENTS: ClassVar[tuple[str, ...]] = GAUSSIAN_ARGUMENTS
     #: View in evaluation mode, for the actions of TD targets, if the trunk ``stacks_rows``.
     at_rest: Any = None
     #: The policy's running normalisation of observations, None for none.
@@ -137,9 +140,7 @@ class Actor(TensorFeatures, BasePolicy):
 
         :param encoder: features extractor, which is in the parameters, the state and the modes of its owner only
         """
-        self._modules.pop("features_extractor", None)
-        # Past nn.Module's own setattr, which would register them.
-        vars(self).update(features_extractor=encoder, _encoder=evaluated(encoder))
+        share(self, encoder)
 
     def __getstate__(self) -> dict[str, Any]:
         # The last actions that somebody asked the distribution for go with no copy: they may have a gradient.
@@ -367,6 +368,9 @@ class DeterministicActor(MeanActor):
     """
 
     has_std: ClassVar[bool] = True
+    #: Whether TD targets have the actions of a Polyak average of it.
+    has_target: ClassVar[bool] = True
+    ARGUMENTS: ClassVar[tuple[str, ...]] = ("exploration_noise", "target_noise", "target_noise_clip")
     _kind: ClassVar[str] = "a deterministic actor (backbone='td3')"
 
     def __init__(
@@ -433,6 +437,65 @@ class DeterministicActor(MeanActor):
         :return: summed over the dimensions, (B, 1)
         """
         return gaussian_kl(torch.tanh(mean), std, torch.tanh(reference_mean), reference_std)
+
+
+class NoisyActor(DeterministicActor):
+    """
+    Deterministic actor of DrQ-v2 (Yarats et al. 2022), ``a = tanh(mean)``: exploration, the TD target's action and the
+    one that it learns through all have Gaussian noise of one standard deviation, ``noise_std``, which moves with the
+    training; clipped but in exploration. Actions are clamped just inside of [-1, 1], with a gradient as if they were
+    not. There is no target actor.
+
+    :param args: as of :class:`DeterministicActor`
+    :param noise_clip: bound of the noise but in exploration
+    :param kwargs: as of :class:`DeterministicActor`, but for the noise
+    :raises ValueError: if the bound is out of range
+    """
+
+    has_target: ClassVar[bool] = False
+    ARGUMENTS: ClassVar[tuple[str, ...]] = ("noise_clip",)
+    #: Standard deviation of the noise in actions of [-1, 1], ().
+    noise_std: torch.Tensor
+
+    def __init__(self, *args: Any, noise_clip: float = 0.3, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.noise_clip = check_value("noise_clip", noise_clip, AT_LEAST_0)
+        self._noise_args = {"noise_clip": noise_clip}
+        self.register_buffer("noise_std", torch.ones(()))
+
+    def gaussian(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        mean = self.mean(self.trunk(features))
+        return mean, self.noise_std.log().expand_as(mean)
+
+    def sample(
+        self,
+        obs: PyTorchObs | Encoded,
+        noise: torch.Tensor | None = None,
+        following: PyTorchObs | Encoded | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        The action of a TD target, and the one that the actor learns through.
+
+        :param obs: observations, (B, O), or a dict of them, or their features
+        :param noise: standard normal noise, (B, A); drawn if None
+        :param following: further observations, stacked below these in the forward pass; None for none
+        :return: action inside of [-1, 1], (B, A), and zeros, (B, 1)
+        """
+        action, log_prob = super().sample(obs, None, following)
+        noise = torch.randn_like(action) if noise is None else noise
+        noisy = action + (self.noise_std * noise).clamp(-self.noise_clip, self.noise_clip)
+        return noisy + (noisy.clamp(-INSIDE, INSIDE) - noisy).detach(), log_prob
+
+    def act(self, mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        return (torch.tanh(mean) + std * noise).clamp(-INSIDE, INSIDE)
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them
+        :param deterministic: without meaning, the actor always is
+        :return: actions in [-1, 1], (B, A)
+        """
+        return super().sample(obs)[0]
 
 
 #: The actor's class by the name that the policy's ``backbone`` takes; "mean" is for DAC alone.

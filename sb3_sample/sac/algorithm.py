@@ -39,7 +39,12 @@ from sb3_sample.replay.buffers import (
     store_float_actions,
 )
 from sb3_sample.replay.columns import has_own_columns
-from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
+from sb3_sample.replay.compact import (
+    CompactDictReplayBuffer,
+    CompactNStepReplayBuffer,
+    CompactReplay,
+    CompactReplayBuffer,
+)
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.sources import DatasetSource, ReplaySource
 from sb3_sample.replay.weighted import PrioritizedReplay
@@ -49,6 +54,7 @@ from sb3_sample.sac.arguments import SACArguments
 from sb3_sample.sac.metrics_log import MetricsLog
 from sb3_sample.sac.model_learner import check_action_space
 from sb3_sample.sac.multi_task import is_multi_task, told_task
+from sb3_sample.sac.pixels import stacked_frames
 from sb3_sample.sac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SACPolicy
 from sb3_sample.sac.sb3_names import SB3Names
 from sb3_sample.sac.update_schedule import UpdateSchedule
@@ -158,6 +164,9 @@ class SAC(  # type: ignore[misc]  # actor
         self._prior_of: dict[str, Any] | None = None
         #: Gradient steps planned, for ``learning_rate_schedule``; None while they are not known.
         self.planned_updates: int | None = self.schedule_steps
+        #: Frames that the environment stacks in an observation, each of which the replay stores once; None for none.
+        #: Saved: a model loaded without an environment goes on with it.
+        self.frame_stack: int | None = None
         # Gradient steps owed but not yet taken, the fraction that a replay ratio leaves over.
         self._updates_owed = 0.0
         self._metrics: dict[str, torch.Tensor] = {}
@@ -170,7 +179,11 @@ class SAC(  # type: ignore[misc]  # actor
     # ---------------------------------------------------------------- construction
 
     def _setup_model(self) -> None:
-        super()._setup_model()
+        with warnings.catch_warnings():
+            # Of Stable-Baselines3, which knows n-step returns of its own buffer only, where a buffer is told of them.
+            if self.replay_buffer_class is None or issubclass(self.replay_buffer_class, CompactNStepReplayBuffer):
+                warnings.filterwarnings("ignore", message="`n_steps=")
+            super()._setup_model()
         assert self.replay_buffer is not None
         store_float_actions(self.replay_buffer)
         if self.compile != "auto":
@@ -218,6 +231,17 @@ class SAC(  # type: ignore[misc]  # actor
         elif self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, ValidationSplit):
             # Loaded, with validation_proportion=0 instead of the saved one.
             self.replay_buffer_class = None
+        can_stack = self.replay_buffer_class is None or issubclass(self.replay_buffer_class, CompactReplay)
+        if can_stack and "frame_stack" not in self.replay_buffer_kwargs:
+            if self.env is not None:
+                self.frame_stack = stacked_frames(self.env, self.observation_space)
+            if self.frame_stack is not None:
+                self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "frame_stack": self.frame_stack}
+        if self.replay_buffer_class is None and self.n_steps > 1 and "frame_stack" in self.replay_buffer_kwargs:
+            self.replay_buffer_class = CompactNStepReplayBuffer
+        if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, CompactNStepReplayBuffer):
+            of_steps = {"n_steps": self.n_steps, "gamma": self.gamma}
+            self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, **of_steps}
         if self.replay_buffer_class is None and self.n_steps == 1:
             self.replay_buffer_class = CompactDictReplayBuffer if is_dict else CompactReplayBuffer
         if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, CompactReplay):
@@ -231,6 +255,8 @@ class SAC(  # type: ignore[misc]  # actor
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         kwargs = {**self.policy_kwargs, "n_outputs": self._make_head().n_outputs, "backbone": self.backbone}
+        if self.augmentation is not None:
+            kwargs.setdefault("share_features_extractor", True)
         if self._width_factor > 1:
             kwargs["width_factor"] = self._width_factor
         return {**kwargs, "normalize_observations": True} if self.normalize_observations else kwargs

@@ -25,6 +25,7 @@ from sb3_sample.kinds import (
     one_of,
     subclass,
 )
+from sb3_sample.learner.augmentation import AUGMENTATIONS
 from sb3_sample.learner.categorical import VALUE_HEADS
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
 from sb3_sample.learner.heads import ValueHead
@@ -138,7 +139,7 @@ class SACArguments(Resumable):
     """share of the transitions that is held out of training, in [0, 1); "vpl" learns from them"""
     exploration: str | type[Exploration] = argument(default="actor", kind=one_of(EXPLORATIONS, Exploration))
     """policy that acts while training: "actor", "held_noise" (FlashSAC), "oac", "optimistic_actor" (DAC),
-    "optimistic_shift" (BRO), or a class derived from ``Exploration``"""
+    "optimistic_shift" (BRO), "scheduled_noise" (DrQ-v2), or a class derived from ``Exploration``"""
     exploration_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
     """its arguments"""
     backbone: str = argument(
@@ -176,6 +177,15 @@ class SACArguments(Resumable):
     place of a class's own ``resets``; None for none. Not together with ``resets``"""
     reset_shrink: float = argument(default=0.0, kind=number("lie in [0, 1)", lambda value: 0 <= value < 1))
     """share of the old parameters that a reset leaves (shrink and perturb), in [0, 1)"""
+    resets_keep: Sequence[str] = argument(
+        default=(),
+        kind=Kind(
+            "be a sequence of what resets keep, of 'encoder'",
+            lambda value: isinstance(value, (list, tuple)) and all(each == "encoder" for each in value),
+        ),
+    )
+    """what a reset leaves as it is: ``("encoder",)`` for the features extractor that actors share with the critics,
+    that of the targets and their part of the optimizer (the primacy bias, Nikishin et al. 2022, from pixels)"""
     redo_period: int | None = argument(default=None, kind=integer(1).or_none("no recycling"))
     """gradient steps between two recyclings of the critics' dormant neurons (ReDo; the original: 1,000); None for
     none"""
@@ -192,6 +202,11 @@ class SACArguments(Resumable):
     )
     """classes derived from ``BatchTransform``, or pairs of one and its arguments, which every batch goes through before
     it is learned from"""
+    augmentation: str | None = argument(default=None, kind=one_of(AUGMENTATIONS).or_none("images as they are"))
+    """"shift": every image of a batch is shifted by a few pixels at random (DrQ), after ``batch_transforms``. Actors
+    then share the critics' features extractor, unless ``policy_kwargs`` has ``share_features_extractor=False``"""
+    augmentation_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
+    """its arguments: ``pad``, 4 pixels, and DrQ's K and M, ``target_copies`` and ``online_copies``, 1 each"""
     reward_scale: str | type[RewardScale] | None = argument(
         default=None, kind=one_of(REWARD_SCALES, RewardScale).or_none("rewards as they are")
     )

@@ -16,6 +16,7 @@ from sb3_sample.kinds import (
     integer,
     one_of,
 )
+from sb3_sample.learner.augmentation import AUGMENTATIONS
 from sb3_sample.learner.exploration import EXPLORATIONS
 from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
 from sb3_sample.learner.reward_scale import LinearScale
@@ -24,6 +25,7 @@ from sb3_sample.replay.columns import has_own_columns
 from sb3_sample.replay.compact import CompactReplay
 from sb3_sample.replay.weighted import FadedReplay, PrioritizedReplay, WindowReplay
 from sb3_sample.sac.multi_task import is_multi_task
+from sb3_sample.sac.pixels import check_images, stacked_frames
 
 
 def check(agent: Any) -> None:
@@ -31,6 +33,9 @@ def check(agent: Any) -> None:
     :param agent: an algorithm whose arguments are stored and whose networks do not exist yet
     :raises ValueError: if an argument is out of range or contradicts another
     """
+    if agent.augmentation in AUGMENTATIONS and hasattr(agent, "observation_space"):
+        # Before a policy asks for less of them.
+        check_images(f"augmentation={agent.augmentation!r}", agent.observation_space)
     check_every(agent)
     n_critics = check_value("n_critics", agent._n_critics(), integer(1))
     check_target_entropy(agent)
@@ -67,6 +72,7 @@ def check(agent: Any) -> None:
         )
     _check_schedule(agent)
     _check_tasks(agent)
+    _check_augmentation(agent)
     of_policy = ["n_quantiles", "n_outputs", "backbone", "normalize_observations", "width_factor"]
     of_policy += ["n_critics"] if "n_critics" in type(agent).constructor_arguments else []
     for name in of_policy:
@@ -265,6 +271,21 @@ def _check_tasks(agent: Any) -> None:
         )
 
 
+def _check_augmentation(agent: Any) -> None:
+    """Whether there are images to be augmented, and an encoder to be kept."""
+    if agent.augmentation is None:
+        check_unused(agent, ["augmentation_kwargs"], "augmentation=None")
+    if not agent.resets_keep:
+        return
+    if agent.reset_gradient_steps is None and not has_resets(agent.resets):
+        check_unused(agent, ["resets_keep"], "no resets")
+    if not agent._full_policy_kwargs().get("share_features_extractor", False):
+        raise ValueError(
+            f"resets_keep={agent.resets_keep!r} keeps one encoder that actors share with the critics: pass "
+            "policy_kwargs=dict(share_features_extractor=True), or augmentation='shift' for images"
+        )
+
+
 def has_resets(resets: Any) -> bool:
     """
     :param resets: the argument of that name, checked or not
@@ -406,7 +427,8 @@ def _check_replay(agent: Any) -> None:
 def _check_memory_map(agent: Any) -> None:
     """A buffer in files: only those of this package know it."""
     cls, is_split = agent.replay_buffer_class, agent.validation_proportion > 0
-    made_by_us = is_split or (agent.n_steps == 1 if cls is None else issubclass(cls, CompactReplay))
+    stacks = stacked_frames(agent.env, agent.observation_space) is not None
+    made_by_us = is_split or (agent.n_steps == 1 or stacks if cls is None else issubclass(cls, CompactReplay))
     if (agent.replay_buffer_kwargs or {}).get("memory_map") is not None and not made_by_us:
         what = f"n_steps={agent.n_steps}" if cls is None else f"replay_buffer_class={cls.__name__}"
         raise ValueError(

@@ -17,7 +17,7 @@ from torch import nn
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.q_values import QValues
 from sb3_sample.networks import Network, RunningNorm, project_weights
-from sb3_sample.sac.features import TensorFeatures
+from sb3_sample.sac.features import TensorFeatures, share
 from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
 
 
@@ -33,6 +33,8 @@ class CriticEnsemble(TensorFeatures, BaseModel):
     :param n_critics: E
     :param n_outputs: K, the number of quantiles, or 1
     :param normalize_images: whether images are divided by 255
+    :param shares_encoder: whether the extractor is that of other critics, whose features are read without gradient and
+        in evaluation mode
     """
 
     action_space: spaces.Box
@@ -40,6 +42,9 @@ class CriticEnsemble(TensorFeatures, BaseModel):
     at_rest: Any = None
     #: The policy's running normalisation of observations, None for none.
     observation_norm: RunningNorm | None = None
+    #: Whether the features extractor is that of other critics.
+    shares_encoder: bool = False
+    _encoder: Any
 
     def __init__(
         self,
@@ -51,6 +56,7 @@ class CriticEnsemble(TensorFeatures, BaseModel):
         n_critics: int = 2,
         n_outputs: int = 1,
         normalize_images: bool = True,
+        shares_encoder: bool = False,
     ):
         super().__init__(
             with_plain_sizes(observation_space),
@@ -58,6 +64,9 @@ class CriticEnsemble(TensorFeatures, BaseModel):
             features_extractor=features_extractor,
             normalize_images=normalize_images,
         )
+        self.shares_encoder = shares_encoder
+        if shares_encoder:
+            share(self, features_extractor)
         self._network_args = {"network": network, "network_kwargs": network_kwargs, "n_outputs": n_outputs}
         self.n_critics = n_critics
         in_features = features_extractor.features_dim + get_action_dim(action_space)
@@ -73,12 +82,23 @@ class CriticEnsemble(TensorFeatures, BaseModel):
         """
         if isinstance(obs, Encoded):
             return torch.cat((obs.features, actions), dim=1)
-        assert isinstance(self.features_extractor, BaseFeaturesExtractor)
+        return torch.cat((self.features(obs), actions), dim=1)
+
+    def features(self, obs: PyTorchObs) -> torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them
+        :return: their features, (B, F), with a gradient to an encoder of their own
+        """
         seen: PyTorchObs = obs if self.observation_norm is None else self.observation_norm(obs)
-        return torch.cat((self.extract_features(seen, self.features_extractor), actions), dim=1)
+        if self.shares_encoder:
+            with torch.no_grad():
+                return self.extract_features(seen, self._encoder)
+        assert isinstance(self.features_extractor, BaseFeaturesExtractor)
+        return self.extract_features(seen, self.features_extractor)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         own = {**self._network_args, "features_extractor": self.features_extractor, "n_critics": self.n_critics}
+        own["shares_encoder"] = self.shares_encoder
         return {**super()._get_constructor_parameters(), **own}
 
     def q_values(self, obs: PyTorchObs, actions: torch.Tensor) -> torch.Tensor:
@@ -130,13 +150,14 @@ class CriticEnsemble(TensorFeatures, BaseModel):
         :return: running statistics that the target critics take over: those of features extractor and trunk
         """
         assert self.features_extractor is not None
-        return [*self.features_extractor.buffers(), *self.trunk.statistics()]
+        extractor = () if self.shares_encoder else self.features_extractor.buffers()
+        return [*extractor, *self.trunk.statistics()]
 
     def copied_parameters(self) -> list[nn.Parameter]:
         """
         :return: the parameters that each critic has a copy of, (E, ...) each: all but the features extractor's
         """
-        return [*self.trunk.parameters(), *self.head.parameters()]
+        return [*self.trunk.copied_parameters(), *self.head.parameters()]
 
 
 class ValueNetwork(TensorFeatures, BaseModel):

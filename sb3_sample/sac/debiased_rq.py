@@ -46,6 +46,8 @@ _FIXED: dict[str, tuple[Any, str]] = {
     "exploration": ("actor", "it explores with its actor and noise"),
     "validation_proportion": (0.0, "its windows of several steps would carry held-out transitions into training"),
     "batch_transforms": ((), "they would change single transitions, and not the windows of the encoder"),
+    "augmentation": (None, "it would change single transitions, and not the windows of the encoder"),
+    "resets_keep": ((), "its resets concern the encoder of states and actions too"),
     "reward_scale": (None, "it would change the rewards of single transitions, and not those of the encoder's windows"),
     "normalize_observations": (False, "its encoder learns from observations as they are"),
     "learning_rate_schedule": (None, "its encoder takes gradient steps of its own, which no schedule counts"),

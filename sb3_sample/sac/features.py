@@ -5,6 +5,9 @@ from typing import Any
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import preprocess_obs
+from torch import nn
+
+from sb3_sample.networks.modes import evaluated
 
 
 class TensorFeatures:
@@ -23,6 +26,19 @@ class TensorFeatures:
         """
         found: torch.Tensor = features_extractor(_preprocessed(obs, self.observation_space, self.normalize_images))
         return found
+
+
+def share(network: Any, encoder: nn.Module) -> None:
+    """
+    Have a network read the features of another module's extractor, without a gradient to it and in evaluation mode: its
+    running statistics are moved by its owner's forward passes alone.
+
+    :param network: actor or critics; their ``_encoder`` is the view in evaluation mode
+    :param encoder: features extractor, which is in the parameters, the state and the modes of its owner only
+    """
+    network._modules.pop("features_extractor", None)
+    # Past nn.Module's own setattr, which would register them.
+    vars(network).update(features_extractor=encoder, _encoder=evaluated(encoder))
 
 
 def _preprocessed(observations: Any, space: spaces.Space[Any], normalize_images: bool) -> Any:

@@ -13,6 +13,7 @@ from torch import nn
 
 from sb3_sample import own_classes
 from sb3_sample.kinds import check_value, chosen, integer
+from sb3_sample.learner.augmentation import AUGMENTATIONS
 from sb3_sample.learner.categorical import VALUE_HEADS
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
 from sb3_sample.learner.heads import QuantileHead, ValueHead
@@ -194,9 +195,12 @@ class HasLearner:
             make_temperature=self._make_temperature,
             make_pessimism=self.make_pessimism,
             make_explorer=self.make_explorer,
-            plasticity=Resets(self.resets, self.reset_shrink, self.reset_gradient_steps),
+            plasticity=Resets(self.resets, self.reset_shrink, self.reset_gradient_steps, self.resets_keep),
             redo=None if self.redo_period is None else ReDo(self.redo_period, self.redo_threshold),
-            make_transforms=[functools.partial(_make_transform, *each) for each in enumerate(self.batch_transforms)],
+            make_transforms=[
+                *(functools.partial(_make_transform, *each) for each in enumerate(self.batch_transforms)),
+                *([] if self.augmentation is None else [self._make_augmentation]),
+            ],
             make_objective=self.make_objective,
             make_reward_scaler=None if self.reward_scale is None else self.make_reward_scaler,
             learning_rate=self.lr_schedule(1),
@@ -381,13 +385,24 @@ class HasLearner:
     def _get_torch_save_params(self: Any) -> tuple[list[str], list[str]]:
         return ["policy", "temperature", *self.learner.parts_with_state(), *self._optimizers()], []
 
-    def reinitialize(self: Any, shrink: float = 0.0) -> None:
+    def reinitialize(self: Any, shrink: float = 0.0, keep: Sequence[str] = ()) -> None:
         """
         Start every network, optimizer and learned number anew, in place; the replay buffer stays.
 
         :param shrink: share of the old parameters that stays
+        :param keep: what stays as it is, "encoder" for an encoder that the critics share with the actors
         """
-        self.learner.reinitialize(shrink)
+        self.learner.reinitialize(shrink, keep)
+
+    def _make_augmentation(self: Any, learner: Learner) -> BatchTransform:
+        cls, kwargs = AUGMENTATIONS[self.augmentation], self._full_augmentation_kwargs()
+        return own_classes.make("augmentation", self.augmentation, cls, BatchTransform, learner, kwargs=kwargs)  # type: ignore[no-any-return]
+
+    def _full_augmentation_kwargs(self: Any) -> dict[str, Any]:
+        """
+        :return: the augmentation's arguments: the user's and the algorithm's
+        """
+        return dict(self.augmentation_kwargs or {})
 
 
 def _make_transform(index: int, choice: Any, learner: Learner) -> BatchTransform:

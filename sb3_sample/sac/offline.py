@@ -105,7 +105,8 @@ class IQL(SAC):
             raise ValueError("share_features_extractor=True is not supported by IQL: its value network needs its own")
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
-        return _starting_wide(super()._full_policy_kwargs())
+        # Not shared with an augmentation either.
+        return _starting_wide({**super()._full_policy_kwargs(), "share_features_extractor": False})
 
     def _make_temperature(self, learner: Learner) -> LogScalar | FixedScalar:
         return FixedScalar(0.0).to(self.device)

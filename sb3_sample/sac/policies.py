@@ -1,8 +1,8 @@
 """Policies of the off-policy family: actor, critics and targets, as Stable-Baselines3 has them."""
 
 import copy
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -20,12 +20,12 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_sample.arguments import check_net_arch
-from sb3_sample.kinds import DICT, TRUE_OR_FALSE, check_value, integer
+from sb3_sample.kinds import ABOVE_0, DICT, TRUE_OR_FALSE, check_value, integer, one_of
 from sb3_sample.learner.batch import Encoded
-from sb3_sample.networks import Network, RunningNorm
+from sb3_sample.networks import Network, Projected, RunningNorm
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.optim import AdamW
-from sb3_sample.sac.actors import BACKBONES, GAUSSIAN_ARGUMENTS, Actor, DeterministicActor
+from sb3_sample.sac.actors import BACKBONES, Actor, DeterministicActor
 from sb3_sample.sac.critics import CriticEnsemble, ValueNetwork
 from sb3_sample.sac.multi_task import TaskOneHot, reads_one_hot
 from sb3_sample.sac.trunks import network_args
@@ -61,11 +61,19 @@ class SACPolicy(BasePolicy):
         Stable-Baselines3, False by default. There the encoder is the actor's, trained by the actor's loss; here it
         is the critics', trained by theirs, and the actors read its features without gradient, encoded anew after
         the critics' step (SAC-AE, Yarats et al. 2021; DrQ, Kostrikov et al. 2021; DrQ-v2 reads those from before
-        the step). The actors read it in evaluation mode. The target critics have a Polyak average of it, which a
-        target actor reads too
+        the step, see ``actor_features``). The actors read it in evaluation mode. The target critics have a Polyak
+        average of it, which a target actor reads too, unless ``target_encoder`` says otherwise
     :param normalize_observations: whether all networks read observations through one running normalisation,
         ``observation_norm``, whose statistics are in the policy
     :param width_factor: by which the hidden layers of all trunks are wider than their arguments say
+    :param target_encoder: of a shared encoder, which one target critics read: "own", a Polyak average, or "online", the
+        critics' without gradient; next observations are then encoded once (DrQ-v2)
+    :param actor_features: of a shared encoder, which features actors learn from: those "after" the critics' step, or
+        "before" it, those of that step; observations are then encoded once (DrQ-v2)
+    :param encoder_learning_rate: learning rate of a shared encoder, which no schedule changes; None: the critics'
+    :param projection: outputs of a dense layer with layer norm and tanh that features go through first, one for the
+        actor and one for all critics (DrQ: 50); None for none
+    :param projection_gain: of its orthogonal kernel
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
@@ -73,6 +81,11 @@ class SACPolicy(BasePolicy):
     actor: Actor
     critic: CriticEnsemble
     critic_target: CriticEnsemble
+    #: Class of the actor by the name that ``backbone`` takes.
+    backbones: ClassVar[Mapping[str, type[Actor]]] = BACKBONES
+    #: Whether observations, and next observations, are encoded once for the whole gradient step.
+    encodes_once: bool = False
+    encodes_next_once: bool = False
 
     def __init__(
         self,
@@ -98,8 +111,26 @@ class SACPolicy(BasePolicy):
         share_features_extractor: bool = False,
         normalize_observations: bool = False,
         width_factor: int = 1,
+        target_encoder: str = "own",
+        actor_features: str = "after",
+        encoder_learning_rate: float | None = None,
+        projection: int | None = None,
+        projection_gain: float = 1.0,
     ):
         check_value("share_features_extractor", share_features_extractor, TRUE_OR_FALSE)
+        check_value("target_encoder", target_encoder, one_of(("own", "online")))
+        check_value("actor_features", actor_features, one_of(("after", "before")))
+        check_value("encoder_learning_rate", encoder_learning_rate, ABOVE_0.or_none())
+        check_value("projection", projection, integer(1).or_none())
+        check_value("projection_gain", projection_gain, ABOVE_0)
+        of_shared = {
+            "target_encoder": target_encoder != "own",
+            "actor_features": actor_features != "after",
+            "encoder_learning_rate": encoder_learning_rate is not None,
+        }
+        for name, is_set in of_shared.items():
+            if is_set and not share_features_extractor:
+                raise ValueError(f"{name} is a choice of one encoder for all: pass share_features_extractor=True too")
         super().__init__(
             observation_space,
             action_space,
@@ -123,58 +154,70 @@ class SACPolicy(BasePolicy):
         actor_args = network_args("actor", actor_network, actor_network_kwargs, pi_arch, *further)
         critic_args = network_args("critic", critic_network, critic_network_kwargs, qf_arch, *further)
 
+        self._projection = projection, projection_gain
         self.observation_norm: RunningNorm | None = None
         if normalize_observations:
             self.observation_norm = RunningNorm(_normalized_shape(observation_space))
 
-        def critics() -> CriticEnsemble:
+        def critics(encoder: Any = None) -> CriticEnsemble:
+            extractor: Any = self.make_features_extractor() if encoder is None else encoder
             made = CriticEnsemble(
                 observation_space,
                 action_space,
-                *critic_args,
-                features_extractor=self.make_features_extractor(),
+                *self._projected(critic_args, extractor),
+                features_extractor=extractor,
                 n_critics=n_critics,
                 n_outputs=n_outputs,
                 normalize_images=normalize_images,
+                shares_encoder=encoder is not None,
             )
             self._share_norm(made)
             return made
 
-        if not isinstance(backbone, str) or backbone not in BACKBONES:
-            raise ValueError(f"backbone must be one of {sorted(BACKBONES)}, not {backbone!r}")
+        if not isinstance(backbone, str) or backbone not in self.backbones:
+            raise ValueError(f"backbone must be one of {sorted(self.backbones)}, not {backbone!r}")
         check_value("actor_kwargs", actor_kwargs, DICT)
         check_value("critic_optimizer_kwargs", critic_optimizer_kwargs, DICT)
         actor_kwargs = dict(actor_kwargs or {})
-        of_noise = ("exploration_noise", "target_noise", "target_noise_clip")
-        allowed = of_noise if backbone == "td3" else GAUSSIAN_ARGUMENTS
+        allowed = self.backbones[backbone].ARGUMENTS
         for name in actor_kwargs:
             if name not in allowed:
                 raise ValueError(f"actor_kwargs has {name!r}, but backbone={backbone!r} takes {allowed}")
-        self._actor_class, self._actor_args = BACKBONES[backbone], (actor_args, actor_kwargs)
+        self._actor_class, self._actor_args = self.backbones[backbone], (actor_args, actor_kwargs)
         self._critic_args = critic_args
         self.share_features_extractor = share_features_extractor
+        self.encodes_once, self.encodes_next_once = actor_features == "before", target_encoder == "online"
         if share_features_extractor:
             self.critic = critics()
         self.actor = self.make_actor()
         #: The actor of the TD targets: a Polyak average with "td3", the actor itself with "sac".
         self.actor_target: Actor | None = None
-        if isinstance(self.actor, DeterministicActor):
+        if isinstance(self.actor, DeterministicActor) and self.actor.has_target:
             self.actor_target = copy.deepcopy(self.actor).requires_grad_(False)
             self._share_norm(self.actor_target)
             self.actor_target.set_training_mode(False)
         if not share_features_extractor:
             self.critic = critics()
-        self.critic_target = critics()
-        self.critic_target.load_state_dict(self.critic.state_dict())
+        self.critic_target = critics(self.critic.features_extractor if target_encoder == "online" else None)
+        own = self.critic_target.state_dict().keys()
+        self.critic_target.load_state_dict({k: v for k, v in self.critic.state_dict().items() if k in own})
         self.critic_target.requires_grad_(False)
         self.critic_target.set_training_mode(False)
         if share_features_extractor and self.actor_target is not None:
             assert self.critic_target.features_extractor is not None
             self.actor_target.share(self.critic_target.features_extractor)
         self.actor.optimizer = self.make_optimizer(self.actor.parameters(), lr_schedule(1))
-        self.critic.optimizer = self.make_optimizer(
-            self.critic.parameters(), lr_schedule(1), **(critic_optimizer_kwargs or {})
-        )
+        parameters: Any = list(self.critic.parameters())
+        if encoder_learning_rate is not None:
+            n = len(list(self.encoders()[0].parameters()))
+            of_encoder = {"params": parameters[:n], "lr": encoder_learning_rate, "scheduled": False}
+            parameters = [of_encoder, {"params": parameters[n:]}]
+        self.critic.optimizer = self.make_optimizer(parameters, lr_schedule(1), **(critic_optimizer_kwargs or {}))
+        if self.critic.trunk.stacks_rows is not None and (self.encodes_once or self.encodes_next_once):
+            raise ValueError(
+                f"target_encoder={target_encoder!r} and actor_features={actor_features!r} encode current and next "
+                f"observations apart, and {type(self.critic.trunk).__name__} stacks them: leave them out"
+            )
         targets = [self.critic_target.trunk] if self.critic_target.trunk.trains_in_target else []
         self._mode_switch = ModeSwitch(self.actor, self.critic, *targets)
         self._constructor_args: dict[str, Any] = dict(
@@ -197,7 +240,30 @@ class SACPolicy(BasePolicy):
             share_features_extractor=share_features_extractor,
             normalize_observations=normalize_observations,
             width_factor=width_factor,
+            target_encoder=target_encoder,
+            actor_features=actor_features,
+            encoder_learning_rate=encoder_learning_rate,
+            projection=projection,
+            projection_gain=projection_gain,
         )
+
+    def _projected(
+        self, args: tuple[type[Network], dict[str, Any]], extractor: BaseFeaturesExtractor
+    ) -> tuple[type[Network], dict[str, Any]]:
+        """Class and arguments of a trunk that reads an extractor's features, behind the projection if there is one."""
+        width, gain = self._projection
+        if width is None:
+            return args
+        network, kwargs = args
+        behind = {"network": network, "network_kwargs": kwargs}
+        return Projected, {"n_features": extractor.features_dim, "width": width, "gain": gain, **behind}
+
+    def encoders(self) -> list[nn.Module]:
+        """
+        :return: encoders that a reset may keep: that of the critics, and that of their targets, if they have their own
+        """
+        critics = (self.critic, self.critic_target)
+        return [critic.features_extractor for critic in critics if not critic.shares_encoder]  # type: ignore[misc]
 
     def _share_norm(self, network: Any) -> None:
         """Have a network read observations through the policy's own normalisation, which is in the policy's state."""
@@ -215,7 +281,7 @@ class SACPolicy(BasePolicy):
         actor = self._actor_class(
             self.observation_space,
             self.action_space,
-            *args,
+            *self._projected(args, extractor),
             features_extractor=extractor,
             normalize_images=self.normalize_images,
             shares_encoder=shared,
@@ -228,11 +294,12 @@ class SACPolicy(BasePolicy):
         """
         :return: a value network with the critics' settings, a features extractor of its own included
         """
+        extractor = self.make_features_extractor()
         value = ValueNetwork(
             self.observation_space,
             self.action_space,
-            *self._critic_args,
-            features_extractor=self.make_features_extractor(),
+            *self._projected(self._critic_args, extractor),
+            features_extractor=extractor,
             normalize_images=self.normalize_images,
         )
         self._share_norm(value)
@@ -255,7 +322,16 @@ class SACPolicy(BasePolicy):
         :param obs: observations, (B, O), or a dict of them
         :return: their features, without gradient, if there is a shared encoder; else the observations
         """
+        if isinstance(obs, Encoded):
+            return Encoded(obs.features.detach())
         return Encoded(self.actor.features(obs)) if self.share_features_extractor else obs
+
+    def features(self, obs: Any) -> torch.Tensor:
+        """
+        :param obs: observations, (B, O), or a dict of them
+        :return: the critics' features of them, (B, F), with a gradient to their encoder
+        """
+        return self.critic.features(obs)
 
     def next_actions(self, obs: PyTorchObs, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """

@@ -32,7 +32,10 @@ MAX_OTHER, MAX_OTHER_HER = 20_000_000, 1_000_000
 #: What belongs to the model and its environment.
 _NOT_SAVED = ("device", "env")
 #: Arguments with which a buffer is made again that gives and takes its own state.
-_ARGUMENTS = ("buffer_size", "n_envs", "handle_timeout_termination", "validation_proportion", "horizon")
+_ARGUMENTS = (
+    "buffer_size", "n_envs", "handle_timeout_termination", "validation_proportion", "horizon", "frame_stack", "n_steps",
+    "gamma",
+)  # fmt: skip
 _ARRAYS = (np.ndarray, torch.Tensor)
 
 

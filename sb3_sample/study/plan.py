@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import numpy as np
 import yaml
 
 from sb3_sample.envs.suites import SUITES
@@ -742,5 +743,11 @@ def _make(algo: str, arguments: dict[str, Any]) -> None:
     default = yaml.safe_load((HYPERPARAMS / f"{algo}.yml").read_text())["default"]
     settings = {name: value for name, value in default.items() if name in known and not isinstance(value, str)}
     settings = ExperimentManager._preprocess_schedules({**settings, **arguments})
-    settings.setdefault("policy", "MlpPolicy")
-    _algorithms()[algo].algorithm(env="Pendulum-v1", device="cpu", **settings)
+    algorithm = _algorithms()[algo].algorithm
+    on: dict[str, Any] = {"policy": "MlpPolicy", "env": "Pendulum-v1"}
+    if "MlpPolicy" not in algorithm.policy_aliases:
+        # From pictures alone, of which nothing is stored here.
+        pictures, actions = gym.spaces.Box(0, 255, (3, 64, 64), np.uint8), gym.spaces.Box(-1, 1, (1,), np.float32)
+        on = {"policy": "CnnPolicy", "env": None, "observation_space": pictures, "action_space": actions}
+        settings["buffer_size"] = 1
+    algorithm(**{**on, "device": "cpu", **settings})

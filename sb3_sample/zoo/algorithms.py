@@ -12,7 +12,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO, RewoundPPO
 from sb3_sample.replay.buffers import DeviceReplayBuffer
-from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
+from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactNStepReplayBuffer, CompactReplayBuffer
 from sb3_sample.replay.weighted import (
     FadedDictReplayBuffer,
     FadedReplayBuffer,
@@ -40,6 +40,8 @@ from sb3_sample.sac import (
     BROFast,
     CrossQ,
     DebiasedRQ,
+    DrQ,
+    DrQv2,
     FlashSAC,
     RegularizedSAC,
     SimBa,
@@ -59,6 +61,7 @@ BUFFERS: dict[str, type[ReplayBuffer]] = {
     cls.__name__: cls
     for cls in (
         CompactDictReplayBuffer,
+        CompactNStepReplayBuffer,
         CompactReplayBuffer,
         DeviceReplayBuffer,
         FadedDictReplayBuffer,
@@ -96,6 +99,8 @@ ALGORITHMS: dict[str, ZooAlgorithm] = {
     "crossq": ZooAlgorithm(CrossQ, search.CROSSQ_SPACE),
     "dac": ZooAlgorithm(DAC, search.DAC_SPACE),
     "dr_q": ZooAlgorithm(DebiasedRQ, search.DR_Q_SPACE),
+    "drq": ZooAlgorithm(DrQ, search.DRQ_SPACE),
+    "drqv2": ZooAlgorithm(DrQv2, search.DRQV2_SPACE),
     "flash_sac": ZooAlgorithm(FlashSAC, search.FLASH_SPACE),
     "gpl_sac": ZooAlgorithm(GPLSAC, search.GPL_SPACE),
     "iql": ZooAlgorithm(IQL, search.IQL_SPACE),

@@ -161,6 +161,14 @@ DR_Q_SPACE: Space = {
     "infonce_weight": _float(0.01, 1.0, log=True),
     "weight_decay": _float(1e-4, 1e-1, log=True),
 }
+#: From pixels. The replay ratio is what a trial's time goes into.
+DRQ_SPACE: Space = {**OFF_POLICY_SPACE, "pessimism": _float(0.0, 1.0), "policy_delay": _int(1, 4)}
+DRQV2_SPACE: Space = {
+    **OFF_POLICY_SPACE,
+    "pessimism": _float(0.0, 1.0),
+    "n_steps": _int(1, 5),
+    "noise_clip": _float(0.1, 1.0, log=True),
+}
 #: Agents that learn from data. A search learns in the environment, with ``--prior-data`` if given; BC, which does not
 #: learn there, is not searched, and has a space for whoever samples of it.
 BC_SPACE: Space = {name: OFF_POLICY_SPACE[name] for name in ("learning_rate", "batch_size_pow")}

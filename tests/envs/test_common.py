@@ -1,7 +1,5 @@
 """What holds for the environments of all suites."""
 
-import subprocess
-import sys
 import warnings
 
 import gymnasium as gym
@@ -93,22 +91,6 @@ def test_the_two_ways_to_make_an_environment_are_the_same(env_id: str) -> None:
 def test_wrong_render_arguments_are_named(env_id: str, argument: dict) -> None:
     with pytest.raises(ValueError, match=next(iter(argument))):
         make_env(env_id, **argument)
-
-
-@pytest.fixture(scope="module")
-def opengl() -> None:
-    """Skip where MuJoCo cannot open an OpenGL context at all (asked in a process of its own: it may crash)."""
-    code = (
-        "from sb3_sample.envs.base import select_gl_backend\n"
-        "select_gl_backend()\n"
-        "import mujoco\n"
-        "renderer = mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 16, 16)\n"
-        "renderer.update_scene(mujoco.MjData(renderer.model))\n"
-        "renderer.render()\n"
-    )
-    probe = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    if probe.returncode != 0:
-        pytest.skip(f"MuJoCo cannot draw here: {probe.stderr[-300:]}")
 
 
 @pytest.mark.parametrize("env_id", ["dmc/cheetah-run-v0", "metaworld/reach-v3", "myosuite/pose-v0"])

@@ -14,7 +14,7 @@ from sb3_sample.learner.execution import CapturedActing, Execution, inputs_like
 from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.pessimism import LearnedPessimism
-from tests.sac.common import COMPILES, MAKERS, random_batch, sac, state
+from tests.sac.common import COMPILES, MAKERS, PIXEL_MAKERS, random_batch, sac, state
 from tests.sac.test_execution import FEW_STEPS, ROUNDING, TOLERANCE, WITHOUT_GRADIENT, Recorder
 
 
@@ -81,7 +81,9 @@ def models_of(maker: str, n: int, **kwargs: Any) -> list[Any]:
     starts = 70 if maker == "DebiasedRQ" else 60
     models = []
     for seed in range(n):
-        model = MAKERS[maker](**{"learning_starts": starts, "compile": False, "seed": seed, **kwargs})
+        model = {**MAKERS, **PIXEL_MAKERS}[maker](
+            **{"learning_starts": starts, "compile": False, "seed": seed, **kwargs}
+        )
         models.append(model.learn(60))
         model.planned_updates = 50
     return models
@@ -94,6 +96,11 @@ def take(model: Any, n: int, around: Callable[[Callable[[], Any], int], Any] = l
         seed = 1_000 * (model.seed or 0) + i
         generator = torch.Generator().manual_seed(seed)
         noise = Noise(*(torch.randn(shape, generator=generator) for _ in range(3)))
+        if len(model.transforms) > 0:
+            k, m = learner.target_copies, learner.online_copies
+            offsets = torch.randint(3, ((k + m) * 8, 2), generator=generator)
+            critic = torch.randn(8 * k, shape[1], generator=generator)
+            noise = noise._replace(critic=critic, transforms=(offsets,))
         extra = None
         if isinstance(learner.pessimism_rule, LearnedPessimism):
             extra = Extra(random_batch(model, seed=seed + 500), torch.zeros(8, 1))
@@ -131,7 +138,13 @@ def assert_alike(maker: str, ours: Sequence[Any], theirs: Sequence[Any]) -> None
         assert of_parameters < tolerance and of_moments < 10 * tolerance
 
 
-@pytest.mark.parametrize("maker", [name for name in MAKERS if name not in REFUSED])
+@pytest.mark.parametrize(
+    "maker",
+    [
+        *(name for name in MAKERS if name not in REFUSED),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in PIXEL_MAKERS),
+    ],
+)
 def test_each_is_what_it_is_alone(maker: str) -> None:
     alone, others = models_of(maker, 3), models_of(maker, 3)
     n = FEW_STEPS.get(maker, 50)

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from sb3_sample import BRO, DAC, SAC, TOPSAC, VPLSAC, Dataset
 from sb3_sample.learner import Learner
 from sb3_sample.learner.batch import Extra, Noise
-from tests.sac.common import MAKERS, random_batch
+from tests.sac.common import MAKERS, PIXEL_MAKERS, random_batch
 
 OBSERVATIONS, ACTIONS = spaces.Box(-np.inf, np.inf, (3,), np.float32), spaces.Box(-2, 2, (2,), np.float32)
 TINY: dict[Any, dict[str, Any]] = {
@@ -64,10 +64,11 @@ def same(first: Learner, second: Learner) -> bool:
 # ---------------------------------------------------------------- the one inside a model
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", [*MAKERS, *PIXEL_MAKERS])
 def test_a_models_steps_are_its_learners(maker: str) -> None:
     """The same batches and noise by ``model._update`` and by a copy of ``model.learner``."""
-    model, other = MAKERS[maker](), MAKERS[maker]()
+    make = {**MAKERS, **PIXEL_MAKERS}[maker]
+    model, other = make(), make()
     assert isinstance(model.learner, Learner) and model.learner is not other.learner
     assert model.actor is model.learner.actor and model.critic_target is model.learner.critic_target
     for step in range(3):

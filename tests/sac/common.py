@@ -32,11 +32,14 @@ from sb3_sample.sac import (
     BROFast,
     CrossQ,
     DebiasedRQ,
+    DrQ,
+    DrQv2,
     FlashSAC,
     RegularizedSAC,
     SimBa,
     SimbaV2,
 )
+from tests.sac.pixels import TINY_DRQ, Pictures
 
 #: Of tests whose gradient step is compiled.
 COMPILES = pytest.mark.skipif(old_torch() is not None, reason="compiling needs a newer torch")
@@ -203,6 +206,17 @@ def _maker(make: Callable[..., Any], cls: type[SAC], **defaults: Any) -> Callabl
     return lambda env=None, **kwargs: make(env, **{"cls": cls, **defaults, **kwargs})
 
 
+def from_pixels(cls: type[SAC], **defaults: Any) -> Callable[..., Any]:
+    """Maker of a tiny algorithm that learns from images, of flat observations drawn as pictures if there are none."""
+
+    def make(env: Any = None, cls: type[SAC] = cls, policy: str = "CnnPolicy", **kwargs: Any) -> Any:
+        env = vec() if env is None else DummyVecEnv([lambda: Monitor(gym.make(env))]) if isinstance(env, str) else env
+        env = Pictures(env) if len(env.observation_space.shape or ()) == 1 else env
+        return cls(policy, env, **{**TINY_SAC, **TINY_DRQ, **defaults, **kwargs})
+
+    return make
+
+
 #: Every algorithm, by its name: tiny, and with what it does happening within a few steps.
 MAKERS: dict[str, Callable[..., Any]] = {
     "SAC": sac,
@@ -242,6 +256,11 @@ MAKERS: dict[str, Callable[..., Any]] = {
     "CrossQ+WN": _maker(sac, CrossQ, weight_norm=True),
     "XQC": _maker(sac, XQC),
     "FlashSAC": _maker(sac, FlashSAC, policy_kwargs=TINY_FLASH),
+}
+#: Those that learn from images, where observations are no vectors.
+PIXEL_MAKERS: dict[str, Callable[..., Any]] = {
+    "DrQ": from_pixels(DrQ),
+    "DrQv2": from_pixels(DrQv2, noise_schedule=(1.0, 0.1, 20)),
 }
 #: One of each kind of part, for the slower tests.
 REPRESENTATIVE = ["SAC", "BRO", "BROTD3", "DAC", "VPLSAC", "OPLSAC", "TOPSAC", "RegularizedSAC", "DebiasedRQ"]
@@ -292,11 +311,17 @@ def random_batch(model: SAC, n: int = 8, seed: int = 0) -> Any:
 
     g = torch.Generator().manual_seed(seed)
     assert model.observation_space.shape is not None
-    o, a = model.observation_space.shape[0], model.actor.action_dim
+    shape, a = model.observation_space.shape, model.actor.action_dim
+
+    def observations() -> torch.Tensor:
+        if len(shape) == 3:
+            return torch.randint(256, (n, *shape), generator=g, dtype=torch.uint8)
+        return torch.randn(n, *shape, generator=g)
+
     return Batch(
-        torch.randn(n, o, generator=g),
+        observations(),
         torch.rand(n, a, generator=g) * 2 - 1,
-        torch.randn(n, o, generator=g),
+        observations(),
         (torch.rand(n, 1, generator=g) < 0.2).float(),
         torch.randn(n, 1, generator=g),
         model.gamma,

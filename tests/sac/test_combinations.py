@@ -211,6 +211,31 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
         for cls in (BC, IQL)
         for network in ("flash", "simbav2", "xqc")
     ],
+    "`augmentation`, `DrQ`, `DrQv2` with observations other than one uint8 image; `augmentation` with `DebiasedRQ`": [
+        (SAC, {"augmentation": "shift"}, ("augmentation='shift'", "one image")),
+        (DebiasedRQ, {"augmentation": "shift"}, ("DebiasedRQ has augmentation=None",)),
+    ],
+    "`resets_keep` without resets, or without `share_features_extractor`": [
+        (SAC, {"resets_keep": ("encoder",)}, ("resets_keep", "no resets")),
+        (SAC, {"resets": 5, "resets_keep": ("encoder",)}, ("resets_keep", "share_features_extractor=True")),
+    ],
+    "`target_encoder`, `actor_features`, `encoder_learning_rate` without `share_features_extractor`, the first two "
+    "with networks that stack rows": [
+        (SAC, {"policy_kwargs": {"target_encoder": "online"}}, ("target_encoder", "share_features_extractor=True")),
+        (
+            SAC,
+            {"policy_kwargs": {"encoder_learning_rate": 1e-4}},
+            ("encoder_learning_rate", "share_features_extractor"),
+        ),
+        (
+            CrossQ,
+            {"policy_kwargs": {"share_features_extractor": True, "actor_features": "before"}},
+            ("actor_features='before'", "CrossQNet"),
+        ),
+    ],
+    '`exploration="scheduled_noise"` with another class than `DrQv2`': [
+        (SAC, {"exploration": "scheduled_noise"}, ("scheduled_noise", "DrQv2")),
+    ],
     "`value_head` with `n_quantiles`, `value_head_kwargs` without `value_head`": [
         (SAC, {"value_head": ValueHead, "n_quantiles": 5}, ("value_head", "n_quantiles=None")),
         (SAC, {"value_head_kwargs": {"a": 1}}, ("value_head_kwargs", "value_head=None")),

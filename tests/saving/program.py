@@ -47,7 +47,8 @@ from sb3_sample.saving import training_state, vec_envs
 from sb3_sample.saving.callbacks import walk
 from sb3_sample.saving.folders import Folder
 from tests.ppo.common import TINY, TINY_MODELS, arguments_of
-from tests.sac.common import MAKERS
+from tests.sac.common import MAKERS, PIXEL_MAKERS
+from tests.sac.pixels import Frames
 
 PPOS = {"MBMA": MBMAPPO, "QMA": QMAPPO, "MBPO": MBPOPPO, "rewound": RewoundPPO}
 
@@ -83,6 +84,8 @@ def make(env: str) -> gym.Env:
     """A monitored environment by its id, with short episodes."""
     if env == "goal":
         return Monitor(Goal())
+    if env == "frames":
+        return Monitor(Frames())
     return Monitor(make_env(env) if env.startswith("dmc/") else make_env(env, max_episode_steps=30))
 
 
@@ -116,7 +119,7 @@ def model(algorithm: str, folder: str, env: dict[str, Any], **kwargs: Any) -> An
         kwargs["replay_buffer_class"] = buffers[kwargs.pop("buffer")]
     if kwargs.pop("noise", False):
         kwargs["action_noise"] = OrnsteinUhlenbeckActionNoise(np.zeros(1), np.full(1, 0.3))
-    return MAKERS[algorithm](venv, **kwargs)
+    return {**MAKERS, **PIXEL_MAKERS}[algorithm](venv, **kwargs)
 
 
 def callbacks(folder: str, env: dict[str, Any], evaluate: bool = False, diagnose: bool = False) -> Any:

@@ -36,6 +36,8 @@ SLOW: dict[str, dict[str, Any]] = {
        for env in ("dmc/cartpole-swingup-v0", "metaworld/push-v3", "Hopper-v5")},
     **{f"SAC, workers, {env}": {"algorithm": "SAC", "env": {"env": env, **WORKERS4}}
        for env in ("dmc/reacher-easy-v0", "metaworld/pick-place-v3", "Ant-v5")},
+    "DrQ": {"algorithm": "DrQ", "env": {"env": "frames"}, "kwargs": {"resets": 40, "resets_keep": ("encoder",)}},
+    "DrQv2, ring, workers": {"algorithm": "DrQv2", "env": {"env": "frames", **WORKERS4}, "kwargs": {"buffer_size": 70}},
     "workers by forkserver": {"algorithm": "SAC", "env": {"n": 2, "workers": "forkserver"}},
     "normalized": {"algorithm": "SAC", "env": NORMALIZED, "evaluate": True},
     "normalized, PPO": {"algorithm": "MBMA", "env": NORMALIZED, "evaluate": True},

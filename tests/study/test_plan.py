@@ -210,9 +210,10 @@ def test_groups_and_factors_come_with_the_folder(plan_of, tmp_path: Path) -> Non
 
 #: Plans with many agents or large critics, each of which is made once to have its arguments checked.
 MANY = {
-    "bro_ablation", "bro_offline_adroit", "bro_scaling", "bro_scaling_small", "mbma", "mbma_figure1", "mbma_small",
-    "mbma_table1", "regularization",
-    "regularization_small", "scaling_dmc", "scaling_dmc_small", "scaling_gym", "scaling_gym_small",
+    "bro_ablation", "bro_offline_adroit", "bro_scaling", "bro_scaling_small", "drq", "mbma", "mbma_figure1", "mbma_small",
+    "mbma_table1", "regularization", "regularization_pixels", "regularization_pixels_humanoid",
+    "regularization_pixels_humanoid_small", "regularization_pixels_small", "regularization_small", "scaling_dmc",
+    "scaling_dmc_small", "scaling_gym", "scaling_gym_small",
 }  # fmt: skip
 #: Runs of the papers' studies: agents, tasks and seeds as the papers state them.
 RUNS = {
@@ -232,6 +233,8 @@ RUNS = {
     "mbma": 4 * 14 * 15,
     "mbma_figure1": 4 * 4 * 45,
     "mbma_table1": 2 * 6 * 10,
+    "regularization_pixels": 4 * 3 * 3,
+    "regularization_pixels_humanoid": 4 * 3 * 3,
     "mbma_quadruped": 3 * 2 * 8,
     "mbma_humanoid": 3 * 2 * 8,
     "scaling_dmc": 4 * 5 * 4 * 7 * 10,
@@ -252,7 +255,8 @@ def test_the_plans_that_come_with_it_are_good(path: Path) -> None:
     if path.parent.name == "papers":
         assert len(plan.runs) == RUNS[path.stem] and f"{len(plan.runs):,} runs of" in text
         assert f"| {len(plan.runs):,}" in (ROOT / "docs/studies.md").read_text()
-        if not path.stem.startswith("mbma"):  # counted in steps of the simulator, or shorter
+        # Others are counted in steps of the simulator, or shorter.
+        if not path.stem.startswith(("mbma", "regularization_pixels")):
             assert {run.steps for run in plan.runs} == {500_000 if "half a million" in text else 1_000_000}
     elif path.stem.endswith("_small"):
         assert f"{len(plan.runs)} runs of" in text and f"papers/{path.stem.removesuffix('_small')}.yml" in text
