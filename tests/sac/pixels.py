@@ -35,10 +35,9 @@ class Frames(gym.Env[np.ndarray, np.ndarray]):
     :param length: steps of an episode, by truncation
     """
 
-    action_space = spaces.Box(-1, 1, (2,), np.float32)
-
     def __init__(self, frame_stack: int = 3, size: int = 8, channels: int = 1, length: int = 7):
         self.stacked_frames, self.size, self.channels, self.length = frame_stack, size, channels, length
+        self.action_space = spaces.Box(-1, 1, (2,), np.float32)
         self.observation_space = spaces.Box(0, 255, (frame_stack * channels, size, size), np.uint8)
 
     def _frame(self) -> np.ndarray:
