@@ -133,7 +133,8 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     """
     Make an environment by its id: the same as ``gym.make(f"sb3_sample:{env_id}", **kwargs)``.
 
-    :param env_id: An id of this package (``dmc/…``, ``metaworld/…``, ``myosuite/…``) or any that Gymnasium knows.
+    :param env_id: An id of this package (``dmc/…``, ``metaworld/…``, ``myosuite/…``), of an Atari game
+        (``ALE/…``; bare, without the wrappers of ``make_atari_env``) or any that Gymnasium knows.
     :param kwargs: Arguments of ``gym.make`` (``render_mode``, ``max_episode_steps``) and of the environment
         (``action_repeat`` for ``dmc/``; ``width``, ``height``, ``camera``).
     :return: The environment.
@@ -142,6 +143,10 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     """
     register_all()
     env_id = env_id.removeprefix(f"{PACKAGE}:")
+    if env_id.startswith("ALE/"):
+        from sb3_sample.envs.atari import register_atari
+
+        register_atari()
     try:
         return gym.make(env_id, **kwargs)
     except (gym.error.UnregisteredEnv, gym.error.DeprecatedEnv) as error:
