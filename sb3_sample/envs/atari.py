@@ -1,8 +1,8 @@
 """
-Atari games (``ALE/<Game>-v5``) as value learners see them: four gray frames of 84 x 84, one decision every four frames.
+Atari games (``ALE/<Game>-v5``) as value learners see them: stacks of gray frames, one decision every four frames.
 
-The wrappers are Stable-Baselines3's, without ``FireResetEnv``, as in Dopamine; the screen is the console's own gray one,
-as there. OpenCV is not needed: reducing a picture by areas is a product with two small matrices.
+The wrappers are Stable-Baselines3's, without ``FireResetEnv``, as in Dopamine; the screen is the console's own gray
+one, as there. OpenCV is not needed: reducing a picture by areas is a product with two small matrices.
 """
 
 from typing import Any
@@ -19,7 +19,7 @@ from sb3_sample.kinds import TRUE_OR_FALSE, check_value, integer
 
 #: Namespace of the games' ids.
 NAMESPACE = "ALE/"
-#: Arguments of ``gym.make`` with which :class:`AtariFrames` does the rest: every frame, every action, ALE's gray screen.
+#: Arguments of ``gym.make`` with which :class:`AtariFrames` does the rest: every frame, the gray screen.
 ENV_KWARGS: dict[str, Any] = {
     "frameskip": 1,
     "repeat_action_probability": 0.0,
@@ -68,7 +68,7 @@ def make_atari_env(env_id: str, training: bool = True, noop_max: int | None = 30
         for evaluation. ``Monitor``, inside of the wrappers, reports returns of whole games with rewards as they are
     :param noop_max: frames without an action after a reset, at most (drawn from 1 on); None for none
     :param kwargs: arguments of ``gym.make`` (``render_mode``) and of the game (``mode``, ``difficulty``)
-    :return: the environment; observations are uint8, (4, 84, 84), the newest frame last, zeros before an episode's start
+    :return: the environment; observations are uint8, (4, 84, 84), the newest frame last, zeros before an episode
     :raises ImportError: ``ale-py`` is not installed
     :raises gymnasium.error.UnregisteredEnv: there is no such game; the message names the closest ones
     :raises ValueError: ``env_id`` is of another suite, or an argument is out of range
@@ -77,7 +77,7 @@ def make_atari_env(env_id: str, training: bool = True, noop_max: int | None = 30
         raise ValueError(f"env_id must be the id of an Atari game, {NAMESPACE}<Game>-v5, not {env_id!r}")
     from sb3_sample.envs.registration import make_env
 
-    env = Monitor(make_env(env_id, **{**ENV_KWARGS, **kwargs}))
+    env: Any = Monitor(make_env(env_id, **{**ENV_KWARGS, **kwargs}))
     return AtariFrames(env, noop_max=noop_max, episodic_life=training, clip_reward=training)
 
 

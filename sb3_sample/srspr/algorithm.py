@@ -112,10 +112,14 @@ class SRSPR(SRSPRArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  
         self._watch = MetricWatch(self.device)
 
     def _check_arguments(self) -> None:
-        space = getattr(self, "observation_space", None)
-        if space is not None:
-            _check_observations(space, self.frame_stack)
         check_every(self)
+        shape = self.observation_space.shape
+        assert shape is not None
+        if min(shape[1:]) < 8 or shape[0] % self.frame_stack:
+            raise NotAllowed(
+                f"env has observations of shape {shape}: their first axis must be frame_stack={self.frame_stack} "
+                "frames, and their sides at least 8 pixels. Stable-Baselines3's VecFrameStack stacks single pictures"
+            )
         if not self.v_min < self.v_max:
             raise ValueError(f"v_min must be below v_max, not v_min={self.v_min} and v_max={self.v_max}")
 
@@ -159,6 +163,13 @@ class SRSPR(SRSPRArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  
         space = env.action_space
         if not isinstance(space, spaces.Discrete) or space.start != 0:
             raise NotAllowed(f"env must have Discrete actions that count from 0, not {space}: BRO is for Box actions")
+        seen = env.observation_space
+        if not isinstance(seen, spaces.Box) or not is_image_space(seen, check_channels=False):
+            raise NotAllowed(
+                "env must have observations that are stacks of frames, uint8 in [0, 255], (frame_stack * C, height, "
+                f"width), not {seen}: make_atari_env gives them, and Stable-Baselines3's VecFrameStack makes them of "
+                "single pictures"
+            )
         return Resumable._wrap_env(env, verbose, monitor_wrapper)
 
     def _excluded_save_params(self) -> list[str]:
@@ -424,18 +435,3 @@ class SRSPR(SRSPRArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  
 def _made(env: Any) -> Any:
     """The environment of an id of an Atari game, with its wrappers; anything else as it is."""
     return make_atari_env(env) if is_atari_id(env) else env
-
-
-def _check_observations(space: spaces.Space, frame_stack: int) -> None:
-    fits = isinstance(space, spaces.Box) and is_image_space(space, check_channels=False)
-    if not fits or not isinstance(space, spaces.Box):
-        raise NotAllowed(
-            "env must have observations that are stacks of frames, uint8 in [0, 255], (frame_stack * C, height, "
-            f"width), not {space}: make_atari_env and dmc/ with pixels=84 give them, and Stable-Baselines3's "
-            "VecFrameStack makes them of single pictures"
-        )
-    if min(space.shape[1:]) < 8 or space.shape[0] % frame_stack:
-        raise NotAllowed(
-            f"env has observations of shape {space.shape}: their first axis must be frame_stack={frame_stack} frames, "
-            "and their sides at least 8 pixels"
-        )
