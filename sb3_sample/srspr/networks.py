@@ -233,6 +233,7 @@ class SPRNetwork(nn.Module):
         noisy: bool = False,
     ):
         super().__init__()
+        self.noisy = noisy
         dense: Callable[[int, int], nn.Module] = NoisyLinear if noisy else nn.Linear
         self.encoder = Encoder(shape, channels)
         self.transition = TransitionModel(channels[-1], n_actions)
@@ -251,7 +252,7 @@ class SPRNetwork(nn.Module):
 
         :return: the layers; none if the network has no noise
         """
-        return (module for module in self.modules() if isinstance(module, NoisyLinear))
+        return (module for module in (self.modules() if self.noisy else ()) if isinstance(module, NoisyLinear))
 
     def project(self, latent: torch.Tensor) -> torch.Tensor:
         """

@@ -20,8 +20,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import numpy as np
 import yaml
+from gymnasium import spaces
 
+from sb3_sample.envs.atari import is_atari_id, register_atari
+from sb3_sample.envs.no_environment import NoEnvironment
 from sb3_sample.envs.suites import SUITES
 from sb3_sample.kinds import check_value
 from sb3_sample.shallow_yaml import ShallowLoader
@@ -603,6 +607,11 @@ class _Reader:
                 line = written[name].start_mark.line + 1
                 raise self._fail(each, f"task {name!r} is there twice: once on line {line}. Each can be there once")
             written[name] = each
+            if is_atari_id(name):
+                try:
+                    register_atari()
+                except ImportError as error:
+                    raise self._fail(each, str(error)) from error
             suite = SUITES.get(name.upper().replace("-", "_"))
             if suite is None and name not in gym.registry:
                 close = difflib.get_close_matches(name, [*gym.registry, *SUITES], 5, 0.5)
@@ -739,8 +748,15 @@ def _make(algo: str, arguments: dict[str, Any]) -> None:
 
     arguments = {name: constructor_value(name, value) for name, value in arguments.items()}
     known = constructor_arguments(algo)
-    default = yaml.safe_load((HYPERPARAMS / f"{algo}.yml").read_text())["default"]
+    entries = yaml.safe_load((HYPERPARAMS / f"{algo}.yml").read_text())
+    default = entries.get("default") or entries["atari"]
     settings = {name: value for name, value in default.items() if name in known and not isinstance(value, str)}
     settings = ExperimentManager._preprocess_schedules({**settings, **arguments})
-    settings.setdefault("policy", "MlpPolicy")
-    _algorithms()[algo].algorithm(env="Pendulum-v1", device="cpu", **settings)
+    algorithm: Any = _algorithms()[algo].algorithm
+    env: Any = "Pendulum-v1"
+    if "MlpPolicy" in algorithm.policy_aliases:
+        settings.setdefault("policy", "MlpPolicy")
+    else:
+        settings = {"policy": "CnnPolicy", "buffer_size": 1_000, **settings}
+        env = NoEnvironment(spaces.Box(0, 255, (4, 84, 84), np.uint8), spaces.Discrete(3))
+    algorithm(env=env, device="cpu", **settings)

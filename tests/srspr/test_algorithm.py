@@ -101,7 +101,7 @@ def test_updates_then_the_reset_then_the_next_decision() -> None:
     assert at[20] == (2 * 9, 0) and at[21] == (2 * 10, 1)
     # Of 90 decisions: 20, 40, 60; after 80, no whole interval is left.
     assert [at[step][1] for step in (41, 61, 81, 90)] == [2, 3, 3, 3] and model.n_resets == 3
-    assert tiny(reset_interval=20, learning_starts=200).learn(100).n_resets == 4
+    assert tiny(reset_interval=20, replay_ratio=0).learn(100).n_resets == 4
 
 
 def test_a_reset_makes_heads_anew_and_shrinks_the_rest() -> None:
@@ -129,6 +129,7 @@ def test_a_reset_makes_heads_anew_and_shrinks_the_rest() -> None:
     model.train(2)
 
 
+@pytest.mark.slow
 def test_it_learns_the_small_world() -> None:
     torch.manual_seed(0)
     model = tiny(learning_rate=3e-3, learning_starts=60, replay_ratio=2, batch_size=16, gamma=0.5, tau=0.05,
@@ -217,7 +218,7 @@ class Stop(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize("at", [33, 52])
+@pytest.mark.parametrize("at", [pytest.param(33, marks=pytest.mark.slow), 52])
 def test_a_run_that_goes_on_ends_as_one_without_interruption(at: int, tmp_path: Path) -> None:
     """Also after a reset, which it does not repeat, and with a buffer that is full."""
     kwargs: dict[str, Any] = {"reset_interval": 25, "learning_starts": 15, "buffer_size": 50}
