@@ -182,7 +182,10 @@ def test_captured_is_eager() -> None:
         model.learner.reset(0.5)
         model.learn(5, reset_num_timesteps=False)
     assert recorder.n_repetitions == 2 * 15 - 3 and recorder.n_recordings == 2
-    assert same(parameters(models[0]), parameters(models[1]))
+    first, second = map(parameters, models)
+    for name in first:
+        # Learning rates are float32 there.
+        assert torch.allclose(first[name], second[name], atol=3e-5), name
 
 
 @pytest.mark.parametrize("kwargs", [{"network": "bronet", "reset_interval": 20}, {"noisy": True}])
@@ -222,10 +225,10 @@ class Stop(BaseCallback):
 def test_a_run_that_goes_on_ends_as_one_without_interruption(at: int, tmp_path: Path) -> None:
     """Also after a reset, which it does not repeat, and with a buffer that is full."""
     kwargs: dict[str, Any] = {"reset_interval": 25, "learning_starts": 15, "buffer_size": 50}
-    whole = tiny(venv(1), **kwargs).learn(80, checkpoint=tmp_path / "whole", checkpoint_freq=10)
+    whole = tiny(venv(1), **kwargs).learn(80, Stop(-1), checkpoint=tmp_path / "whole", checkpoint_freq=10)
     with pytest.raises(KeyboardInterrupt):
         tiny(venv(1), **kwargs).learn(80, Stop(at), checkpoint=tmp_path / "run", checkpoint_freq=10)
-    resumed = tiny(venv(1), **kwargs).learn(80, checkpoint=tmp_path / "run", checkpoint_freq=10)
+    resumed = tiny(venv(1), **kwargs).learn(80, Stop(-1), checkpoint=tmp_path / "run", checkpoint_freq=10)
     assert resumed.n_resets == whole.n_resets == 2 and resumed._n_updates == whole._n_updates
     assert same(parameters(whole), parameters(resumed))
     first, second = whole.replay_buffer, resumed.replay_buffer
