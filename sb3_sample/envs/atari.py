@@ -13,12 +13,9 @@ from gymnasium import spaces
 from stable_baselines3.common.atari_wrappers import ClipRewardEnv, EpisodicLifeEnv, MaxAndSkipEnv, NoopResetEnv
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_sample.envs.registration import PACKAGE
-from sb3_sample.extras import install
+from sb3_sample.envs.registration import ATARI, is_atari_id, make_env
 from sb3_sample.kinds import TRUE_OR_FALSE, check_value, integer
 
-#: Namespace of the games' ids.
-NAMESPACE = "ALE/"
 #: Arguments of ``gym.make`` with which :class:`AtariFrames` does the rest: every frame, the gray screen.
 ENV_KWARGS: dict[str, Any] = {
     "frameskip": 1,
@@ -28,35 +25,12 @@ ENV_KWARGS: dict[str, Any] = {
 }
 
 
-def is_atari_id(env_id: Any) -> bool:
-    """
-    :param env_id: anything
-    :return: whether it is the id of an Atari game
-    """
-    return isinstance(env_id, str) and env_id.removeprefix(f"{PACKAGE}:").startswith(NAMESPACE)
-
-
 def is_atari(env: gym.Env) -> bool:
     """
     :param env: an environment, wrapped or not
     :return: whether it is simulated by the Arcade Learning Environment
     """
     return type(env.unwrapped).__module__.partition(".")[0] == "ale_py"
-
-
-def register_atari() -> None:
-    """
-    Register the games with Gymnasium, which ``ale-py`` does when it is imported.
-
-    :raises ImportError: ``ale-py`` is not installed; the message says how to install it
-    """
-    try:
-        import ale_py
-    except ModuleNotFoundError as error:
-        raise ImportError(
-            f"the {NAMESPACE}... environments need ale-py ({error}). Install it with: {install('atari')}"
-        ) from error
-    gym.register_envs(ale_py)
 
 
 def make_atari_env(env_id: str, training: bool = True, noop_max: int | None = 30, **kwargs: Any) -> gym.Env:
@@ -74,9 +48,7 @@ def make_atari_env(env_id: str, training: bool = True, noop_max: int | None = 30
     :raises ValueError: ``env_id`` is of another suite, or an argument is out of range
     """
     if not is_atari_id(env_id):
-        raise ValueError(f"env_id must be the id of an Atari game, {NAMESPACE}<Game>-v5, not {env_id!r}")
-    from sb3_sample.envs.registration import make_env
-
+        raise ValueError(f"env_id must be the id of an Atari game, {ATARI}<Game>-v5, not {env_id!r}")
     env: Any = Monitor(make_env(env_id, **{**ENV_KWARGS, **kwargs}))
     return AtariFrames(env, noop_max=noop_max, episodic_life=training, clip_reward=training)
 
@@ -164,7 +136,7 @@ class AtariFrames(gym.Wrapper[np.ndarray, int, np.ndarray, int]):
 
 def _check_game(env: gym.Env) -> None:
     if not is_atari(env):
-        raise ValueError(f"env must be an Atari game ({NAMESPACE}<Game>-v5), not {env}")
+        raise ValueError(f"env must be an Atari game ({ATARI}<Game>-v5), not {env}")
     game: Any = env.unwrapped
     space, frameskip = env.observation_space, game._frameskip
     if frameskip != 1:

@@ -19,7 +19,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_sample.arguments import NotAllowed, check_every, check_program
 from sb3_sample.console import say
 from sb3_sample.constructor import Given
-from sb3_sample.envs.atari import is_atari_id, make_atari_env
+from sb3_sample.envs.atari import make_atari_env
+from sb3_sample.envs.registration import is_atari_id
 from sb3_sample.faults import MetricWatch
 from sb3_sample.learner.execution import PAYS_FROM, old_torch, warn_not_compiled, why_not_compiled
 from sb3_sample.logged_values import LoggedValues

@@ -24,8 +24,8 @@ import numpy as np
 import yaml
 from gymnasium import spaces
 
-from sb3_sample.envs.atari import is_atari_id, register_atari
 from sb3_sample.envs.no_environment import NoEnvironment
+from sb3_sample.envs.registration import is_atari_id, register_atari
 from sb3_sample.envs.suites import SUITES
 from sb3_sample.kinds import check_value
 from sb3_sample.shallow_yaml import ShallowLoader
