@@ -13,7 +13,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.arguments import NotAllowed, check_every, check_program
@@ -22,7 +22,6 @@ from sb3_sample.constructor import Given
 from sb3_sample.envs.atari import make_atari_env
 from sb3_sample.envs.registration import is_atari_id
 from sb3_sample.faults import MetricWatch
-from sb3_sample.learner.execution import PAYS_FROM, old_torch, warn_not_compiled, why_not_compiled
 from sb3_sample.logged_values import LoggedValues
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
 from sb3_sample.saving.encoding import Lenient
@@ -296,29 +295,6 @@ class SRSPR(SRSPRArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  
             checkpoint,
             checkpoint_freq,
         )
-
-    def _before_turns(self) -> None:
-        if self.compiled is not None:
-            return
-        n_of_warm_up = max(self.learning_starts - self.num_transitions, 0)
-        n_updates = self._updates_in(self._total_timesteps - self.num_timesteps - n_of_warm_up)
-        ours = type(self.policy).__module__.startswith("sb3_sample.")
-        reason = why_not_compiled(self.learner) if n_updates >= PAYS_FROM and ours else None
-        self.compiled = n_updates >= PAYS_FROM and ours and reason is None
-        if reason is not None and reason == old_torch():
-            warn_not_compiled(self.learner, reason)
-        self.learner.forget_execution()
-
-    def _updates_in(self, n_steps: int) -> float:
-        """Gradient steps in as many decisions after the warm-up; 0 where that is not known."""
-        if self.replay_ratio is not None:
-            return self.replay_ratio * n_steps
-        assert isinstance(self.train_freq, TrainFreq)
-        if self.gradient_steps < 0:
-            return n_steps
-        if self.train_freq.unit is TrainFrequencyUnit.EPISODE:
-            return 0  # How long episodes are is not known.
-        return self.gradient_steps * n_steps / (self.n_envs * self.train_freq.frequency)
 
     def _turn(self, callback: BaseCallback, log_interval: int) -> bool:
         assert self.env is not None and self.replay_buffer is not None
