@@ -1,7 +1,7 @@
 """Sample-efficient reinforcement learning for users of Stable-Baselines3."""
 
 from sb3_sample.diagnostics import DiagnosticsCallback, NoiseScaleCallback
-from sb3_sample.envs import EnvironmentDied, SupervisedSubprocVecEnv, make_env, multi_task_env
+from sb3_sample.envs import EnvironmentDied, SupervisedSubprocVecEnv, make_atari_env, make_env, multi_task_env
 from sb3_sample.faults import TrainingDiverged
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO, RewoundPPO
 from sb3_sample.replay.buffers import DeviceReplayBuffer
@@ -44,6 +44,7 @@ from sb3_sample.sac import (
 )
 from sb3_sample.sac.encoders import ConvEncoder
 from sb3_sample.sac.many import train_many
+from sb3_sample.srspr import SRSPR
 from sb3_sample.training.task_evaluation import MultiTaskEvalCallback, evaluate_tasks
 from sb3_sample.version import __version__
 
@@ -62,6 +63,7 @@ __all__ = [
     "QMAPPO",
     "SAC",
     "SRSAC",
+    "SRSPR",
     "TD3BC",
     "TOPSAC",
     "VPLSAC",
@@ -96,6 +98,7 @@ __all__ = [
     "WindowReplayBuffer",
     "__version__",
     "evaluate_tasks",
+    "make_atari_env",
     "make_env",
     "multi_task_env",
     "record",

@@ -53,7 +53,7 @@ ALL_ENTRIES = [(name, env_id) for name in zoo.ALGORITHMS for env_id in entries(n
 #: One file of a kind; the others' entries are nearly the same.
 SAMPLE = ("bro", "bro_fast", "regularized_sac", "top_sac")
 BUILT = [
-    pytest.param(name, env_id, marks=() if name in SAMPLE or env_id == "default" else pytest.mark.slow)
+    pytest.param(name, env_id, marks=() if name in SAMPLE or env_id in ("default", "atari") else pytest.mark.slow)
     for name, env_id in ALL_ENTRIES
 ]
 #: Those of the MBMA paper.
@@ -64,11 +64,13 @@ SUCCESSORS = ("brc", "crossq", "dr_q", "flash_sac", "simba", "simbav2", "xqc")
 PIXELS = ("drq", "drqv2")
 #: What learns from data.
 OFFLINE = ("bc", "iql", "td3bc")
+#: What learns from pictures, and discrete actions.
+PICTURES = ("srspr",)
 #: Algorithms with the settings that DAC, VPL and the regularization study (2403.00514) share.
 FAMILY = sorted(
     name
     for name, entry in zoo.ALGORITHMS.items()
-    if not issubclass(entry.algorithm, BRO) and name not in (*ON_POLICY, *SUCCESSORS, *OFFLINE, *PIXELS)
+    if not issubclass(entry.algorithm, BRO) and name not in (*ON_POLICY, *SUCCESSORS, *OFFLINE, *PIXELS, *PICTURES)
 )
 
 
@@ -169,7 +171,7 @@ def test_the_defaults_lie_in_the_search_space(name: str) -> None:
     assert sample(optuna.trial.FixedTrial(stored), 1, 1, NO_HER) == pytest.approx(defaults)
 
 
-@pytest.mark.parametrize("name", zoo.ALGORITHMS)
+@pytest.mark.parametrize("name", [name for name in zoo.ALGORITHMS if name not in PICTURES])
 def test_what_the_search_samples_builds_a_model(name: str) -> None:
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for _ in range(3):
@@ -246,6 +248,9 @@ def test_an_entry_builds_a_model(name: str, env_id: str, tmp_path: Path) -> None
         pytest.importorskip("dm_control")
     if name in PIXELS and env_id == "default":
         pytest.skip("its pictures are asked for on the command line")
+    if env_id == "atari":
+        pytest.importorskip("ale_py")
+        env_id = "ALE/Pong-v5"
     # Any task without an entry has the default.
     env_id = "MountainCarContinuous-v0" if env_id == "default" else env_id
     experiment = manager(name, env_id, tmp_path, hyperparams=small_buffer(name))

@@ -5,6 +5,7 @@ The environments of the papers under short ids, registered with Gymnasium when t
 when an environment is made.
 """
 
+from sb3_sample.envs.atari import make_atari_env
 from sb3_sample.envs.multi_task import TaskEnv, multi_task_env
 from sb3_sample.envs.registration import (
     ALL_IDS,
@@ -29,6 +30,7 @@ __all__ = [
     "EnvironmentDied",
     "SupervisedSubprocVecEnv",
     "TaskEnv",
+    "make_atari_env",
     "make_env",
     "multi_task_env",
     "published_key",

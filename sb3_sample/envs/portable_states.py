@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from sb3_sample.envs.atari import is_atari
 from sb3_sample.envs.states import layers_of, model_arrays, simulator_of
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name
 
@@ -58,6 +59,7 @@ def pack_all(envs: Sequence[gym.Env]) -> tuple[list[dict[str, Any]], list[str]]:
         states.append({
             "layers": described,
             "simulator": None if simulator is None else _pack_simulator(*simulator),
+            **({"console": _pack_console(env)} if is_atari(env) else {}),
             "classes": classes,
         })  # fmt: skip
     return states, opaque + describer.finish()
@@ -97,6 +99,10 @@ def _unpack(env: gym.Env, state: dict[str, Any], restorer: Restorer) -> None:
         raise DoesNotFit("only one of the environment and the saved one is simulated by MuJoCo")
     if simulator is not None:
         _unpack_simulator(*simulator, state["simulator"])
+    if is_atari(env) != ("console" in state):
+        raise DoesNotFit("only one of the environment and the saved one is Atari's")
+    if "console" in state:
+        _unpack_console(env, state["console"])
     restorer.enter(_saved_otherwise(env), _origin(simulator))
     for layer, saved in zip(layers, state["layers"], strict=True):
         restorer.attributes(layer, saved["attributes"], _skipped(layer))
@@ -106,7 +112,8 @@ def _unpack(env: gym.Env, state: dict[str, Any], restorer: Restorer) -> None:
 
 def _saved_otherwise(env: gym.Env) -> list[Any]:
     """Objects that are no attributes' values: each layer, and the simulator."""
-    return [*layers_of(env), *(simulator_of(env) or ()), *_physics(env)]
+    console = [env.unwrapped.ale] if is_atari(env) else []  # type: ignore[attr-defined]
+    return [*layers_of(env), *(simulator_of(env) or ()), *_physics(env), *console]
 
 
 def _skipped(layer: Any) -> tuple[str, ...]:
@@ -157,6 +164,22 @@ def _unpack_simulator(model: Any, data: Any, state: dict[str, Any]) -> None:
     mujoco.mj_step1(model, data)
     for name in _data_arrays():
         getattr(data, name)[...] = state["data"][name]
+
+
+def _pack_console(env: Any) -> np.ndarray:
+    """The whole state of an Atari console, its generator included, as the bytes in which the emulator writes it."""
+    return np.frombuffer(env.unwrapped.clone_state(include_rng=True).serialize(), np.uint8).copy()
+
+
+def _unpack_console(env: Any, state: Any) -> None:
+    import ale_py
+
+    if not isinstance(state, np.ndarray) or state.dtype != np.uint8 or state.ndim != 1:
+        raise DoesNotFit("the state of the Atari console is not what is saved of one")
+    try:
+        env.unwrapped.restore_state(ale_py.ALEState(state.tobytes()))
+    except SystemError as error:  # whatever the emulator raises of bytes that it did not write
+        raise DoesNotFit("the state of the Atari console is damaged, or of another game") from error
 
 
 def _check_like(own: np.ndarray, array: Any, name: str) -> None:

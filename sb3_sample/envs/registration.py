@@ -14,7 +14,11 @@ from typing import Any
 
 import gymnasium as gym
 
+from sb3_sample.extras import install
+
 PACKAGE = "sb3_sample"
+#: Before the ids of Atari games, which are ale-py's own.
+ATARI = "ALE/"
 
 #: Domain to tasks: ``dm_control.suite.ALL_TASKS`` without the two lqr tasks (no time limit, unbounded actions).
 DMC_TASKS: dict[str, tuple[str, ...]] = {
@@ -129,11 +133,35 @@ def _register(env_id: str, entry_point: str, kwargs: dict[str, Any], max_episode
         gym.register(env_id, entry_point=entry_point, kwargs=kwargs, max_episode_steps=max_episode_steps)
 
 
+def is_atari_id(env_id: Any) -> bool:
+    """
+    :param env_id: anything
+    :return: whether it is the id of an Atari game
+    """
+    return isinstance(env_id, str) and env_id.removeprefix(f"{PACKAGE}:").startswith(ATARI)
+
+
+def register_atari() -> None:
+    """
+    Register the games with Gymnasium, which ``ale-py`` does when it is imported.
+
+    :raises ImportError: ``ale-py`` is not installed; the message says how to install it
+    """
+    try:
+        import ale_py
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            f"the {ATARI}... environments need ale-py ({error}). Install it with: {install('atari')}"
+        ) from error
+    gym.register_envs(ale_py)
+
+
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     """
     Make an environment by its id: the same as ``gym.make(f"sb3_sample:{env_id}", **kwargs)``.
 
-    :param env_id: An id of this package (``dmc/…``, ``metaworld/…``, ``myosuite/…``) or any that Gymnasium knows.
+    :param env_id: An id of this package (``dmc/…``, ``metaworld/…``, ``myosuite/…``), of an Atari game
+        (``ALE/…``; bare, without the wrappers of ``make_atari_env``) or any that Gymnasium knows.
     :param kwargs: Arguments of ``gym.make`` (``render_mode``, ``max_episode_steps``) and of the environment
         (``action_repeat`` for ``dmc/``; ``width``, ``height``, ``camera``).
     :return: The environment.
@@ -142,6 +170,8 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     """
     register_all()
     env_id = env_id.removeprefix(f"{PACKAGE}:")
+    if is_atari_id(env_id):
+        register_atari()
     try:
         return gym.make(env_id, **kwargs)
     except (gym.error.UnregisteredEnv, gym.error.DeprecatedEnv) as error:

@@ -22,7 +22,10 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import yaml
+from gymnasium import spaces
 
+from sb3_sample.envs.no_environment import NoEnvironment
+from sb3_sample.envs.registration import is_atari_id, register_atari
 from sb3_sample.envs.suites import SUITES
 from sb3_sample.kinds import check_value
 from sb3_sample.shallow_yaml import ShallowLoader
@@ -604,6 +607,11 @@ class _Reader:
                 line = written[name].start_mark.line + 1
                 raise self._fail(each, f"task {name!r} is there twice: once on line {line}. Each can be there once")
             written[name] = each
+            if is_atari_id(name):
+                try:
+                    register_atari()
+                except ImportError as error:
+                    raise self._fail(each, str(error)) from error
             suite = SUITES.get(name.upper().replace("-", "_"))
             if suite is None and name not in gym.registry:
                 close = difflib.get_close_matches(name, [*gym.registry, *SUITES], 5, 0.5)
@@ -740,14 +748,17 @@ def _make(algo: str, arguments: dict[str, Any]) -> None:
 
     arguments = {name: constructor_value(name, value) for name, value in arguments.items()}
     known = constructor_arguments(algo)
-    default = yaml.safe_load((HYPERPARAMS / f"{algo}.yml").read_text())["default"]
+    entries = yaml.safe_load((HYPERPARAMS / f"{algo}.yml").read_text())
+    default = entries.get("default") or entries["atari"]
     settings = {name: value for name, value in default.items() if name in known and not isinstance(value, str)}
     settings = ExperimentManager._preprocess_schedules({**settings, **arguments})
-    algorithm = _algorithms()[algo].algorithm
+    algorithm: Any = _algorithms()[algo].algorithm
     on: dict[str, Any] = {"policy": "MlpPolicy", "env": "Pendulum-v1"}
     if "MlpPolicy" not in algorithm.policy_aliases:
-        # From pictures alone, of which nothing is stored here.
-        pictures, actions = gym.spaces.Box(0, 255, (3, 64, 64), np.uint8), gym.spaces.Box(-1, 1, (1,), np.float32)
-        on = {"policy": "CnnPolicy", "env": None, "observation_space": pictures, "action_space": actions}
-        settings["buffer_size"] = 1
+        # From pictures alone, of which hardly anything is stored here.
+        size, actions = (3, 64, 64), spaces.Box(-1, 1, (1,), np.float32)
+        if not hasattr(algorithm, "learn_offline"):
+            size, actions = (4, 84, 84), spaces.Discrete(3)
+        on = {"policy": "CnnPolicy", "env": NoEnvironment(spaces.Box(0, 255, size, np.uint8), actions)}
+        settings = {**settings, "buffer_size": 1_000}
     algorithm(**{**on, "device": "cpu", **settings})

@@ -70,7 +70,7 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
 
     @classmethod
     def place_of(cls, name: str) -> str:
-        of_policy = inspect.signature(cls.policy_aliases["MlpPolicy"]).parameters.get(name)
+        of_policy = inspect.signature(next(iter(cls.policy_aliases.values()))).parameters.get(name)
         is_choice = of_policy is not None and of_policy.default is not inspect.Parameter.empty
         return f"policy_kwargs=dict({name}=...)" if is_choice else ""
 

@@ -48,6 +48,7 @@ from sb3_sample.sac import (
     SimbaV2,
 )
 from sb3_sample.saving.untrusted import BadFile
+from sb3_sample.srspr import SRSPR
 from sb3_sample.zoo import search
 from sb3_sample.zoo.trials import check_params
 
@@ -115,6 +116,7 @@ ALGORITHMS: dict[str, ZooAlgorithm] = {
     "simba": ZooAlgorithm(SimBa, search.SIMBA_SPACE),
     "simbav2": ZooAlgorithm(SimbaV2, search.SIMBAV2_SPACE),
     "sr_sac": ZooAlgorithm(SRSAC, search.SR_SAC_SPACE),
+    "srspr": ZooAlgorithm(SRSPR, search.SRSPR_SPACE),
     "td3bc": ZooAlgorithm(TD3BC, search.TD3BC_SPACE),
     "top_sac": ZooAlgorithm(TOPSAC, search.TOP_SPACE),
     "vpl_sac": ZooAlgorithm(VPLSAC, search.VPL_SPACE),

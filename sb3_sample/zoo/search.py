@@ -178,6 +178,15 @@ IQL_SPACE: Space = {
     "inverse_temperature": _float(0.3, 10.0, log=True),
     "replay_ratio": _int(1, 8, log=True),
 }
+SRSPR_SPACE: Space = {
+    "learning_rate": _float(1e-5, 1e-3, log=True),
+    "one_minus_gamma": _float(1e-3, 0.05, log=True),
+    "tau": _float(1e-3, 0.08, log=True),
+    "n_steps": _int(1, 20),
+    "spr_weight": _float(0.5, 10.0, log=True),
+    "replay_ratio": _int(1, 8, log=True),
+    "shrink": _float(0.3, 0.95),
+}
 TD3BC_SPACE: Space = {
     **OFF_POLICY_SPACE,
     "alpha": _float(0.5, 10.0, log=True),

@@ -20,6 +20,7 @@ from sb3_contrib.common.wrappers import TimeFeatureWrapper
 from stable_baselines3.common import atari_wrappers, vec_env
 from stable_baselines3.common.monitor import Monitor
 
+from sb3_sample.envs.atari import AtariFrames
 from sb3_sample.saving.classes import resolve, within
 from sb3_sample.saving.untrusted import BadFile, read_regular
 from sb3_sample.shallow_yaml import ShallowLoader
@@ -208,6 +209,10 @@ WRAPPERS: dict[type, Arguments] = {
     Monitor: {
         "filename": _is_nothing, "allow_early_resets": _is_flag, "reset_keywords": _are_words,
         "info_keywords": _are_words,
+    },
+    AtariFrames: {
+        "size": _is_count, "frame_stack": _is_count, "frame_skip": _is_count, "noop_max": _is_count,
+        "episodic_life": _is_flag, "clip_reward": _is_flag,
     },
     atari_wrappers.AtariWrapper: {
         **_EXTREMES, "screen_size": _is_shape, "clip_reward": _is_flag, "action_repeat_probability": _is_number,

@@ -1,0 +1,5 @@
+"""Value learning from pictures: SR-SPR."""
+
+from sb3_sample.srspr.algorithm import SRSPR
+
+__all__ = ["SRSPR"]

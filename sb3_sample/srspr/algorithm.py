@@ -1,0 +1,414 @@
+"""SR-SPR as Stable-Baselines3's ``DQN``: acting, storing, when and how often to learn, logging, files."""
+
+import pathlib
+import warnings
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_sample.arguments import NotAllowed, check_every, check_program
+from sb3_sample.console import say
+from sb3_sample.constructor import Given
+from sb3_sample.envs.atari import make_atari_env
+from sb3_sample.envs.registration import is_atari_id
+from sb3_sample.faults import MetricWatch
+from sb3_sample.logged_values import LoggedValues
+from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
+from sb3_sample.saving.encoding import Lenient
+from sb3_sample.saving.kept import Kept
+from sb3_sample.saving.model import SafeFiles
+from sb3_sample.saving.replay import SafeReplayBuffers, encode_buffer
+from sb3_sample.saving.unsaved import plain_attributes
+from sb3_sample.srspr.arguments import SRSPRArguments
+from sb3_sample.srspr.learner import SPRLearner
+from sb3_sample.srspr.policies import SPRPolicy
+from sb3_sample.srspr.replay import SPRReplayBuffer
+from sb3_sample.training.resumable import Resumable
+
+Self = TypeVar("Self", bound="SRSPR")
+
+#: Added to a loss before its root becomes a priority.
+_SMALL = 1e-10
+
+
+class SRSPR(SRSPRArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]
+    """
+    SR-SPR, the scaled-by-resetting agent for Atari with 100,000 decisions (D'Oro et al. 2023, on SPR, Schwarzer et al.
+    2021), with the regular Q-network or BroNet (BRO, appendix E): Rainbow's value learning (C51, dueling, double,
+    n-step returns, prioritised replay), the prediction of future latent states, and shrink and perturb. docs/srspr.md.
+
+    :raises ValueError: if an argument is out of range or contradicts another, or the environment's observations are no
+        stacks of uint8 frames
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": SPRPolicy}
+    policy_base: ClassVar[type[BasePolicy]] = SPRPolicy
+    _kept: ClassVar[dict[str, Kept]] = {
+        # Saved as the policy.
+        "learner": Kept.NOWHERE,
+        "_watch": Kept.NOWHERE,
+        "_plain_attributes": Kept.NOWHERE,
+        # For the log of a run that goes on.
+        "_metrics": Kept.IN_CHECKPOINTS,
+    }
+    policy: SPRPolicy
+
+    def _construct(self, given: Given) -> None:
+        check_program(type(self), given)
+        given["env"] = _made(given["env"])
+        if given["train_freq"] is not None or given["gradient_steps"] is not None:
+            # Stable-Baselines3's two arguments are in force.
+            given["replay_ratio"] = None
+        for name in "train_freq", "gradient_steps":
+            given[name] = 1 if given[name] is None else given[name]
+        is_set_up = given.pop("_init_setup_model")
+        theirs = self._store(given, OffPolicyAlgorithm)
+        OffPolicyAlgorithm.__init__(self, **theirs, sde_support=False, support_multi_env=True)
+        #: Whether the gradient step is compiled; None while that is not decided. Saved: a loaded model goes on with it.
+        self.compiled: bool | None = None
+        #: Transitions stored over the model's life; unlike ``num_timesteps`` never zeroed by ``learn``.
+        self.num_transitions = 0
+        #: Resets over the model's life.
+        self.n_resets = 0
+        # Gradient steps owed but not yet taken, the fraction that a replay ratio leaves over.
+        self._updates_owed = 0.0
+        self._metrics: dict[str, torch.Tensor] = {}
+        if is_set_up:
+            self._setup_model()
+
+    # ---------------------------------------------------------------- construction
+
+    def _setup_model(self) -> None:
+        n_steps = self.n_steps
+        try:
+            super()._setup_model()
+        finally:
+            self.n_steps = n_steps
+        if self.compile != "auto":
+            self.compiled = bool(self.compile)
+        self.learner = SPRLearner(
+            self.policy,
+            self,
+            gamma=self.gamma,
+            tau=self.tau,
+            n_steps=n_steps,
+            n_predictions=self.n_predictions,
+            spr_weight=self.spr_weight,
+            compile=self.compile,
+            device=self.device,
+            verbose=self.verbose,
+        )
+        self._plain_attributes = plain_attributes(self)
+        self._watch = MetricWatch(self.device)
+
+    def _check_arguments(self) -> None:
+        check_every(self)
+        shape = self.observation_space.shape
+        assert shape is not None
+        if min(shape[1:]) < 8 or shape[0] % self.frame_stack:
+            raise NotAllowed(
+                f"env has observations of shape {shape}: their first axis must be frame_stack={self.frame_stack} "
+                "frames, and their sides at least 8 pixels. Stable-Baselines3's VecFrameStack stacks single pictures"
+            )
+        if not self.v_min < self.v_max:
+            raise ValueError(f"v_min must be below v_max, not v_min={self.v_min} and v_max={self.v_max}")
+
+    def _complete_arguments(self) -> None:
+        super()._complete_arguments()
+        if self.replay_buffer_class is None:
+            self.replay_buffer_class = SPRReplayBuffer
+        own = {"frame_stack": self.frame_stack, "horizon": max(self.n_steps, self.n_predictions)}
+        if taken := own.keys() & self.replay_buffer_kwargs.keys():
+            raise ValueError(f"replay_buffer_kwargs has {sorted(taken)}, which follow from the algorithm's arguments")
+        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, **own}
+        self.optimize_memory_usage = False
+        # Stable-Baselines3 would take it for an argument of a buffer of its own.
+        self.n_steps = 1
+
+    def _full_policy_kwargs(self) -> dict[str, Any]:
+        return {
+            **self.policy_kwargs,
+            "network": self.network,
+            "noisy": self.noisy,
+            "n_atoms": self.n_atoms,
+            "v_min": self.v_min,
+            "v_max": self.v_max,
+        }
+
+    @classmethod
+    def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
+        implied: dict[str, Any] = {"compiled": None} if "compile" in kwargs else {}
+        if "train_freq" in kwargs or "gradient_steps" in kwargs:
+            implied["replay_ratio"] = None
+        return implied
+
+    @classmethod
+    def _made(  # type: ignore[override]
+        cls, content: Any, attributes: dict[str, Any], kwargs: dict[str, Any], custom: Any, env: Any, *args: Any
+    ) -> Any:
+        return super()._made(content, attributes, kwargs, custom, _made(env), *args)
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        space = env.action_space
+        if not isinstance(space, spaces.Discrete) or space.start != 0:
+            raise NotAllowed(f"env must have Discrete actions that count from 0, not {space}: BRO is for Box actions")
+        seen = env.observation_space
+        if not isinstance(seen, spaces.Box) or not is_image_space(seen, check_channels=False):
+            raise NotAllowed(
+                "env must have observations that are stacks of frames, uint8 in [0, 255], (frame_stack * C, height, "
+                f"width), not {seen}: make_atari_env gives them, and Stable-Baselines3's VecFrameStack makes them of "
+                "single pictures"
+            )
+        return Resumable._wrap_env(env, verbose, monitor_wrapper)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "learner"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer"], []
+
+    def _described(self) -> Lenient:
+        encoder = super()._described()
+        if self.replay_buffer is not None:
+            encode_buffer(self.replay_buffer, encoder, only_small=True)
+        return encoder
+
+    # ---------------------------------------------------------------- acting
+
+    @property
+    def exploration_rate(self) -> float:
+        """Rate of random decisions in training, by the decisions so far."""
+        past = self.num_transitions - self.learning_starts
+        left = 1.0 if past < 0 else max(0.0, 1 - past / self.exploration_steps) if self.exploration_steps else 0.0
+        return self.exploration_final_eps + left * (self.exploration_initial_eps - self.exploration_final_eps)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        Choose actions by the target network, as in evaluation.
+
+        :param observation: as the environment gives it, one or a batch
+        :param state: as in Stable-Baselines3, without meaning here
+        :param episode_start: likewise
+        :param deterministic: the best actions, instead of random ones at the rate ``evaluation_eps``
+        :return: actions, and ``state``
+        :raises ValueError: if the observation is not one of the observation space
+        """
+        self._silence()
+        actions, state = self.policy.predict(observation, state, episode_start, deterministic=True)
+        return (actions if deterministic else self._with_random(actions, self.evaluation_eps)), state
+
+    def _silence(self) -> None:
+        for layer in self.policy.q_net_target.noisy_layers():
+            layer.silence()
+
+    def _with_random(self, actions: np.ndarray, rate: float) -> np.ndarray:
+        """Put random actions in the place of some."""
+        chosen = np.random.random(actions.shape) < rate  # noqa: NPY002  # the generator that Stable-Baselines3 seeds
+        if not chosen.any():
+            return actions
+        drawn = np.array([self.action_space.sample() for _ in range(actions.size)]).reshape(actions.shape)
+        return np.where(chosen, drawn, actions)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        rate = self.exploration_rate
+        if rate < 1:
+            for layer in self.policy.q_net_target.noisy_layers():
+                layer.draw()
+            assert self._last_obs is not None
+            actions = self.policy.predict(self._last_obs, deterministic=True)[0]  # type: ignore[arg-type]
+        else:
+            actions = np.zeros(n_envs, np.int64)
+        actions = self._with_random(actions, rate)
+        return actions, actions
+
+    def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any, **kwargs: Any) -> None:
+        super()._store_transition(replay_buffer, *args, **kwargs)
+        if self._vec_normalize_env is None:
+            # Set by it all the same; saved, it says that there was a VecNormalize.
+            self._last_original_obs = None
+        self.num_transitions += self.n_envs
+
+    def _on_step(self) -> None:
+        self.logger.record("rollout/exploration_rate", self.exploration_rate)
+
+    def _on_environment_reset(self) -> None:
+        assert isinstance(self.replay_buffer, SPRReplayBuffer)
+        self.replay_buffer.cut_episodes()
+
+    # ---------------------------------------------------------------- learning
+
+    def learn(
+        self: Self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+        checkpoint: str | pathlib.Path | None = None,
+        checkpoint_freq: int = CHECKPOINT_FREQ,
+    ) -> Self:
+        """
+        Train, as in Stable-Baselines3; with ``checkpoint``, so that nothing is lost when the program ends before it is
+        done: the same program, started again, goes on where the folder's last checkpoint is, and the result is the same
+        bit by bit (docs/saving.md).
+
+        :param total_timesteps: decisions to take
+        :param callback: called at every step
+        :param log_interval: episodes between two lines of the log
+        :param tb_log_name: name of the run in the TensorBoard log; the class's name if None
+        :param reset_num_timesteps: whether ``num_timesteps`` starts at zero again
+        :param progress_bar: whether to show a progress bar (needs tqdm and rich)
+        :param checkpoint: folder of the run; None for no checkpoints. Each call of ``learn`` needs a folder of its own
+        :param checkpoint_freq: decisions between two checkpoints
+        :return: the trained model
+        :raises ValueError: if an argument is out of range, or the folder is of another run (the message names what
+            differs) or of an earlier call of ``learn``, cannot be used, or has checkpoints that are all damaged
+        :raises TrainingDiverged: if a loss, another metric or a parameter is NaN or infinite
+        """
+        return self._learn(
+            total_timesteps,
+            callback,
+            log_interval,
+            tb_log_name,
+            reset_num_timesteps,
+            progress_bar,
+            checkpoint,
+            checkpoint_freq,
+        )
+
+    def _turn(self, callback: BaseCallback, log_interval: int) -> bool:
+        assert self.env is not None and self.replay_buffer is not None
+        before = self.num_transitions
+        rollout = self.collect_rollouts(
+            self.env,
+            train_freq=self.train_freq,  # type: ignore[arg-type]  # converted in _setup_model
+            action_noise=None,
+            callback=callback,
+            learning_starts=self.learning_starts,
+            replay_buffer=self.replay_buffer,
+            log_interval=log_interval,
+        )
+        if rollout.continue_training:
+            n_updates = self._updates_due(rollout.episode_timesteps)
+            if n_updates > 0:
+                self.train(n_updates, self.batch_size)
+            self._reset_if_due(before)
+        return rollout.continue_training
+
+    def _updates_due(self, n_collected: int) -> int:
+        """Gradient steps to take now."""
+        buffer = self.replay_buffer
+        assert isinstance(buffer, SPRReplayBuffer)
+        # A model that was loaded without its buffer fills it first, acting with what it has learned.
+        n_needed = min(self.learning_starts, buffer.buffer_size * buffer.n_envs)
+        if self.num_transitions <= self.learning_starts or buffer.size() * buffer.n_envs < n_needed:
+            return 0
+        if buffer.n_drawable == 0:
+            return 0
+        if self.replay_ratio is None:
+            return self.gradient_steps if self.gradient_steps >= 0 else n_collected
+        self._updates_owed += self.replay_ratio * n_collected
+        # The tolerance keeps 10 times 0.1 from falling short of 1 by rounding.
+        n_updates = int(self._updates_owed + 1e-6)
+        self._updates_owed -= n_updates
+        return n_updates
+
+    def _reset_if_due(self, before: int) -> None:
+        """Reset where the last decisions have reached a multiple of the interval, and a whole one is left."""
+        every, now = self.reset_interval, self.num_transitions
+        left = self._total_timesteps - self.num_timesteps
+        if every is None or before // every == now // every or left < every:
+            return
+        self.learner.reset(self.shrink)
+        self.n_resets += 1
+        if self.verbose >= 1:
+            say(f"Reset at {now} decisions")
+
+    def _after_turns(self) -> None:
+        """Say if nothing was learned for want of steps."""
+        wanted = self.gradient_steps if self.replay_ratio is None else self.replay_ratio
+        if self._n_updates == 0 and wanted != 0 and 0 < self.num_transitions <= self.learning_starts:
+            warnings.warn(
+                f"learn ended without a single gradient step: learning_starts={self.learning_starts} decisions come "
+                f"before the first, and this model has taken {self.num_transitions}. Train for more, or pass a smaller "
+                "learning_starts=",
+                stacklevel=4,
+            )
+
+    def train(self, gradient_steps: int, batch_size: int | None = None) -> None:
+        """
+        Take gradient steps on windows from the replay buffer, and record the metrics of the last one.
+
+        :param gradient_steps: how many
+        :param batch_size: windows a step; None: the model's own ``batch_size``
+        :raises TrainingDiverged: if a metric is NaN or infinite; on a GPU that may be noticed later, at the latest when
+            the log is written
+        """
+        buffer = self.replay_buffer
+        assert isinstance(buffer, SPRReplayBuffer)
+        for name in SPRLearner.SETTINGS:
+            setattr(self.learner, name, getattr(self, name))
+        rate = self.lr_schedule(self._current_progress_remaining)
+        for group in self.policy.optimizer.param_groups:
+            group["lr"] = rate
+        self.learner.prepared_execution()
+        for _ in range(gradient_steps):
+            slots = buffer.draw(self.batch_size if batch_size is None else batch_size)
+            windows = buffer.states_of(slots, self.n_steps, self.n_predictions, self._vec_normalize_env)
+            metrics, td_losses = self.learner.step(windows)
+            # Each step renews the priorities of which the next one's batch is drawn.
+            buffer.weights.renew(slots, td_losses.cpu().numpy() + _SMALL)
+            self._watch.note(metrics, self._n_updates, self.num_timesteps)
+            self._metrics.update(metrics)
+        if self.device.type == "cpu":
+            self._watch.check()
+        self._record_metrics(rate)
+
+    def _record_metrics(self, rate: float) -> None:
+        if not hasattr(self, "_logger"):
+            return  # There is none before ``learn`` or ``set_logger``.
+        LoggedValues.of(self.logger)
+        if self.device.type == "cpu":
+            for name, value in self._metrics.items():
+                self.logger.record(name, float(value.numpy()))
+        else:
+            LoggedValues.record_later(self.logger, self._metrics)
+        self.logger.record("train/learning_rate", rate)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("plasticity/reset", self.n_resets)
+        if self.learner.seconds_compiling > 0:
+            self.logger.record("time/seconds_compiling", self.learner.seconds_compiling)
+
+    def dump_logs(self) -> None:
+        """
+        Write the log. On a GPU the host waits here for the metrics, at the latest.
+
+        :raises TrainingDiverged: if one of them was NaN or infinite since the last time
+        """
+        self._watch.check()
+        super().dump_logs()
+
+
+def _made(env: Any) -> Any:
+    """The environment of an id of an Atari game, with its wrappers; anything else as it is."""
+    return make_atari_env(env) if is_atari_id(env) else env
