@@ -17,7 +17,7 @@ import re
 from collections import deque
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import gymnasium as gym
 import numpy as np
@@ -756,8 +756,8 @@ def _make(algo: str, arguments: dict[str, Any]) -> None:
     on: dict[str, Any] = {"policy": "MlpPolicy", "env": "Pendulum-v1"}
     if "MlpPolicy" not in algorithm.policy_aliases:
         # From pictures alone, of which hardly anything is stored here.
-        size, actions = (3, 64, 64), spaces.Box(-1, 1, (1,), np.float32)
-        if not hasattr(algorithm, "learn_offline"):
+        size, actions = (3, 64, 64), cast("spaces.Space[Any]", spaces.Box(-1, 1, (1,), np.float32))
+        if not hasattr(algorithm, "learn_offline"):  # that of Atari's games
             size, actions = (4, 84, 84), spaces.Discrete(3)
         on = {"policy": "CnnPolicy", "env": NoEnvironment(spaces.Box(0, 255, size, np.uint8), actions)}
         settings = {**settings, "buffer_size": 1_000}
