@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
+from sb3_sample.envs.atari import is_atari
 from sb3_sample.saving.attributes import is_view_of_foreign_memory
 
 #: Attributes of these types cannot change, so that they are kept as they are.
@@ -188,14 +189,6 @@ def simulator_of(env: gym.Env) -> tuple[Any, Any] | None:
         if type(model).__module__.startswith("mujoco"):
             return model, data
     return None
-
-
-def is_atari(env: gym.Env) -> bool:
-    """
-    :param env: an environment, wrapped or not
-    :return: whether it is simulated by the Arcade Learning Environment
-    """
-    return type(env.unwrapped).__module__.partition(".")[0] == "ale_py"
 
 
 @functools.cache
