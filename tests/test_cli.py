@@ -307,8 +307,9 @@ def test_every_algorithm_is_run() -> None:
     pytest.importorskip("rl_zoo3")
     from sb3_sample.zoo import ALGORITHMS
 
-    # Those that learn from data sets: test_zoo_data.py; from Atari: tests/srspr.
-    assert list(ALGORITHMS) == sorted([*NAMES, *ON_POLICY, "bc", "iql", "td3bc", "srspr"])
+    # Those that learn from data sets: test_zoo_data.py; from Atari: tests/srspr. Those from drawn pictures are built in
+    # test_zoo.py, and trained in sac/test_drq.py.
+    assert list(ALGORITHMS) == sorted([*NAMES, *ON_POLICY, "bc", "iql", "td3bc", "srspr", "drq", "drqv2"])
 
 
 @pytest.mark.slow

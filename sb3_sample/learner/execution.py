@@ -270,8 +270,9 @@ def captures(learner: Any, of: Any = None) -> bool:
     :param of: learner whose parts count; None: its own
     :return: whether it is: on a GPU, unless that is declined, or parts of one's own may look at values on the host
     """
-    asked = learner.compile is True or (learner.compile == "auto" and not foreign_parts(of or learner))
-    return learner.device.type == "cuda" and asked
+    if learner.device.type != "cuda":
+        return False
+    return learner.compile is True or (learner.compile == "auto" and not foreign_parts(of or learner))
 
 
 class CannotCompile(Exception):

@@ -181,7 +181,8 @@ class SAC(  # type: ignore[misc]  # actor
     def _setup_model(self) -> None:
         with warnings.catch_warnings():
             # Of Stable-Baselines3, which knows n-step returns of its own buffer only, where a buffer is told of them.
-            if self.replay_buffer_class is None or issubclass(self.replay_buffer_class, CompactNStepReplayBuffer):
+            cls = self.replay_buffer_class
+            if cls is None or (isinstance(cls, type) and issubclass(cls, CompactNStepReplayBuffer)):
                 warnings.filterwarnings("ignore", message="`n_steps=")
             super()._setup_model()
         assert self.replay_buffer is not None

@@ -256,13 +256,14 @@ def _measured(folder: Path, run: _Run, metrics: Sequence[str]) -> dict[str, tupl
     if "episode_length" in found:
         found["episode_length"] = (steps, found["episode_length"][1] * run.repeat)
     # A run that learned from data first has their log apart, and a clock that began anew afterwards.
-    logged = _logged(folder / OFFLINE / _LOG, run.repeat * run.skip, metrics)
+    before = folder / OFFLINE / _LOG
+    logged = _logged(before, run.repeat * run.skip, metrics) if before.exists() else {}
     online = _logged(folder / _LOG, run.repeat * run.skip, metrics)
     if _SECONDS in logged and _SECONDS in online:
         online[_SECONDS] = online[_SECONDS][0], online[_SECONDS][1] + logged[_SECONDS][1][-1]
     for name, (at, values) in online.items():
-        before = logged.get(name, (at[:0], values[:0]))
-        logged[name] = np.append(before[0], at), np.append(before[1], values)
+        first = logged.get(name, (at[:0], values[:0]))
+        logged[name] = np.append(first[0], at), np.append(first[1], values)
     seconds = logged.pop(_SECONDS, None)
     if seconds is None and _matches("hours", metrics):
         monitored = read_monitors(folder) if monitored is None and any(folder.glob("*monitor.csv")) else monitored

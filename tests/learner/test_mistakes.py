@@ -447,7 +447,7 @@ class Head(ValueHead):
         ),
         (
             {"policy_kwargs": {"qqq": 1}},
-            "policy_kwargs has 'qqq', which is no argument of SACPolicy. It takes ['activation_fn', 'actor_kwargs',",
+            "policy_kwargs has 'qqq', which is no argument of SACPolicy. It takes ['activation_fn', 'actor_features',",
         ),
         (
             {"pessimism_kwargs": {"a": 1}},
