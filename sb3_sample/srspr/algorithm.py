@@ -61,7 +61,6 @@ class SRSPR(SRSPRArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  
         # For the log of a run that goes on.
         "_metrics": Kept.IN_CHECKPOINTS,
     }
-    policy: SPRPolicy
 
     def _construct(self, given: Given) -> None:
         check_program(type(self), given)
@@ -215,8 +214,13 @@ class SRSPR(SRSPRArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  
         return (actions if deterministic else self._with_random(actions, self.evaluation_eps)), state
 
     def _silence(self) -> None:
-        for layer in self.policy.q_net_target.noisy_layers():
+        for layer in self._noisy_layers():
             layer.silence()
+
+    def _noisy_layers(self) -> list[Any]:
+        """Those of the network that acts."""
+        policy: Any = self.policy
+        return list(policy.q_net_target.noisy_layers())
 
     def _with_random(self, actions: np.ndarray, rate: float) -> np.ndarray:
         """Put random actions in the place of some."""
@@ -231,7 +235,7 @@ class SRSPR(SRSPRArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  
     ) -> tuple[np.ndarray, np.ndarray]:
         rate = self.exploration_rate
         if rate < 1:
-            for layer in self.policy.q_net_target.noisy_layers():
+            for layer in self._noisy_layers():
                 layer.draw()
             assert self._last_obs is not None
             actions = self.policy.predict(self._last_obs, deterministic=True)[0]  # type: ignore[arg-type]
