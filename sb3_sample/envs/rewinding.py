@@ -172,7 +172,7 @@ def _wrapped_like(wrapper: gym.Wrapper, env: gym.Env) -> gym.Env:
     recorded = getattr(wrapper, "_saved_kwargs", None)
     if recorded is not None:
         return make(env, **recorded)
-    # What its state is, restoring replaces; the rest describes it, unless it leads to the environment itself.
+    # Restoring replaces its state; the rest describes it, unless it leads to the environment itself.
     inside = [value for layer in layers_of(wrapper.env) for value in vars(layer).values() if is_simulator(value)]
     for name, value in vars(wrapper).items():
         if name != "env" and (isinstance(value, gym.Env) or any(value is each for each in inside)):

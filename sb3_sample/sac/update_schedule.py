@@ -16,9 +16,10 @@ from sb3_sample.learner.execution import (
 from sb3_sample.replay.buffers import ValidationSplit
 from sb3_sample.replay.weighted import PrioritizedReplay
 from sb3_sample.sac import checks
+from sb3_sample.training.updates_owed import UpdatesOwed
 
 
-class UpdateSchedule:
+class UpdateSchedule(UpdatesOwed):
     """Part of an off-policy algorithm, before Stable-Baselines3's class: when it learns, and how many steps at once."""
 
     def _before_turns(self: Any) -> None:
@@ -116,10 +117,4 @@ class UpdateSchedule:
             return 0
         if isinstance(self.replay_buffer, PrioritizedReplay) and self.replay_buffer.n_drawable == 0:
             return 0
-        if self.replay_ratio is None:
-            return self.gradient_steps if self.gradient_steps >= 0 else n_collected
-        self._updates_owed += self.replay_ratio * n_collected / self._tasks_together
-        # The tolerance keeps 10 times 0.1 from falling short of 1 by rounding.
-        n_updates = int(self._updates_owed + 1e-6)
-        self._updates_owed -= n_updates
-        return n_updates
+        return self._updates_for(n_collected, self._tasks_together)  # type: ignore[no-any-return]

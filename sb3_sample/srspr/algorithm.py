@@ -34,6 +34,7 @@ from sb3_sample.srspr.learner import SPRLearner
 from sb3_sample.srspr.policies import SPRPolicy
 from sb3_sample.srspr.replay import SPRReplayBuffer
 from sb3_sample.training.resumable import Resumable
+from sb3_sample.training.updates_owed import UpdatesOwed
 
 Self = TypeVar("Self", bound="SRSPR")
 
@@ -41,7 +42,7 @@ Self = TypeVar("Self", bound="SRSPR")
 _SMALL = 1e-10
 
 
-class SRSPR(SRSPRArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]
+class SRSPR(SRSPRArguments, UpdatesOwed, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]
     """
     SR-SPR, the scaled-by-resetting agent for Atari with 100,000 decisions (D'Oro et al. 2023, on SPR, Schwarzer et al.
     2021), with the regular Q-network or BroNet (BRO, appendix E): Rainbow's value learning (C51, dueling, double,
@@ -329,13 +330,7 @@ class SRSPR(SRSPRArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  
             return 0
         if buffer.n_drawable == 0:
             return 0
-        if self.replay_ratio is None:
-            return self.gradient_steps if self.gradient_steps >= 0 else n_collected
-        self._updates_owed += self.replay_ratio * n_collected
-        # The tolerance keeps 10 times 0.1 from falling short of 1 by rounding.
-        n_updates = int(self._updates_owed + 1e-6)
-        self._updates_owed -= n_updates
-        return n_updates
+        return self._updates_for(n_collected)
 
     def _reset_if_due(self, before: int) -> None:
         """Reset where the last decisions have reached a multiple of the interval, and a whole one is left."""

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from sb3_sample.networks.bronet import ResidualBlock
 from sb3_sample.networks.ensemble import layer_norm
 
-#: What stands between latent state and output layers, by the name that ``network`` takes. "nature": a Dense layer,
+#: Layers between latent state and output layers, by the name that ``network`` takes. "nature": a Dense layer,
 #: which is SPR's projection too, and ReLU. "bronet": BroNet in its place, whose first Dense layer is the projection.
 #: "bronet_after_projection": the projection, and BroNet on it.
 NETWORKS = ("nature", "bronet", "bronet_after_projection")
@@ -62,7 +62,7 @@ class Encoder(nn.Module):
         convolutions = []
         for n_out, (kernel, stride) in zip(channels, self.LAYERS, strict=True):
             (top, bottom), (left, right) = (same_padding(size, kernel, stride) for size in sizes)
-            # What is the same on all sides costs nothing inside of the convolution.
+            # Padding that is the same on all sides costs nothing inside of the convolution.
             inside = (top, left) if (top, left) == (bottom, right) else (0, 0)
             self._paddings.append(() if inside == (top, left) else (left, right, top, bottom))
             convolutions.append(nn.Conv2d(n_in, n_out, kernel, stride, padding=inside))

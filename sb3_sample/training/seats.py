@@ -105,7 +105,7 @@ class Member:
 
 
 def _acting_of(seat: Seat, learner: Learner) -> Acting | None:
-    """What computes the actions of a learner together with those of others; None for an explorer's own ``act``."""
+    """Computation of a learner's actions together with those of others; None for an explorer's own ``act``."""
     explorer = learner.explorer
     if type(explorer).act is not Exploration.act or not explorer.can_be_mapped or not seat.with_others:
         return acting_of(learner)

@@ -10,8 +10,9 @@ import pytest
 import torch
 from torch.nn import functional as F
 
+from sb3_sample.learner.augmentation import shifted
 from sb3_sample.srspr import losses
-from sb3_sample.srspr.augmentation import augmented, shifted
+from sb3_sample.srspr.augmentation import SHIFT, augmented
 from sb3_sample.srspr.learner import AugmentationNoise
 from sb3_sample.srspr.networks import NETWORKS, NoisyLinear, SPRNetwork, renormalize
 from sb3_sample.srspr.replay import StateWindows
@@ -88,7 +89,7 @@ def test_shifts() -> None:
     pictures = torch.arange(2 * 3 * 6 * 5).view(2, 3, 6, 5).to(torch.uint8)
     padded = F.pad(pictures.float(), (4, 4, 4, 4), mode="replicate").to(torch.uint8)
     for row, column in itertools.product(range(9), range(9)):
-        got = shifted(pictures, torch.tensor([[row, column], [4, 4]]))
+        got = shifted(pictures, torch.tensor([[row, column], [4, 4]]), SHIFT)
         assert torch.equal(got[0], padded[0, :, row : row + 6, column : column + 5])
         assert torch.equal(got[1], pictures[1])
     noise = AugmentationNoise.draw(81 * 200, torch.device("cpu"))
