@@ -14,8 +14,9 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalC
 from sb3_sample import SAC, TrainingDiverged
 from sb3_sample.faults import HoldBack, MetricWatch, check_finite_parameters
 from sb3_sample.sac import algorithm
+from tests.agents import LOSS, OFF_POLICY, value_network
 from tests.ppo.common import ALGORITHMS, TINY, tiny
-from tests.sac.common import COMPILES, MAKERS, Toy, random_batch, sac, vec
+from tests.sac.common import COMPILES, MAKERS, PIXEL_MAKERS, Toy, random_batch, sac, vec
 from tests.sac.test_execution import captured
 
 NAN, INF = float("nan"), float("inf")
@@ -36,7 +37,7 @@ class At(BaseCallback):
 
 
 def poison_critic(model: Any, value: float = NAN) -> None:
-    next(model.critic.parameters()).view(-1)[0] = value
+    next(value_network(model).parameters()).view(-1)[0] = value
 
 
 def poison_value(model: Any) -> None:
@@ -47,15 +48,15 @@ def poison_value(model: Any) -> None:
 # ---------------------------------------------------------------- off-policy
 
 
-@pytest.mark.parametrize("maker", list(MAKERS))
+@pytest.mark.parametrize("maker", OFF_POLICY)
 def test_a_nan_in_a_parameter_stops_the_run_and_is_named(maker: str) -> None:
-    model = MAKERS[maker](compile=False)
-    with pytest.raises(TrainingDiverged, match=r"train/critic_loss is nan") as caught:
+    model = OFF_POLICY[maker](compile=False)
+    with pytest.raises(TrainingDiverged, match=f"{LOSS[maker]} is nan") as caught:
         model.learn(60, callback=At(30, poison_critic))
     # A transition a step, one gradient step a transition after the first ten, or the parts' own beginning.
     assert model.num_timesteps == caught.value.environment_step == 30
     assert f"at gradient step {model._n_updates} (environment step 30)" in str(caught.value)
-    assert np.isnan(caught.value.values["train/critic_loss"])
+    assert np.isnan(caught.value.values[LOSS[maker]])
 
 
 @pytest.mark.parametrize("value", [INF, -INF])
@@ -365,6 +366,6 @@ def test_an_evaluation_that_raises(tmp_path: Path) -> None:
 
 def test_a_step_is_finite() -> None:
     """The metrics of every algorithm, which are looked at, are finite by themselves."""
-    for make in MAKERS.values():
+    for make in (*MAKERS.values(), *PIXEL_MAKERS.values()):
         model = make(compile=False)
         assert all(torch.isfinite(value) for value in model._update(random_batch(model)).values())

@@ -29,6 +29,7 @@ from sb3_sample.envs import suites
 from sb3_sample.ppo import ExtraSamplesPPO
 from sb3_sample.sac.bro import BRO_RESETS
 from tests.sac.pixels import TINY, frames
+from tests.srspr import common as srspr
 
 ROOT = Path(__file__).parent.parent
 #: Keys that the zoo takes out of an entry, or turns into constructor arguments, before it builds the model.
@@ -171,13 +172,14 @@ def test_the_defaults_lie_in_the_search_space(name: str) -> None:
     assert sample(optuna.trial.FixedTrial(stored), 1, 1, NO_HER) == pytest.approx(defaults)
 
 
-@pytest.mark.parametrize("name", [name for name in zoo.ALGORITHMS if name not in PICTURES])
+@pytest.mark.parametrize("name", zoo.ALGORITHMS)
 def test_what_the_search_samples_builds_a_model(name: str) -> None:
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for _ in range(3):
         arguments = HYPERPARAMS_SAMPLER[name](study.ask(), 1, 1, dict(NO_HER))
-        made: Any = ("CnnPolicy", frames()) if name in PIXELS else ("MlpPolicy", "Pendulum-v1")
-        pictures = {"policy_kwargs": TINY} if name in PIXELS else {}
+        seen: Any = frames() if name in PIXELS else srspr.Frames() if name in PICTURES else "Pendulum-v1"
+        made: Any = ("MlpPolicy" if isinstance(seen, str) else "CnnPolicy", seen)
+        pictures = {"policy_kwargs": TINY if name in PIXELS else srspr.TINY} if name in (*PIXELS, *PICTURES) else {}
         model: Any = zoo.ALGORITHMS[name].algorithm(*made, device="cpu", **pictures, **small_buffer(name), **arguments)  # type: ignore[call-arg]
         for argument in arguments.keys() - {"learning_rate"}:
             if name != "regularized_sac" or arguments[argument] is not None:

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -180,10 +180,9 @@ class SAC(  # type: ignore[misc]  # actor
 
     def _setup_model(self) -> None:
         with warnings.catch_warnings():
-            # Of Stable-Baselines3, which knows n-step returns of its own buffer only, where a buffer is told of them.
-            cls = self.replay_buffer_class
-            if cls is None or (isinstance(cls, type) and issubclass(cls, CompactNStepReplayBuffer)):
-                warnings.filterwarnings("ignore", message="`n_steps=")
+            # Of Stable-Baselines3, which tells its own buffer of n-step returns only where it has chosen it. Here they
+            # all are told, and others are refused.
+            warnings.filterwarnings("ignore", message="`n_steps=")
             super()._setup_model()
         assert self.replay_buffer is not None
         store_float_actions(self.replay_buffer)
@@ -238,12 +237,15 @@ class SAC(  # type: ignore[misc]  # actor
                 self.frame_stack = stacked_frames(self.env, self.observation_space)
             if self.frame_stack is not None:
                 self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "frame_stack": self.frame_stack}
-        if self.replay_buffer_class is None and self.n_steps > 1 and "frame_stack" in self.replay_buffer_kwargs:
-            self.replay_buffer_class = CompactNStepReplayBuffer
-        if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, CompactNStepReplayBuffer):
+        if self.replay_buffer_class is None and self.n_steps > 1:
+            stacks = "frame_stack" in self.replay_buffer_kwargs
+            self.replay_buffer_class = CompactNStepReplayBuffer if stacks else NStepReplayBuffer
+        # Stable-Baselines3's has settings of its own where the algorithm has none.
+        told = NStepReplayBuffer if self.n_steps > 1 else CompactNStepReplayBuffer
+        if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, told):
             of_steps = {"n_steps": self.n_steps, "gamma": self.gamma}
             self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, **of_steps}
-        if self.replay_buffer_class is None and self.n_steps == 1:
+        if self.replay_buffer_class is None:
             self.replay_buffer_class = CompactDictReplayBuffer if is_dict else CompactReplayBuffer
         if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, CompactReplay):
             # It saves the memory in any case. Where Stable-Baselines3 reads the argument, it would end an episode that
@@ -282,6 +284,14 @@ class SAC(  # type: ignore[misc]  # actor
 
     @classmethod
     def _made(cls, content: Any, attributes: dict[str, Any], kwargs: dict[str, Any], *args: Any) -> Any:
+        n_step_buffers = NStepReplayBuffer, CompactNStepReplayBuffer
+        if "n_steps" in kwargs and attributes.get("replay_buffer_class") in n_step_buffers:
+            # It was chosen for the file's n_steps, which files of before have among its arguments.
+            attributes["replay_buffer_class"] = None
+            of_buffer = attributes.get("replay_buffer_kwargs")
+            if isinstance(of_buffer, dict):
+                others = {name: value for name, value in of_buffer.items() if name not in ("n_steps", "gamma")}
+                attributes["replay_buffer_kwargs"] = others
         prior_of, (_, env, *_) = attributes.get("_prior_of"), args
         if prior_of is not None and env is not None and "prior_data" not in kwargs:
             checks.check_prior_of(prior_of)

@@ -139,10 +139,7 @@ class DebiasedRQ(SAC):
         super()._construct(given)
 
     def _setup_model(self) -> None:
-        with warnings.catch_warnings():
-            # Of Stable-Baselines3, which knows n-step returns of its own buffer only.
-            warnings.filterwarnings("ignore", message="`n_steps=")
-            super()._setup_model()
+        super()._setup_model()
         self._source: WindowSource = WindowSource(self)
 
     def _check_arguments(self) -> None:

@@ -2,6 +2,7 @@
 
 import copy
 import io
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -9,53 +10,67 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from torch import nn
 
-from sb3_sample import BRO
+from sb3_sample import BRO, CompactReplayBuffer
 from sb3_sample.sac import SAC, BROFast
 from sb3_sample.sac.policies import SACPolicy
 from sb3_sample.saving import container
+from tests.agents import OFF_POLICY, env_of, seen_by
 from tests.sac.common import MAKERS, REPRESENTATIVE, bro, differing, sac, state, vec
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(16, 3)).astype(np.float32)
 
 
-def continue_training(model: Any, n: int = 25) -> Any:
+def resetting(maker: str, *steps: int) -> dict[str, Any]:
+    """Arguments that have the networks reset at some of the first steps; SR-SPR's resets are apart by an interval."""
+    return {"reset_interval": 12} if maker == "SRSPR" else {"resets": steps}
+
+
+def n_resets(model: Any) -> int:
+    return int(model.n_resets if hasattr(model, "n_resets") else model.plasticity.n_done)
+
+
+def continue_training(maker: str, model: Any, n: int = 25) -> Any:
     """Train on from a fresh environment and a fixed seed."""
-    model.set_env(vec())
+    model.set_env(env_of(maker))
     model.set_random_seed(11)
     return model.learn(n, reset_num_timesteps=False)
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", OFF_POLICY)
 @pytest.mark.parametrize("trained", [True, False])
 def test_save_load_gives_the_same_model(maker: str, trained: bool, tmp_path: Path) -> None:
-    model = MAKERS[maker](resets=(18,))
+    model = OFF_POLICY[maker](**resetting(maker, 18))
     if trained:
         model.learn(30)
     path = tmp_path / "model.zip"
     model.save(path)
-    loaded = type(model).load(path, env=vec(), device="cpu")
+    loaded = type(model).load(path, env=env_of(maker), device="cpu")
     assert type(loaded) is type(model)
     assert not differing(state(model), state(loaded))
     for deterministic in (True, False):
         torch.manual_seed(3)
-        ours, _ = model.predict(OBSERVATIONS, deterministic=deterministic)
+        np.random.seed(3)
+        ours, _ = model.predict(seen_by(model), deterministic=deterministic)
         torch.manual_seed(3)
-        np.testing.assert_array_equal(loaded.predict(OBSERVATIONS, deterministic=deterministic)[0], ours)
+        np.random.seed(3)
+        np.testing.assert_array_equal(loaded.predict(seen_by(model), deterministic=deterministic)[0], ours)
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", OFF_POLICY)
 def test_loaded_model_trains_on_identically(maker: str, tmp_path: Path) -> None:
-    model = MAKERS[maker](resets=(18, 50), replay_ratio=1.5, target_update_interval=2).learn(30)
+    interval = {} if maker == "SRSPR" else {"target_update_interval": 2}
+    model = OFF_POLICY[maker](**resetting(maker, 18, 50), replay_ratio=1.5, **interval).learn(30)
     model.save(tmp_path / "m")
     model.save_replay_buffer(tmp_path / "b")
-    loaded = type(model).load(tmp_path / "m", env=vec(), device="cpu")
+    loaded = type(model).load(tmp_path / "m", env=env_of(maker), device="cpu")
     loaded.load_replay_buffer(tmp_path / "b")
-    continue_training(model)
-    continue_training(loaded)
+    continue_training(maker, model)
+    continue_training(maker, loaded)
     assert model._n_updates == loaded._n_updates and model.num_transitions == loaded.num_transitions == 55
-    assert model.plasticity.n_done == loaded.plasticity.n_done == 2
+    assert n_resets(model) == n_resets(loaded) == 2
     assert not differing(state(model), state(loaded))
     np.testing.assert_array_equal(model.replay_buffer.actions, loaded.replay_buffer.actions)
 
@@ -72,16 +87,16 @@ def test_through_memory_and_a_second_time(maker: str) -> None:
         model = loaded
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", OFF_POLICY)
 def test_load_without_environment(maker: str, tmp_path: Path) -> None:
-    model = MAKERS[maker]().learn(20)
+    model = OFF_POLICY[maker]().learn(20)
     model.save(tmp_path / "m")
     loaded = type(model).load(tmp_path / "m")
     assert loaded.get_env() is None
     np.testing.assert_array_equal(
-        loaded.predict(OBSERVATIONS, deterministic=True)[0], model.predict(OBSERVATIONS, deterministic=True)[0]
+        loaded.predict(seen_by(model), deterministic=True)[0], model.predict(seen_by(model), deterministic=True)[0]
     )
-    loaded.set_env(vec())
+    loaded.set_env(env_of(maker))
     loaded.learn(15)
 
 
@@ -148,6 +163,25 @@ def test_a_part_given_at_loading_is_taken_or_refused(tmp_path: Path) -> None:
         BRO.load(tmp_path / "m", env=vec(), exploration="actor")
 
 
+def test_n_step_returns_are_those_of_the_arguments(tmp_path: Path) -> None:
+    """Of the caller's at loading, in files too that have them among the buffer's arguments; and nothing is ignored."""
+    given: dict[str, Any] = {}
+    model = sac(n_steps=5, gamma=0.9, replay_buffer_kwargs=given)
+    assert given == model.replay_buffer_kwargs == {}
+    model.save(tmp_path / "m")
+    model.replay_buffer_kwargs = {"n_steps": 5, "gamma": 0.9}
+    model.save(tmp_path / "before")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for name in "m", "before":
+            for kwargs in ({}, {"n_steps": 2}, {"gamma": 0.5}, {"n_steps": 2, "gamma": 0.5}):
+                loaded: Any = SAC.load(tmp_path / name, env=vec(), **kwargs)
+                buffer = loaded.replay_buffer
+                assert type(buffer) is NStepReplayBuffer
+                assert {"n_steps": 5, "gamma": 0.9} | kwargs == {"n_steps": buffer.n_steps, "gamma": buffer.gamma}
+            assert type(SAC.load(tmp_path / name, env=vec(), n_steps=1).replay_buffer) is CompactReplayBuffer
+
+
 def test_bad_override_at_loading(tmp_path: Path) -> None:
     sac().save(tmp_path / "m")
     with pytest.raises(ValueError, match="replay_ratio.*-1"):
@@ -161,14 +195,14 @@ def test_bad_override_at_loading(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- parameters
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", OFF_POLICY)
 def test_get_and_set_parameters(maker: str) -> None:
-    model, other = MAKERS[maker](seed=0).learn(20), MAKERS[maker](seed=1)
+    model, other = OFF_POLICY[maker](seed=0).learn(20), OFF_POLICY[maker](seed=1)
     assert differing(state(model), state(other))
     other.set_parameters(model.get_parameters())
     assert not differing(state(model), state(other))
     np.testing.assert_array_equal(
-        model.predict(OBSERVATIONS, deterministic=True)[0], other.predict(OBSERVATIONS, deterministic=True)[0]
+        model.predict(seen_by(model), deterministic=True)[0], other.predict(seen_by(model), deterministic=True)[0]
     )
 
 
@@ -179,9 +213,9 @@ def test_set_parameters_from_a_file(tmp_path: Path) -> None:
     assert not differing(state(model), state(other))
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", OFF_POLICY)
 def test_exact_match(maker: str) -> None:
-    model = MAKERS[maker]()
+    model = OFF_POLICY[maker]()
     parameters = model.get_parameters()
     with pytest.raises(ValueError, match="foo"):
         model.set_parameters({**parameters, "foo": {}}, exact_match=True)
@@ -209,15 +243,16 @@ def test_every_learned_tensor_is_in_the_parameters() -> None:
     assert not differing(state(model), state(other))
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", OFF_POLICY)
 def test_policy_save_load(maker: str, tmp_path: Path) -> None:
-    policy = MAKERS[maker]().learn(20).policy
+    model = OFF_POLICY[maker]().learn(20)
+    policy = model.policy
     policy.save(tmp_path / "p")
-    loaded = (type(policy) if maker == "DebiasedRQ" else SACPolicy).load(tmp_path / "p")
+    loaded = (type(policy) if maker in ("DebiasedRQ", "DrQv2", "SRSPR") else SACPolicy).load(tmp_path / "p")
     for (name, a), b in zip(policy.state_dict().items(), loaded.state_dict().values(), strict=True):
         assert torch.equal(a, b), name
     np.testing.assert_array_equal(
-        policy.predict(OBSERVATIONS, deterministic=True)[0], loaded.predict(OBSERVATIONS, deterministic=True)[0]
+        policy.predict(seen_by(model), deterministic=True)[0], loaded.predict(seen_by(model), deterministic=True)[0]
     )
 
 

@@ -37,18 +37,21 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
-from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO, RewoundPPO
+from sb3_sample import MBMAPPO, MBPOPPO, QMAPPO, RewoundPPO, make_atari_env
 from sb3_sample.diagnostics import DiagnosticsCallback, NoiseScaleCallback
 from sb3_sample.envs import make_env
+from sb3_sample.envs.registration import is_atari_id
 from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.replay.compact import CompactReplay
+from sb3_sample.replay.frames import OLDER, OLDER_FRAMES, StackedFrames
 from sb3_sample.replay.weighted import FadedReplayBuffer, PrioritizedReplayBuffer
 from sb3_sample.saving import training_state, vec_envs
 from sb3_sample.saving.callbacks import walk
 from sb3_sample.saving.folders import Folder
+from tests.agents import OFF_POLICY
 from tests.ppo.common import TINY, TINY_MODELS, arguments_of
-from tests.sac.common import MAKERS, PIXEL_MAKERS
 from tests.sac.pixels import Frames
+from tests.srspr import common as srspr
 
 PPOS = {"MBMA": MBMAPPO, "QMA": QMAPPO, "MBPO": MBPOPPO, "rewound": RewoundPPO}
 
@@ -86,6 +89,10 @@ def make(env: str) -> gym.Env:
         return Monitor(Goal())
     if env == "frames":
         return Monitor(Frames())
+    if env == "stacks":
+        return Monitor(srspr.Frames())
+    if is_atari_id(env):
+        return make_atari_env(env)
     return Monitor(make_env(env) if env.startswith("dmc/") else make_env(env, max_episode_steps=30))
 
 
@@ -119,7 +126,7 @@ def model(algorithm: str, folder: str, env: dict[str, Any], **kwargs: Any) -> An
         kwargs["replay_buffer_class"] = buffers[kwargs.pop("buffer")]
     if kwargs.pop("noise", False):
         kwargs["action_noise"] = OrnsteinUhlenbeckActionNoise(np.zeros(1), np.full(1, 0.3))
-    return {**MAKERS, **PIXEL_MAKERS}[algorithm](venv, **kwargs)
+    return OFF_POLICY[algorithm](venv, **kwargs)
 
 
 def callbacks(folder: str, env: dict[str, Any], evaluate: bool = False, diagnose: bool = False) -> Any:
@@ -319,7 +326,13 @@ def outcome(agent: Any, folder: str, callback: Any = None) -> dict[str, str]:
         own = {k: v for k, v in vars(buffer).items() if k not in ("infos", "slot", "_ring", "_first", "_last", "aside")}
         note("buffer", {k: v for k, v in own.items() if isinstance(v, (np.ndarray, dict, int, float))})
         if isinstance(buffer, CompactReplay):
-            note("buffer/rows", buffer.new_rows(buffer.size()))
+            rows = buffer.new_rows(buffer.size())
+            if isinstance(buffer.observations, StackedFrames):
+                # Nor is where the older frames of a stack are.
+                newest_last = np.arange(buffer.pos - buffer.size(), buffer.pos) % buffer.buffer_size
+                rows = {name: rows[name] for name in rows.keys() - {OLDER, OLDER_FRAMES}}
+                note("buffer/stacks", buffer.observations[newest_last])
+            note("buffer/rows", rows)
             note("buffer/changing", buffer.changing_state())
         if hasattr(buffer, "_ring"):
             note("buffer/_ring", buffer._ring[np.arange(buffer._first, buffer._last) % len(buffer._ring)])

@@ -33,6 +33,7 @@ from sb3_sample.saving.encoding import NotPortable, decode, encode
 from sb3_sample.saving.kept import Kept, declared
 from sb3_sample.saving.model_tree import Description
 from sb3_sample.saving.run_folder import RunFolder
+from tests.agents import OFF_POLICY, env_of
 from tests.ppo.common import EVERY, tiny
 from tests.sac.common import MAKERS, bro, differing, sac, state, vec
 from tests.saving.hostile_folders import facts_of, rewritten
@@ -52,14 +53,16 @@ def steps_of(folder: Path) -> list[int]:
     "maker",
     [
         pytest.param(maker, marks=[] if maker in ("BRO", "VPLSAC", MBMAPPO) else pytest.mark.slow)
-        for maker in (*MAKERS, *EVERY)
+        for maker in (*OFF_POLICY, *EVERY)
     ],
 )
 def test_every_attribute_that_changes_is_held(maker: Any, tmp_path: Path) -> None:
     """Fails when somebody adds state to an algorithm that no checkpoint holds."""
 
     def model() -> Any:
-        return MAKERS[maker](vec(2)) if isinstance(maker, str) else tiny(maker, vec(2), warm_up_until=0.5)
+        if isinstance(maker, str):
+            return OFF_POLICY[maker](env_of(maker, 2))
+        return tiny(maker, vec(2), warm_up_until=0.5)
 
     def look(owner: Any) -> dict[str, Any]:
         """Everything about an object, its parts by their identity."""
@@ -137,7 +140,8 @@ def test_an_attribute_is_declared_or_refused(tmp_path: Path) -> None:
 
 def test_what_is_declared_is_there() -> None:
     """No name in a declaration that no algorithm has any more."""
-    trained = [MAKERS["BRO"](vec(2)).learn(32), *(tiny(cls, vec(2)).learn(32) for cls in EVERY)]
+    trained = [OFF_POLICY[maker](env_of(maker, 2)).learn(32) for maker in ("BRO", "SRSPR")]
+    trained += [tiny(cls, vec(2)).learn(32) for cls in EVERY]
     names = {name for model in trained for name in declared(type(model))}
     assert [name for name in names if not any(hasattr(model, name) for model in trained)] == []
 

@@ -26,11 +26,13 @@ from sb3_sample.parts import Pessimism, argument
 from sb3_sample.sac import DAC, SAC
 from sb3_sample.saving import BadFile, container, load_vec_normalize, model_tree, save_vec_normalize
 from sb3_sample.saving.container import PickledFile
+from tests.agents import OFF_POLICY, env_of
 from tests.ppo.common import ALGORITHMS, tiny
-from tests.sac.common import MAKERS, bro, differing, sac, state, vec
+from tests.sac.common import bro, differing, sac, state, vec
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(16, 3)).astype(np.float32)
-MAKE: dict[str, Any] = {**MAKERS, **{cls.__name__: lambda cls=cls, **kwargs: tiny(cls, **kwargs) for cls in ALGORITHMS}}
+ON_POLICY = {cls.__name__: lambda cls=cls, **kwargs: tiny(cls, **kwargs) for cls in ALGORITHMS}
+MAKE: dict[str, Any] = {**OFF_POLICY, **ON_POLICY}
 
 
 @pytest.fixture
@@ -58,7 +60,7 @@ def no_pickle(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_no_pickle_is_touched(maker: str, tmp_path: Path, no_pickle: None) -> None:
     model = MAKE[maker]().learn(32)
     model.save(tmp_path / "m")
-    loaded = type(model).load(tmp_path / "m", env=vec(), device="cpu")
+    loaded = type(model).load(tmp_path / "m", env=env_of(maker), device="cpu")
     loaded.set_parameters(tmp_path / "m")
     assert not differing(state(model), state(loaded))
     if hasattr(model, "replay_buffer"):
@@ -96,7 +98,7 @@ def test_the_fixture_catches_pickles(tmp_path: Path, no_pickle: None) -> None:
         sac().save(tmp_path / "m", allow_pickle=True)
 
 
-@pytest.mark.parametrize("maker", ["BRO", "VPLSAC", "MBMAPPO"])
+@pytest.mark.parametrize("maker", ["BRO", "VPLSAC", "DrQv2", "SRSPR", "MBMAPPO"])
 def test_every_attribute_comes_back(maker: str, tmp_path: Path) -> None:
     model = MAKE[maker]().learn(32)
     model.save(tmp_path / "m")
@@ -564,7 +566,7 @@ def test_models_of_one_class_lose_no_arguments(maker: str, tmp_path: Path, monke
     class Same(type(model)):  # type: ignore[misc]
         pass
 
-    other = Same("MlpPolicy", None, _init_setup_model=False)
+    other = Same(next(iter(model.policy_aliases)), None, _init_setup_model=False)
     vars(other).update(vars(model))
     other.save(tmp_path / "other")
     monkeypatch.setattr(model_tree, "_below", lambda cls: iter(()))

@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from tests.sac.common import MAKERS
+from tests.agents import OFF_POLICY
+from tests.sac.common import PIXEL_MAKERS
 from tests.saving.program import PPOS, result, run
 
 N = 96
@@ -36,6 +37,10 @@ SLOW: dict[str, dict[str, Any]] = {
        for env in ("dmc/cartpole-swingup-v0", "metaworld/push-v3", "Hopper-v5")},
     **{f"SAC, workers, {env}": {"algorithm": "SAC", "env": {"env": env, **WORKERS4}}
        for env in ("dmc/reacher-easy-v0", "metaworld/pick-place-v3", "Ant-v5")},
+    "SRSPR": {"algorithm": "SRSPR", "env": {"env": "stacks"}, "kwargs": {"reset_interval": 50}},
+    "SRSPR, ring, workers": {"algorithm": "SRSPR", "env": {"env": "stacks", **WORKERS4}, "kwargs": {
+        "network": "bronet", "noisy": True, "buffer_size": 70, "replay_ratio": 0.7}},
+    "SRSPR, ALE/Pong-v5": {"algorithm": "SRSPR", "env": {"env": "ALE/Pong-v5"}},
     "DrQ": {"algorithm": "DrQ", "env": {"env": "frames"}, "kwargs": {"resets": 40, "resets_keep": ("encoder",)}},
     "DrQv2, ring, workers": {"algorithm": "DrQv2", "env": {"env": "frames", **WORKERS4}, "kwargs": {"buffer_size": 70}},
     "workers by forkserver": {"algorithm": "SAC", "env": {"n": 2, "workers": "forkserver"}},
@@ -105,8 +110,8 @@ def test_killed_while_a_checkpoint_is_written(seed: int, tmp_path: Path) -> None
     assert not differing(result(whole), result(killed))
 
 
-#: Every algorithm, and what goes wrong besides the kill.
-ALGORITHMS = (*MAKERS, *PPOS)
+#: Every algorithm, those that stand alone first, and what goes wrong besides the kill.
+ALGORITHMS = (*reversed(OFF_POLICY), *PPOS)
 TROUBLE = ("tee", "full disk", "no log", "writing", "nothing")
 #: How many kills there are; ``KILLS=100`` has every algorithm under every circumstance.
 KILLS = int(os.environ.get("KILLS", "20"))
@@ -120,10 +125,15 @@ def wholes(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], str]:
     def whole(algorithm: str) -> str:
         path = str(folder / algorithm)
         if not Path(f"{path}.json").exists():
-            run({"algorithm": algorithm}, _total(algorithm), 24, path, (-1, 10**9))
+            run(_case(algorithm), _total(algorithm), 24, path, (-1, 10**9))
         return path
 
     return whole
+
+
+def _case(algorithm: str) -> dict[str, Any]:
+    envs = {"SRSPR": "stacks", **dict.fromkeys(PIXEL_MAKERS, "frames")}
+    return {"algorithm": algorithm, "env": {"env": envs[algorithm]} if algorithm in envs else {}}
 
 
 def _total(algorithm: str) -> int:
@@ -140,7 +150,7 @@ def test_killed_under_all_circumstances(number: int, wholes: Callable[[str], str
     algorithm = ALGORITHMS[number % len(ALGORITHMS)]
     trouble = TROUBLE[(number + number // len(ALGORITHMS)) % len(TROUBLE)]
     rng = random.Random(number)
-    case, total, killed = {"algorithm": algorithm}, _total(algorithm), str(tmp_path / "killed")
+    case, total, killed = _case(algorithm), _total(algorithm), str(tmp_path / "killed")
     whole = wholes(algorithm)
     kill: tuple[int, float] = (N, rng.uniform(0, 0.02))
     if trouble == "writing":
