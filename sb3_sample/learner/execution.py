@@ -105,13 +105,7 @@ def foreign_parts(learner: Any) -> list[str]:
         True``, as "argument=class": a number that changes at every step, for example, causes a compilation at every
         step
     """
-    objects = {
-        "exploration": learner.explorer,
-        "pessimism": learner.pessimism_rule,
-        "value_head": learner.head,
-        "actor_network": learner.actor.trunk,
-        "critic_network": learner.critic.trunk,
-    }
+    objects = learner.exchangeable()
     if not _is_ours(type(learner).gradient_step):
         objects["learner_class"] = learner
     return [f"{name}={type(one).__name__}" for name, one in objects.items() if not _is_compilable(type(one))]

@@ -17,6 +17,7 @@ from torch.optim import Optimizer
 from sb3_sample.learner import first_step, losses
 from sb3_sample.learner.batch import SLOTS, Batch, CriticStep, Encoded, Extra, Noise, Store, first_copy, widened
 from sb3_sample.learner.descent import descend, follow, minimize
+from sb3_sample.learner.executable import Executable
 from sb3_sample.learner.execution import Acting, Execution, acting_of
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.heads import ValueHead
@@ -67,7 +68,7 @@ class Counts:
         self.planned_updates: int | None = None
 
 
-class Learner:
+class Learner(Executable):
     """
     Soft actor-critic with exchangeable parts, without an environment, a file or a replay buffer around it.
 
@@ -160,7 +161,7 @@ class Learner:
         self.target_subset, self.actor_pessimism, self.sam_radius = target_subset, actor_pessimism, sam_radius
         self.learning_starts, self.compile = learning_starts, compile
         self.n_tasks, self._n_envs = n_tasks, 1
-        self._counts = Counts() if counts is None else counts
+        super().__init__(Counts() if counts is None else counts)
         self._generators, self.head = generators, head.to(self.device)
         with self._random():
             self.networks = make_networks().to(self.device) if networks is None else networks
@@ -185,12 +186,9 @@ class Learner:
             betas = (temperature_beta1, 0.999)
             self.temperature_optimizer = AdamW(self.temperature.parameters(), lr=learning_rate, betas=betas)
         self._parts_mode = ModeSwitch(*self.parts().values())
-        self._execution: Execution | None = None
         # Where :meth:`drawn_step` draws its batches from; None: it cannot be taken.
         self._store: Store | None = None
         self._drawing: Execution | None = None
-        #: Chooses how the gradient steps are run: takes the learner and the method's name.
-        self.make_execution: Callable[[Any, str], Any] = Execution.of
         #: Chooses how the explorer's actions are computed.
         self.make_acting: Callable[[Any], Acting | None] = acting_of
         # The explorer, and what computes its actions; None for its own ``act``.
@@ -266,15 +264,6 @@ class Learner:
         critic's, from before the step, (B,). None if the batch came without the column ``slots``.
         """
         return self._td_errors
-
-    @property
-    def compiled(self) -> bool | None:
-        """Whether the gradient step is compiled; None while that is not decided."""
-        return self._counts.compiled  # type: ignore[no-any-return]
-
-    @compiled.setter
-    def compiled(self, value: bool | None) -> None:
-        self._counts.compiled = value
 
     def make_explorer(self) -> Exploration:
         """
@@ -495,25 +484,22 @@ class Learner:
         sizes = (len(group["params"]) for optimizer in optimizers for group in optimizer.param_groups)
         return (*map(id, (*objects, *optimizers, self.head, self._store)), *sizes)
 
+    def exchangeable(self) -> dict[str, Any]:
+        return {
+            "exploration": self.explorer,
+            "pessimism": self.pessimism_rule,
+            "value_head": self.head,
+            "actor_network": self.actor.trunk,
+            "critic_network": self.critic.trunk,
+        }
+
     @property
     def seconds_compiling(self) -> float:
-        """Seconds spent on compiling the gradient step."""
-        return sum(each.seconds_compiling for each in (self._execution, self._drawing) if each is not None)
+        return super().seconds_compiling + (0.0 if self._drawing is None else self._drawing.seconds_compiling)
 
     def forget_execution(self) -> None:
-        """Drop the execution: how the gradient steps are run is decided anew before the next one."""
-        self._execution = self._drawing = self._acting = None
-
-    def prepared_execution(self) -> Execution:
-        """
-        Prepare the gradient steps that follow.
-
-        :return: runner of the gradient steps
-        """
-        if self._execution is None or not self._execution.serves(self):
-            self._execution = self.make_execution(self, "gradient_step")
-        self._execution.prepare(self)
-        return self._execution
+        super().forget_execution()
+        self._drawing = self._acting = None
 
     def draw_from(self, store: Store) -> None:
         """

@@ -51,7 +51,7 @@ from sb3_sample.replay.weighted import PrioritizedReplay
 from sb3_sample.sac import checks
 from sb3_sample.sac.apart import ActsApart, Apart
 from sb3_sample.sac.arguments import SACArguments
-from sb3_sample.sac.metrics_log import MetricsLog
+from sb3_sample.sac.metrics_log import FamilyLog
 from sb3_sample.sac.model_learner import check_action_space
 from sb3_sample.sac.multi_task import is_multi_task, told_task
 from sb3_sample.sac.pixels import stacked_frames
@@ -81,7 +81,7 @@ class GradientStepBar(ProgressBarCallback):
 
 
 class SAC(  # type: ignore[misc]  # actor
-    ActsApart, UpdateSchedule, SB3Names, MetricsLog, SACArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
+    ActsApart, UpdateSchedule, SB3Names, FamilyLog, SACArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
 ):
     """
     Soft actor-critic with exchangeable parts, the base of every off-policy algorithm here. On its own it is the

@@ -1,47 +1,20 @@
-"""Metrics of the gradient steps in Stable-Baselines3's logger."""
+"""What the off-policy family logs beside the metrics of its gradient steps."""
 
 from typing import Any
 
-from stable_baselines3.common.logger import Logger
-
-from sb3_sample.logged_values import LoggedValues
 from sb3_sample.replay.buffers import ValidationSplit
+from sb3_sample.training.metrics_log import MetricsLog
 
 
-class MetricsLog:
-    """Part of an off-policy algorithm, before Stable-Baselines3's class: what it logs, and when."""
+class FamilyLog(MetricsLog):
+    """Part of an off-policy algorithm, before Stable-Baselines3's class: resets, the validation set, tasks."""
 
-    @property
-    def logger(self: Any) -> Logger:
-        """The logger. Metrics in it may be on the device until somebody reads them."""
-        if isinstance(self._logger, Logger):
-            LoggedValues.of(self._logger)
-        return self._logger
-
-    @property
-    def _metrics_wait(self: Any) -> bool:
-        """Whether the host would wait for the device if it read a metric now."""
-        return self.device.type != "cpu"
-
-    def _record_metrics(self: Any) -> None:
-        """Record the metrics of the latest gradient step: numbers on a CPU, on a GPU what becomes them when read."""
-        if not hasattr(self, "_logger"):
-            return  # There is none before ``learn`` or ``set_logger``.
-        if self._metrics_wait:
-            LoggedValues.record_later(self.logger, self._metrics)
-        else:
-            for name, value in self._metrics.items():
-                self.logger.record(name, float(value.numpy()))
-        self._record_counts()
+    def _rate_in_force(self: Any) -> float:
+        rate = self.learner.scheduled_rate
+        return super()._rate_in_force() if rate is None else rate
 
     def _record_counts(self: Any) -> None:
-        rate = self.learner.scheduled_rate
-        if rate is None:
-            rate = self.lr_schedule(self._current_progress_remaining)
-        self.logger.record("train/learning_rate", rate)
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        if self.learner.seconds_compiling > 0:
-            self.logger.record("time/seconds_compiling", self.learner.seconds_compiling)
+        super()._record_counts()
         self.logger.record("plasticity/reset", self.plasticity.n_done)
         if isinstance(self.replay_buffer, ValidationSplit):
             self.logger.record("validation/size", self.replay_buffer.n_validation)
@@ -62,18 +35,5 @@ class MetricsLog:
                 self.logger.record(f"rollout_success/{task_id}", sum(rates) / len(rates), exclude="stdout")
 
     def dump_logs(self: Any) -> None:
-        """
-        Write the log. On a GPU the host waits here for the metrics, at the latest.
-
-        :raises TrainingDiverged: if one of them was NaN or infinite since the last time
-        """
-        self._watch.check()
-        # Those of the latest gradient step also where there was none since the last time; a callback may have put
-        # others in the place of those that there are.
-        recorded = getattr(self.logger, "name_to_excluded", ())
-        for name, value in self._metrics.items():
-            if name not in recorded:
-                self.logger.record(name, float(value))
-        self._record_counts()
         self._record_tasks()
-        super().dump_logs()  # type: ignore[misc]  # of Stable-Baselines3's algorithm
+        super().dump_logs()

@@ -3,23 +3,14 @@
 import warnings
 from typing import Any
 
-from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
-
-from sb3_sample.console import say
-from sb3_sample.learner.execution import (
-    PAYS_FROM,
-    foreign_parts,
-    old_torch,
-    warn_not_compiled,
-    why_not_compiled,
-)
 from sb3_sample.replay.buffers import ValidationSplit
 from sb3_sample.replay.weighted import PrioritizedReplay
 from sb3_sample.sac import checks
+from sb3_sample.training.compiling import DecidesCompiling
 from sb3_sample.training.updates_owed import UpdatesOwed
 
 
-class UpdateSchedule(UpdatesOwed):
+class UpdateSchedule(DecidesCompiling, UpdatesOwed):
     """Part of an off-policy algorithm, before Stable-Baselines3's class: when it learns, and how many steps at once."""
 
     def _before_turns(self: Any) -> None:
@@ -37,40 +28,15 @@ class UpdateSchedule(UpdatesOwed):
                     f"schedule_steps must be given, as learning_rate_schedule={self.learning_rate_schedule!r} needs to "
                     "know how many gradient steps are planned, and the arguments do not say it"
                 )
-        if self.compiled is not None:
-            return
         n_of_warm_up = 0 if self._learns_from is not None else max(self.learning_starts - self.num_transitions, 0)
-        n_updates = self._updates_in(n_steps - n_of_warm_up)
-        # Warn of reasons not to compile only where compiling was asked for, and of an old torch, which is easily
-        # renewed.
-        foreign = foreign_parts(self.learner) if n_updates >= PAYS_FROM else []
-        if foreign and self.verbose >= 1:
-            verb = "does" if len(foreign) == 1 else "do"
-            say(f"The gradient step is not compiled: {', '.join(foreign)} {verb} not declare compilable = True")
-        pays = n_updates >= PAYS_FROM and not foreign
-        reason = why_not_compiled(self.learner) if pays else None
-        self.compiled = pays and reason is None
-        if reason is not None and reason == old_torch():
-            warn_not_compiled(self.learner, reason)
-        self.learner.forget_execution()
+        self._decide_compiling(self._updates_in(n_steps - n_of_warm_up))
 
     @property
     def _tasks_together(self: Any) -> int:
-        """Tasks that take a step together; 1 where a single environment has one after the other."""
         return min(self.n_tasks, self.n_envs)
 
     def _updates_in(self: Any, n_steps: int) -> float:
-        """Gradient steps in as many environment steps after the warm-up; 0 where that is not known."""
-        if self._learns_from is not None:
-            return n_steps
-        if self.replay_ratio is not None:
-            return self.replay_ratio * n_steps / self._tasks_together
-        assert isinstance(self.train_freq, TrainFreq)
-        if self.gradient_steps < 0:
-            return n_steps
-        if self.train_freq.unit is TrainFrequencyUnit.EPISODE:
-            return 0  # How long episodes are is not known.
-        return self.gradient_steps * n_steps / (self.n_envs * self.train_freq.frequency)
+        return n_steps if self._learns_from is not None else super()._updates_in(n_steps)
 
     def _after_turns(self: Any) -> None:
         """Say if nothing was learned for want of steps."""
@@ -117,4 +83,4 @@ class UpdateSchedule(UpdatesOwed):
             return 0
         if isinstance(self.replay_buffer, PrioritizedReplay) and self.replay_buffer.n_drawable == 0:
             return 0
-        return self._updates_for(n_collected, self._tasks_together)  # type: ignore[no-any-return]
+        return self._updates_for(n_collected)  # type: ignore[no-any-return]

@@ -22,7 +22,6 @@ from sb3_sample.constructor import Given
 from sb3_sample.envs.atari import make_atari_env
 from sb3_sample.envs.registration import is_atari_id
 from sb3_sample.faults import MetricWatch
-from sb3_sample.logged_values import LoggedValues
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
 from sb3_sample.saving.encoding import Lenient
 from sb3_sample.saving.kept import Kept
@@ -33,6 +32,8 @@ from sb3_sample.srspr.arguments import SRSPRArguments
 from sb3_sample.srspr.learner import SPRLearner
 from sb3_sample.srspr.policies import SPRPolicy
 from sb3_sample.srspr.replay import SPRReplayBuffer
+from sb3_sample.training.compiling import DecidesCompiling
+from sb3_sample.training.metrics_log import MetricsLog
 from sb3_sample.training.resumable import Resumable
 from sb3_sample.training.updates_owed import UpdatesOwed
 
@@ -42,7 +43,9 @@ Self = TypeVar("Self", bound="SRSPR")
 _SMALL = 1e-10
 
 
-class SRSPR(SRSPRArguments, UpdatesOwed, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm):  # type: ignore[misc]
+class SRSPR(  # type: ignore[misc]
+    MetricsLog, DecidesCompiling, UpdatesOwed, SRSPRArguments, SafeReplayBuffers, SafeFiles, OffPolicyAlgorithm
+):
     """
     SR-SPR, the scaled-by-resetting agent for Atari with 100,000 decisions (D'Oro et al. 2023, on SPR, Schwarzer et al.
     2021), with the regular Q-network or BroNet (BRO, appendix E): Rainbow's value learning (C51, dueling, double,
@@ -301,6 +304,10 @@ class SRSPR(SRSPRArguments, UpdatesOwed, SafeReplayBuffers, SafeFiles, OffPolicy
             checkpoint_freq,
         )
 
+    def _before_turns(self) -> None:
+        n_of_warm_up = max(self.learning_starts - self.num_transitions, 0)
+        self._decide_compiling(self._updates_in(self._total_timesteps - self.num_timesteps - n_of_warm_up))
+
     def _turn(self, callback: BaseCallback, log_interval: int) -> bool:
         assert self.env is not None and self.replay_buffer is not None
         before = self.num_transitions
@@ -330,7 +337,7 @@ class SRSPR(SRSPRArguments, UpdatesOwed, SafeReplayBuffers, SafeFiles, OffPolicy
             return 0
         if buffer.n_drawable == 0:
             return 0
-        return self._updates_for(n_collected)
+        return self._updates_for(n_collected)  # type: ignore[no-any-return]
 
     def _reset_if_due(self, before: int) -> None:
         """Reset where the last decisions have reached a multiple of the interval, and a whole one is left."""
@@ -367,9 +374,8 @@ class SRSPR(SRSPRArguments, UpdatesOwed, SafeReplayBuffers, SafeFiles, OffPolicy
         assert isinstance(buffer, SPRReplayBuffer)
         for name in SPRLearner.SETTINGS:
             setattr(self.learner, name, getattr(self, name))
-        rate = self.lr_schedule(self._current_progress_remaining)
         for group in self.policy.optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = self._rate_in_force()
         self.learner.prepared_execution()
         for _ in range(gradient_steps):
             slots = buffer.draw(self.batch_size if batch_size is None else batch_size)
@@ -379,33 +385,13 @@ class SRSPR(SRSPRArguments, UpdatesOwed, SafeReplayBuffers, SafeFiles, OffPolicy
             buffer.weights.renew(slots, td_losses.cpu().numpy() + _SMALL)
             self._watch.note(metrics, self._n_updates, self.num_timesteps)
             self._metrics.update(metrics)
-        if self.device.type == "cpu":
+        if not self._metrics_wait:
             self._watch.check()
-        self._record_metrics(rate)
+        self._record_metrics()
 
-    def _record_metrics(self, rate: float) -> None:
-        if not hasattr(self, "_logger"):
-            return  # There is none before ``learn`` or ``set_logger``.
-        LoggedValues.of(self.logger)
-        if self.device.type == "cpu":
-            for name, value in self._metrics.items():
-                self.logger.record(name, float(value.numpy()))
-        else:
-            LoggedValues.record_later(self.logger, self._metrics)
-        self.logger.record("train/learning_rate", rate)
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+    def _record_counts(self) -> None:
+        super()._record_counts()
         self.logger.record("plasticity/reset", self.n_resets)
-        if self.learner.seconds_compiling > 0:
-            self.logger.record("time/seconds_compiling", self.learner.seconds_compiling)
-
-    def dump_logs(self) -> None:
-        """
-        Write the log. On a GPU the host waits here for the metrics, at the latest.
-
-        :raises TrainingDiverged: if one of them was NaN or infinite since the last time
-        """
-        self._watch.check()
-        super().dump_logs()
 
 
 def _made(env: Any) -> Any:

@@ -105,5 +105,5 @@ class SRSPRArguments(Resumable):
     compile: bool | str = argument(
         default="auto", kind=Kind('be True, False or "auto"', lambda value: value in (True, False, "auto"))
     )
-    """whether Inductor makes one program of the gradient step; "auto" does not. On a GPU the step is captured as a CUDA
-    graph unless this is False"""
+    """whether Inductor makes one program of the gradient step; "auto": where that pays back within the run. On a GPU
+    the step is captured as a CUDA graph unless this is False"""

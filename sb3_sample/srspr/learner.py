@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 from sb3_sample.learner.descent import follow, minimize
-from sb3_sample.learner.execution import Execution, cuda_graph, warn_not_compiled, why_not_compiled
+from sb3_sample.learner.executable import Executable
 from sb3_sample.srspr.augmentation import SHIFT, augmented
 from sb3_sample.srspr.losses import alive_after, n_step_return, project, spr_loss
 from sb3_sample.srspr.networks import FRESH, SPRNetwork
@@ -40,7 +40,7 @@ class AugmentationNoise(NamedTuple):
         return cls(offsets, torch.randn(n, device=device))
 
 
-class SPRLearner:
+class SPRLearner(Executable):
     """
     Value learner with self-predictive representations (SPR, Schwarzer et al. 2021): C51's loss of n-step double
     Q-learning, and the prediction of the latent states that follow.
@@ -52,7 +52,7 @@ class SPRLearner:
     :param n_steps: steps whose rewards are summed
     :param n_predictions: steps whose latent states are predicted
     :param spr_weight: weight of their loss
-    :param compile: whether the gradient step is compiled; "auto": as ``counts.compiled`` says, on a GPU captured
+    :param compile: whether the gradient step is compiled; "auto": as ``counts.compiled`` says, else not
     :param device: where the learner computes
     :param verbose: 0 nothing, 1 info
     """
@@ -73,10 +73,10 @@ class SPRLearner:
         device: torch.device,
         verbose: int,
     ):
-        self.policy, self._counts = policy, counts
+        super().__init__(counts)
+        self.policy = policy
         self.gamma, self.tau, self.n_steps, self.n_predictions = gamma, tau, n_steps, n_predictions
         self.spr_weight, self.compile, self.device, self.verbose = spr_weight, compile, device, verbose
-        self._execution: Execution | None = None
 
     # ---------------------------------------------------------------- what it consists of
 
@@ -89,15 +89,6 @@ class SPRLearner:
     def target(self) -> SPRNetwork:
         """Network that follows it, and acts."""
         return self.policy.q_net_target  # type: ignore[no-any-return]
-
-    @property
-    def compiled(self) -> bool | None:
-        """Whether the gradient step is compiled; None while that is not decided."""
-        return self._counts.compiled  # type: ignore[no-any-return]
-
-    @compiled.setter
-    def compiled(self, value: bool | None) -> None:
-        self._counts.compiled = value
 
     def optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """
@@ -123,33 +114,11 @@ class SPRLearner:
         """
         return tuple(map(id, (self.online, self.target, self.policy.optimizer)))
 
+    def exchangeable(self) -> dict[str, Any]:
+        # A policy of one's own may have another network.
+        return {"policy": self.online}
+
     # ---------------------------------------------------------------- the update
-
-    def prepared_execution(self) -> Execution:
-        """
-        Prepare the gradient steps that follow.
-
-        :return: runner of the gradient steps
-        """
-        if self._execution is None or not self._execution.serves(self):
-            if self.compiled and (reason := why_not_compiled(self)) is not None:
-                warn_not_compiled(self, reason)
-                self.compiled = False
-            captures = self.device.type == "cuda" and self.compile is not False
-            self._execution = Execution(
-                self, bool(self.compiled), self.compile == "auto", cuda_graph if captures else None
-            )
-        self._execution.prepare(self)
-        return self._execution
-
-    def forget_execution(self) -> None:
-        """Drop the execution: how the gradient steps are run is decided anew before the next one."""
-        self._execution = None
-
-    @property
-    def seconds_compiling(self) -> float:
-        """Seconds spent on compiling the gradient step."""
-        return 0.0 if self._execution is None else self._execution.seconds_compiling
 
     def step(
         self, windows: StateWindows, noise: AugmentationNoise | None = None

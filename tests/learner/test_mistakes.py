@@ -231,7 +231,7 @@ def test_an_error_that_a_part_raises_has_a_note_of_where(kwargs: dict[str, Any],
 def test_an_error_inside_of_a_compiled_step_is_the_parts_own(
     update: Any, error: Any, words: str, compile: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sb3_sample.sac.update_schedule.PAYS_FROM", 5)
+    monkeypatch.setattr("sb3_sample.training.compiling.PAYS_FROM", 5)
     model = sac(pessimism=rule(update=update, compilable=True), compile=compile)
     with pytest.raises(error, match=words):
         model.learn(30)

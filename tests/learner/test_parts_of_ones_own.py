@@ -317,7 +317,7 @@ def test_which_parts_are_compiled_unasked(
         return
     sac(**kwargs, verbose=1).learn(12)
     assert "not compiled" not in capsys.readouterr().out  # few steps, which would not be compiled anyway
-    monkeypatch.setattr("sb3_sample.sac.update_schedule.PAYS_FROM", 1)
+    monkeypatch.setattr("sb3_sample.training.compiling.PAYS_FROM", 1)
     sac(**kwargs, verbose=1).learn(12)
     does = "does" if len(foreign) == 1 else "do"
     line = f"The gradient step is not compiled: {', '.join(foreign)} {does} not declare compilable = True\n"
@@ -329,7 +329,7 @@ def test_which_parts_are_compiled_unasked(
 @pytest.mark.slow
 @COMPILES
 def test_parts_that_say_so_are_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_sample.sac.update_schedule.PAYS_FROM", 5)
+    monkeypatch.setattr("sb3_sample.training.compiling.PAYS_FROM", 5)
     kwargs: dict[str, Any] = {"pessimism": Rule, "value_head": TwoHot, "policy_kwargs": {"critic_network": Unit}}
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*not compiled")

@@ -20,16 +20,21 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sb3_sample import BRO, DiagnosticsCallback
+from sb3_sample import BRO, SRSPR, DiagnosticsCallback
 from sb3_sample.learner import execution
-from sb3_sample.learner.execution import Execution, old_torch, why_not_compiled
+from sb3_sample.learner.execution import Execution, foreign_parts, old_torch, why_not_compiled
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.pessimism import PESSIMISMS, Pessimism
 from sb3_sample.replay.buffers import PLAIN_BUFFERS, BatchMemory, DeviceReplayBuffer
 from sb3_sample.replay.sources import draw_batches
-from sb3_sample.sac import SAC, update_schedule
-from tests.sac.common import COMPILES, MAKERS, Toy, bro, differing, sac, state, vec
+from sb3_sample.sac import SAC
+from sb3_sample.srspr.networks import SPRNetwork
+from sb3_sample.srspr.policies import SPRPolicy
+from sb3_sample.training import compiling
+from tests.agents import OFF_POLICY, env_of
+from tests.sac.common import COMPILES, Toy, bro, differing, sac, state, vec
+from tests.srspr.common import TINY
 
 #: Largest difference of a parameter after 50 updates, each of which moves it by up to 3e-4. The same arithmetic in
 #: another order differs by rounding; Adam makes much of it where a gradient is nearly zero.
@@ -55,15 +60,13 @@ class Recorder:
     same memory, whatever Python would do by then.
     """
 
-    def __init__(self, model: SAC):
-        self.model = model
+    def __init__(self, model: Any):
+        self.learner = model.learner
         self.n_recordings = self.n_repetitions = 0
 
     def _memory(self) -> list[torch.Tensor]:
-        parts = (self.model.explorer, self.model.pessimism_rule, self.model.objective)
-        modules = (self.model.policy, self.model.temperature, *parts)
-        tensors = [t for module in modules for t in (*module.parameters(), *module.buffers())]
-        for optimizer in self.model._optimizers().values():
+        tensors = [t for module in self.learner.step_modules() for t in (*module.parameters(), *module.buffers())]
+        for optimizer in self.learner.optimizers().values():
             tensors += [t for s in optimizer.state.values() for t in s.values() if isinstance(t, torch.Tensor)]
         return tensors
 
@@ -90,7 +93,7 @@ class Recorder:
         return repeat, result
 
 
-def captured(model: SAC, warm_up: int = 3) -> Recorder:
+def captured(model: Any, warm_up: int = 3) -> Recorder:
     """Let a model's gradient steps be captured by a recorder, after some that are run as they are."""
     recorder = Recorder(model)
     model.learner._execution = Execution(model.learner, False, False, recorder)
@@ -108,7 +111,7 @@ ROUNDING = ("CrossQ+WN", "DebiasedRQ", "FlashSAC", "XQC")
 FEW_STEPS = {"CrossQ+WN": 5, "XQC": 10}
 
 
-def largest_difference(a: SAC, b: SAC) -> float:
+def largest_difference(a: Any, b: Any) -> float:
     """Of any parameter or learned number; of the optimizers' moments, which are as large as gradients, relative."""
     ours, theirs = state(a), state(b)
     assert ours.keys() == theirs.keys()
@@ -122,20 +125,20 @@ def largest_difference(a: SAC, b: SAC) -> float:
     return largest
 
 
-def pair(maker: str, **kwargs: Any) -> tuple[SAC, SAC]:
+def pair(maker: str, **kwargs: Any) -> tuple[Any, Any]:
     """Two equal models with filled buffers and no gradient step taken."""
     models = []
     for compile in (False, kwargs.pop("compile", False)):
         # The ends of episodes count too where they take places in the buffer.
         starts = 70 if maker == "DebiasedRQ" else 60
-        model = MAKERS[maker](**{"learning_starts": starts, "compile": compile, **kwargs})
+        model = OFF_POLICY[maker](**{"learning_starts": starts, "compile": compile, **kwargs})
         model.learn(60)
         models.append(model)
     assert not differing(state(models[0]), state(models[1]))
     return models[0], models[1]
 
 
-def updates(model: SAC, n: int, seed: int = 0, each: Callable[[int], None] = lambda i: None) -> None:
+def updates(model: Any, n: int, seed: int = 0, each: Callable[[int], None] = lambda i: None) -> None:
     np.random.seed(seed)
     torch.manual_seed(seed)
     for i in range(n):
@@ -143,12 +146,12 @@ def updates(model: SAC, n: int, seed: int = 0, each: Callable[[int], None] = lam
         model.train(1, 8)
 
 
-FAST = ["BRO", "VPLSAC"]
+FAST = ["BRO", "VPLSAC", "SRSPR"]
 
 
 @COMPILES
 @pytest.mark.parametrize(
-    "maker", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in MAKERS]
+    "maker", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in OFF_POLICY]
 )
 def test_compiled_is_eager(maker: str) -> None:
     model, compiled = pair(maker, compile=True)
@@ -163,7 +166,7 @@ def test_compiled_is_eager(maker: str) -> None:
         assert compiled._metrics[name].item() == pytest.approx(value.item(), rel=1e-2, abs=1e-3), name
 
 
-@pytest.mark.parametrize("maker", list(MAKERS))
+@pytest.mark.parametrize("maker", OFF_POLICY)
 def test_captured_is_eager(maker: str) -> None:
     model, other = pair(maker)
     recorder = captured(other)
@@ -174,7 +177,7 @@ def test_captured_is_eager(maker: str) -> None:
     # Learning rates are float32 there.
     assert largest_difference(model, other) < (10 * TOLERANCE if maker in ROUNDING else TOLERANCE)
     # Every kind of step is warmed up three times.
-    n_kinds = 2 if model.policy_delay > 1 else 1
+    n_kinds = 2 if getattr(model, "policy_delay", 1) > 1 else 1
     assert recorder.n_recordings == n_kinds
     assert recorder.n_repetitions == n - 3 * n_kinds
 
@@ -385,17 +388,21 @@ def test_compiled_models_do_not_share() -> None:
 
 
 @COMPILES
-def test_auto_compiles_where_it_pays_and_the_file_remembers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(update_schedule, "PAYS_FROM", 50)
-    model = sac(learning_starts=20, replay_ratio=1)
-    assert model.compile == "auto" and model.compiled is None
-    assert sac(learning_starts=20, replay_ratio=1).learn(69).compiled is False
+@pytest.mark.parametrize("maker", ["SAC", "SRSPR"])
+def test_auto_compiles_where_it_pays_and_the_file_remembers(
+    maker: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compiling, "PAYS_FROM", 50)
+    model, other = (OFF_POLICY[maker](learning_starts=20, replay_ratio=1, compile="auto") for _ in range(2))
+    assert model.compiled is None
+    assert other.learn(69).compiled is False
     model.learn(70)
     assert model.compiled is True and model.learner._execution.compiled
     model.save(tmp_path / "model.zip")
-    assert SAC.load(tmp_path / "model.zip").compiled is True
-    assert SAC.load(tmp_path / "model.zip", compile=False).compiled is False
-    undecided = SAC.load(tmp_path / "model.zip", env=vec(), compile="auto")
+    load = type(model).load
+    assert load(tmp_path / "model.zip").compiled is True
+    assert load(tmp_path / "model.zip", compile=False).compiled is False
+    undecided = load(tmp_path / "model.zip", env=env_of(maker), compile="auto")
     assert undecided.compiled is None and undecided.learn(10).compiled is False
 
 
@@ -416,7 +423,7 @@ def test_counts_the_gradient_steps_to_come(
     kwargs: dict[str, Any], n_updates: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for threshold, expected in ((n_updates, True), (n_updates + 1, False)):
-        monkeypatch.setattr(update_schedule, "PAYS_FROM", threshold)
+        monkeypatch.setattr(compiling, "PAYS_FROM", threshold)
         model = sac(learning_starts=20, **kwargs)
         model._total_timesteps = 100
         model._before_turns()
@@ -424,7 +431,7 @@ def test_counts_the_gradient_steps_to_come(
 
 
 def test_episodes_of_unknown_length_stay_uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(update_schedule, "PAYS_FROM", 1)
+    monkeypatch.setattr(compiling, "PAYS_FROM", 1)
     model = sac(learning_starts=20, train_freq=(1, "episode"), gradient_steps=2)
     model._total_timesteps = 100
     model._before_turns()
@@ -432,10 +439,13 @@ def test_episodes_of_unknown_length_stay_uncompiled(monkeypatch: pytest.MonkeyPa
 
 
 @COMPILES
+@pytest.mark.parametrize("maker", ["SAC", "SRSPR"])
 @pytest.mark.parametrize("compile", [True, "auto"])
-def test_without_a_compiler_training_goes_on_uncompiled(compile: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(update_schedule, "PAYS_FROM", 5)
-    model = sac(compile=compile)
+def test_without_a_compiler_training_goes_on_uncompiled(
+    compile: Any, maker: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compiling, "PAYS_FROM", 5)
+    model = OFF_POLICY[maker](compile=compile)
     without = torch._inductor.config.patch({"cpp.cxx": ("/nonexistent/c++",)})
     with without, warnings.catch_warnings(record=True) as caught:
         assert "C++ compiler" in (why_not_compiled(model.learner) or "")
@@ -450,7 +460,7 @@ def test_without_a_compiler_training_goes_on_uncompiled(compile: Any, monkeypatc
 @pytest.mark.parametrize("version", ["2.10.0+cu130", "2.4.1", "1.13.1"])
 def test_an_old_torch_is_told_of_once(compile: Any, version: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over several models, calls of ``learn`` and a file that says to go on compiled; and the numbers are eager's."""
-    monkeypatch.setattr(update_schedule, "PAYS_FROM", 5)
+    monkeypatch.setattr(compiling, "PAYS_FROM", 5)
     eager = sac(compile=False).learn(30)
     monkeypatch.setattr(torch, "__version__", version)
     monkeypatch.setattr(execution, "_told", set())
@@ -497,7 +507,7 @@ class Peeking(BaseFeaturesExtractor):
 
 @COMPILES
 def test_what_cannot_be_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(update_schedule, "PAYS_FROM", 5)
+    monkeypatch.setattr(compiling, "PAYS_FROM", 5)
     kwargs = {"policy_kwargs": {"net_arch": [8], "features_extractor_class": Peeking}}
     model = sac(compile="auto", **kwargs)
     with pytest.warns(UserWarning, match="not compiled, as it cannot be"):
@@ -521,7 +531,7 @@ def test_parts_of_ones_own_are_compiled_when_asked_for(monkeypatch: pytest.Monke
         def before_updates(self, agent: SAC) -> None:
             self.constant += 0.01
 
-    monkeypatch.setattr(update_schedule, "PAYS_FROM", 5)
+    monkeypatch.setattr(compiling, "PAYS_FROM", 5)
     monkeypatch.setitem(PESSIMISMS, "own", Own)
     monkeypatch.setitem(PESSIMISMS, "counting", Counting)
     assert sac(pessimism="own").learn(20).compiled is False
@@ -531,12 +541,41 @@ def test_parts_of_ones_own_are_compiled_when_asked_for(monkeypatch: pytest.Monke
         sac(pessimism="counting", compile=True).learn(20)
 
 
-def test_foreign_optimizers_stay_uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(update_schedule, "PAYS_FROM", 5)
-    kwargs = {"policy_kwargs": {"net_arch": [8], "optimizer_class": torch.optim.RMSprop}}
-    assert sac(**kwargs).learn(30).compiled is False
+@pytest.mark.parametrize("maker", ["SAC", "SRSPR"])
+def test_foreign_optimizers_stay_uncompiled(maker: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiling, "PAYS_FROM", 5)
+    make = OFF_POLICY[maker]
+    small: dict[str, Any] = TINY if maker == "SRSPR" else {"net_arch": [8]}
+    kwargs = {"policy_kwargs": {**small, "optimizer_class": torch.optim.RMSprop}}
+    assert make(**kwargs).learn(30).compiled is False
     with pytest.warns(UserWarning, match="AdamW only, not of RMSprop"):
-        assert sac(compile=True, **kwargs).learn(30).compiled is False
+        assert make(compile=True, **kwargs).learn(30).compiled is False
+
+
+@COMPILES
+def test_a_network_of_ones_own_is_compiled_when_asked_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where the networks are one, in a policy of one's own."""
+    monkeypatch.setattr(compiling, "PAYS_FROM", 5)
+    kwargs: dict[str, Any] = {"learning_starts": 10, "policy_kwargs": TINY, "verbose": 1}
+    model = SRSPR(OwnSPRPolicy, env_of("SRSPR"), buffer_size=100, batch_size=4, n_steps=3, n_predictions=2, **kwargs)
+    assert model.learn(16).compiled is False
+    words = "The gradient step is not compiled: policy=OwnSPRNetwork does not declare compilable = True\n"
+    assert words in capsys.readouterr().out
+    monkeypatch.setattr(OwnSPRNetwork, "compilable", True, raising=False)
+    assert not foreign_parts(model.learner)
+
+
+class OwnSPRNetwork(SPRNetwork):
+    pass
+
+
+class OwnSPRPolicy(SPRPolicy):
+    def make_network(self) -> SPRNetwork:
+        network = super().make_network()
+        network.__class__ = OwnSPRNetwork
+        return network
 
 
 @COMPILES

@@ -1,13 +1,11 @@
 """SR-SPR as a user has it: acting, when it learns, resets, files, runs that go on, errors."""
 
 import copy
-import json
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import optuna
 import pytest
 import torch
 from gymnasium import spaces
@@ -15,10 +13,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 from sb3_sample import SRSPR
-from sb3_sample.learner.execution import Execution
 from sb3_sample.srspr.networks import FRESH
-from sb3_sample.zoo import search
-from tests.sac.test_execution import Recorder
+from tests.sac.common import COMPILES
+from tests.sac.test_execution import TOLERANCE, captured, largest_difference, pair, updates
 from tests.srspr.common import SIZE, TINY, Frames, tiny, venv
 
 
@@ -153,29 +150,29 @@ def test_noisy_layers_are_silent_in_evaluation() -> None:
 # ---------------------------------------------------------------- ways to run, files
 
 
-class SPRRecorder(Recorder):
-    """Repeats the operations of a recorded gradient step, as a CUDA graph does."""
+@COMPILES
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"network": "bronet", "noisy": True},
+        pytest.param({"network": "bronet_after_projection"}, marks=pytest.mark.slow),
+    ],
+)
+def test_compiled_is_eager(kwargs: dict[str, Any]) -> None:
+    """The same windows, noise and draws of noisy layers, across a reset; the regular network: test_execution.py."""
+    model, compiled = pair("SRSPR", compile=True, **kwargs)
+    for seed in range(2):
+        for each in (model, compiled):
+            updates(each, 20, seed)
+            torch.manual_seed(9)
+            each.learner.reset(0.5)
+    assert compiled.learner._execution.compiled and compiled.learner.seconds_compiling > 0
+    assert largest_difference(model, compiled) < TOLERANCE
 
-    def _memory(self) -> list[torch.Tensor]:
-        policy: Any = self.model.policy
-        moments = [t for state in policy.optimizer.state.values() for t in state.values()]
-        return [*policy.parameters(), *policy.buffers(), *moments]
 
-
-@pytest.mark.slow
-@pytest.mark.parametrize("network", ["nature", "bronet"])
-def test_compiled_is_eager(network: str) -> None:
-    models = [tiny(network=network, compile=compiled).learn(36) for compiled in (False, True)]
-    assert models[1].compiled and models[1].learner.seconds_compiling > 0
-    first, second = map(parameters, models)
-    for name in first:
-        assert torch.allclose(first[name], second[name], atol=2e-4), name
-
-
-def test_captured_is_eager() -> None:
+def test_captured_survives_a_reset() -> None:
     models = [tiny(learning_starts=20, compile=False) for _ in range(2)]
-    recorder = SPRRecorder(models[1])  # type: ignore[arg-type]
-    models[1].learner._execution = Execution(models[1].learner, False, False, recorder)
+    recorder = captured(models[1])
     for model in models:
         model.set_random_seed(0)
         model.learn(30)
@@ -234,30 +231,6 @@ def test_a_run_that_goes_on_ends_as_one_without_interruption(at: int, tmp_path: 
     first, second = whole.replay_buffer, resumed.replay_buffer
     assert np.array_equal(np.asarray(first.observations), np.asarray(second.observations))
     assert np.array_equal(first.weights.priority, second.weights.priority)
-
-
-@pytest.mark.slow
-def test_export(tmp_path: Path) -> None:
-    pytest.importorskip("onnxscript")
-    onnxruntime = pytest.importorskip("onnxruntime")
-    model = tiny(network="bronet")
-    onnx_path, script_path = model.export(tmp_path / "policy")
-    observations = np.stack([Frames().reset(seed=seed)[0] for seed in range(6)])
-    expected = model.predict(observations, deterministic=True)[0]
-    session = onnxruntime.InferenceSession(str(onnx_path))
-    assert np.array_equal(session.run(None, {"observation": observations})[0], expected)
-    script = torch.jit.load(str(script_path))
-    assert np.array_equal(script(torch.as_tensor(observations)).numpy(), expected)
-    assert json.loads(session.get_modelmeta().custom_metadata_map["inputs"])[0]["layout"] == "channels first"
-
-
-def test_what_the_search_samples_builds_a_model() -> None:
-    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
-    for _ in range(3):
-        trial = study.ask()
-        arguments = search.decode({name: suggest(trial, name) for name, suggest in search.SRSPR_SPACE.items()})
-        model = tiny(**arguments)
-        assert all(getattr(model, name) == value for name, value in arguments.items() if name != "learning_rate")
 
 
 # ---------------------------------------------------------------- errors
