@@ -11,7 +11,7 @@ class FamilyLog(MetricsLog):
 
     def _rate_in_force(self: Any) -> float:
         rate = self.learner.scheduled_rate
-        return super()._rate_in_force() if rate is None else rate
+        return super()._rate_in_force() if rate is None else float(rate)
 
     def _record_counts(self: Any) -> None:
         super()._record_counts()

@@ -337,7 +337,7 @@ class SRSPR(  # type: ignore[misc]
             return 0
         if buffer.n_drawable == 0:
             return 0
-        return self._updates_for(n_collected)  # type: ignore[no-any-return]
+        return self._updates_for(n_collected)
 
     def _reset_if_due(self, before: int) -> None:
         """Reset where the last decisions have reached a multiple of the interval, and a whole one is left."""
