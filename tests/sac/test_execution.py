@@ -33,7 +33,7 @@ from sb3_sample.srspr.networks import SPRNetwork
 from sb3_sample.srspr.policies import SPRPolicy
 from sb3_sample.training import compiling
 from tests.agents import OFF_POLICY, env_of
-from tests.sac.common import COMPILES, Toy, bro, differing, sac, state, vec
+from tests.sac.common import COMPILES, PIXEL_MAKERS, Toy, bro, differing, sac, state, vec
 from tests.srspr.common import TINY
 
 #: Largest difference of a parameter after 50 updates, each of which moves it by up to 3e-4. The same arithmetic in
@@ -146,12 +146,17 @@ def updates(model: Any, n: int, seed: int = 0, each: Callable[[int], None] = lam
         model.train(1, 8)
 
 
-FAST = ["BRO", "VPLSAC", "SRSPR"]
+FAST = ["BRO", "VPLSAC"]
 
 
 @COMPILES
 @pytest.mark.parametrize(
-    "maker", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in OFF_POLICY]
+    "maker",
+    [
+        name if name in FAST else pytest.param(name, marks=pytest.mark.slow)
+        for name in OFF_POLICY
+        if name not in PIXEL_MAKERS  # test_drq.py, with a tolerance for its convolutions
+    ],
 )
 def test_compiled_is_eager(maker: str) -> None:
     model, compiled = pair(maker, compile=True)
@@ -388,7 +393,7 @@ def test_compiled_models_do_not_share() -> None:
 
 
 @COMPILES
-@pytest.mark.parametrize("maker", ["SAC", "SRSPR"])
+@pytest.mark.parametrize("maker", ["SAC", pytest.param("SRSPR", marks=pytest.mark.slow)])
 def test_auto_compiles_where_it_pays_and_the_file_remembers(
     maker: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

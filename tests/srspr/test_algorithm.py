@@ -151,13 +151,8 @@ def test_noisy_layers_are_silent_in_evaluation() -> None:
 
 
 @COMPILES
-@pytest.mark.parametrize(
-    "kwargs",
-    [
-        {"network": "bronet", "noisy": True},
-        pytest.param({"network": "bronet_after_projection"}, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kwargs", [{"network": "bronet", "noisy": True}, {"network": "bronet_after_projection"}])
 def test_compiled_is_eager(kwargs: dict[str, Any]) -> None:
     """The same windows, noise and draws of noisy layers, across a reset; the regular network: test_execution.py."""
     model, compiled = pair("SRSPR", compile=True, **kwargs)
