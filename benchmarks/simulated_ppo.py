@@ -4,7 +4,7 @@ machine can do, all in one run.
 
     python benchmarks/simulated_ppo.py [--threads 1] [--rounds 3] [--device cpu]
     python benchmarks/simulated_ppo.py --memory    # peak memory of one iteration of 4,096 steps and 16 actions
-    python benchmarks/simulated_ppo.py --short --device cuda    # each row as soon as it is measured, in a minute
+    python benchmarks/simulated_ppo.py --short --device cuda    # each row as soon as it is measured
 
 An iteration is that of the MBMA paper (https://arxiv.org/abs/2210.13011): 2,048 steps, minibatches of 64, 10 epochs,
 networks of 512 (actor) and 1024 (critic and models), horizon 12; observations and actions of cheetah-run. The
