@@ -75,6 +75,7 @@ AGENTS: dict[str, tuple[type[SAC], dict[str, Any]]] = {
     "dr_q": (DebiasedRQ, {}),
     "sac-drawn": (SAC, DRAWN),
     "bro-drawn": (BROFast, {"model_size": "4.92M", **DRAWN}),
+    "vpl-drawn": (VPLSAC, DRAWN),
 }
 #: What is measured, in this order: label, number of learners, whether compiled.
 PARTS: dict[str, tuple[str, int, bool]] = {
@@ -84,6 +85,7 @@ PARTS: dict[str, tuple[str, int, bool]] = {
     "sac-x10": ("sac", 10, True),
     "sac-drawn": ("sac-drawn", 1, True),
     "bro-drawn": ("bro-drawn", 1, True),
+    "vpl-drawn": ("vpl-drawn", 1, True),
     "sac-drawn-x10": ("sac-drawn", 10, True),
     "bro-drawn-x10": ("bro-drawn", 10, True),
     "dac": ("dac", 1, True),
@@ -271,7 +273,7 @@ def several(label: str, n: int, compiled: bool, device: str, turn: Turn) -> Iter
     inputs = [inputs_of(model) for model in models]
     observed = [(own[0].observations[:1], own[1].critic[:1]) for own in inputs]
     if all(model._draws_in_steps() for model in models):
-        inputs = [(model.batch_size, True, True) for model in models]
+        inputs = [(model.batch_size, 0, True, True) for model in models]
     for _ in range(6):
         group.step(inputs)
     with turn:
