@@ -423,9 +423,13 @@ def main() -> None:
                     ended(name, folder)
                     told(name, running.pop(name).returncode, folder)
             time.sleep(0.05)
-        for process in running.values():
+        late = {name: process for name, process in running.items() if process.poll() is None}
+        for process in late.values():
             process.kill()
         for name, process in running.items():
+            if name not in late:
+                told(name, process.returncode, folder)
+                continue
             process.wait()
             said(name, f"left out: {args.seconds:.0f} s are over")
 
