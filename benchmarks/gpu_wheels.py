@@ -4,7 +4,11 @@ and DeepMind Control, the last without what its suite does not need (locomotion,
 
     python benchmarks/gpu_wheels.py FOLDER [--python 3.12]
 
-The versions are those of the lock file. ``make gpu`` installs them there.
+The versions are those of the lock file, where it has one. ``make gpu`` installs them there.
+
+Among them is what SBX lacks on a machine that has JAX for CUDA, Flax and Optax (7 MiB, nearly all of it TensorFlow
+Probability, of which SBX asks for the nightly builds). JAX itself cannot be carried: with CUDA it is larger than all
+else together may be. Without it the benchmark leaves SBX's row out, with a word. All together stay under ``LARGEST``.
 """
 
 import argparse
@@ -19,6 +23,10 @@ NAMES = (
     "stable-baselines3", "gymnasium", "cloudpickle", "farama-notifications", "mujoco", "dm-env", "dm-tree", "glfw",
     "pyopengl",
 )  # fmt: skip
+#: What SBX needs besides JAX, Flax and Optax, which the machine has or has not, and what they bring along.
+OF_SBX = ("sbx-rl", "tfp-nightly", "decorator", "gast")
+#: MiB of all wheels.
+LARGEST = 64
 PLATFORMS = [f"manylinux_2_{n}_x86_64" for n in (17, 24, 26, 27, 28, 31, 34)] + [
     "manylinux1_x86_64",
     "manylinux2014_x86_64",
@@ -38,6 +46,7 @@ def main() -> None:
     for old in args.folder.glob("*.whl"):
         old.unlink()
     download(args.folder, args.python, [pinned(name, pins) for name in NAMES])
+    download(args.folder, args.python, [pinned(name, pins) for name in OF_SBX], "--pre")
     with tempfile.TemporaryDirectory() as folder:
         download(Path(folder), args.python, [pinned("dm-control", pins)])
         (whole,) = Path(folder).glob("dm_control-*.whl")
@@ -50,6 +59,8 @@ def main() -> None:
                     small.writestr(name, ours.read(name))
     size = sum(path.stat().st_size for path in args.folder.glob("*.whl")) / 2**20
     print(f"{args.folder}: {size:.0f} MiB")
+    if size > LARGEST:
+        raise SystemExit(f"that is more than {LARGEST} MiB")
 
 
 def pinned(name: str, pins: dict[str, str]) -> str:
@@ -58,10 +69,10 @@ def pinned(name: str, pins: dict[str, str]) -> str:
     return name if version is None else f"{name}=={version}"
 
 
-def download(folder: Path, python: str, requirements: list[str]) -> None:
+def download(folder: Path, python: str, requirements: list[str], *more: str) -> None:
     """Wheels for Linux and the version of Python, without their dependencies."""
     platforms = [argument for platform in PLATFORMS for argument in ("--platform", platform)]
-    options = ["--no-deps", "--only-binary=:all:", "--python-version", python, "--implementation", "cp"]
+    options = [*more, "--no-deps", "--only-binary=:all:", "--python-version", python, "--implementation", "cp"]
     command = [sys.executable, "-m", "pip", "download", "--quiet", *options, *platforms, "-d", str(folder)]
     subprocess.run([*command, *requirements], check=True)
 

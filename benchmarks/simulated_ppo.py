@@ -4,6 +4,7 @@ machine can do, all in one run.
 
     python benchmarks/simulated_ppo.py [--threads 1] [--rounds 3] [--device cpu]
     python benchmarks/simulated_ppo.py --memory    # peak memory of one iteration of 4,096 steps and 16 actions
+    python benchmarks/simulated_ppo.py --short --device cuda    # each row as soon as it is measured
 
 An iteration is that of the MBMA paper (https://arxiv.org/abs/2210.13011): 2,048 steps, minibatches of 64, 10 epochs,
 networks of 512 (actor) and 1024 (critic and models), horizon 12; observations and actions of cheetah-run. The
@@ -11,6 +12,10 @@ environment costs next to nothing. The contenders take turns; figures are median
 medians of each round's ratio. "of matmul" is the rate of the phases' matrix multiplications (counted by torch) over the
 rate at which this machine multiplies 2048 x 1024 by 1024 x 1024, measured in the same rounds. Leave the machine alone
 meanwhile: a run takes some ten minutes on a CPU.
+
+``--short`` measures one iteration of each, right after one of PPO's, and counts no multiplications. On a CPU an
+iteration is then of 256 steps, unless ``--steps`` says otherwise: all of its phases grow with them, so that times are
+of one real step.
 """
 
 import argparse
@@ -18,8 +23,9 @@ import platform
 import resource
 import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -119,6 +125,64 @@ class Contender:
         return sum(self.flops.get(phase, 0) for phase in phases), statistics.median(times)
 
 
+def contenders_of(
+    actions: Sequence[int], device: str, steps: int, epochs: int, horizon: int, rivals: bool = False
+) -> dict[str, Callable[[], Contender]]:
+    """
+    List the contenders.
+
+    :param actions: numbers of simulated actions; with 0, MBMA's base, which is to cost what PPO does
+    :param device: of the models
+    :param steps: of an iteration
+    :param epochs: of an iteration
+    :param horizon: of the simulation
+    :param rivals: whether QMA and MBPO are among them
+    :return: what makes each, by name, PPO first
+    """
+    sizes: dict[str, Any] = dict(n_steps=steps, n_epochs=epochs, device=device)
+    ours: dict[str, Any] = {**sizes, "warm_up_until": 0}
+    rollouts: dict[str, Any] = {**ours, "simulation_horizon": horizon}
+    theirs: dict[str, Any] = dict(normalize_advantage=False, policy_kwargs=dict(net_arch=dict(NET_ARCH)))
+    made: dict[str, Callable[[], Contender]] = {PPO: partial(Contender, stable_baselines3.PPO, **sizes, **theirs)}
+    for n in actions:
+        made[f"MBMA {n}"] = partial(Contender, MBMAPPO, n_simulated=n, **(rollouts if n > 0 else sizes))
+    for n in (n for n in actions if n > 0 and rivals):
+        made[f"QMA {n}"] = partial(Contender, QMAPPO, n_simulated=n, **ours)
+        enough = {**rollouts, "simulation_horizon": max(horizon, n + 1)}
+        made[f"MBPO {n}"] = partial(Contender, MBPOPPO, n_simulated=n, **enough)
+    return made
+
+
+def short_rows(
+    actions: Sequence[int], device: str, steps: int | None = None, epochs: int = 10, horizon: int = 12
+) -> Iterator[tuple[str, float, float]]:
+    """
+    Measure an iteration of PPO, then one of MBMA for each number of actions, each right after another of PPO's; before,
+    a small one of each that sets the libraries up.
+
+    :param actions: numbers of simulated actions
+    :param device: of the models
+    :param steps: of an iteration; None: 2,048, on a CPU 256
+    :param epochs: of an iteration
+    :param horizon: of the simulation
+    :return: name, milliseconds of one real step, and the iteration's time over PPO's, each when it is measured
+    """
+    if steps is None:
+        steps = 256 if device == "cpu" else 2048
+    for make in contenders_of(actions, device, 64, 1, horizon).values():
+        make().iterate()
+    made = contenders_of(actions, device, steps, epochs, horizon)
+    ppo = made.pop(PPO)()
+    ppo.iterate()
+    yield PPO, 1e3 * ppo.seconds["iteration"][-1] / steps, 1.0
+    for name, make in made.items():
+        contender = make()
+        for each in (ppo, contender):
+            each.iterate()
+        ours, theirs = (each.seconds["iteration"][-1] for each in (contender, ppo))
+        yield name, 1e3 * ours / steps, ours / theirs
+
+
 def matmul_seconds(device: str, x: torch.Tensor, w: torch.Tensor) -> float:
     """Seconds of one multiplication."""
     n = 20
@@ -152,32 +216,29 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--actions", type=int, nargs="+", default=[0, 4, 8, 16])
-    parser.add_argument("--steps", type=int, default=2048, help="of an iteration")
+    parser.add_argument("--steps", type=int, help="of an iteration; 2,048, in short on a CPU 256")
     parser.add_argument("--epochs", type=int, default=10)
     parser.add_argument("--horizon", type=int, default=12)
     parser.add_argument("--rivals", action="store_true", help="QMA and MBPO too")
     parser.add_argument("--memory", action="store_true", help="only the peak memory")
+    parser.add_argument("--short", action="store_true", help="one iteration of each, without QMA and MBPO")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     if args.memory:
         peak_memory(args)
         return
+    if args.short:
+        if args.rivals:
+            raise SystemExit("--rivals are none of --short: leave one of them out")
+        print(f"{'':26}{'ms a step':>10}{'x PPO':>8}{'paper GPU':>11}", flush=True)
+        for name, ms, ratio in short_rows(args.actions, args.device, args.steps, args.epochs, args.horizon):
+            published = f"{PUBLISHED[name]:11.2f}" if name in PUBLISHED else ""
+            print(f"{name:26}{ms:10.3f}{ratio:8.2f}{published}", flush=True)
+        return
 
-    sizes: dict[str, Any] = dict(n_steps=args.steps, n_epochs=args.epochs, device=args.device)
-    ours: dict[str, Any] = {**sizes, "warm_up_until": 0}
-    rollouts: dict[str, Any] = {**ours, "simulation_horizon": args.horizon}
-    contenders = {
-        PPO: Contender(
-            stable_baselines3.PPO, **sizes, normalize_advantage=False, policy_kwargs=dict(net_arch=dict(NET_ARCH))
-        )
-    }
-    for n in args.actions:
-        contenders[f"MBMA {n}"] = Contender(MBMAPPO, n_simulated=n, **(rollouts if n > 0 else sizes))
-    if args.rivals:
-        for n in (n for n in args.actions if n > 0):
-            contenders[f"QMA {n}"] = Contender(QMAPPO, n_simulated=n, **ours)
-            horizon = {"simulation_horizon": max(args.horizon, n + 1)}
-            contenders[f"MBPO {n}"] = Contender(MBPOPPO, n_simulated=n, **{**rollouts, **horizon})
+    args.steps = 2048 if args.steps is None else args.steps
+    made = contenders_of(args.actions, args.device, args.steps, args.epochs, args.horizon, args.rivals)
+    contenders = {name: make() for name, make in made.items()}
 
     x, w = torch.randn(2048, 1024, device=args.device), torch.randn(1024, 1024, device=args.device)
     for contender in contenders.values():

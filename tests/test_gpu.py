@@ -21,6 +21,7 @@ from sb3_sample.learner.group import LearnerGroup
 from tests.learner.test_group import REFUSED, take, together
 from tests.sac import test_golden as golden
 from tests.sac.common import MAKERS, TINY_BRO, TINY_SAC, Toy, random_batch, state
+from tests.sac.test_drawn_steps import n_further
 from tests.sac.test_execution import FEW_STEPS, ROUNDING, WITHOUT_GRADIENT
 
 pytestmark = [
@@ -141,7 +142,7 @@ def test_actions_of_groups_are_those_of_each(maker: str) -> None:
     assert isinstance(group._acting, CapturedActing) and group._acting.captured._recorded
 
 
-@pytest.mark.parametrize("maker", ["SAC", "BRO", "DAC"])
+@pytest.mark.parametrize("maker", ["SAC", "BRO", "DAC", "VPLSAC"])
 @pytest.mark.parametrize("n", [1, 3])
 def test_steps_that_draw_their_batches(maker: str, n: int) -> None:
     """Captured steps draw what those that are run as they are draw, and the counters of the generator go on alike."""
@@ -157,9 +158,9 @@ def test_steps_that_draw_their_batches(maker: str, n: int) -> None:
         for _ in range(12):
             if group is None:
                 models[0].learner.prepared_drawing()
-                models[0].learner.take_drawn_step(8)
+                models[0]._drawn_update(8)
             else:
-                group.step([(8, True, True)] * n)
+                group.step([(8, n_further(models[0]), True, True)] * n)
         execution = models[0].learner._drawing if group is None else group._drawing
         assert execution is not None and (execution._captured is not None) == (how == "captured")
         found.append((models, float(torch.rand((), device="cuda"))))

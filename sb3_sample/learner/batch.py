@@ -186,11 +186,55 @@ class Store(Protocol):
 
     def draw(self, n: int) -> Any:
         """
-        Draw transitions, with operations on tensors alone, by torch's generator of the device.
+        Draw transitions to train on, with operations on tensors alone, by torch's generator of the device.
 
         :param n: how many
         :return: transitions as Stable-Baselines3's buffers give them
         """
+
+    def draw_held_out(self, n: int) -> Any:
+        """
+        Draw transitions of the validation side in the same way.
+
+        :param n: how many
+        :return: transitions as Stable-Baselines3's buffers give them
+        """
+
+    def newest(self, n_steps: int) -> tuple[Any, torch.Tensor]:
+        """
+        Gather the newest transitions, with operations on tensors alone.
+
+        :param n_steps: T
+        :return: the latest T steps of every environment, the oldest first, as Stable-Baselines3's buffers give them;
+            and 1 where an episode ended with the step, (T, N)
+        """
+
+
+class StoreSource:
+    """
+    Source of a gradient step that draws of a store itself: there are as many transitions as it asks for.
+
+    :param store: the store
+    :param n: transitions of the validation side that :meth:`held_out` draws
+    :param gamma: discount factor, where the transitions have none of their own
+    """
+
+    def __init__(self, store: Store, n: int, gamma: float):
+        self._store, self._n, self._gamma = store, n, gamma
+
+    def held_out(self) -> Batch:
+        """
+        :return: n transitions of the validation side
+        """
+        return Batch.of(self._store.draw_held_out(self._n), self._gamma)
+
+    def latest(self, n_steps: int) -> Extra:
+        """
+        :param n_steps: T
+        :return: the latest T steps of every environment, the oldest first
+        """
+        samples, ends = self._store.newest(n_steps)
+        return Extra(Batch.of(samples, self._gamma), ends)
 
 
 class Noise(NamedTuple):

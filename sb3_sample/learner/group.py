@@ -235,19 +235,27 @@ class LearnerGroup:
         """
         return self._mapped("gradient_step", inputs)
 
-    def mapped_drawn_step(self, batch_size: int, moves_targets: bool, moves_actor: bool) -> Metrics:
+    def mapped_drawn_step(self, batch_size: int, n_further: int, moves_targets: bool, moves_actor: bool) -> Metrics:
         """
         Draw batches and compute the gradient step of all learners: this function is compiled or captured.
 
         :param batch_size: B, of each
+        :param n_further: as of ``drawn_step``, of each
         :param moves_targets: as of ``gradient_step``
         :param moves_actor: as of ``gradient_step``
         :return: each learner's result, by name, (S, ...)
         """
-        inputs = [learner.drawn_inputs(batch_size) for learner in self.learners]
-        drawn = _stacked([(batch._replace(discounts=None), noise) for batch, noise in inputs], self.device)
-        batch = drawn[0]._replace(discounts=self._discounts)
-        return self._mapped("gradient_step", (batch, drawn[1], None, moves_targets, moves_actor))
+        inputs = []
+        for learner in self.learners:
+            batch, noise, extra = learner.drawn_inputs(batch_size, n_further)
+            if extra is not None:
+                extra = extra._replace(batch=extra.batch._replace(discounts=None))
+            inputs.append((batch._replace(discounts=None), noise, extra))
+        batch, noise, extra = _stacked(inputs, self.device)
+        batch = batch._replace(discounts=self._discounts)
+        if extra is not None:
+            extra = extra._replace(batch=extra.batch._replace(discounts=self._discounts))
+        return self._mapped("gradient_step", (batch, noise, extra, moves_targets, moves_actor))
 
     def mapped_actions(self, *inputs: Any) -> Metrics:
         """

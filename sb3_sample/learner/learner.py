@@ -15,7 +15,18 @@ from torch import nn
 from torch.optim import Optimizer
 
 from sb3_sample.learner import first_step, losses
-from sb3_sample.learner.batch import SLOTS, Batch, CriticStep, Encoded, Extra, Noise, Store, first_copy, widened
+from sb3_sample.learner.batch import (
+    SLOTS,
+    Batch,
+    CriticStep,
+    Encoded,
+    Extra,
+    Noise,
+    Store,
+    StoreSource,
+    first_copy,
+    widened,
+)
 from sb3_sample.learner.descent import descend, follow, minimize
 from sb3_sample.learner.executable import Executable
 from sb3_sample.learner.execution import Acting, Execution, acting_of
@@ -622,53 +633,58 @@ class Learner(Executable):
             metrics.update(logged(part, "after_update", part.after_update(self, batch)))
         return metrics
 
-    def take_drawn_step(self, batch_size: int) -> dict[str, torch.Tensor]:
+    def take_drawn_step(self, batch_size: int, n_further: int = 0) -> dict[str, torch.Tensor]:
         """
         Take one gradient step that draws its batch itself (:meth:`draw_from`), and count it: on a GPU one launch,
         drawing included.
 
         :param batch_size: B
+        :param n_further: by the rule of pessimism's ``n_further``
         :return: as of :meth:`step`
         """
         if not self._checked_step:
             # A batch apart, so that a training that goes on draws what it would have drawn.
             with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
-                batch = self._drawn(batch_size)
+                batch, _, extra = self.drawn_inputs(batch_size, n_further)
             first_step.check_batch("batch", batch)
-            first_step.check(self, batch, None)
+            first_step.check(self, batch, extra)
             self._checked_step = True
         execution = self._drawing or self.prepared_drawing()
         self._count()
-        metrics = execution(self, batch_size, *self._what_moves())
+        metrics = execution(self, batch_size, n_further, *self._what_moves())
         self._td_errors = None
         self.gradients_are_stale = not execution.leaves_gradients
         return metrics
 
-    def _drawn(self, batch_size: int) -> Batch:
-        assert self._store is not None
-        return Batch.of(self._store.draw(batch_size), self.gamma)
-
-    def drawn_inputs(self, batch_size: int) -> tuple[Batch, Noise]:
+    def drawn_inputs(self, batch_size: int, n_further: int = 0) -> tuple[Batch, Noise, Extra | None]:
         """
         Draw what a gradient step takes, with operations on tensors alone.
 
         :param batch_size: B
-        :return: transitions and noise
+        :param n_further: by the rule of pessimism's ``n_further``
+        :return: transitions, noise, and further transitions for the rule of pessimism, None for ``n_further=0``
         """
-        batch = self._drawn(batch_size)
-        return batch, Noise().completed(batch, None, self._subset())
+        assert self._store is not None
+        batch = Batch.of(self._store.draw(batch_size), self.gamma)
+        extra = None
+        if n_further > 0:
+            extra = self.pessimism_rule.draw(StoreSource(self._store, n_further, self.gamma))
+        return batch, Noise().completed(batch, extra, self._subset()), extra
 
-    def drawn_step(self, batch_size: int, moves_targets: bool, moves_actor: bool) -> dict[str, torch.Tensor]:
+    def drawn_step(
+        self, batch_size: int, n_further: int, moves_targets: bool, moves_actor: bool
+    ) -> dict[str, torch.Tensor]:
         """
         Draw a batch and compute its gradient step: this function is compiled or captured.
 
         :param batch_size: B
+        :param n_further: by the rule of pessimism's ``n_further``
         :param moves_targets: as of :meth:`gradient_step`
         :param moves_actor: as of :meth:`gradient_step`
         :return: as of :meth:`gradient_step`
         """
-        batch, noise = self.drawn_inputs(batch_size)
-        return self.gradient_step(batch, noise, None, moves_targets, moves_actor)
+        batch, noise, extra = self.drawn_inputs(batch_size, n_further)
+        return self.gradient_step(batch, noise, extra, moves_targets, moves_actor)
 
     def why_no_drawn_steps(self) -> str | None:
         """
@@ -678,8 +694,9 @@ class Learner(Executable):
         """
         if self.transforms or self.reward_scaler is not None:
             return "batches are transformed before the gradient step (batch_transforms, reward_scale)"
-        if isinstance(self.pessimism_rule, LearnedPessimism):
-            return f"pessimism={type(self.pessimism_rule).__name__} learns from further transitions"
+        rule = type(self.pessimism_rule)
+        if rule.draw not in (Pessimism.draw, LearnedPessimism.draw):
+            return f"pessimism={rule.__name__} draws further transitions by a method of its own"
         after = [n for n, part in self.parts().items() if type(part).after_update is not Part.after_update]
         return f"{', '.join(after)} looks at the batch after the gradient step" if after else None
 

@@ -95,6 +95,16 @@ class Pessimism(Part):
         """
         return None
 
+    def n_further(self, n_held_out: int, n_steps: int) -> int:
+        """
+        Count what :meth:`draw` draws, for gradient steps that draw themselves.
+
+        :param n_held_out: transitions of the validation side that a step may draw, 0 while there are fewer
+        :param n_steps: steps of every environment in the replay buffer
+        :return: transitions of the validation side, or newest steps; 0 where :meth:`draw` would give None
+        """
+        return 0
+
     def update(
         self,
         learner: Learning,
@@ -222,6 +232,21 @@ class LearnedPessimism(Pessimism):
         if self.source == "on_policy" and self._n_steps < self.segment_length:
             return None
         return source.latest(self.segment_length)
+
+    def n_further(self, n_held_out: int, n_steps: int) -> int:
+        """
+        Count what :meth:`draw` draws, for gradient steps that draw themselves.
+
+        :param n_held_out: transitions of the validation side that a step may draw, 0 while there are fewer
+        :param n_steps: steps of every environment in the replay buffer
+        :return: transitions of the validation side, or newest steps; 0 where :meth:`draw` would give None
+        """
+        if self.source == "replay":
+            return 0
+        if self.source == "validation":
+            return n_held_out
+        acted = min(self._n_steps, n_steps) if self.source == "on_policy" else n_steps
+        return self.segment_length if acted >= self.segment_length else 0
 
     def update(
         self,

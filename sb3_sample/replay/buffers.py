@@ -22,7 +22,6 @@ from sb3_sample.replay.columns import (
 from sb3_sample.replay.compact import (
     CompactDictReplayBuffer,
     CompactNStepReplayBuffer,
-    CompactReplay,
     CompactReplayBuffer,
 )
 from sb3_sample.replay.next_observations import ONLY, taken
@@ -30,7 +29,7 @@ from sb3_sample.replay.rows import action_dtype
 from sb3_sample.replay.weighted import FadedDictReplayBuffer, FadedReplay, FadedReplayBuffer
 
 
-class ValidationSplit(CompactReplay):
+class ValidationSplit(HasColumns):
     """
     Mixin of the replay buffers that hold transitions out (VPL, section 4.1 and algorithm 1, lines 4-10): each
     transition of each environment goes to the validation side with a given probability, for as long as it is in the
@@ -38,14 +37,18 @@ class ValidationSplit(CompactReplay):
 
     Nothing is stored twice: the split is a mask, and a list of the places that it marks.
 
-    :param args: as of ``CompactReplayBuffer``
-    :param kwargs: as of ``CompactReplayBuffer``
+    :param args: as of the buffer that it is mixed into, which calls ``_replacing`` and ``_restored``
+    :param kwargs: as of that buffer
     :param validation_proportion: probability of the validation side, in (0, 1)
     """
 
     more_columns = (HELD_OUT,)
     #: Which transitions are held out, (buffer_size, n_envs).
     held_out: np.ndarray
+    buffer_size: int
+    n_envs: int
+    pos: int
+    full: bool
 
     def __init__(self, *args: Any, validation_proportion: float, **kwargs: Any):
         super().__init__(*args, **kwargs)
@@ -76,17 +79,24 @@ class ValidationSplit(CompactReplay):
 
     def reset(self) -> None:
         """Empty the buffer."""
-        super().reset()
+        super().reset()  # type: ignore[misc]  # the buffer's
         self.held_out[...] = False
         self._first = self._last = 0
 
     def _restored(self) -> None:
         super()._restored()
+        held_out = self._oldest_first(True)
+        self._ring = np.zeros(self.buffer_size * self.n_envs, dtype=np.int64)
+        self._first, self._last = 0, len(held_out)
+        self._ring[: self._last] = held_out
+
+    def _oldest_first(self, held_out: bool) -> np.ndarray:
+        """The places (position * n_envs + environment) of one side, oldest first."""
         size = self.buffer_size if self.full else self.pos
-        oldest_first = (np.arange(size) + (self.pos if self.full else 0)) % self.buffer_size
-        steps, envs = np.nonzero(self.held_out[oldest_first])
-        self._first, self._last = 0, len(steps)
-        self._ring[: self._last] = oldest_first[steps] * self.n_envs + envs
+        rows = (np.arange(size) + (self.pos if self.full else 0)) % self.buffer_size
+        steps, envs = np.nonzero(self.held_out[rows] == held_out)
+        places: np.ndarray = rows[steps] * self.n_envs + envs
+        return places
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
         """
@@ -107,8 +117,7 @@ class ValidationSplit(CompactReplay):
         :return: places of training transitions (position * n_envs + environment), uniformly with replacement, (n,)
         :raises ValueError: if there is none
         """
-        if self.n_training == 0:
-            raise ValueError(f"there is no transition to train on: all {self.n_validation} are held out")
+        self._check_can_train()
         size = (self.buffer_size if self.full else self.pos) * self.n_envs
         mask = self.held_out.reshape(-1)
         places = np.random.randint(size, size=n)
@@ -117,6 +126,10 @@ class ValidationSplit(CompactReplay):
             places[again] = np.random.randint(size, size=len(again))
             again = again[mask[places[again]]]
         return places
+
+    def _check_can_train(self) -> None:
+        if self.n_training == 0:
+            raise ValueError(f"there is no transition to train on: all {self.n_validation} are held out")
 
     def sample_validation(self, batch_size: int, env: VecNormalize | None = None) -> Any:
         """
@@ -133,6 +146,7 @@ class ValidationSplit(CompactReplay):
         return self._at(self._ring[drawn % len(self._ring)], env)
 
     def _at(self, places: np.ndarray, env: VecNormalize | None) -> Any:
+        """The transitions at these places."""
         assert isinstance(self, ReplayBuffer)
         return samples_at(self, *np.divmod(places, self.n_envs), env)
 
@@ -184,8 +198,9 @@ class DeviceReplayBuffer(HasColumns, ReplayBuffer):
             raise ValueError(f"sampling must be 'host' or 'device', not {sampling!r}")
         super().__init__(*args, **kwargs)
         self.sampling = sampling
-        # Number of places that can be drawn, on the device, where a captured step reads it.
+        # On the device, where a captured step reads them: number of places that can be drawn, and the next row.
         self._drawable = torch.zeros((), dtype=torch.float64, device=self.device)
+        self._next_row = torch.zeros((), dtype=torch.int64, device=self.device)
         store_float_actions(self)
         given = {column.name for column in OF_EVERY_BUFFER}
         for name, column in columns_of(self).items():
@@ -238,9 +253,33 @@ class DeviceReplayBuffer(HasColumns, ReplayBuffer):
         uniform = torch.rand(n, dtype=torch.float64, device=self.device)
         return self._taken((uniform * self._drawable).long())
 
+    def draw_held_out(self, n: int) -> Any:
+        """
+        Draw transitions of the validation side, as :meth:`draw` does those to train on.
+
+        :param n: how many
+        :return: the transitions
+        :raises ValueError: if the buffer holds none out, as this one
+        """
+        raise ValueError(f"{type(self).__name__} holds no transition out: pass validation_proportion to the algorithm")
+
+    def newest(self, n_steps: int) -> tuple[Any, torch.Tensor]:
+        """
+        Gather the latest steps of every environment, with operations on tensors alone, as of the last
+        :meth:`prepare_draws`.
+
+        :param n_steps: T, at most as many as are stored
+        :return: as of :func:`latest`
+        """
+        rows = (self._next_row - n_steps + torch.arange(n_steps, device=self.device)) % self.buffer_size
+        places = rows.unsqueeze(1) * self.n_envs + torch.arange(self.n_envs, device=self.device)
+        ends: Any = self.dones
+        return self._taken(places.flatten()), ends.index_select(0, rows)
+
     def prepare_draws(self) -> None:
-        """Have :meth:`draw` draw from all transitions that are stored now."""
+        """Have :meth:`draw`, :meth:`draw_held_out` and :meth:`newest` draw from all that is stored now."""
         self._drawable.fill_(self.size() * self.n_envs)
+        self._next_row.fill_(self.pos)
 
     def _taken(self, places: torch.Tensor) -> Any:
         def take(column: Column, array: Any, but: Any = None) -> torch.Tensor:
@@ -262,6 +301,156 @@ class DeviceReplayBuffer(HasColumns, ReplayBuffer):
         if isinstance(array, torch.Tensor):
             return array.clone() if copy else array
         return super().to_torch(array, copy)
+
+
+class _Places:
+    """
+    Places of a buffer on its device, oldest first: a ring, of which a gradient step draws itself.
+
+    :param capacity: largest number of places
+    :param device: the device
+    """
+
+    def __init__(self, capacity: int, device: torch.device):
+        self._ring = torch.zeros(capacity, dtype=torch.int64, device=device)
+        # The first of the ring, and one after its last, neither ever reduced; and what a captured step reads of them.
+        self._first = self._last = 0
+        self._start = torch.zeros((), dtype=torch.int64, device=device)
+        self._drawable = torch.zeros((), dtype=torch.float64, device=device)
+
+    def replace(self, n_gone: int, new: np.ndarray) -> None:
+        """
+        Drop the oldest places and add new ones.
+
+        :param n_gone: how many are dropped
+        :param new: what is added
+        """
+        self._first += n_gone
+        if len(new) == 0:
+            return
+        at = torch.from_numpy((self._last + np.arange(len(new))) % len(self._ring))
+        self._ring[at.to(self._ring.device)] = torch.from_numpy(new).to(self._ring.device)
+        self._last += len(new)
+
+    def restart(self, places: np.ndarray) -> None:
+        """
+        Hold other places, in the same memory.
+
+        :param places: they, oldest first
+        """
+        self._first = self._last = 0
+        self.replace(0, places)
+
+    def prepare(self) -> None:
+        """Have :meth:`draw` draw from all places there are now."""
+        self._start.fill_(self._first % len(self._ring))
+        self._drawable.fill_(self._last - self._first)
+
+    def draw(self, n: int) -> torch.Tensor:
+        """
+        Draw places uniformly with replacement; at least one must be there.
+
+        :param n: how many
+        :return: (n,)
+        """
+        uniform = torch.rand(n, dtype=torch.float64, device=self._ring.device)
+        at = (self._start + (uniform * self._drawable).long()) % len(self._ring)
+        return self._ring.index_select(0, at)
+
+
+class DeviceValidationReplayBuffer(ValidationSplit, DeviceReplayBuffer):
+    """
+    Replay buffer in the memory of the model's device that holds transitions out. Both sides are overwritten in the
+    order in which they came, so that the places of each are a ring.
+
+    :param args: as of ``DeviceReplayBuffer``
+    :param kwargs: as of ``DeviceReplayBuffer``
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        # On the host, where it is asked for.
+        self.held_out = np.zeros((self.buffer_size, self.n_envs), dtype=bool)
+        self._make_sides()
+
+    def _make_sides(self) -> None:
+        # What the split follows from: not saved.
+        self._training_side, self._validation_side = (
+            _Places(self.buffer_size * self.n_envs, self.device) for _ in range(2)
+        )
+
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        Store one transition of each environment, as in Stable-Baselines3, each on one of the two sides.
+
+        :raises ValueError: if something has another shape than its space; nothing is stored then
+        """
+        row, was_full = self.pos, self.full
+        n_held_out = int(self.held_out[row].sum())
+        super().add(obs, next_obs, action, reward, done, infos)
+        self._replacing(row)
+        for side, n_gone, which in (
+            (self._validation_side, n_held_out, self.held_out[row]),
+            (self._training_side, self.n_envs - n_held_out if was_full else 0, ~self.held_out[row]),
+        ):
+            side.replace(n_gone, row * self.n_envs + np.flatnonzero(which))
+
+    def reset(self) -> None:
+        """Empty the buffer."""
+        super().reset()
+        self._restart_sides()
+
+    def _restored(self) -> None:
+        super()._restored()
+        if not hasattr(self, "_training_side"):
+            self._make_sides()
+        self._restart_sides()
+
+    def _restart_sides(self) -> None:
+        self._validation_side.restart(self._oldest_first(True))
+        self._training_side.restart(self._oldest_first(False))
+
+    def draw(self, n: int) -> Any:
+        """
+        Draw transitions to train on uniformly with replacement, as ``DeviceReplayBuffer`` draws of all.
+
+        :param n: how many
+        :return: the transitions
+        """
+        return self._taken(self._training_side.draw(n))
+
+    def draw_held_out(self, n: int) -> Any:
+        """
+        Draw transitions of the validation side, as :meth:`draw` does those to train on.
+
+        :param n: how many
+        :return: the transitions
+        """
+        return self._taken(self._validation_side.draw(n))
+
+    def prepare_draws(self) -> None:
+        """
+        Have :meth:`draw`, :meth:`draw_held_out` and :meth:`newest` draw from all that is stored now.
+
+        :raises ValueError: if there is none to train on
+        """
+        self._check_can_train()
+        super().prepare_draws()
+        self._training_side.prepare()
+        self._validation_side.prepare()
+
+    def _at(self, places: np.ndarray, env: VecNormalize | None) -> Any:
+        if env is not None:
+            raise ValueError("VecNormalize normalises on the host: use ReplayBuffer with it, not DeviceReplayBuffer")
+        return self._taken(torch.from_numpy(places).to(self.device))
 
 
 def store_float_actions(buffer: ReplayBuffer) -> None:
@@ -288,7 +477,13 @@ PLAIN_BUFFERS = (
 )
 #: Buffers whose every transition is drawn independently, so that one large draw can be cut into batches. Others compose
 #: each batch (HerReplayBuffer: so many real, so many relabelled transitions) and are asked once a gradient step.
-INDEPENDENT_BUFFERS = (*PLAIN_BUFFERS, NStepReplayBuffer, CompactNStepReplayBuffer, DeviceReplayBuffer)
+INDEPENDENT_BUFFERS = (
+    *PLAIN_BUFFERS,
+    NStepReplayBuffer,
+    CompactNStepReplayBuffer,
+    DeviceReplayBuffer,
+    DeviceValidationReplayBuffer,
+)
 #: Methods that make a buffer's samples.
 _SAMPLING = ("sample", "_get_samples", "_at", "training_places", "to_torch", "_normalize_obs", "_normalize_reward")
 _OWN_SAMPLING = {cls: [getattr(cls, name, None) for name in _SAMPLING] for cls in INDEPENDENT_BUFFERS}

@@ -203,6 +203,9 @@ class HasColumns:
     def __getstate__(self) -> dict[str, Any]:
         return vars(self)
 
+    def _restored(self) -> None:
+        """Called when the rows have been restored, from a file or a checkpoint."""
+
 
 def columns_of(buffer: Any) -> dict[str, Column]:
     """

@@ -457,9 +457,6 @@ class CompactReplay(HasColumns):
         self._restored()
         self.load_changing_state(changing)
 
-    def _restored(self) -> None:
-        """Called when the rows have been restored."""
-
 
 def _n_frames(frame_stack: Any, space: spaces.Space) -> int | None:
     """Frames of an observation, checked; None for one."""

@@ -58,7 +58,7 @@ class DatasetSource:
 
         :return: as many as those of :meth:`ReplaySource.held_out`; None while there are fewer
         """
-        n = _n_held_out(self._model)
+        n = n_held_out(self._model)
         return self.drawn_held_out(n) if len(self._held_out) >= n else None
 
     def drawn_held_out(self, n: int) -> Batch:
@@ -162,7 +162,7 @@ class ReplaySource:
         """
         model, split = self._model, self._model.replay_buffer
         assert isinstance(split, ValidationSplit)
-        n, n_prior = _n_held_out(model), 0
+        n, n_prior = n_held_out(model), 0
         if self._prior is not None:
             n_prior = round(model.prior_share * n)
         if split.n_validation < n - n_prior or (self._prior is not None and self._prior.n_held_out < n_prior):
@@ -223,7 +223,11 @@ class WindowSource(ReplaySource):
         return found
 
 
-def _n_held_out(model: Any) -> int:
+def n_held_out(model: Any) -> int:
+    """
+    :param model: the algorithm
+    :return: transitions of the validation side that a gradient step learns from
+    """
     return max(1, round(model.validation_proportion * model.batch_size))
 
 

@@ -33,6 +33,7 @@ from sb3_sample.learner.batch import SLOTS, Batch, Noise
 from sb3_sample.learner.learner import Learner
 from sb3_sample.replay.buffers import (
     DeviceReplayBuffer,
+    DeviceValidationReplayBuffer,
     ValidationDictReplayBuffer,
     ValidationReplayBuffer,
     ValidationSplit,
@@ -46,7 +47,7 @@ from sb3_sample.replay.compact import (
     CompactReplayBuffer,
 )
 from sb3_sample.replay.dataset import Dataset
-from sb3_sample.replay.sources import DatasetSource, ReplaySource
+from sb3_sample.replay.sources import DatasetSource, ReplaySource, n_held_out
 from sb3_sample.replay.weighted import PrioritizedReplay
 from sb3_sample.sac import checks
 from sb3_sample.sac.apart import ActsApart, Apart
@@ -223,14 +224,17 @@ class SAC(  # type: ignore[misc]  # actor
         is_dict = isinstance(self.observation_space, spaces.Dict)
         if self.validation_proportion > 0:
             if not has_own_columns(self.replay_buffer_class):
-                self.replay_buffer_class = ValidationDictReplayBuffer if is_dict else ValidationReplayBuffer
+                ours = ValidationDictReplayBuffer if is_dict else ValidationReplayBuffer
+                on_device = self.replay_buffer_class in (DeviceReplayBuffer, DeviceValidationReplayBuffer)
+                self.replay_buffer_class = DeviceValidationReplayBuffer if on_device else ours
             self.replay_buffer_kwargs = {
                 **self.replay_buffer_kwargs,
                 "validation_proportion": self.validation_proportion,
             }
         elif self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, ValidationSplit):
             # Loaded, with validation_proportion=0 instead of the saved one.
-            self.replay_buffer_class = None
+            on_device = issubclass(self.replay_buffer_class, DeviceReplayBuffer)
+            self.replay_buffer_class = DeviceReplayBuffer if on_device else None
         can_stack = self.replay_buffer_class is None or issubclass(self.replay_buffer_class, CompactReplay)
         if can_stack and "frame_stack" not in self.replay_buffer_kwargs:
             if self.env is not None:
@@ -628,7 +632,7 @@ class SAC(  # type: ignore[misc]  # actor
             given = None if draws_itself else self._source.batches(n_batches, batch_size)
             for i in range(n_batches):
                 self._keeps_gradients = self.keep_next_gradients and taken + i + 1 == gradient_steps
-                metrics = self.learner.take_drawn_step(batch_size) if given is None else self._update(given[i])
+                metrics = self._drawn_update(batch_size) if given is None else self._update(given[i])
                 self._watch.note(metrics, self._n_updates, self.num_timesteps)
                 self._metrics.update(metrics)
             taken += n_batches
@@ -649,6 +653,15 @@ class SAC(  # type: ignore[misc]  # actor
         self.learner.draw_from(buffer)
         buffer.prepare_draws()
         return True
+
+    def _drawn_update(self, batch_size: int) -> dict[str, torch.Tensor]:
+        """One gradient step of the learner that draws its batch itself, with what its rule of pessimism judges."""
+        buffer = self.replay_buffer
+        assert buffer is not None
+        held_out = n_held_out(self)
+        if not isinstance(buffer, ValidationSplit) or buffer.n_validation < held_out:
+            held_out = 0
+        return self.learner.take_drawn_step(batch_size, self.pessimism_rule.n_further(held_out, buffer.size()))
 
     def _before_batches(self, batch_size: int) -> None:
         """

@@ -20,7 +20,7 @@ from sb3_sample.learner.augmentation import AUGMENTATIONS
 from sb3_sample.learner.exploration import EXPLORATIONS
 from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
 from sb3_sample.learner.reward_scale import LinearScale
-from sb3_sample.replay.buffers import DeviceReplayBuffer, ValidationSplit
+from sb3_sample.replay.buffers import DeviceReplayBuffer, DeviceValidationReplayBuffer, ValidationSplit
 from sb3_sample.replay.columns import has_own_columns
 from sb3_sample.replay.compact import CompactReplay
 from sb3_sample.replay.weighted import FadedReplay, PrioritizedReplay, WindowReplay
@@ -410,12 +410,14 @@ def _check_replay(agent: Any) -> None:
                 f"validation_proportion={agent.validation_proportion} holds transitions out of uniform draws, which "
                 f"replay_buffer_class={cls.__name__} does not make: leave one of them out"
             )
-        if cls is not None and cls not in (ReplayBuffer, DictReplayBuffer) and not issubclass(cls, CompactReplay):
+        known = (ReplayBuffer, DictReplayBuffer, DeviceReplayBuffer)
+        ours = (CompactReplay, DeviceValidationReplayBuffer)
+        if cls is not None and cls not in known and not issubclass(cls, ours):
             raise ValueError(
                 f"validation_proportion={agent.validation_proportion} holds single transitions out, which is known of "
-                f"ReplayBuffer and DictReplayBuffer only, not of {cls.__name__} (samples of several transitions, as "
-                "relabelled goals are, would carry them into training): leave replay_buffer_class out, or pass "
-                "validation_proportion=0"
+                f"ReplayBuffer, DictReplayBuffer and DeviceReplayBuffer only, not of {cls.__name__} (samples of "
+                "several transitions, as relabelled goals are, would carry them into training): leave "
+                "replay_buffer_class out, or pass validation_proportion=0"
             )
         if agent.n_steps > 1:
             raise ValueError(
@@ -428,7 +430,10 @@ def _check_memory_map(agent: Any) -> None:
     """A buffer in files: only those of this package know it."""
     cls, is_split = agent.replay_buffer_class, agent.validation_proportion > 0
     stacks = stacked_frames(agent.env, agent.observation_space) is not None
-    made_by_us = is_split or (agent.n_steps == 1 or stacks if cls is None else issubclass(cls, CompactReplay))
+    on_device = cls is not None and issubclass(cls, DeviceReplayBuffer)
+    made_by_us = (is_split and not on_device) or (
+        agent.n_steps == 1 or stacks if cls is None else issubclass(cls, CompactReplay)
+    )
     if (agent.replay_buffer_kwargs or {}).get("memory_map") is not None and not made_by_us:
         what = f"n_steps={agent.n_steps}" if cls is None else f"replay_buffer_class={cls.__name__}"
         raise ValueError(

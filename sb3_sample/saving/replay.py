@@ -12,7 +12,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_sample.replay.columns import columns_of
+from sb3_sample.replay.columns import HasColumns, columns_of
 from sb3_sample.saving import container, notice, paths
 from sb3_sample.saving.classes import PACKAGES, check_trusted, has_state, may_be_set, path_of, within
 from sb3_sample.saving.container import BadFile, PickledFile
@@ -29,8 +29,8 @@ SUFFIX, PICKLES_SUFFIX = "buffer.zip", "pkl"
 MAX_TRANSITIONS, MAX_HER_TRANSITIONS = 100_000_000, 5_000_000
 #: The same of a replay buffer's file, if it is larger than the model's own.
 MAX_OTHER, MAX_OTHER_HER = 20_000_000, 1_000_000
-#: What belongs to the model and its environment.
-_NOT_SAVED = ("device", "env")
+#: What belongs to the model and its environment, and what follows from the rows.
+_NOT_SAVED = ("device", "env", "_training_side", "_validation_side")
 #: Arguments with which a buffer is made again that gives and takes its own state.
 _ARGUMENTS = (
     "buffer_size", "n_envs", "handle_timeout_termination", "validation_proportion", "horizon", "frame_stack", "n_steps",
@@ -302,6 +302,8 @@ def _with_attributes(
             check_values({name: column[:filled]}, "replay_buffer", cls)
     check_episodes(buffer, "replay_buffer")
     _check_spaces(buffer, model)
+    if isinstance(buffer, HasColumns):
+        buffer._restored()
     return buffer
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_sample.replay.columns import columns_of
+from sb3_sample.replay.columns import HasColumns, columns_of
 from sb3_sample.replay.compact import CompactReplay
 from sb3_sample.saving.untrusted import BadFile
 
@@ -22,7 +22,10 @@ _OF_HINDSIGHT = ("ep_start",)
 #: What changes in rows that are there already, or is no row; written anew each time.
 _SMALL = ("ep_length", "_current_ep_start")
 #: Never used (infos, without copy_info_dict), or never changes; and what follows from the rows.
-_DERIVED = ("infos", "obs_shape", "device", "observation_space", "action_space", "env", "slot", "_ring", "_drawable")
+_DERIVED = (
+    "infos", "obs_shape", "device", "observation_space", "action_space", "env", "slot", "_ring", "_drawable",
+    "_next_row",
+)  # fmt: skip
 
 
 def check_values(columns: Mapping[str, Any], name: str, buffer: Any) -> None:
@@ -223,6 +226,8 @@ class Ring:
             check_values({"observations": np.asarray(small["head"])}, "the last row", self.buffer)
             head[...] = small["head"]
         check_episodes(self.buffer, "the buffer")
+        if isinstance(self.buffer, HasColumns):
+            self.buffer._restored()
 
     def interrupt(self) -> None:
         """
