@@ -9,6 +9,8 @@ from sb3_sample.learner.execution import PAYS_FROM, foreign_parts, old_torch, wa
 class DecidesCompiling:
     """Part of an algorithm with a learner, ``compile`` and ``compiled``, before Stable-Baselines3's class."""
 
+    compiled: bool | None
+
     def _decide_compiling(self: Any, n_updates: float) -> None:
         """
         Decide, with ``compile="auto"`` once and for all, whether the coming gradient steps pay for compiling.
