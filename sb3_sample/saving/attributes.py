@@ -20,7 +20,7 @@ import struct
 import types
 import uuid
 import weakref
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -458,8 +458,20 @@ class Restorer:
             present = own.get(name)
             if not is_elsewhere(name, node, present):
                 yield name, self.restore(node, present, part_name(place, f".{name}"))
-            elif not is_moved(node, present) and f"{place}.{name}" not in self.kept:
+                continue
+            self.leave(node, present)
+            if not is_moved(node, present) and f"{place}.{name}" not in self.kept:
                 self.kept.append(f"{place}.{name}")
+
+    def leave(self, node: Node, present: Any) -> None:
+        """
+        Have what refers to an attribute that stays as it is refer to its present value.
+
+        :param node: the attribute's
+        :param present: the value that is there now
+        """
+        if type(node.get("id")) is int:
+            self._made[node["id"]] = present
 
     def classes(self, described: dict[str, dict[str, Node]]) -> None:
         """
@@ -614,6 +626,36 @@ class Restorer:
             return holding(function, values)
         except OtherKind as error:
             raise DoesNotFit(f"{name}: {error}") from error
+
+
+def with_what_they_refer_to(names: Iterable[str], described: dict[str, Node]) -> dict[str, Node]:
+    """
+    :param names: of attributes
+    :param described: from :meth:`Describer.attributes`
+    :return: these attributes and those that hold what they refer to, the latter first
+    """
+    holders = {number: name for name, node in described.items() for number in _numbers(node, "id")}
+    found, ahead = set(names) & described.keys(), list(names)
+    while ahead:
+        for number in _numbers(described.get(ahead.pop(), {}), "same"):
+            if (holder := holders[number]) not in found:
+                found.add(holder)
+                ahead.append(holder)
+    # The order of the description, in which nothing is referred to before it is described.
+    return {name: node for name, node in described.items() if name in found}
+
+
+def _numbers(tree: Any, key: str) -> Iterator[int]:
+    """The numbers under a key, anywhere in a tree."""
+    if isinstance(tree, dict):
+        # An object's attribute may have the name, and is a tree.
+        if type(tree.get(key)) is int:
+            yield tree[key]
+        tree = tree.values()
+    elif not isinstance(tree, (list, tuple)):
+        return
+    for part in tree:
+        yield from _numbers(part, key)
 
 
 def same(first: Any, second: Any) -> bool:

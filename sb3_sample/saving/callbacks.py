@@ -14,7 +14,15 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.envs.portable_states import pack, unpack
 from sb3_sample.saving import vec_envs
-from sb3_sample.saving.attributes import Describer, DoesNotFit, Node, Restorer, class_name, same
+from sb3_sample.saving.attributes import (
+    Describer,
+    DoesNotFit,
+    Node,
+    Restorer,
+    class_name,
+    same,
+    with_what_they_refer_to,
+)
 from sb3_sample.saving.classes import may_be_set
 from sb3_sample.saving.places import brings_text
 
@@ -110,7 +118,7 @@ class CallbackStates:
         }
         return {
             "class": class_name(callback),
-            "attributes": {name: now[name] for name in self._changed[path] if name in now},
+            "attributes": with_what_they_refer_to(self._changed[path], now),
             "state": Describer().describe(callback.state_dict()) if _gives_state(callback) else None,  # type: ignore[attr-defined]
             "environments": {name: _save_env(env)[0] for name, env in environments(callback)},
         }
@@ -147,6 +155,8 @@ class CallbackStates:
         # Where it writes, and what it writes, is said by the present program.
         said = [name for name in attributes if name in arguments and brings_text(attributes[name], own.get(name))]
         restorer = Restorer()
+        for name in said:
+            restorer.leave(attributes[name], own.get(name))
         restorer.attributes(callback, {name: node for name, node in attributes.items() if name not in said})
         kept = [*(f"{type(callback).__name__}.{name}" for name in said), *restorer.kept]
         if kept:

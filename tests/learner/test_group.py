@@ -69,13 +69,6 @@ def together(
     return group
 
 
-class GroupRecorder(Recorder):
-    def _memory(self) -> list[torch.Tensor]:
-        group: Any = self.model
-        tensors = [t for module in group.step_modules() for t in (*module.parameters(), *module.buffers())]
-        return tensors + [t for o in group.optimizers().values() for s in o.state.values() for t in s.values()]
-
-
 def models_of(maker: str, n: int, **kwargs: Any) -> list[Any]:
     """Models of the seeds 0, 1, ..., none with a gradient step taken."""
     starts = 70 if maker == "DebiasedRQ" else 60
@@ -177,7 +170,7 @@ def test_actions_are_those_of_each(maker: str, how: str) -> None:
     with torch.inference_mode():
         alone = [learner.action_step(*own)["actions"].clone() for learner, own in zip(learners, inputs, strict=True)]
     group = LearnerGroup(learners)
-    recorder = GroupRecorder(group) if how == "captured" else None
+    recorder = Recorder(group) if how == "captured" else None
     if recorder is not None:
         group._acting = CapturedActing(group, "mapped_actions", recorder)
     for _ in range(1 if recorder is None else 5):
@@ -220,7 +213,7 @@ def test_compiled_and_captured_groups(how: str) -> None:
     group = LearnerGroup(learners)
     recorder = None
     if how == "captured":
-        recorder = GroupRecorder(group)
+        recorder = Recorder(group)
         group._execution = Execution(group, False, False, recorder, "mapped_step")
     together(learners, lambda i: take(others[i], 20), group)
     assert_alike("SAC", alone, others)
@@ -278,7 +271,7 @@ def test_groups_go_on_after_resets(how: str) -> None:
         learner.compiled = how == "compiled"
     group = LearnerGroup(learners)
     if how == "captured":
-        group._execution = Execution(group, False, False, GroupRecorder(group), "mapped_step")
+        group._execution = Execution(group, False, False, Recorder(group), "mapped_step")
     together(learners, lambda i: train(others[i]), group)
     if how == "captured":
         assert group._execution._captured._recorder.n_recordings == 2

@@ -16,7 +16,6 @@ from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.replay.buffers import PLAIN_BUFFERS, DeviceValidationReplayBuffer, latest
 from sb3_sample.sac import SAC, VPLSAC, many
-from tests.learner.test_group import GroupRecorder
 from tests.sac.common import COMPILES, MAKERS, TINY_SAC, Toy, sac, state, vec
 from tests.sac.test_execution import Recorder
 
@@ -158,7 +157,7 @@ def test_it_is_the_gradient_step_on_what_it_draws(maker: str, how: str) -> None:
             with torch.random.fork_rng([]):  # a capture draws nothing
                 return super().__call__(run)
 
-    recorder = Drawing(ours)
+    recorder = Drawing(learner)
     if how == "captured":
         learner._drawing = Execution(learner, False, False, recorder, "drawn_step")
     for model in (ours, theirs):
@@ -212,7 +211,7 @@ def test_learners_draw_together(maker: str, how: str, gammas: tuple[float, ...])
         model.learner.compiled = how == "compiled"
     groups = [LearnerGroup([model.learner for model in models]) for models in (ours, theirs)]
     if how == "captured":
-        groups[0]._drawing = Execution(groups[0], False, False, GroupRecorder(groups[0]), "mapped_drawn_step")
+        groups[0]._drawing = Execution(groups[0], False, False, Recorder(groups[0]), "mapped_drawn_step")
     for i in range(6):
         torch.manual_seed(i)
         groups[0].step([(8, n, True, True)] * 3)

@@ -58,10 +58,12 @@ class Recorder:
     """
     In the place of CUDA's graphs: what is recorded takes no effect, and a repetition runs the same operations on the
     same memory, whatever Python would do by then.
+
+    :param learner: whose steps are recorded, or a group of learners
     """
 
-    def __init__(self, model: Any):
-        self.learner = model.learner
+    def __init__(self, learner: Any):
+        self.learner = learner
         self.n_recordings = self.n_repetitions = 0
 
     def _memory(self) -> list[torch.Tensor]:
@@ -95,7 +97,7 @@ class Recorder:
 
 def captured(model: Any, warm_up: int = 3) -> Recorder:
     """Let a model's gradient steps be captured by a recorder, after some that are run as they are."""
-    recorder = Recorder(model)
+    recorder = Recorder(model.learner)
     model.learner._execution = Execution(model.learner, False, False, recorder)
     assert model.learner._execution._captured is not None and model.learner._execution._captured.WARM_UP == 3
     model.learner._execution._captured.WARM_UP = warm_up

@@ -178,7 +178,7 @@ class Replay:
         self.learner: DebiasedRQLearner = self.model.learner
         self.recorders: list[Recorder] = []
         if execution == "captured":
-            self.recorders = [captured(self.model, warm_up=0), Recorder(self.model)]
+            self.recorders = [captured(self.model, warm_up=0), Recorder(self.model.learner)]
             encoder = self.learner._encoder_execution = Execution(
                 self.learner, False, False, self.recorders[1], "encoder_step"
             )

@@ -877,6 +877,57 @@ def test_callback_states_notice_changes_in_place() -> None:
     assert set(states.save()["callback"]["attributes"]) == {"best"}
 
 
+class Aliases(BaseCallback):
+    """Attributes that hold what others hold, of which some never change."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first, self.best, self.names = [0.0, None], None, ["a"]
+        for i in range(8):
+            setattr(self, f"here{i}", [])
+            setattr(self, f"there{i}", [])
+
+    def _on_step(self) -> bool:
+        self.best, self.named = self.first, [self.names, {}]
+        for i in range(8):
+            here = getattr(self, f"here{i}")
+            here.append({self.num_timesteps: i})
+            getattr(self, f"there{i}").append(here)
+        return True
+
+
+def test_what_several_attributes_of_a_callback_hold_stays_one() -> None:
+    """As Stable-Baselines3's EvalCallback has its latest successes in two of them."""
+    first, again = Aliases(), Aliases()
+    states = [CallbackStates(callback) for callback in (first, again)]
+    sac().learn(2, first)
+    saved = states[0].save()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        states[1].restore(saved)
+    assert again.best is again.first and again.named[0] is again.names
+    for i in range(8):
+        here, there = getattr(again, f"here{i}"), getattr(again, f"there{i}")
+        assert here == [{1: i}, {2: i}] and len(there) == 2 and there[0] is there[1] is here
+
+
+def test_evaluations_with_successes_go_on(tmp_path: Path) -> None:
+    def evaluation() -> EvalCallback:
+        env = DummyVecEnv([lambda: Monitor(Goal())])
+        return EvalCallback(env, eval_freq=24, n_eval_episodes=1, verbose=0, log_path=str(tmp_path / "evaluations"))
+
+    def learn(stop: int, callback: EvalCallback) -> None:
+        model = sac(env=DummyVecEnv([lambda: Monitor(Goal())]), policy="MultiInputPolicy", verbose=0)
+        model.learn(stop, callback, checkpoint=tmp_path / "run", checkpoint_freq=12)
+
+    learn(60, evaluation())
+    again = evaluation()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*starts anew")
+        learn(96, again)
+    assert again.evaluations_timesteps == [24, 48, 72, 96] and len(again.evaluations_successes) == 4
+
+
 def test_a_folder_that_cannot_be_synced(tmp_path: Path, monkeypatch: Any) -> None:
     """Checkpoints are kept there, which is said once, and the run goes on from them."""
     fsync = os.fsync
