@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -382,7 +383,17 @@ def test_from_a_table_to_settings(tmp_path: Path) -> None:
         assert one.params() == other.params() and one.steps == pytest.approx(other.steps)
         assert one.steps.low <= one.steps.value <= one.steps.high
     found = again.predict(replay_ratio=16.0)
-    assert re.fullmatch(r"replay_ratio:16 batch_size:\d+ learning_rate:0.0003", found.params())
+    assert re.fullmatch(
+        r"""replay_ratio:16 batch_size:\d+ learning_rate:0.0003 model_size:"'0.55M'\"""", found.params()
+    )
+    assert found.others == {"model_size": "0.55M"} and shlex.split(found.params())[-1] == "model_size:'0.55M'"
+    found = found._replace(others={"resets": [], "buffer_size": 100, "note": 'a "$x"'})
+    assert [word.partition(":")[2] for word in shlex.split(found.params())[-3:]] == ["[]", "100", "'a \"$x\"'"]
+    of_before = json.loads((tmp_path / "laws.json").read_text())
+    del of_before["others"]
+    (tmp_path / "before.json").write_text(json.dumps(of_before))
+    assert scaling.read_laws(tmp_path / "before.json").predict(replay_ratio=16.0).others == {}
+    found = again.predict(replay_ratio=16.0)
     assert any("extrapolated" in limit for limit in found.limits)
     slow, fast = (again.predict(replay_ratio=4.0, task=task).steps.value for task in reversed(TASKS))
     assert slow / fast == pytest.approx(3, rel=0.15)

@@ -122,7 +122,8 @@ def read_laws(path: str | Path) -> Laws:
         rest = {
             field.name: found[field.name]
             for field in dataclasses.fields(Laws)
-            if field.name not in ("hyperparameters", "levels")
+            # Files of before have no "others".
+            if field.name not in ("hyperparameters", "levels") and (field.name in found or field.name != "others")
         }
         return Laws(hyperparameters=hyperparameters, levels=levels, **rest)
     except (KeyError, TypeError, ValueError, AttributeError) as error:

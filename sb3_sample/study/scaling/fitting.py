@@ -1,5 +1,6 @@
 """From a table of runs to its laws, with intervals by the bootstrap over seeds."""
 
+import json
 import math
 import warnings
 from collections.abc import Iterable, Sequence
@@ -178,12 +179,24 @@ def fit(
         loss=loss,
         choice_level=choice,
         notes=notes,
+        others=_others(found),
     )
     if laws.has_compute and len(data) <= HELD_OUT + 1:
         notes.append(
             f"{len(data)} levels: the law of the budget needs at least {HELD_OUT + 2}, of which two are held out"
         )
     return laws
+
+
+def _others(found: list[Configuration]) -> dict[str, Any]:
+    """The arguments that all runs have, without those that the laws are of, and the policy that is every agent's."""
+    first, *rest = (json.loads(each.arguments) for each in found)
+    own = {"replay_ratio", *NAMES} | ({"policy"} if first.get("policy") == "MlpPolicy" else set())
+    return {
+        name: value
+        for name, value in first.items()
+        if name not in own and all(name in each and each[name] == value for each in rest)
+    }
 
 
 def _only(values: Iterable[float]) -> float | None:

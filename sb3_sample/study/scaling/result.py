@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import shlex
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -120,6 +121,7 @@ class Prediction(NamedTuple):
     :param compute: FLOPs; None without the size of the critics
     :param level: of the return; None for a budget between levels
     :param limits: what the prediction rests on, and what not
+    :param others: further arguments that all runs of the laws have
     """
 
     replay_ratio: Estimate
@@ -129,17 +131,24 @@ class Prediction(NamedTuple):
     compute: Estimate | None
     level: float | None
     limits: list[str]
+    others: dict[str, Any]
 
     def params(self) -> str:
         """
-        :return: arguments of ``sb3-sample train``, after ``-params``
+        :return: arguments of ``sb3-sample train``, after ``-params``, quoted for a shell
         """
         words = [f"replay_ratio:{self.replay_ratio.value:.4g}"]
         if self.batch_size is not None:
             words.append(f"batch_size:{rounded_batch_size(self.batch_size.value)}")
         if self.learning_rate is not None:
             words.append(f"learning_rate:{self.learning_rate.value:.3g}")
-        return " ".join(words)
+        return " ".join([*words, *(f"{name}:{_quoted(repr(value))}" for name, value in self.others.items())])
+
+
+def _quoted(text: str) -> str:
+    """A word of a shell."""
+    plain = shlex.quote(text)
+    return f'"{text}"' if plain != text and not set(text) & set('"$`\\!') else plain
 
 
 def rounded_batch_size(value: float) -> int:
@@ -167,6 +176,7 @@ class Laws:
     :param loss: of the data laws
     :param choice_level: at which batch sizes and learning rates were chosen
     :param notes: limits of all this, in words
+    :param others: further arguments that all runs have
     """
 
     tasks: list[str]
@@ -181,6 +191,7 @@ class Laws:
     loss: str
     choice_level: float
     notes: list[str]
+    others: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     # ------------------------------------------------ numbers
 
@@ -363,8 +374,9 @@ class Laws:
         compute = [budget - self.delta * each for each in steps]
         batch, rate = (self._hyperparameter(name, ratios, task) for name in ("batch_size", "learning_rate"))
         return Prediction(
-            self.interval(ratios), batch, rate, self.interval(steps), self.interval(compute), reached, limits
-        )
+            self.interval(ratios), batch, rate, self.interval(steps), self.interval(compute), reached, limits,
+            self.others,
+        )  # fmt: skip
 
     def _at(self, ratios: list[np.ndarray], level: Level, task: str | None) -> Prediction:
         data = self._data(level, task)
@@ -381,7 +393,7 @@ class Laws:
         batch, rate = (self._hyperparameter(name, ratios, task) for name in ("batch_size", "learning_rate"))
         return Prediction(
             Estimate(ratio) if exact else self.interval(ratios),
-            batch, rate, self.interval(steps), compute, level.level, limits,
+            batch, rate, self.interval(steps), compute, level.level, limits, self.others,
         )  # fmt: skip
 
     def _hyperparameter(self, name: str, ratios: list[np.ndarray], task: str | None) -> Estimate | None:
