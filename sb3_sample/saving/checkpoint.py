@@ -61,8 +61,10 @@ def refuse_second_call(model: BaseAlgorithm, folder: str | Path | None) -> None:
 
     :param model: the algorithm, before anything of the call has changed it
     :param folder: the run's folder; None for no checkpoints
-    :raises ValueError: an earlier call of ``learn`` of this model has ended with the folder
+    :raises ValueError: it is no path, or an earlier call of ``learn`` of this model has ended with the folder
     """
+    if folder is not None and not isinstance(folder, (str, os.PathLike)):
+        raise ValueError(f"checkpoint must name a folder, by a text or a path, or be None, not {folder!r:.100}")
     if folder is not None and os.path.realpath(folder) in _TRAINED.get(model, ()):
         raise ValueError(
             f"checkpoint={str(folder)!r} must be another folder for each call of learn: an earlier call has trained "

@@ -133,8 +133,9 @@ class StudyFolder:
         :return: the runs of the plan that was last run there
         :raises StudyError: there is none, or its list is not what was written
         """
+        content = self._list()
         try:
-            return [Run.of_json(run) for run in self._list()["runs"]]
+            return [Run.of_json(run) for run in content["runs"]]
         except (ValueError, KeyError, TypeError) as error:
             raise StudyError(f"{self.path / LIST} is not what sb3-sample study run has written: {error}") from error
 

@@ -429,6 +429,8 @@ def test_no_file_is_pickled(tmp_path: Path) -> None:
 
 def test_a_file_in_place_of_the_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="checkpoint must name a folder, by a text or a path, or be None, not 5"):
+        sac().learn(20, checkpoint=5)
     with pytest.raises(ValueError, match=r"checkpoint must name a folder, but .*file is a file"):
         sac().learn(10, checkpoint=tmp_path / "file")
     with pytest.raises(ValueError, match="checkpoint='.*/file/below' cannot be used"):

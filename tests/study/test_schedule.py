@@ -163,7 +163,7 @@ def test_other_settings_in_a_folder_are_refused(tmp_path: Path) -> None:
     assert (tmp_path / "study.json").read_text() == before
     with pytest.raises(ValueError, match="workers must be an integer of at least 1, or None, not 0"):
         run(nothing.plan(1), tmp_path, workers=0)
-    with pytest.raises(study.StudyError, match="is no folder of sb3-sample study run"):
+    with pytest.raises(study.StudyError, match=r"^\S+ is no folder of sb3-sample study run: it has no study.json$"):
         study.status(tmp_path / "runs")
 
 
