@@ -103,7 +103,7 @@ demo-imports: setup.cfg $(LOCK)
 	rm -rf .venv-demo
 
 test-all: lint demo-imports
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -n 2 --durations=60
 
 WORKERS ?= 1
 evidence:

@@ -192,10 +192,8 @@ def _untouched(modules: list[nn.Module]) -> Iterator[None]:
         yield
     finally:
         for module, own, held in attributes:
-            vars(module).clear()
-            vars(module).update(own)
-            module._buffers.clear()
-            module._buffers.update(held)
+            _replace(vars(module), own)
+            _replace(module._buffers, held)
         for script, mode in scripts.items():
             script.train(mode)
         with torch.no_grad():
@@ -230,3 +228,10 @@ def _check(part: Any, method: str, got: Any, what: str, shape: tuple[int, ...], 
 def _check_entry(who: str, name: str, got: Any, shape: tuple[int, ...], otherwise: str = "") -> None:
     if not _is_tensor(got) or tuple(got.shape) != shape:
         raise ValueError(f"{who} must have {name} that are {otherwise}a tensor of shape {shape}, not {_shown(got)}")
+
+
+def _replace(content: dict[str, Any], earlier: dict[str, Any]) -> None:
+    """Give a dict its earlier content. It is never without what both have: another thread may act meanwhile."""
+    content.update(earlier)
+    for name in content.keys() - earlier.keys():
+        del content[name]

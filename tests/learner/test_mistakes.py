@@ -2,6 +2,8 @@
 
 import copy
 import re
+import sys
+import threading
 import warnings
 from pathlib import Path
 from typing import Any
@@ -295,6 +297,33 @@ def test_the_check_leaves_nothing_behind(maker: str) -> None:
     assert not differing(before, state(model)) and modes == [module.training for module in model.policy.modules()]
     assert torch.equal(random, torch.get_rng_state())
     assert np.array_equal(arrays, np.random.get_state()[1])  # type: ignore[arg-type]
+
+
+def test_who_acts_in_another_thread_meanwhile_finds_all_parameters() -> None:
+    model = sac()
+    modules = list(model.policy.modules())
+    n, found, is_over = len(list(model.policy.parameters())), set(), threading.Event()
+
+    def read() -> None:
+        while not is_over.is_set():
+            try:
+                found.add(len(list(model.policy.parameters())))
+            except AttributeError as error:
+                found.add(repr(error))
+
+    switch = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    thread = threading.Thread(target=read)
+    thread.start()
+    try:
+        for _ in range(3_000):
+            with first_step._untouched(modules):
+                pass
+    finally:
+        is_over.set()
+        thread.join()
+        sys.setswitchinterval(switch)
+    assert found == {n}
 
 
 class Counting(Network):
