@@ -108,9 +108,10 @@ def captured(model: Any, warm_up: int = 3) -> Recorder:
 #: that follow them.
 WITHOUT_GRADIENT = re.compile(r"input_norm\.bias|running_mean|critic\.trunk\.dense\.\d\.bias")
 #: Agents of whose gradients some elements are rounding, which Adam makes steps of.
-ROUNDING = ("CrossQ+WN", "DebiasedRQ", "FlashSAC", "XQC")
-#: Gradient steps of those whose rounding grows fastest, through batch norm over eight rows; others take 50.
-FEW_STEPS = {"CrossQ+WN": 5, "XQC": 10}
+ROUNDING = ("CrossQ+WN", "DebiasedRQ", "FlashSAC", "SRSPR", "XQC")
+#: Gradient steps of those whose rounding grows fastest, through batch norm over eight rows or convolutions (SRSPR: 3e-7
+#: after one step, 4e-5 after ten, 3e-4 after fifty); others take 50.
+FEW_STEPS = {"CrossQ+WN": 5, "SRSPR": 10, "XQC": 10}
 
 
 def largest_difference(a: Any, b: Any) -> float:
