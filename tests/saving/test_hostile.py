@@ -41,7 +41,7 @@ from tests.saving.test_replay import goals
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
 #: Seconds of the processor and bytes that one file may take; measured were at most 0.3 s and 64 MiB, for 3 MB of JSON.
-SECONDS, BYTES = 2.0, 128 * 2**20
+SECONDS, BYTES = 10.0, 128 * 2**20
 #: Of address space, in which more is taken than is ever filled: a crash before the machine's memory is gone.
 HEADROOM = 16 * 2**30
 

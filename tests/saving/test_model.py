@@ -394,7 +394,7 @@ def test_hostile_files(maker: str, change: Any, files: dict[str, Path]) -> None:
         start = time.process_time()
         with pytest.raises(ValueError):
             type(MAKE[maker]()).load(file, device="cpu")
-        assert time.process_time() - start < 2
+        assert time.process_time() - start < 10  # a slow processor, beside others
 
 
 @pytest.mark.parametrize("device", [{"device": "meta"}, "x"])
