@@ -293,8 +293,9 @@ def outcome(agent: Any, folder: str, callback: Any = None) -> dict[str, str]:
         if isinstance(value, dict):
             for key, item in value.items():
                 # Seconds that an episode took, and a whole run: they are what may differ; and the generators of workers
-                # are seeded by the system.
-                if key not in ("t", "episode_times", "id", "generators") and not str(key).startswith("time/"):
+                # and of observation spaces, from which nothing is drawn, are seeded by the system.
+                system = ("generators", "observation_space", "_observation_space")
+                if key not in ("t", "episode_times", "id", *system) and not str(key).startswith("time/"):
                     note(f"{name}/{key}", item)
         elif isinstance(value, (list, tuple, collections.deque)):
             found[f"{name}/length"] = str(len(value))
