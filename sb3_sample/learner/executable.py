@@ -1,4 +1,4 @@
-"""What every learner has of the ways to run its gradient step: eager, compiled, captured."""
+"""Ways to run a learner's gradient step: eager, compiled, captured."""
 
 from collections.abc import Callable
 from typing import Any

@@ -374,7 +374,7 @@ class DeviceValidationReplayBuffer(ValidationSplit, DeviceReplayBuffer):
         self._make_sides()
 
     def _make_sides(self) -> None:
-        # What the split follows from: not saved.
+        # Places of the two sides, which follow from ``held_out`` and are not saved.
         self._training_side, self._validation_side = (
             _Places(self.buffer_size * self.n_envs, self.device) for _ in range(2)
         )

@@ -1,4 +1,4 @@
-"""What the off-policy family logs beside the metrics of its gradient steps."""
+"""Log of the off-policy family beside the metrics of its gradient steps."""
 
 from typing import Any
 

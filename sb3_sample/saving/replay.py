@@ -29,7 +29,7 @@ SUFFIX, PICKLES_SUFFIX = "buffer.zip", "pkl"
 MAX_TRANSITIONS, MAX_HER_TRANSITIONS = 100_000_000, 5_000_000
 #: The same of a replay buffer's file, if it is larger than the model's own.
 MAX_OTHER, MAX_OTHER_HER = 20_000_000, 1_000_000
-#: What belongs to the model and its environment, and what follows from the rows.
+#: Attributes that belong to the model and its environment, and those that follow from the rows.
 _NOT_SAVED = ("device", "env", "_training_side", "_validation_side")
 #: Arguments with which a buffer is made again that gives and takes its own state.
 _ARGUMENTS = (
