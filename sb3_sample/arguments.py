@@ -3,7 +3,7 @@
 import difflib
 import inspect
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -18,7 +18,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from sb3_sample.errors import ParametersDoNotFit
-from sb3_sample.kinds import AT_LEAST_0, DICT, VERBOSE, Kind, check_value, integer, maker
+from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, DICT, VERBOSE, Kind, check_value, integer, maker
+from sb3_sample.warn import warn
 
 
 class NotAllowed(ValueError, AssertionError):
@@ -41,6 +42,8 @@ _ENVIRONMENT = Kind(
     "be an environment, a vectorised environment or the id of one",
     lambda value: isinstance(value, (str, VecEnv)) or (hasattr(value, "action_space") and hasattr(value, "step")),
 )
+#: Arguments that may be functions of the remaining progress, and what their values must be.
+_SCHEDULED = {"learning_rate": AT_LEAST_0, "clip_range": ABOVE_0, "clip_range_vf": ABOVE_0}
 #: Arguments of ``learn`` in both families.
 _LEARN: dict[str, Kind] = {
     "total_timesteps": AT_LEAST_0,
@@ -70,6 +73,8 @@ def check_every(agent: Any, needs_spaces: bool = True) -> None:
             # Stable-Baselines3 stores some under the argument's name that are declared under another for their type.
             attribute = argument.attribute if argument.attribute in vars(agent) else name
             setattr(agent, attribute, check_value(name, getattr(agent, attribute), argument.kind))
+            if name in _SCHEDULED and callable(getattr(agent, attribute)):
+                _check_schedule(name, getattr(agent, attribute))
     kwargs, space = agent.policy_kwargs, getattr(agent, "observation_space", None)
     for name, kind in EVERY_POLICY.items():
         if name in kwargs:
@@ -87,6 +92,18 @@ def check_every(agent: Any, needs_spaces: bool = True) -> None:
             "policy='CnnPolicy' needs images, of integers in [0, 255] (with policy_kwargs={'normalize_images': False} "
             f"of any numbers), not {space}: use 'MlpPolicy' for vectors"
         )
+
+
+def _check_schedule(name: str, schedule: Callable[[float], Any]) -> None:
+    """Check that a function gives a number at the begin, where Stable-Baselines3 asks it first."""
+    try:
+        first = float(schedule(1.0))
+    except Exception as error:
+        raise ValueError(
+            f"{name} must be a function of the remaining progress, from 1 to 0, that returns a number, but at 1.0 "
+            f"{schedule!r} fails: {type(error).__name__}: {error}"
+        ) from error
+    check_value(f"{name}, {schedule!r}, at the begin", first, _SCHEDULED[name])
 
 
 def _check_names(policy_kwargs: Mapping[str, Any], policy: type) -> None:
@@ -160,9 +177,12 @@ def check_device(device: Any) -> None:
     :raises ValueError: if torch has no device of this name
     """
     try:
-        get_device(device)
+        used = get_device(device)
     except (RuntimeError, TypeError, ValueError) as error:
         raise ValueError(f"device must be 'auto', 'cpu', 'cuda' or another of torch's, not {device!r}") from error
+    if device != "auto" and torch.device(device).type != used.type:
+        # Stable-Baselines3 does the same, without a word.
+        warn(f"device={str(device)!r}: torch finds no such device here, so {used} is used")
 
 
 def check_program(cls: type, given: Mapping[str, Any]) -> None:

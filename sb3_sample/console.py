@@ -3,8 +3,9 @@
 import contextlib
 import os
 import sys
-import warnings
 from typing import Any
+
+from sb3_sample.warn import warn
 
 
 def standard_error() -> int | None:
@@ -76,8 +77,7 @@ class _Lossy:
         except OSError as error:
             if not self._warned:
                 self._warned = True
-                warnings.warn(
+                warn(
                     f"{self._name} of the log cannot be written to ({error}): lines of it are lost. The training goes "
-                    "on.",
-                    stacklevel=4,
+                    "on."
                 )

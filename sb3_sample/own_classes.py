@@ -3,13 +3,14 @@
 import difflib
 import inspect
 import types
-import warnings
 import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
 
 from torch import nn
 from torch.optim import Optimizer
+
+from sb3_sample.warn import warn
 
 #: Classes whose names were warned of.
 _told: weakref.WeakSet[type] = weakref.WeakSet()
@@ -97,10 +98,7 @@ def check(argument: str, cls: type, base: type) -> None:
         for name in vars(c):
             near = difflib.get_close_matches(name, hooks, 1, 0.8)
             if near and not name.startswith("_") and not hasattr(base, name) and name not in used:
-                warnings.warn(
-                    f"{c.__name__}.{name} is called by nobody; did you mean {near[0]}? ({argument}={c.__name__})",
-                    stacklevel=3,
-                )
+                warn(f"{c.__name__}.{name} is called by nobody; did you mean {near[0]}? ({argument}={c.__name__})")
 
 
 def _check_signature(argument: str, cls: type, base: type, name: str) -> None:

@@ -14,7 +14,6 @@ import sys
 import threading
 import time
 import traceback
-import warnings
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkProcess
@@ -26,6 +25,8 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, VecEnvObs, VecEnvStepReturn
 from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker as serve
+
+from sb3_sample.warn import warn
 
 #: Seconds for a worker that has hung up to be gone.
 PATIENCE = 5.0
@@ -444,9 +445,7 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
         """
         while self.restart_envs and self.n_restarts < self.max_restarts:
             self.n_restarts += 1
-            warnings.warn(
-                f"{error} It is restarted, as {self.n_restarts} of at most {self.max_restarts}.", stacklevel=4
-            )
+            warn(f"{error} It is restarted, as {self.n_restarts} of at most {self.max_restarts}.")
             self.remotes[index].finish()
             self.processes[index], self.remotes[index] = self._start(index)
             seed = None

@@ -8,7 +8,6 @@ noise as tensors, does not branch on the value of a tensor, and counts nothing o
 import operator
 import re
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -18,6 +17,7 @@ from sb3_sample.console import say
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.optim import AdamW
 from sb3_sample.tracing import compile_graph, trace, undone
+from sb3_sample.warn import warn
 
 #: With ``compile="auto"``, gradient steps in one ``learn`` from which on compiling pays: it takes the time of some
 #: thousand steps (docs/performance.md). A number of steps, not a measurement, so that a seed fixes the whole run.
@@ -59,7 +59,7 @@ def warn_not_compiled(learner: Any, reason: str) -> None:
         if learner.compile in _told:
             return
         _told.add(learner.compile)
-    warnings.warn(f"The gradient step is not compiled: {reason}", stacklevel=3)
+    warn(f"The gradient step is not compiled: {reason}")
 
 
 def why_not_compiled(learner: Any) -> str | None:
@@ -234,7 +234,7 @@ class Execution:
                 raise RuntimeError(
                     f"compile=True, but the gradient step cannot be compiled: {error}. Pass compile=False, or 'auto'"
                 ) from error
-            warnings.warn(f"The gradient step is not compiled, as it cannot be: {error}", stacklevel=2)
+            warn(f"The gradient step is not compiled, as it cannot be: {error}")
             self._compiled, learner.compiled = None, False
             return self._step(learner, *inputs)
 

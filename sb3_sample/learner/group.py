@@ -3,7 +3,6 @@ Many learners in one gradient step: their networks, moments and statistics are s
 gradient step of one is mapped over it by ``torch.vmap``.
 """
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import zip_longest
@@ -28,6 +27,7 @@ from sb3_sample.learner.execution import (
 )
 from sb3_sample.learner.learner import Learner
 from sb3_sample.optim import AdamW
+from sb3_sample.warn import warn
 
 #: Numbers of a learner that its gradient step does not read, or reads from its inputs.
 _NOT_READ = {"learning_starts", "verbose", "compile", "learning_rate", "gamma"}
@@ -221,7 +221,7 @@ class LearnerGroup:
         if self.compiled:
             reason = why_not_compiled(self)
             if reason is not None:
-                warnings.warn(f"The gradient step is not compiled: {reason}", stacklevel=4)
+                warn(f"The gradient step is not compiled: {reason}")
                 self.compiled = False
         recorder = cuda_graph if captures(self, self._first) else None
         return Execution(self, self.compiled, self.compile == "auto", recorder, method)

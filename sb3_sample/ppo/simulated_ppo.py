@@ -8,7 +8,6 @@ samples come from is the business of its subclasses, in ``fit_models`` and ``_si
 import math
 import pathlib
 import time
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar
@@ -35,6 +34,7 @@ from sb3_sample.ppo.spaces import FlatObservations, ModelActions
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
 from sb3_sample.saving.kept import Kept
 from sb3_sample.saving.model import SafeFiles
+from sb3_sample.warn import warn
 
 Self = TypeVar("Self", bound="ExtraSamplesPPO")
 
@@ -193,11 +193,10 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         self._iteration = 0
         starts_at_none = self._n_extra > 0 and self._warm_up > 0 and self.num_timesteps == 0
         if starts_at_none and self._total_timesteps <= self.n_steps * self.n_envs:
-            warnings.warn(
+            warn(
                 f"{self._total_timesteps} steps are a single iteration (n_steps={self.n_steps} times {self.n_envs} "
                 "environments), in which nothing is simulated: the number of simulated samples rises from 0. Train "
-                "longer, or pass warm_up_until=0",
-                stacklevel=4,
+                "longer, or pass warm_up_until=0"
             )
 
     def _turn(self, callback: BaseCallback, log_interval: int) -> bool:

@@ -5,7 +5,6 @@ the step after it.
 
 import functools
 import os
-import warnings
 from collections.abc import Iterable
 from typing import Any
 
@@ -19,6 +18,7 @@ from sb3_sample.replay import memory_map as files
 from sb3_sample.replay.columns import NEXT_OBSERVATIONS, OBSERVATIONS, HasColumns, samples_at
 from sb3_sample.replay.frames import OLDER, OLDER_FRAMES, StackedFrames
 from sb3_sample.replay.next_observations import NEXT_ROW, ONLY, NextObservations, SideStore
+from sb3_sample.warn import warn
 
 try:  # As in Stable-Baselines3: without it the free memory is not checked.
     import psutil
@@ -106,10 +106,9 @@ class CompactReplay(HasColumns):
         #: The folder that holds the arrays; None if the memory does.
         self.memory_map = None if memory_map is None else files.check_folder(memory_map, needed)
         if memory_map is None and psutil is not None and needed > (available := psutil.virtual_memory().available):
-            warnings.warn(
+            warn(
                 f"the full replay buffer takes {needed / 1e9:.2f} GB, and {available / 1e9:.2f} GB of memory are free: "
-                "pass a smaller buffer_size, or replay_buffer_kwargs={'memory_map': <folder>}",
-                stacklevel=2,
+                "pass a smaller buffer_size, or replay_buffer_kwargs={'memory_map': <folder>}"
             )
         zeros = functools.partial(files.zeros, self.memory_map)
         stored: dict[str, Any] = {

@@ -1,7 +1,6 @@
 """Fixed data sets of transitions as a source of batches."""
 
 import os
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from hashlib import sha256
 from typing import Any
@@ -15,6 +14,7 @@ from sb3_sample.replay.columns import samples_at
 from sb3_sample.replay.dataset_files import opened_hdf5, read_minari, write_minari
 from sb3_sample.replay.memory_map import check_folder, zeros
 from sb3_sample.replay.steps import CHUNK, Steps, check_action_space, check_actions, put, stored_dtype
+from sb3_sample.warn import warn
 
 Arrays = np.ndarray | dict[str, np.ndarray]
 
@@ -47,10 +47,9 @@ class Dataset:
         self._fingerprint = ""
         if n_left_out:
             what = "its next observation is not known" if n_left_out == 1 else "their next observations are not known"
-            warnings.warn(
+            warn(
                 f"{n_left_out} of {n_left_out + len(self)} steps left out of the data set, the last of episodes that "
-                f"were cut off: {what}",
-                stacklevel=3,
+                f"were cut off: {what}"
             )
 
     @classmethod

@@ -66,6 +66,7 @@ from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.replay import SafeReplayBuffers, encode_buffer
 from sb3_sample.saving.unsaved import plain_attributes
 from sb3_sample.training.resumable import Resumable
+from sb3_sample.warn import warn
 
 Self = TypeVar("Self", bound="SAC")
 
@@ -204,10 +205,9 @@ class SAC(  # type: ignore[misc]  # actor
         """Note which the prior data are; a loaded model may have had others."""
         now = {"fingerprint": data.fingerprint, "size": len(data)}
         if self._prior_of is not None and self._prior_of != now:
-            warnings.warn(
+            warn(
                 f"prior_data are other transitions than this model has learned from so far: {data!r}, not "
-                f"{checks.prior_words(self._prior_of)}",
-                stacklevel=6,
+                f"{checks.prior_words(self._prior_of)}"
             )
         self._prior_of = now
 

@@ -3,7 +3,6 @@
 import contextlib
 import math
 import threading
-import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -14,6 +13,7 @@ from stable_baselines3.her import HerReplayBuffer
 from sb3_sample.kinds import ABOVE_0, TRUE_OR_FALSE, check_value
 from sb3_sample.learner.exploration import Exploration, HeldNoise, OptimisticActor, OptimisticShift
 from sb3_sample.training.acting import ActingThread, Chosen, Step
+from sb3_sample.warn import warn
 
 #: Gradient steps after which parameters are handed over to whoever acts.
 MAX_AGE = 4
@@ -127,11 +127,10 @@ class Apart:
             self._ages.append(step.age)
         if not self._has_warned and self._n_periods >= ENOUGH and self._n_missed > MISSED * self._n_periods:
             self._has_warned = True
-            warnings.warn(
+            warn(
                 f"{self._n_missed} of {self._n_periods} periods of 1 / {self._frequency} s were missed: the "
                 "environment's step and the choice of an action take longer than a period, or checkpoints and other "
-                "programs keep them waiting. Pass a smaller control_frequency",
-                stacklevel=2,
+                "programs keep them waiting. Pass a smaller control_frequency"
             )
 
         self._warn_of_lapsed()
@@ -141,11 +140,10 @@ class Apart:
         if self._has_warned_of_lapsed or self._n_periods < ENOUGH or self._n_lapsed <= LAPSED * n_due:
             return
         self._has_warned_of_lapsed = True
-        warnings.warn(
+        warn(
             f"{self._n_lapsed} of {n_due} gradient steps have lapsed: they take longer than the environment's steps, "
             f"so that fewer are taken than replay_ratio={self._model.replay_ratio} a transition. Pass a smaller "
-            "replay_ratio or control_frequency, or choose smaller networks",
-            stacklevel=3,
+            "replay_ratio or control_frequency, or choose smaller networks"
         )
 
     def record(self) -> None:

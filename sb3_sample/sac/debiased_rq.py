@@ -1,7 +1,6 @@
 """DR.Q, under the name ``DebiasedRQ``."""
 
 import math
-import warnings
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -25,6 +24,7 @@ from sb3_sample.sac.embeddings import DebiasedRQCnnPolicy, DebiasedRQMultiInputP
 from sb3_sample.sac.model_learner import OfLearner
 from sb3_sample.sac.policies import SACPolicy
 from sb3_sample.sac.policy_kwargs import with_weight_decay
+from sb3_sample.warn import warn
 
 _RANGE = Kind(
     "be two finite numbers, the smaller first",
@@ -241,8 +241,7 @@ class DebiasedRQ(SAC):
         super()._after_turns()
         assert isinstance(self.replay_buffer, WindowReplay)
         if self._n_updates == 0 and not self._is_warming_up() and self.replay_buffer.n_drawable == 0:
-            warnings.warn(
+            warn(
                 f"learn ended without a single gradient step: no episode had more than {self._horizon} steps before a "
-                "time limit, which the windows of encoder_horizon and n_steps need",
-                stacklevel=4,
+                "time limit, which the windows of encoder_horizon and n_steps need"
             )

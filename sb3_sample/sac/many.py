@@ -1,7 +1,6 @@
 """``train_many``: the same training with many seeds, in one process."""
 
 import functools
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,6 +19,7 @@ from sb3_sample.sac.algorithm import SAC
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
 from sb3_sample.saving.interrupts import Interrupts
 from sb3_sample.training.seats import all_made, joint_of
+from sb3_sample.warn import warn
 
 Agent = TypeVar("Agent", bound=SAC)
 
@@ -121,7 +121,7 @@ def train_many(
             )
         except TrainingDiverged as error:
             diverged[index] = error
-            warnings.warn(f"The learner of seed {seed} is stopped, and the others go on: {error}", stacklevel=2)
+            warn(f"The learner of seed {seed} is stopped, and the others go on: {error}")
 
     seats = [
         Seat(f"the learner of seed {seed}", functools.partial(train, index), folders[index])
@@ -130,10 +130,7 @@ def train_many(
     train_together(seats, checkpoint)
     if diverged:
         words = "; ".join(f"seed {names[index]}: {error}" for index, error in sorted(diverged.items()))
-        warnings.warn(
-            f"{len(diverged)} of {len(names)} learners have diverged, and are returned as they were then. {words}",
-            stacklevel=2,
-        )
+        warn(f"{len(diverged)} of {len(names)} learners have diverged, and are returned as they were then. {words}")
     return models
 
 
@@ -158,7 +155,7 @@ def train_together(seats: Sequence[Seat], folder: str | Path | None) -> None:
         assert seat.error is not None
         if seat.began:
             saved = " The others are saved" if folder is not None else ""
-            warnings.warn(f"{seat.name} has ended by {type(seat.error).__name__}.{saved}", stacklevel=3)
+            warn(f"{seat.name} has ended by {type(seat.error).__name__}.{saved}")
         raise seat.error
     for seat in seats:
         if seat.error is not None:

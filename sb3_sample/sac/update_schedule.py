@@ -1,6 +1,5 @@
 """How many gradient steps follow the environment steps."""
 
-import warnings
 from typing import Any
 
 from sb3_sample.replay.buffers import ValidationSplit
@@ -8,6 +7,7 @@ from sb3_sample.replay.weighted import PrioritizedReplay
 from sb3_sample.sac import checks
 from sb3_sample.training.compiling import DecidesCompiling
 from sb3_sample.training.updates_owed import UpdatesOwed
+from sb3_sample.warn import warn
 
 
 class UpdateSchedule(DecidesCompiling, UpdatesOwed):
@@ -44,12 +44,11 @@ class UpdateSchedule(DecidesCompiling, UpdatesOwed):
         if self._n_updates > 0 or self.num_transitions == 0 or wanted == 0 or not self._is_warming_up():
             return
         assert self.replay_buffer is not None
-        warnings.warn(
+        warn(
             f"learn ended without a single gradient step: learning_starts={self.learning_starts} transitions come "
             f"before the first, and the replay buffer has {self.replay_buffer.size() * self.n_envs} of the "
             f"{self.num_transitions} of this model's life. Train for more than {self.learning_starts} steps, or pass a "
-            "smaller learning_starts= to the constructor or to load (Stable-Baselines3's SAC has 100)",
-            stacklevel=4,
+            "smaller learning_starts= to the constructor or to load (Stable-Baselines3's SAC has 100)"
         )
 
     def _is_warming_up(self: Any) -> bool:

@@ -4,7 +4,6 @@ attributes has changed since the training began, so that what was never changed 
 """
 
 import inspect
-import warnings
 from collections.abc import Iterator, Set
 from typing import Any
 
@@ -25,6 +24,7 @@ from sb3_sample.saving.attributes import (
 )
 from sb3_sample.saving.classes import may_be_set
 from sb3_sample.saving.places import brings_text
+from sb3_sample.warn import warn
 
 #: What every callback has and that is not its own.
 _NOT_OWN = ("model", "parent", "locals", "globals", "verbose")
@@ -132,20 +132,15 @@ class CallbackStates:
         for path, state in states.items():
             callback = self._callbacks.get(path)
             if callback is None or class_name(callback) != state["class"]:
-                warnings.warn(
-                    f"The checkpoint has the state of a {state['class']} ({path}), which this training is without.",
-                    stacklevel=4,
-                )
+                warn(f"The checkpoint has the state of a {state['class']} ({path}), which this training is without.")
                 continue
             try:
                 self._restore(path, callback, state)
             except DoesNotFit as error:
-                warnings.warn(f"{type(callback).__name__} ({path}) starts anew: {error}", stacklevel=4)
+                warn(f"{type(callback).__name__} ({path}) starts anew: {error}")
         for path, callback in self._callbacks.items():
             if path not in states:
-                warnings.warn(
-                    f"{type(callback).__name__} ({path}) starts anew: it is not in the checkpoint", stacklevel=4
-                )
+                warn(f"{type(callback).__name__} ({path}) starts anew: it is not in the checkpoint")
 
     def _restore(self, path: str, callback: BaseCallback, state: dict[str, Any]) -> None:
         attributes, own, arguments = state["attributes"], vars(callback), _arguments(callback)
@@ -160,9 +155,7 @@ class CallbackStates:
         restorer.attributes(callback, {name: node for name, node in attributes.items() if name not in said})
         kept = [*(f"{type(callback).__name__}.{name}" for name in said), *restorer.kept]
         if kept:
-            warnings.warn(
-                f"{', '.join(kept)} of the checkpoint may name files, and stay as they are ({path})", stacklevel=5
-            )
+            warn(f"{', '.join(kept)} of the checkpoint may name files, and stay as they are ({path})")
         self._changed[path] |= attributes.keys()
         if state["state"] is not None:
             callback.load_state_dict(Restorer().restore(state["state"], None, path))  # type: ignore[attr-defined]

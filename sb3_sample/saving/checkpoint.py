@@ -11,7 +11,6 @@ import contextlib
 import os
 import sys
 import time
-import warnings
 import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -41,6 +40,7 @@ from sb3_sample.saving.interrupts import Interrupts
 from sb3_sample.saving.progress import ProgressFile
 from sb3_sample.saving.rings import Ring
 from sb3_sample.saving.run_folder import MODEL, STATE, RunFolder, Segment
+from sb3_sample.warn import warn
 
 #: Environment steps between two checkpoints, unless ``learn`` is told otherwise.
 CHECKPOINT_FREQ = 10_000
@@ -239,11 +239,10 @@ class Checkpointer:
         if self._resumed is None:
             return
         if self._manifest["steps"] >= total_timesteps:
-            warnings.warn(
+            warn(
                 f"Nothing is left to train: the run in checkpoint={str(self._name)!r} has {self._manifest['steps']} "
                 f"steps already, of {total_timesteps}. The model is as it was saved. For more steps pass a larger "
-                "total_timesteps, for a new run another folder",
-                stacklevel=4,
+                "total_timesteps, for a new run another folder"
             )
         state, model = self._resumed, self._model
         safe_files: Any = model
@@ -252,10 +251,9 @@ class Checkpointer:
             f"{name} {theirs.get(name)} (now {value})" for name, value in ours.items() if theirs.get(name) != value
         ]
         if changed:
-            warnings.warn(
+            warn(
                 f"The run goes on under other circumstances, so that it need not be the same to the last bit: the "
-                f"checkpoint was made with {', '.join(changed)}",
-                stacklevel=4,
+                f"checkpoint was made with {', '.join(changed)}"
             )
         assert self._folder is not None
         segments = self._folder.segments(self._manifest)
@@ -343,14 +341,13 @@ class Checkpointer:
         missing = self._missing = vec_envs.save(self._env)[1]
         # Where a run goes on without the episodes in progress, that they start anew is said then.
         if missing and (self._resumed is None or self._resumed["env"].get("environments") is not None):
-            warnings.warn(
+            warn(
                 "The state of the environment cannot be saved, so that the episodes in progress start anew when the "
-                f"run goes on: {'; '.join(missing)}",
-                stacklevel=5,
+                f"run goes on: {'; '.join(missing)}"
             )
         lost = self._states.lost()
         if lost:
-            warnings.warn(f"A checkpoint does not hold all of the callbacks' state: {'; '.join(lost)}", stacklevel=5)
+            warn(f"A checkpoint does not hold all of the callbacks' state: {'; '.join(lost)}")
 
     def _restore_rest(self, state: dict[str, Any]) -> None:
         with self._restoring(state):
@@ -369,7 +366,7 @@ class Checkpointer:
 
     def _start_episodes_anew(self, reasons: list[str]) -> None:
         model: Any = self._model
-        warnings.warn(f"The episodes in progress start anew: {'; '.join(reasons)}", stacklevel=6)
+        warn(f"The episodes in progress start anew: {'; '.join(reasons)}")
         if model.seed is not None:
             # Not the episodes of the run's beginning once more.
             self._env.seed(model.seed + model.num_timesteps)
@@ -440,10 +437,9 @@ class Checkpointer:
             self._save()
         except (OSError, NotPortable, container.TooLarge) as error:
             last = "there is none yet" if self._saved_at is None else f"the last one is of {self._saved_at} steps"
-            warnings.warn(
+            warn(
                 f"No checkpoint at {self._model.num_timesteps} steps, {last}: {self._name} cannot be written to "
-                f"({error}). The training goes on, and it is tried again after {self._every} steps.",
-                stacklevel=5,
+                f"({error}). The training goes on, and it is tried again after {self._every} steps."
             )
 
     def _save(self) -> None:

@@ -18,7 +18,6 @@ import pathlib
 import platform
 import re
 import struct
-import warnings
 import zipfile
 from collections.abc import Iterator
 from typing import IO, Any
@@ -31,6 +30,7 @@ import torch
 from sb3_sample.saving.temporary import becoming, remove_abandoned
 from sb3_sample.saving.untrusted import BadFile, PickledFile, open_regular
 from sb3_sample.version import __version__ as sb3_sample_version
+from sb3_sample.warn import warn
 
 DATA, TENSORS, CHECKSUMS = "data.json", "tensors.safetensors", "checksums.json"
 ENTRIES = (TENSORS, DATA, CHECKSUMS)
@@ -181,10 +181,9 @@ def _say_not_synced(folder: pathlib.Path, error: OSError) -> None:
     known = any(folder == other or folder in other.parents or other in folder.parents for other in _not_synced)
     _not_synced.add(folder)
     if not known:
-        warnings.warn(
+        warn(
             f"{folder} cannot be synced ({error.strerror}): files in it are complete, but a power cut can cost the "
-            "newest",
-            stacklevel=4,
+            "newest"
         )
 
 

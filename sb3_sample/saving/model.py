@@ -2,7 +2,6 @@
 
 import io
 import pathlib
-import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, TypeVar
 
@@ -28,6 +27,7 @@ from sb3_sample.saving.classes import check_trusted
 from sb3_sample.saving.container import BadFile, PickledFile
 from sb3_sample.saving.kept import Kept, declared
 from sb3_sample.saving.model_tree import KIND, Content, Description
+from sb3_sample.warn import warn
 
 Self = TypeVar("Self", bound="SafeFiles")
 
@@ -173,19 +173,15 @@ class SafeFiles(BaseAlgorithm):
             attributes = content.attributes(kwargs.keys(), custom_objects)
             if "policy_kwargs" in kwargs:
                 content.check_policy_kwargs(kwargs["policy_kwargs"])
-            _forget_folder(attributes, warn=env is not None)
+            _forget_folder(attributes, say_so=env is not None)
             model = cls._made(content, attributes, kwargs, custom_objects, env, device, force_reset)
             model._trusted_modules = trusted
             dropped = [name for name in content.without_place() if name not in custom_objects]
             if dropped:
-                warnings.warn(
-                    f"{content.another_class()}A {cls.__name__} makes no use of {', '.join(dropped)}", stacklevel=2
-                )
+                warn(f"{content.another_class()}A {cls.__name__} makes no use of {', '.join(dropped)}")
             if content.left_out:
                 shown = ", ".join(f"{name} ({reason:.200})" for name, reason in content.left_out.items())
-                warnings.warn(
-                    f"{content.name} was saved without {shown}: the model has its defaults there", stacklevel=2
-                )
+                warn(f"{content.name} was saved without {shown}: the model has its defaults there")
             return model
 
     @classmethod
@@ -340,13 +336,12 @@ def class_of(path: str | pathlib.Path) -> str:
         return Content(file, anything, SafeFiles, ()).tree["classes"][0]
 
 
-def _forget_folder(attributes: dict[str, Any], warn: bool) -> None:
+def _forget_folder(attributes: dict[str, Any], say_so: bool) -> None:
     """A file does not choose where this computer writes, nor does a loaded model write over the buffer of its run."""
     buffer_kwargs = attributes.get("replay_buffer_kwargs")
     folder = buffer_kwargs.pop("memory_map", None) if isinstance(buffer_kwargs, dict) else None
-    if folder is not None and warn:
-        warnings.warn(
+    if folder is not None and say_so:
+        warn(
             f"the replay buffer was in the folder {folder!r:.200}, the loaded model's is in memory: pass "
-            "replay_buffer_kwargs={'memory_map': <folder>} to load for another folder",
-            stacklevel=3,
+            "replay_buffer_kwargs={'memory_map': <folder>} to load for another folder"
         )

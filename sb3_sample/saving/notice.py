@@ -1,12 +1,12 @@
 """The one warning of what a model's files lack, and what reading them needs."""
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
 from sb3_sample.saving.classes import within
 from sb3_sample.saving.encoding import Lenient
 from sb3_sample.saving.training_state import argument_names
+from sb3_sample.warn import warn
 
 
 def argument_for(cls: type, name: str) -> str | None:
@@ -40,14 +40,13 @@ def need(cls: type, name: str, path: str, trusted: Sequence[str] = ()) -> str:
     return f"load needs {' or '.join([*wanted, argument])}"
 
 
-def say_once(model: Any, encoder: Lenient, trusted: Sequence[str] = (), stacklevel: int = 3) -> None:
+def say_once(model: Any, encoder: Lenient, trusted: Sequence[str] = ()) -> None:
     """
     Warn of what was not named before.
 
     :param model: an algorithm
     :param encoder: by which its file is written, or would be
     :param trusted: modules that the caller vouches for anyway
-    :param stacklevel: frames from here to the program's
     """
     cls, vouched = type(model), (*model._trusted_modules, *trusted)
     said: dict[str, str] = {}
@@ -63,4 +62,4 @@ def say_once(model: Any, encoder: Lenient, trusted: Sequence[str] = (), stacklev
     new = "; ".join(text for key, text in said.items() if key not in model._told)
     model._told = frozenset({*model._told, *said})
     if new:
-        warnings.warn(f"What is saved of this {cls.__name__} (docs/saving.md): {new}", stacklevel=stacklevel)
+        warn(f"What is saved of this {cls.__name__} (docs/saving.md): {new}")

@@ -5,13 +5,13 @@ import errno
 import io
 import os
 import pathlib
-import warnings
 from collections.abc import Iterator
 from typing import IO, Any
 
 from stable_baselines3.common.save_util import open_path
 
 from sb3_sample.saving.untrusted import check_regular
+from sb3_sample.warn import warn
 
 PathOrFile = str | pathlib.Path | io.BufferedIOBase
 
@@ -30,7 +30,7 @@ def to_write(path: PathOrFile, suffix: str) -> Any:
         path = path.with_name(f"{path.name}.{suffix}")
     while path.is_dir():
         other = path.with_name(f"{path.name}_2")
-        warnings.warn(f"Path {str(path)!r} is a folder, written is {str(other)!r} instead", stacklevel=4)
+        warn(f"Path {str(path)!r} is a folder, written is {str(other)!r} instead")
         path = other
     path.parent.mkdir(parents=True, exist_ok=True)
     return path

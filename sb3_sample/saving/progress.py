@@ -4,7 +4,6 @@ import collections
 import contextlib
 import json
 import os
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from stable_baselines3.common.logger import KVWriter, filter_excluded_keys
 
 from sb3_sample.saving.folders import Folder
 from sb3_sample.saving.run_folder import LOG
+from sb3_sample.warn import warn
 
 #: Characters of the lines that are kept while they cannot be written.
 MAX_PENDING = 2**20
@@ -75,7 +75,7 @@ class ProgressFile(KVWriter):
             self._file = folder.descriptor(LOG, os.O_RDWR | os.O_CREAT)
         there = os.lseek(self._file, 0, os.SEEK_END)
         if there < self._size:
-            warnings.warn(f"{self.path} has {there} bytes instead of {self._size}: lines are missing", stacklevel=6)
+            warn(f"{self.path} has {there} bytes instead of {self._size}: lines are missing")
             self._size = there
         elif there > self._size:
             os.ftruncate(self._file, self._size)
@@ -91,10 +91,9 @@ class ProgressFile(KVWriter):
                 os.close(file)
         if not self._warned:
             self._warned = True
-            warnings.warn(
+            warn(
                 f"{self.path} cannot be written to ({error}): its lines are kept, the last {MAX_PENDING} characters of "
-                "them. The training goes on.",
-                stacklevel=5,
+                "them. The training goes on."
             )
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:

@@ -18,7 +18,6 @@ import os
 import re
 import secrets
 import stat
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -27,6 +26,7 @@ from sb3_sample.saving import temporary
 from sb3_sample.saving.container import is_sha256, sync_folder
 from sb3_sample.saving.folders import Folder
 from sb3_sample.saving.locks import Lock
+from sb3_sample.warn import warn
 
 MODEL, STATE, MANIFEST = "model.zip", "state.zip", "manifest.json"
 SEGMENTS, LOG = "replay", "progress.jsonl"
@@ -166,7 +166,7 @@ class RunFolder:
         """Once: the same is found again at each checkpoint."""
         if message not in self._told:
             self._told.add(message)
-            warnings.warn(f"{message}. Nothing of the run is lost by it.", stacklevel=4)
+            warn(f"{message}. Nothing of the run is lost by it.")
 
     # ---------------------------------------------------------------- reading
 
@@ -189,7 +189,7 @@ class RunFolder:
                 reasons.append(str(error))
                 continue
             if reasons:
-                warnings.warn(f"{_some(reasons)}. Going on from {path} instead.", stacklevel=3)
+                warn(f"{_some(reasons)}. Going on from {path} instead.")
                 self._put_damaged_aside(path)
             return path, manifest
         if reasons:
@@ -438,7 +438,7 @@ def common_starts(folders: Iterable[Path]) -> Starts:
                 reasons.append(str(error))
                 continue
             if reasons:
-                warnings.warn(f"{_some(reasons)}. The runs go on from {steps} steps instead.", stacklevel=3)
+                warn(f"{_some(reasons)}. The runs go on from {steps} steps instead.")
             return Starts(steps, {folder: made[steps] for folder, made in there.items()})
         del there[min(there, key=lambda folder: max(there[folder]))]
     return Starts(0, {})

@@ -9,7 +9,6 @@ processes values are pickled, as always there; in the files they are not.
 
 import random
 import signal
-import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -22,6 +21,7 @@ from sb3_sample.envs.portable_states import HELPER, pack, pack_all, unpack, unpa
 from sb3_sample.envs.workers import SupervisedSubprocVecEnv
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name
 from sb3_sample.saving.statistics import ARGUMENTS, check_normalization, shapes_of
+from sb3_sample.warn import warn
 
 #: Of each wrapper: what leads elsewhere, what is an argument, and clocks, which count from when it was made.
 _SKIPPED = (
@@ -263,9 +263,7 @@ def restore(venv: VecEnv, state: dict[str, Any]) -> list[str]:
                 raise DoesNotFit(f"the statistics of VecNormalize are of the shapes {_shapes(wrapper)}, not {before}")
     restorer.classes(state.get("classes", {}))
     if restorer.kept:
-        warnings.warn(
-            f"{', '.join(restorer.kept)} of the checkpoint name other files, and stay as they are", stacklevel=5
-        )
+        warn(f"{', '.join(restorer.kept)} of the checkpoint name other files, and stay as they are")
     if isinstance(innermost, SupervisedSubprocVecEnv) and state.get("last") is not None:
         innermost.last_observations = list(state["last"])
     innermost._seeds, innermost._options = _for_the_next_reset(state, innermost.num_envs)

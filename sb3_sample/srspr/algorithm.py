@@ -1,7 +1,6 @@
 """SR-SPR as Stable-Baselines3's ``DQN``: acting, storing, when and how often to learn, logging, files."""
 
 import pathlib
-import warnings
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -36,6 +35,7 @@ from sb3_sample.training.compiling import DecidesCompiling
 from sb3_sample.training.metrics_log import MetricsLog
 from sb3_sample.training.resumable import Resumable
 from sb3_sample.training.updates_owed import UpdatesOwed
+from sb3_sample.warn import warn
 
 Self = TypeVar("Self", bound="SRSPR")
 
@@ -354,11 +354,10 @@ class SRSPR(  # type: ignore[misc]
         """Say if nothing was learned for want of steps."""
         wanted = self.gradient_steps if self.replay_ratio is None else self.replay_ratio
         if self._n_updates == 0 and wanted != 0 and 0 < self.num_transitions <= self.learning_starts:
-            warnings.warn(
+            warn(
                 f"learn ended without a single gradient step: learning_starts={self.learning_starts} decisions come "
                 f"before the first, and this model has taken {self.num_transitions}. Train for more, or pass a smaller "
-                "learning_starts=",
-                stacklevel=4,
+                "learning_starts="
             )
 
     def train(self, gradient_steps: int, batch_size: int | None = None) -> None:

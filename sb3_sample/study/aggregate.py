@@ -8,7 +8,6 @@ import contextlib
 import itertools
 import json
 import math
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -19,6 +18,7 @@ from sb3_sample.envs.scores import SCORED, Score, score_of
 from sb3_sample.envs.suites import DAC_NAMED
 from sb3_sample.extras import install
 from sb3_sample.study.table import RUN
+from sb3_sample.warn import warn
 
 #: Scores of tasks that have no common one, or another: ``score_of`` for the rest.
 Scores = Mapping[str, Score | float]
@@ -233,19 +233,15 @@ def _warn_of_gaps(matrix: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> 
     for step in matrix:
         left_out = int(matrix[step].isna().sum())
         if left_out:
-            warnings.warn(
-                f"{left_out} of {len(matrix)} runs have no evaluations around step {step:,} and are left out there",
-                stacklevel=3,
-            )
+            warn(f"{left_out} of {len(matrix)} runs have no evaluations around step {step:,} and are left out there")
     by_agent = {agent: set(rows.index.get_level_values("task")) for agent, rows in matrix.groupby("agent", sort=False)}
     for name, members in groups.items():
         counts = {agent: len(tasks & set(members)) for agent, tasks in by_agent.items() if tasks & set(members)}
         if any(by_agent[agent] & set(members) != set(members) for agent in counts):
             found = ", ".join(f"{agent} {n}" for agent, n in counts.items())
-            warnings.warn(
+            warn(
                 f"agents have not the same tasks of the {len(members)} of {name!r} ({found}): common=True (--common) "
-                "compares them on those that all have",
-                stacklevel=3,
+                "compares them on those that all have"
             )
 
 

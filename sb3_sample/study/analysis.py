@@ -8,7 +8,6 @@ import itertools
 import json
 import math
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -31,6 +30,7 @@ from sb3_sample.study.aggregate import (
     scored,
 )
 from sb3_sample.study.table import RUN
+from sb3_sample.warn import warn
 
 #: Evaluations at the end of a run that are averaged (the regularization study, appendix A).
 LAST = 10
@@ -71,10 +71,7 @@ def final(
     found = rows.groupby(RUN, sort=False, dropna=False).agg(step=("step", "last")).join(_ends(rows, "score", last))
     steps = found["step"]
     if steps.nunique() > 1:
-        warnings.warn(
-            f"runs end at different steps, from {steps.min():,} to {steps.max():,}; each is taken at its own end",
-            stacklevel=3,
-        )
+        warn(f"runs end at different steps, from {steps.min():,} to {steps.max():,}; each is taken at its own end")
     for metric in metrics:
         rows = table[table["metric"] == metric].sort_values("step", kind="stable")
         if not len(rows):
@@ -212,10 +209,9 @@ def _warn_of_missing(runs: pd.DataFrame, factors: list[str], group: str) -> None
     combinations = math.prod(runs[factor].nunique() for factor in factors)
     missing = int((combinations - there).sum())
     if missing:
-        warnings.warn(
+        warn(
             f"{missing} of {combinations * len(there)} combinations of choices and tasks have no run in {group!r}: "
-            "what is averaged over is not the same for all choices",
-            stacklevel=3,
+            "what is averaged over is not the same for all choices"
         )
 
 

@@ -11,7 +11,6 @@ import functools
 import json
 import math
 import re
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,6 +25,7 @@ from sb3_sample.extras import install
 from sb3_sample.plots import DATA, all_published_curves, find_runs, named_algorithms, run_env_id
 from sb3_sample.run_logs import EVALUATIONS, OFFLINE, read_evaluations, read_monitors
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
+from sb3_sample.warn import warn
 
 COLUMNS = ["agent", "arguments", "task", "seed", "step", "metric", "value"]
 #: Columns that make a run.
@@ -178,10 +178,9 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
             for metric, (steps, values) in _measured(folder, run, metrics).items():
                 rows.add(agent, arguments, run.task, seed, metric, steps, values)
     if training:
-        warnings.warn(
+        warn(
             f"{len(training)} runs have no {EVALUATIONS} ({training[0]}, ...): their rows are training episodes, which "
-            "explore",
-            stacklevel=2,
+            "explore"
         )
     table = rows.table()
     table = pd.concat([table, *tables], ignore_index=True) if len(table) else pd.concat(tables or [table])

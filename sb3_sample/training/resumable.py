@@ -159,7 +159,7 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         self._before_training()
-        say_once(self, self._described(), stacklevel=4)
+        say_once(self, self._described())
         with (
             seated(self) as seat,
             Checkpointer(self, callback, checkpoint, checkpoint_freq, learns_from) as checkpointer,

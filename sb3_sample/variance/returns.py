@@ -1,6 +1,5 @@
 """Q-values of actions at visited states: the environment goes back to the state and the policy goes on from there."""
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,6 +13,7 @@ from sb3_sample.envs.rewinding import rewound_returns
 from sb3_sample.envs.states import EnvState
 from sb3_sample.saving.normalization import lacks_vec_normalize
 from sb3_sample.variance.scores import check_policy
+from sb3_sample.warn import warn
 
 
 class Agent:
@@ -43,7 +43,7 @@ class Agent:
             if model.env is None:
                 raise ValueError(message)
             # It may have been trained on in an environment without one.
-            warnings.warn(message, stacklevel=3)
+            warn(message)
 
     def normalize_observations(self, observations: np.ndarray) -> np.ndarray:
         """

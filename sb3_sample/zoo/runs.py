@@ -41,6 +41,7 @@ from sb3_sample.saving.folders import Folder, is_plain
 from sb3_sample.saving.training_state import argument_names
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.training.seats import all_made
+from sb3_sample.warn import warn
 from sb3_sample.zoo.algorithms import ALGORITHMS
 from sb3_sample.zoo.files import RunError, add_trust
 from sb3_sample.zoo.patches import managed_by, monitors_go_on
@@ -772,10 +773,10 @@ class RunFiles(BaseCallback):
         except FileNotFoundError:
             there = 0
         except OSError as error:
-            warnings.warn(f"{path} cannot be cut back to the checkpoint ({error})", stacklevel=3)
+            warn(f"{path} cannot be cut back to the checkpoint ({error})")
             return
         if there < size:
-            warnings.warn(f"{path} has {there} bytes, {size} at the checkpoint: episodes are missing", stacklevel=3)
+            warn(f"{path} has {there} bytes, {size} at the checkpoint: episodes are missing")
 
     def _on_step(self) -> bool:
         return True

@@ -173,11 +173,28 @@ def test_numbers_of_numpy_will_do(tmp_path: Path) -> None:
     assert (loaded.seed, loaded.buffer_size, type(loaded.gamma)) == (3, 100, float)
 
 
+def test_a_schedule_is_asked_for_its_first_value() -> None:
+    words = (
+        "^learning_rate must be a function of the remaining progress, from 1 to 0, that returns a number, but at 1.0"
+    )
+    refused(
+        lambda: sac(learning_rate=lambda: 1e-3), words, "TypeError: .* takes 0 positional arguments but 1 was given"
+    )
+    refused(lambda: sac(learning_rate=lambda progress: None), words, "TypeError: float")
+    refused(lambda: sac(learning_rate=dict), words)
+    refused(
+        lambda: sac(learning_rate=lambda progress: -progress), "^learning_rate, .*, at the begin must be at least 0"
+    )
+    refused(lambda: sac(learning_rate=lambda progress: NAN), "^learning_rate, .*, at the begin must be .* not nan")
+    assert sac(learning_rate=lambda progress: np.float32(1e-3) * progress).lr_schedule(0.5) == pytest.approx(5e-4)
+
+
 @pytest.mark.parametrize(
     ("kwargs", "words"),
     [
         ({"device": "gpu"}, "^device must be .*, not 'gpu'"),
         ({"verbose": "info"}, "^verbose must be .*, not 'info'"),
+        ({"learning_rate": lambda: 3e-4}, "^learning_rate must be a function of the remaining progress"),
         ({"learning_rate": "3e-4"}, "^learning_rate must be .*, not '3e-4'"),
         ({"buffer_size": 1e6}, "^buffer_size must be .*, not 1000000.0"),
         ({"action_noise": 0.1}, "^action_noise must be .*, not 0.1"),

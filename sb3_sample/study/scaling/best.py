@@ -1,6 +1,5 @@
 """Best batch size and learning rate by task and replay ratio (paper, D.1 and D.4)."""
 
-import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -9,6 +8,7 @@ import pandas as pd
 
 from sb3_sample.study.aggregate import Scores
 from sb3_sample.study.scaling.crossings import Configuration, check_levels, configurations, number
+from sb3_sample.warn import warn
 
 #: Bootstrap draws of the choice (K).
 DRAWS = 100
@@ -180,10 +180,9 @@ def best_hyperparameters(
     if len(undecided) == len(summary):
         raise ValueError(f"level must be one that runs reach: {level:g} is reached in fewer than half of the draws")
     for row in undecided.itertuples():
-        warnings.warn(
+        warn(
             f"{row.name} on {row.task} at replay ratio {row.replay_ratio:g}: the level {level:g} is reached in "
-            f"{row.decided:.0%} of the draws only, and no value is chosen",
-            stacklevel=2,
+            f"{row.decided:.0%} of the draws only, and no value is chosen"
         )
     return summary
 

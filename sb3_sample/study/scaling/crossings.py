@@ -5,7 +5,6 @@ is at least the level ("Value-Based Deep RL Scales Predictably", Rybkin et al. 2
 
 import json
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -13,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_sample.study.aggregate import Scores, scored
+from sb3_sample.warn import warn
 
 #: Levels and returns are on a scale of 0 to this.
 SCALE = 1_000.0
@@ -198,10 +198,9 @@ def configurations(
                 "averaged over the seeds first: give runs with evaluations at fixed steps"
             )
         if len(steps) < n_steps:
-            warnings.warn(
+            warn(
                 f"{n_steps - len(steps)} of {n_steps} evaluations of {agent} on {task} are not of all its "
-                f"{len(curves)} runs and are left out",
-                stacklevel=3,
+                f"{len(curves)} runs and are left out"
             )
         given = json.loads(arguments)
         repeat = (given.get("env_kwargs") or {}).get("action_repeat", 1)
