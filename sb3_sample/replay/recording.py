@@ -27,10 +27,15 @@ def record(
     :param deterministic: whether the policy's mean action is taken instead of a sample
     :param seed: of the environment; None: as it is
     :return: the data set
-    :raises ValueError: if ``episodes`` is no number above 0
+    :raises ValueError: if ``episodes`` is no number above 0, or the model is of other spaces than the environment's
     """
     check_value("episodes", episodes, integer(1))
-    venv: VecEnv = make_vec_env(env) if isinstance(env, str) else BaseAlgorithm._wrap_env(env)  # type: ignore[arg-type]
+    made: Any = make_vec_env(env) if isinstance(env, str) else env
+    venv: VecEnv = BaseAlgorithm._wrap_env(made)
+    for name in "observation_space", "action_space":
+        theirs, of_model = getattr(venv, name), getattr(model, name, None)
+        if of_model is not None and of_model != theirs:
+            raise ValueError(f"env: its {name} is {theirs}, and the model's is {of_model}")
     normalize = unwrap_vec_normalize(venv)
     venv = _below(venv, normalize)
     if seed is not None:

@@ -254,6 +254,8 @@ def test_record_by_id_with_a_seed() -> None:
     assert one.fingerprint != other.fingerprint and one.action_space == gym.make("Pendulum-v1").action_space
     with pytest.raises(ValueError, match="episodes must be an integer of at least 1, not 0"):
         record(model, "Pendulum-v1", 0)
+    with pytest.raises(ValueError, match="^env: its observation_space is Box.*, and the model's is Box"):
+        record(model, "MountainCarContinuous-v0", 1)
 
 
 def test_a_dataset_in_files_is_the_same(tmp_path: Path) -> None:
