@@ -33,7 +33,14 @@ from sb3_sample.networks import (
     project_weights,
 )
 from sb3_sample.optim import AdamW
+from sb3_sample.replay.buffers import (
+    DeviceReplayBuffer,
+    DeviceValidationReplayBuffer,
+    ValidationDictReplayBuffer,
+    ValidationReplayBuffer,
+)
 from sb3_sample.replay.columns import Column, Step
+from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplayBuffer
 
 __all__ = [
     "EXPLORATIONS",
@@ -48,7 +55,11 @@ __all__ = [
     "BatchTransform",
     "CategoricalHead",
     "Column",
+    "CompactDictReplayBuffer",
+    "CompactReplayBuffer",
     "CriticStep",
+    "DeviceReplayBuffer",
+    "DeviceValidationReplayBuffer",
     "EnsembleLayerNorm",
     "EnsembleLinear",
     "Exploration",
@@ -67,6 +78,8 @@ __all__ = [
     "RewardScale",
     "Step",
     "UnitNorm",
+    "ValidationDictReplayBuffer",
+    "ValidationReplayBuffer",
     "ValueHead",
     "argument",
     "bootstrap",

@@ -269,7 +269,7 @@ def train_parser() -> argparse.ArgumentParser:
         help="How many seeds, from 0 on, or several seeds by name: a run of each, with a folder of its own, as by as "
         "many commands with --seed; --run-dir then has the folders seed-0, seed-1 and so on (docs/many_learners.md)",
     )
-    group = parser.add_argument_group("data that are there already (our algorithms, but those with PPO in their names)")
+    group = parser.add_argument_group("data that are there already (the family of SAC; --dataset not dr_q)")
     group.add_argument(
         "--dataset",
         metavar="PATH",
