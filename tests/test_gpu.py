@@ -287,6 +287,15 @@ def test_captured_actions_are_the_explorers(maker: str) -> None:
     assert isinstance(learner._acting[1], CapturedActing) and learner._acting[1].captured._recorded
 
 
+def test_acting_beside_a_capture() -> None:
+    """What acts draws from the generator that is captured: it waits meanwhile."""
+    model = SAC("MlpPolicy", Toy(), device="cuda", **{**TINY_SAC, "compile": "auto", "learning_starts": 20})
+    model.learn(600, asynchronous=True, control_frequency=200)
+    assert model.num_timesteps == 600
+    captured = model.learner._execution._captured
+    assert captured is not None and captured._recorded
+
+
 def test_compiles_here() -> None:
     if old_torch() is None:
         assert why_not_compiled(model_on("cuda", "SAC").learner) is None

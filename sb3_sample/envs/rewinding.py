@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_sample.envs.states import EnvState, is_simulator, layers_of, restore_state
+from sb3_sample.envs.states import EnvState, is_simulator, layers_of, restore_state, state_attributes
 
 
 class Follower(Protocol):
@@ -172,7 +172,7 @@ def _wrapped_like(wrapper: gym.Wrapper, env: gym.Env) -> gym.Env:
     recorded = getattr(wrapper, "_saved_kwargs", None)
     if recorded is not None:
         return make(env, **recorded)
-    # Restoring replaces its state; the rest describes it, unless it leads to the environment itself.
+    # Its state is copied; the rest describes it, unless it leads to the environment itself.
     inside = [value for layer in layers_of(wrapper.env) for value in vars(layer).values() if is_simulator(value)]
     for name, value in vars(wrapper).items():
         if name != "env" and (isinstance(value, gym.Env) or any(value is each for each in inside)):
@@ -181,5 +181,6 @@ def _wrapped_like(wrapper: gym.Wrapper, env: gym.Env) -> gym.Env:
                 "too: derive it from gymnasium.utils.RecordConstructorArgs"
             )
     like = copy.copy(wrapper)
+    vars(like).update(copy.deepcopy(state_attributes(wrapper)))
     like.env = env
     return like

@@ -62,7 +62,7 @@ def save_state(env: gym.Env) -> EnvState:
         data = copy.copy(simulator[1])
         model = {name: getattr(simulator[0], name).copy() for name in model_arrays()}
     # Copied together, so that a generator that two of them share is shared in the copy.
-    attributes = copy.deepcopy([_attributes(layer) for layer in layers])
+    attributes = copy.deepcopy([state_attributes(layer) for layer in layers])
     base: Any = env.unwrapped
     return EnvState(attributes, data, model, base.clone_state(include_rng=True) if is_atari(env) else None)
 
@@ -206,7 +206,13 @@ def model_arrays() -> tuple[str, ...]:
     return tuple(name for name, value in arrays.items() if value.dtype == np.float64 or name == "hfield_data")
 
 
-def _attributes(layer: Any) -> dict[str, Any]:
+def state_attributes(layer: Any) -> dict[str, Any]:
+    """
+    Select what may change of a wrapper or an environment.
+
+    :param layer: the wrapper or environment
+    :return: its attributes that are data through and through, by name, themselves and no copies
+    """
     return {name: value for name, value in vars(layer).items() if _is_state(value)}
 
 

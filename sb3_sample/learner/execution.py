@@ -7,6 +7,7 @@ noise as tensors, does not branch on the value of a tensor, and counts nothing o
 
 import operator
 import re
+import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -430,6 +431,10 @@ def inputs_like(inputs: Any, make: Callable[[torch.Tensor], torch.Tensor]) -> An
     return inputs
 
 
+#: Held during a capture, in which no other thread may use the GPU, and by whoever does so beside a training.
+CAPTURING = threading.Lock()
+
+
 def cuda_graph(run: Callable[[], Metrics]) -> tuple[Callable[[], None], Metrics]:
     """
     Capture as a CUDA graph.
@@ -438,7 +443,7 @@ def cuda_graph(run: Callable[[], Metrics]) -> tuple[Callable[[], None], Metrics]
     :return: function that repeats it, and its result
     """
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
+    with CAPTURING, torch.cuda.graph(graph):
         metrics = run()
     return graph.replay, metrics
 

@@ -47,6 +47,7 @@ from sb3_sample.replay.compact import (
     CompactReplayBuffer,
 )
 from sb3_sample.replay.dataset import Dataset
+from sb3_sample.replay.endings import end_episodes
 from sb3_sample.replay.sources import DatasetSource, ReplaySource, n_held_out
 from sb3_sample.replay.weighted import PrioritizedReplay
 from sb3_sample.sac import checks
@@ -601,6 +602,9 @@ class SAC(  # type: ignore[misc]  # actor
 
     def _on_environment_reset(self) -> None:
         self.learner.on_environment_reset()
+        if isinstance(self.replay_buffer, NStepReplayBuffer):
+            # Its returns would sum the rewards of the next episode.
+            end_episodes(self.replay_buffer)
 
     def train(self, gradient_steps: int, batch_size: int | None = None) -> None:
         """

@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.kinds import ABOVE_0, TRUE_OR_FALSE, check_value
+from sb3_sample.learner.execution import CAPTURING
 from sb3_sample.learner.exploration import Exploration, HeldNoise, OptimisticActor, OptimisticShift
 from sb3_sample.training.acting import ActingThread, Chosen, Step
 from sb3_sample.warn import warn
@@ -39,6 +40,8 @@ class Apart:
         self._model, self._frequency = model, frequency
         self._learner = model._make_learner(counts=model)
         self._learner.set_training_mode(False)
+        # Not captured: meanwhile the learner could not draw from the GPU's generator.
+        self._learner.make_acting = lambda learner: None
         # Held while actions are chosen, and while parameters are handed over.
         self._lock = threading.Lock()
         self._handed_over_at = -1
@@ -101,7 +104,7 @@ class Apart:
         model = self._model
         counted = self._n_before + n_before * model.n_envs
         at_random = counted < model.learning_starts and model._n_offline_updates == 0
-        with self._lock:
+        with CAPTURING, self._lock:
             age = None if at_random else self.age
             actions, scaled = model._choose(self._learner, observations, at_random, model.n_envs)
         return Chosen(actions, scaled, age)

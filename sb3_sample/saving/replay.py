@@ -87,7 +87,8 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
         Load a replay buffer, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it.
 
         :param path: file, or where ``save_replay_buffer`` wrote it; what it holds, and not its name, says what it is
-        :param truncate_last_traj: with ``HerReplayBuffer``, whether the last episode counts as ended
+        :param truncate_last_traj: whether the last episode counts as ended, and the next ``learn`` begins with a reset
+            of the environment; False to go on with the episode in which the buffer was saved
         :param allow_pickle: whether a file in Stable-Baselines3's own, pickled format is loaded too, which can run any
             code that its author wanted
         :param trusted_modules: modules, or packages of modules, whose classes the file may name, besides those that the
@@ -118,6 +119,9 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
                     buffer.truncate_last_trajectory()
         self._check_replay_buffer(buffer, path)
         self.replay_buffer = buffer
+        if truncate_last_traj:
+            # What is under way is of another episode: the next ``learn`` resets the environment.
+            self._last_obs = None
 
     def _pickled_buffer(self, path: Any, name: str, truncate_last_traj: bool) -> ReplayBuffer:
         before = getattr(self, "replay_buffer", None)

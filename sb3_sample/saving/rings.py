@@ -15,6 +15,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_sample.replay.columns import HasColumns, columns_of
 from sb3_sample.replay.compact import CompactReplay
+from sb3_sample.replay.endings import end_episodes
 from sb3_sample.saving.untrusted import BadFile
 
 #: Attributes that hindsight keeps of each row besides the columns.
@@ -233,19 +234,9 @@ class Ring:
         """
         The episodes in progress end here, without their environments' saying so: nothing that follows belongs to them.
         """
-        buffer: Any = self.buffer
         if self.size() == 0:
             return
-        last = (int(buffer.pos) - 1) % self.capacity
-        if hasattr(buffer, "truncate_last_trajectory"):
-            buffer.truncate_last_trajectory()
-        else:
-            # As Stable-Baselines3 does it where the following row holds the next observation. A time limit, where the
-            # buffer knows them, so that the bootstrap goes on.
-            goes_on = buffer.dones[last] == 0
-            buffer.dones[last][goes_on] = 1
-            if buffer.handle_timeout_termination:
-                buffer.timeouts[last][goes_on] = 1
+        end_episodes(self.buffer)
         # The last row has changed, and is written once more.
         self.n_written = max(self.n_rows - 1, 0)
 

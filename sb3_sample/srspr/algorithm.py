@@ -187,6 +187,16 @@ class SRSPR(  # type: ignore[misc]
             encode_buffer(self.replay_buffer, encoder, only_small=True)
         return encoder
 
+    def _check_replay_buffer(self, buffer: ReplayBuffer, path: Any) -> None:
+        super()._check_replay_buffer(buffer, path)
+        needed = max(self.n_steps, self.n_predictions)
+        horizon = getattr(buffer, "horizon", None)
+        if not isinstance(buffer, SPRReplayBuffer) or horizon != needed:
+            raise ValueError(
+                f"the replay buffer of {path} is a {type(buffer).__name__} of windows of {horizon} steps, but this "
+                f"model needs an SPRReplayBuffer of {needed}, the larger of n_steps and n_predictions"
+            )
+
     # ---------------------------------------------------------------- acting
 
     @property

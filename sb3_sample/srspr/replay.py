@@ -85,10 +85,16 @@ class SPRReplay(WindowReplay):
         :param n_predictions: K
         :param env: normalises rewards
         :return: the windows
+        :raises ValueError: if they are longer than ``horizon``
         """
         assert isinstance(self, ReplayBuffer)
         first, n = self.places(slots), self.buffer_size * self.n_envs
         length = max(n_steps, n_predictions)
+        if length > self.horizon:
+            raise ValueError(
+                f"n_steps={n_steps} and n_predictions={n_predictions} must be at most the {self.horizon} steps of the "
+                "replay buffer's windows, with which it was made"
+            )
         places = (first[:, None] + np.arange(length) * self.n_envs) % n
 
         def flat(array: np.ndarray) -> np.ndarray:

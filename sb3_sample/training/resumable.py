@@ -170,7 +170,7 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
             checkpointer.start()
             begin(seat)
             while self.num_timesteps < total_timesteps:
-                if not self._turn(checkpointer.callback, log_interval):
+                if not self._whole_turn(checkpointer.callback, log_interval, not learns_from):
                     break
                 if checkpointer.is_due() and not self._rest(checkpointer.callback, log_interval):
                     break
@@ -218,6 +218,17 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
         :return: False if the callback ended the training, in which case nothing is learned
         """
         raise NotImplementedError
+
+    def _whole_turn(self, callback: BaseCallback, log_interval: int, in_environment: bool) -> bool:
+        """Take a turn. One that is broken off leaves the environment ahead of what was stored of it."""
+        goes_on = False
+        try:
+            goes_on = self._turn(callback, log_interval)
+        finally:
+            if not goes_on and in_environment:
+                # A later ``learn`` begins with a reset, since the episode cannot go on.
+                self._last_obs = None
+        return goes_on
 
     def _rest(self, callback: BaseCallback, log_interval: int) -> bool:
         """

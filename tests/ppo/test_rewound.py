@@ -410,6 +410,26 @@ def test_a_sibling_shares_nothing_that_changes() -> None:
     assert [env.step(0)[0].tolist() for _ in range(3)] == first
 
 
+class Noisy(gym.Wrapper):
+    """Has a generator of its own, which starts with it, and keeps what it has drawn."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        self.rng, self.drawn = np.random.default_rng(0), []
+
+    def step(self, action: Any) -> Any:
+        observation, *rest = self.env.step(action)
+        self.drawn.append(self.rng.normal())
+        return observation + np.float32(self.drawn[-1]), *rest
+
+
+def test_the_course_of_a_copied_wrapper_is_its_own() -> None:
+    envs = [Noisy(Toy()), Noisy(Toy())]
+    for n_actions, env in enumerate(envs, 1):
+        rewound(env, n_actions=n_actions, n_steps=8, batch_size=8, copies=16).learn(8)
+    assert len(envs[0].drawn) == 8 and envs[0].drawn == envs[1].drawn
+
+
 def test_atari_states() -> None:
     """Sticky actions, which the console draws, and the stack of frames are restored bit by bit."""
     ale_py = pytest.importorskip("ale_py", reason="needs ale-py")

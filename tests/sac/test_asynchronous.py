@@ -16,6 +16,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_sample import SAC
+from sb3_sample.learner.execution import CAPTURING
 from sb3_sample.sac.apart import MAX_AGE, Apart
 from sb3_sample.saving.checkpoint import Checkpointer
 from sb3_sample.training import acting
@@ -228,6 +229,20 @@ def test_parameters_are_handed_over_at_a_bounded_age(monkeypatch: pytest.MonkeyP
     assert ages[:20] == [None] * 20 and all(same) and len(learned) > 120
     assert max(age for age in ages if age is not None) <= MAX_AGE
     assert len({sum(float(each.sum()) for each in tensors) for tensors in learned.values()}) > 100
+
+
+def test_it_does_not_act_during_a_capture() -> None:
+    """A GPU's generator and memory are the capture's meanwhile; what acts is never captured itself."""
+    model = sac().learn(24)
+    apart = Apart(model, None)
+    chosen: list[Chosen] = []
+    thread = threading.Thread(target=lambda: chosen.append(apart._choose(model._last_obs, 0)))
+    with CAPTURING:
+        thread.start()
+        thread.join(0.2)
+        assert thread.is_alive() and not chosen
+    thread.join(10)
+    assert len(chosen) == 1 and apart._learner.make_acting(apart._learner) is None
 
 
 def test_an_environment_that_is_too_fast_does_not_wait_and_the_log_says_so(clock: Made) -> None:
