@@ -15,7 +15,7 @@ from sb3_sample.learner.batch import Batch, for_each
 from sb3_sample.learner.parts import Learning, Part
 from sb3_sample.learner.pessimism import epistemic_std
 from sb3_sample.learner.scalars import BoundedLogScalar, FixedScalar, LogScalar
-from sb3_sample.learner.target import values
+from sb3_sample.learner.target import at_rest, values
 from sb3_sample.networks import NETWORKS, Projected, linear, widened
 from sb3_sample.optim import AdamW
 
@@ -140,11 +140,11 @@ class HeldNoise(Exploration):
         return self._held
 
     def get_extra_state(self) -> dict[str, Any]:
-        held = None if self._held is None else self._held.tolist()
+        held = [] if self._held is None else self._held.tolist()
         return {"held": held, "length": self._length, "n_held": self._n_held}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self._held = None if state["held"] is None else torch.tensor(state["held"])
+        self._held = torch.tensor(state["held"]) if state["held"] else None
         self._length, self._n_held = int(state["length"]), int(state["n_held"])
 
 
@@ -342,8 +342,10 @@ class OptimisticExploration(Exploration):
     def update(self, learner: Learning, batch: Batch, noise: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         observations = learner.encoded(batch.observations)
         with torch.no_grad():
-            features = learner.actor.features(observations)
-            mean, log_std = learner.actor.gaussian(features)
+            # As it acts: its running statistics are moved by its own step alone.
+            pessimistic = at_rest(learner.actor)
+            features = pessimistic.features(observations)
+            mean, log_std = pessimistic.gaussian(features)
             std = log_std.exp()
         noise = torch.randn_like(mean) if noise is None else noise
         optimism, kl_weight = self._optimism(learner), self._kl_weight()

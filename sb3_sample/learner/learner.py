@@ -73,6 +73,8 @@ class Counts:
         self._n_updates = 0
         #: Transitions reported by :meth:`Learner.on_step`.
         self.num_transitions = 0
+        #: The same of each task, where several take a step together.
+        self.num_task_steps = 0
         #: Whether the gradient step is compiled; None while that is not decided.
         self.compiled: bool | None = None
         #: Gradient steps planned, for the schedule of the learning rate; None while they are not known.
@@ -252,7 +254,7 @@ class Learner(Executable):
     @property
     def environment_steps(self) -> int:
         """The same of each task, where several take a step together."""
-        return self.num_transitions // min(self.n_tasks, self.n_envs)
+        return self.num_transitions if self.n_tasks == 1 else int(self._counts.num_task_steps)
 
     @property
     def n_envs(self) -> int:
@@ -455,6 +457,7 @@ class Learner(Executable):
         """
         self._heard, self._n_envs = True, len(dones)
         self._counts.num_transitions += len(dones)
+        self._counts.num_task_steps += len(dones) // min(self.n_tasks, len(dones))
         for part in self.parts().values():
             part.on_step(self, rewards, dones, infos)
             for index in np.flatnonzero(dones):
@@ -778,7 +781,7 @@ class Learner(Executable):
         :param moves_actor: whether actors and temperature learn in this step
         :return: what to log, by name, scalars
         """
-        copies = self._encoded_once(batch)
+        images, copies = batch.observations, self._encoded_once(batch)
         batch = self._first_copy(copies)
         alpha = self.temperature_of(batch)
         metrics, prepared = self.objective.prepare(self, batch)
@@ -787,7 +790,7 @@ class Learner(Executable):
             alpha = self.temperature_of(batch)
         step: CriticStep | None = None
         if self.objective.learns_critics:
-            step, of_critics = self._learn_critics(batch, copies, noise, alpha, moves_targets, prepared)
+            step, of_critics = self._learn_critics(batch, copies, images, noise, alpha, moves_targets, prepared)
             metrics.update(of_critics)
         if moves_actor and not self.actor_first:
             metrics.update(self._learn_actors(batch, noise, alpha, prepared))
@@ -802,11 +805,18 @@ class Learner(Executable):
         return {name: value.detach() for name, value in metrics.items()}
 
     def _learn_critics(
-        self, batch: Batch, copies: Batch, noise: Noise, alpha: torch.Tensor, moves_targets: bool, prepared: Prepared
+        self,
+        batch: Batch,
+        copies: Batch,
+        observations: Any,
+        noise: Noise,
+        alpha: torch.Tensor,
+        moves_targets: bool,
+        prepared: Prepared,
     ) -> tuple[CriticStep | None, dict[str, torch.Tensor]]:
         """
         Take the critics' step on all copies of the transitions, and that of their targets; None for what the rule of
-        pessimism judges, if nothing.
+        pessimism judges, if nothing. ``observations`` are those of the copies before they were encoded.
         """
         # Critics, towards the targets' value of the actor's next action, unless the objective has another target.
         step: CriticStep | None = None
@@ -825,7 +835,8 @@ class Learner(Executable):
         if self.sam_radius is None:
             self.minimize(self.critic.optimizer, critic_loss)
         else:
-            self._sharpness_aware_step(critic_loss, copies, next_actions, target)
+            # Uphill, features are others too.
+            self._sharpness_aware_step(critic_loss, copies._replace(observations=observations), next_actions, target)
         self.critic.project()
         q = self.head.values(q)
         if self._has_copies:
@@ -959,6 +970,7 @@ class Learner(Executable):
         counts = {
             "n_updates": self.n_updates,
             "num_transitions": self.num_transitions,
+            "num_task_steps": self._counts.num_task_steps,
             "planned_updates": self.planned_updates,
             "heard": self._heard,
         }
@@ -979,6 +991,7 @@ class Learner(Executable):
             owner.load_state_dict(state[name])
         counts = state["counts"]
         self._counts._n_updates, self._counts.num_transitions = counts["n_updates"], counts["num_transitions"]
+        self._counts.num_task_steps = counts["num_task_steps"]
         self.planned_updates, self._heard = counts["planned_updates"], counts["heard"]
         if self._generators is not None:
             self._generators.load_state_dict(state["generators"])

@@ -418,7 +418,8 @@ class TOP(Pessimism):
 
     def on_step(self, learner: Learning, rewards: Any, dones: Any, infos: list[dict[str, Any]]) -> None:
         for index in np.flatnonzero(dones):
-            if "episode" not in infos[index]:
+            # That of a worker that has died is none.
+            if "episode" not in infos[index] and "worker_died" not in infos[index]:
                 raise ValueError(
                     f"TOP learns from episodic returns, and environment {index} reports none: wrap it in "
                     "stable_baselines3.common.monitor.Monitor, as make_vec_env does"

@@ -166,11 +166,11 @@ class StdOrMaxScale(ReturnScale):
         self._waiting = None
 
     def get_extra_state(self) -> dict[str, Any]:
-        return {**super().get_extra_state(), "waiting": None if self._waiting is None else list(self._waiting)}
+        return {**super().get_extra_state(), "waiting": list(self._waiting or ())}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         super().set_extra_state(state)
-        self._waiting = None if state["waiting"] is None else tuple(state["waiting"])
+        self._waiting = tuple(state["waiting"]) or None
 
 
 class Float32Scale(ReturnScale):
@@ -222,6 +222,10 @@ class TaskScale(RewardScale):
     def __init__(self, learner: Learning, n_tasks: int = 1, max_return: float | None = None):
         super().__init__(learner)
         check_value("n_tasks", n_tasks, integer(1))
+        if not learner.gamma < 1:
+            raise ValueError(
+                f"gamma must be below 1 with reward_scale='brc', which divides by 1 - gamma, not {learner.gamma}"
+            )
         self.max_return = _bound(learner, max_return, 10.0)
         self.register_buffer("smallest", torch.full((n_tasks,), torch.inf))
         self.register_buffer("largest", torch.full((n_tasks,), -torch.inf))
@@ -232,7 +236,7 @@ class TaskScale(RewardScale):
 
     def on_observations(self, learner: Learning, observations: Any) -> None:
         told = observations.get("task") if isinstance(observations, dict) else None
-        self._tasks = [] if told is None else [int(task) for task in np.asarray(told).reshape(-1)]
+        self._tasks = [] if told is None else torch.as_tensor(told).reshape(-1).tolist()
 
     def on_step(self, learner: Learning, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         if len(self._episodes) != len(dones):

@@ -33,13 +33,18 @@ def outputs(critics: Any, observations: Any, actions: torch.Tensor) -> torch.Ten
     :param actions: actions in [-1, 1], (B, A)
     :return: (E, B, n_outputs)
     """
-    return evaluate(_at_rest(critics), observations, actions)
+    return evaluate(at_rest(critics), observations, actions)
 
 
-def _at_rest(critics: Any) -> Any:
-    """Critics as they are evaluated outside of their own step."""
-    view = getattr(critics, "at_rest", None)
-    return critics if view is None else view
+def at_rest(network: Any) -> Any:
+    """
+    Take an actor or critics as they are evaluated outside of their own step.
+
+    :param network: the actor, or the critics
+    :return: their view in evaluation mode, if the modes differ
+    """
+    view = getattr(network, "at_rest", None)
+    return network if view is None else view
 
 
 def next_step(
@@ -135,7 +140,7 @@ def bootstrap(
     actions, entropy_bonus = next_step(learner, batch, alpha, noise)
     with torch.no_grad():
         critics = learner.critic if learner.critic.trunk.stacks_rows == "online" else learner.critic_target
-        next_q = evaluate(_at_rest(critics), batch.next_observations, actions)
+        next_q = evaluate(at_rest(critics), batch.next_observations, actions)
         return next_q if subset is None else next_q[subset], entropy_bonus
 
 

@@ -9,7 +9,7 @@ import contextlib
 import pathlib
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -31,6 +31,8 @@ from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, no
 from sb3_sample.kinds import check_value, instance, integer
 from sb3_sample.learner.batch import SLOTS, Batch, Noise
 from sb3_sample.learner.learner import Learner
+from sb3_sample.learner.reward_scale import LinearScale
+from sb3_sample.learner.scalars import FixedScalar
 from sb3_sample.replay.buffers import (
     DeviceReplayBuffer,
     DeviceValidationReplayBuffer,
@@ -157,6 +159,8 @@ class SAC(  # type: ignore[misc]  # actor
         self._keeps_gradients = False
         #: Transitions stored over the model's life; unlike ``num_timesteps`` never zeroed by ``learn``.
         self.num_transitions = 0
+        #: The same of each task, where several take a step together.
+        self.num_task_steps = 0
         #: Gradient steps of ``learn_offline`` over the model's life.
         self._n_offline_updates = 0
         # The data set of a ``learn_offline`` under way, and what a file names of the prior data.
@@ -414,6 +418,14 @@ class SAC(  # type: ignore[misc]  # actor
                 f"validation_proportion={self.validation_proportion}"
             )
         checks.check_sampling(self, buffer)
+
+    def _arguments_in_parameters(self, given: Collection[str]) -> list[torch.Tensor]:
+        scale, found = self.learner.reward_scaler, []
+        if "ent_coef" in given and isinstance(self.learner.temperature, FixedScalar):
+            found.append(self.learner.temperature.value)
+        if "reward_scale_kwargs" in given and isinstance(scale, LinearScale) and scale.return_range is None:
+            found.append(scale.factor)
+        return found
 
     # ---------------------------------------------------------------- learning
 

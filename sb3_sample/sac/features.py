@@ -45,10 +45,10 @@ def _preprocessed(observations: Any, space: spaces.Space[Any], normalize_images:
     if isinstance(space, spaces.Dict):
         return {key: _preprocessed(observations[key], part, normalize_images) for key, part in space.spaces.items()}
     if isinstance(space, spaces.Discrete):
-        return _one_hot(observations, int(space.n))
+        return _one_hot(observations - int(space.start), int(space.n))
     if isinstance(space, spaces.MultiDiscrete):
-        columns = zip(observations.split(1, dim=1), space.nvec, strict=True)
-        return torch.cat([_one_hot(column.squeeze(1), int(n)) for column, n in columns], dim=-1)
+        columns = zip(observations.split(1, dim=1), space.nvec, space.start, strict=True)
+        return torch.cat([_one_hot(column.squeeze(1) - int(first), int(n)) for column, n, first in columns], dim=-1)
     return preprocess_obs(observations, space, normalize_images)
 
 

@@ -24,10 +24,8 @@ def stacked_frames(env: Any, space: Any) -> int | None:
         n_frames = layer.stacked_obs.n_stack if isinstance(layer, VecFrameStack) else None
         layer = layer.venv
     if n_frames is None:
-        try:
-            n_frames = env.get_attr("stacked_frames", 0)[0]
-        except AttributeError:
-            return None
+        # Asked first, since a worker of SubprocVecEnv does not survive the question for what is not there.
+        n_frames = env.get_attr("stacked_frames", 0)[0] if env.has_attr("stacked_frames") else None
     return n_frames if isinstance(n_frames, int) and n_frames > 1 and space.shape[0] % n_frames == 0 else None
 
 

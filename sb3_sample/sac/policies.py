@@ -269,7 +269,9 @@ class SACPolicy(BasePolicy):
         """Have a network read observations through the policy's own normalisation, which is in the policy's state."""
         if self.observation_norm is not None:
             # Past nn.Module's own setattr, which would register it.
-            vars(network)["observation_norm"] = self.observation_norm
+            for each in (network, getattr(network, "at_rest", None)):
+                if each is not None:
+                    vars(each)["observation_norm"] = self.observation_norm
 
     def make_actor(self) -> Actor:
         """

@@ -22,7 +22,9 @@ class UpdateSchedule(DecidesCompiling, UpdatesOwed):
         checks.check_scale_is_known(self)
         n_steps = self._total_timesteps - self.num_timesteps
         if self.learning_rate_schedule is not None and self.planned_updates is None:
-            self.planned_updates = round(self._updates_in(n_steps)) or None
+            # Optimizers count their steps over the model's life.
+            coming = round(self._updates_in(n_steps))
+            self.planned_updates = self._n_updates + coming if coming else None
             if self.planned_updates is None and n_steps > 0:
                 raise ValueError(
                     f"schedule_steps must be given, as learning_rate_schedule={self.learning_rate_schedule!r} needs to "

@@ -2,11 +2,12 @@
 
 import io
 import pathlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
+from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
@@ -223,6 +224,10 @@ class SafeFiles(BaseAlgorithm):
             env = cls._wrap_env(maybe_make_env(env, verbose), verbose)
             spaces = [attributes.get(name, getattr(env, name)) for name in ("observation_space", "action_space")]
             check_for_correct_spaces(env, *spaces)
+            noise = attributes.get("action_noise")
+            if isinstance(noise, VectorizedActionNoise) and noise.n_envs != env.num_envs:
+                # ``learn`` makes one of each environment again.
+                attributes["action_noise"] = noise.base_noise
             attributes["n_envs"] = env.num_envs
             if force_reset:
                 attributes["_last_obs"] = None
@@ -243,7 +248,11 @@ class SafeFiles(BaseAlgorithm):
             if kwargs:
                 content.check_shapes(model)
             content.check_parameters(model)
+            kept = [(tensor, tensor.clone()) for tensor in model._arguments_in_parameters(given)]
             model.set_parameters(content.parameters(model), exact_match=True, device=device)
+            with torch.no_grad():
+                for tensor, value in kept:
+                    tensor.copy_(value)
             content.set_own(model, given)
             if model.use_sde:
                 model.policy.reset_noise()  # type: ignore[operator]
@@ -261,6 +270,13 @@ class SafeFiles(BaseAlgorithm):
                 why = f"{why} (pass a smaller buffer_size= or n_steps= to load)"
             raise BadFile(f"{lacks}{content.name}: no {cls.__name__} can be made of what it holds: {why}") from error
         return model
+
+    def _arguments_in_parameters(self, given: Collection[str]) -> list[torch.Tensor]:
+        """
+        :param given: names of arguments
+        :return: tensors among the parameters that are nothing but values of these arguments
+        """
+        return []
 
     @classmethod
     def _policy_class(cls, policy: Any) -> Any:

@@ -95,10 +95,10 @@ def task_ids(name: str, env: Any) -> list[str]:
     :return: ids of its tasks, in their order
     :raises ValueError: if it is not of several tasks
     """
-    try:
-        return [str(task_id) for task_id in env.get_attr("task_id")]
-    except AttributeError:
-        raise ValueError(f"{name} must be of multi_task_env, whose environments have a task_id, not {env!r}") from None
+    # Asked first, since a worker of SubprocVecEnv does not survive the question for what is not there.
+    if not (hasattr(env, "has_attr") and env.has_attr("task_id")):
+        raise ValueError(f"{name} must be of multi_task_env, whose environments have a task_id, not {env!r}")
+    return [str(task_id) for task_id in env.get_attr("task_id")]
 
 
 class MultiTaskEvalCallback(EvalCallback):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.reward_scale import REWARD_SCALES
@@ -188,9 +189,11 @@ def test_which_observations_count() -> None:
     assert norm.count.item() == pytest.approx(count + 5)
 
 
-def test_every_network_reads_them() -> None:
+@pytest.mark.parametrize("maker", ["SAC", "CrossQ", "XQC", "FlashSAC", "BROTD3"])
+def test_every_network_reads_them(maker: str) -> None:
     """Networks on raw observations with statistics are those without on normalised ones."""
-    model, plain = sac(normalize_observations=True), sac()
+    given: dict[str, Any] = {"reward_scale": None, "reward_scale_kwargs": None} if maker in ("XQC", "FlashSAC") else {}
+    model, plain = MAKERS[maker](normalize_observations=True, **given), MAKERS[maker](**given)
     norm = model.policy.observation_norm
     norm.update(torch.tensor([[1.0, -3.0, 0.5], [2.0, 5.0, 0.5]]))
     weights = {name: value for name, value in model.policy.state_dict().items() if "observation_norm" not in name}
@@ -224,6 +227,56 @@ def test_statistics_stay_at_a_reset(maker: str, tmp_path: Path) -> None:
     assert names == ["observation_norm.mean", "observation_norm.var", "observation_norm.count"]
     model.save(tmp_path / "model")
     assert not differing(state(model), state(type(model).load(tmp_path / "model")))
+
+
+@pytest.mark.parametrize("maker", ["SimbaV2", "FlashSAC"])
+def test_parameters_of_a_file_of_another_moment(maker: str, tmp_path: Path) -> None:
+    """What a rule or an explorer keeps for the next step is not there in its midst, when callbacks save, or before."""
+
+    class Saves(BaseCallback):
+        def _on_step(self) -> bool:
+            self.model.save(tmp_path / "m")
+            return True
+
+    never = MAKERS[maker]()
+    never.save(tmp_path / "never")
+    model = MAKERS[maker]().learn(24, Saves())
+    model.set_parameters(tmp_path / "m")
+    model.set_parameters(tmp_path / "never")
+    never.set_parameters(tmp_path / "m")
+    never.learn(12)
+
+
+def test_a_fixed_scale_and_temperature_are_those_of_the_arguments(tmp_path: Path) -> None:
+    linear: dict[str, Any] = {"reward_scale": "linear", "reward_scale_kwargs": {"factor": 2.0}}
+    sac(ent_coef=0.2, **linear).save(tmp_path / "m")
+    batch = random_batch(sac())
+    for kwargs, temperature, factor, shift in (
+        ({}, 0.2, 2.0, 0.0),
+        ({"ent_coef": 0.5}, 0.5, 2.0, 0.0),
+        ({"reward_scale_kwargs": {"factor": 10.0, "shift": -1.0}}, 0.2, 10.0, -1.0),
+    ):
+        model = SAC.load(tmp_path / "m", env=vec(), **kwargs)  # type: ignore[arg-type]
+        assert model.learner.temperature().item() == pytest.approx(temperature)
+        scaled = model.learner.reward_scaler.transform(batch, None).rewards
+        assert torch.allclose(scaled, batch.rewards * factor + shift)
+
+
+def test_brcs_rule_divides_by_one_minus_gamma(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="gamma must be below 1 with reward_scale='brc', .* not 1"):
+        sac(reward_scale="brc", gamma=1.0)
+    sac(reward_scale="brc").save(tmp_path / "m")
+    with pytest.raises(ValueError, match="gamma must be below 1"):
+        SAC.load(tmp_path / "m", env=vec(), gamma=1.0)
+
+
+def test_tasks_told_by_tensors() -> None:
+    of = learner()
+    for told_of in (np.array([1]), torch.tensor([[1]]), [1]):
+        scale: Any = REWARD_SCALES["brc"](of, n_tasks=2)
+        scale.on_observations(of, {"observation": np.zeros((1, 3)), "task": told_of})
+        scale.on_step(of, np.array([3.0]), np.array([True]), [{}])
+        assert scale.largest.tolist() == [-math.inf, 3.0]
 
 
 def test_spaces_that_are_not_normalised() -> None:

@@ -62,6 +62,15 @@ def test_planned_are_the_first_learns(tmp_path: Path) -> None:
     assert sac(learning_rate_schedule="cosine", schedule_steps=7).learn(40).planned_updates == 7
 
 
+def test_a_schedule_that_comes_at_loading_begins_there(tmp_path: Path) -> None:
+    sac(replay_ratio=2, learning_starts=10).learn(40).save(tmp_path / "model")
+    loaded = SAC.load(tmp_path / "model", env=vec(), learning_rate_schedule="linear", learning_starts=0)
+    loaded.learn(30)
+    # 60 steps before it, and 60 of its own.
+    assert loaded.planned_updates == 120 and loaded._n_updates == 120
+    assert loaded.learner.scheduled_rate == pytest.approx(0, abs=1e-12)
+
+
 def test_stable_baselines3s_arguments() -> None:
     model = sac(learning_rate_schedule="linear", train_freq=2, gradient_steps=3, env=vec(2)).learn(40)
     assert model.planned_updates == 30

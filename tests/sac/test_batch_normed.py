@@ -104,6 +104,20 @@ def test_renormalisation_of_a_dead_neuron_has_finite_gradients() -> None:
         assert gradient.isfinite().all()
 
 
+@pytest.mark.parametrize("agent", ["CrossQ", "XQC", "FlashSAC"])
+@pytest.mark.parametrize("exploration", ["optimistic_shift", "optimistic_actor"])
+def test_an_explorer_that_learns_leaves_the_actors_statistics(agent: str, exploration: str) -> None:
+    statistics = []
+    for chosen in "actor", exploration:
+        model = MAKERS[agent](exploration=chosen, exploration_kwargs=None)
+        generator = torch.Generator().manual_seed(0)
+        for i in range(6):
+            drawn = [torch.randn(16, model.actor.action_dim, generator=generator) for _ in range(3)]
+            model.learner.update(random_batch(model, 16, seed=i), Noise(*drawn))
+        statistics.append([b.clone() for b in model.actor.trunk.buffers()])
+    assert len(statistics[0]) > 0 and all(map(torch.equal, *statistics))
+
+
 # ---------------------------------------------------------------- unit norm
 
 

@@ -124,6 +124,22 @@ def test_replay_ratio_and_resets_count_the_steps_of_each_task() -> None:
     assert model._n_updates == 2 * (24 - 10)
 
 
+def test_steps_of_each_task_are_saved(tmp_path: Path) -> None:
+    """A loaded model is as far as it was, before it has taken a step and with another number of environments too."""
+    model = make("BRO", learning_starts=10, resets=(40,)).learn(48)
+    assert model.num_task_steps == 24 and model.plasticity.n_done == 0
+    model.save(tmp_path / "m")
+    model.save_replay_buffer(tmp_path / "b")
+    for env in tasks(), None:
+        loaded = BRO.load(tmp_path / "m", env=env)
+        if env is not None:
+            loaded.load_replay_buffer(tmp_path / "b")
+            loaded.set_logger(configure(None, []))
+            loaded.train(1)
+        assert loaded.learner.environment_steps == 24 and loaded.plasticity.n_done == 0
+    assert model.learner.state_dict()["counts"]["num_task_steps"] == 24
+
+
 # ---------------------------------------------------------------- temperatures
 
 

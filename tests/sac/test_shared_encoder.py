@@ -42,6 +42,18 @@ class WithoutNorm(Encoder):
         return torch.tanh(self.dense(observations))
 
 
+class Dense(BaseFeaturesExtractor):
+    """A layer alone."""
+
+    def __init__(self, observation_space: spaces.Space):
+        super().__init__(observation_space, 6)
+        assert observation_space.shape is not None
+        self.dense = nn.Linear(observation_space.shape[0], 6)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        return torch.tanh(self.dense(observations))
+
+
 def shared(maker: str = "SAC", extractor: Any = Encoder, **kwargs: Any) -> Any:
     """A tiny model with one encoder."""
     make = MAKERS[maker]
@@ -316,6 +328,22 @@ def test_with_redo_sam_and_resets() -> None:
     model = shared("RegularizedSAC", resets=25).learn(60)
     assert model.plasticity.n_done == 2 and model._n_updates > 30
     check_one(model)
+
+
+@pytest.mark.parametrize("features", ["after", "before"])
+def test_sam_encodes_uphill(features: str) -> None:
+    """Whoever encodes the observations once, the critics' second gradient is that of the encoder uphill."""
+    found = []
+    for radius in (0.05, None):
+        model = shared("SAC", Dense, policy_kwargs={"actor_features": features}, sam_radius=radius)
+        torch.manual_seed(0)
+        model._update(random_batch(model))
+        found.append([p.detach().clone() for p in model.critic.parameters()])
+    reference = shared("SAC", Dense, sam_radius=0.05)
+    torch.manual_seed(0)
+    reference._update(random_batch(reference))
+    assert all(torch.allclose(a, b, atol=1e-6) for a, b in zip(found[0], reference.critic.parameters(), strict=True))
+    assert not all(map(torch.equal, *found))
 
 
 def test_modes() -> None:

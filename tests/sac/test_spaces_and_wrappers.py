@@ -25,8 +25,10 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
+from sb3_sample import evaluate_tasks
 from sb3_sample.replay.compact import CompactReplayBuffer
 from sb3_sample.sac import SAC
+from sb3_sample.sac.features import _preprocessed
 from tests.sac.common import MAKERS, Toy, bro, random_batch, sac, vec
 
 BOX = spaces.Box(-10, 10, (3,), np.float32)
@@ -207,6 +209,43 @@ def test_subprocesses() -> None:
         check_trains(bro(env))
     finally:
         env.close()
+
+
+@pytest.mark.parametrize("shape", [(3, 36, 36), (8,)])
+def test_integers_of_subprocesses(shape: tuple[int, ...]) -> None:
+    """A worker does not survive the question for an attribute that its environment lacks."""
+    space = spaces.Box(0, 255, shape, np.uint8)
+    env = SubprocVecEnv([lambda: Monitor(Toy(obs_space=space))], start_method="fork")
+    try:
+        check_trains(sac(env))
+        with pytest.raises(ValueError, match="env must be of multi_task_env"):
+            evaluate_tasks(sac(env), env)
+    finally:
+        env.close()
+
+
+def test_noise_of_another_number_of_environments(tmp_path: Path) -> None:
+    noise = NormalActionNoise(np.zeros(2), np.full(2, 0.1))
+    for n_envs, other in ((3, 2), (3, 1), (1, 2), (2, 2)):
+        sac(vec(n_envs), action_noise=noise).learn(24).save(tmp_path / "m")
+        check_trains(SAC.load(tmp_path / "m", env=vec(other)))
+
+
+@pytest.mark.parametrize(
+    ("space", "plain"),
+    [
+        (spaces.Discrete(5, start=10), spaces.Discrete(5)),
+        (spaces.MultiDiscrete([3, 4], start=[-1, 2]), spaces.MultiDiscrete([3, 4])),
+    ],
+)
+def test_numbers_that_do_not_count_from_0(space: Any, plain: Any) -> None:
+    first = torch.as_tensor(np.atleast_1d(space.start))
+    numbers = torch.as_tensor(np.stack([np.atleast_1d(plain.sample()) for _ in range(6)]))
+    given = (numbers + first, numbers)
+    if isinstance(space, spaces.Discrete):
+        given = (given[0][:, 0], given[1][:, 0])
+    shifted, expected = (_preprocessed(x, of, True) for x, of in zip(given, (space, plain), strict=True))
+    assert torch.equal(shifted, expected) and (expected.sum(dim=1) == len(first)).all()
 
 
 def test_plain_environment_and_id() -> None:

@@ -120,6 +120,15 @@ def test_no_overflow(sign: int, scale: float) -> None:
         assert all(0 <= p <= 1 for p in probabilities) and sum(probabilities) == pytest.approx(1)
 
 
+def test_an_episode_whose_worker_has_died_is_none() -> None:
+    model = top(vec(2))
+    infos: Any = [{"worker_died": "a reason"}, {"episode": {"r": 3.0, "l": 7}}]
+    model.learner.on_step(np.zeros(2), np.array([True, True]), infos)
+    assert model.pessimism_rule._previous == {1: 3.0}
+    with pytest.raises(ValueError, match="environment 0 reports none: wrap it in"):
+        model.learner.on_step(np.zeros(2), np.array([True, True]), [{}, infos[1]])
+
+
 def test_the_better_arm_wins() -> None:
     """Returns that rise under one arm and fall under the other."""
     torch.manual_seed(1)
