@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from sb3_sample.errors import ParametersDoNotFit
-from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, DICT, VERBOSE, Kind, check_value, integer, maker
+from sb3_sample.kinds import AT_LEAST_0, DICT, VERBOSE, Kind, check_value, integer, maker
 from sb3_sample.warn import warn
 
 
@@ -42,8 +42,9 @@ _ENVIRONMENT = Kind(
     "be an environment, a vectorised environment or the id of one",
     lambda value: isinstance(value, (str, VecEnv)) or (hasattr(value, "action_space") and hasattr(value, "step")),
 )
-#: Arguments that may be functions of the remaining progress, and what their values must be.
-_SCHEDULED = {"learning_rate": AT_LEAST_0, "clip_range": ABOVE_0, "clip_range_vf": ABOVE_0}
+#: Arguments that may be functions of the remaining progress, whose values are numbers of at least 0: the zoo passes such
+#: a one that is 0 where a model is loaded to act.
+_SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf")
 #: Arguments of ``learn`` in both families.
 _LEARN: dict[str, Kind] = {
     "total_timesteps": AT_LEAST_0,
@@ -103,7 +104,7 @@ def _check_schedule(name: str, schedule: Callable[[float], Any]) -> None:
             f"{name} must be a function of the remaining progress, from 1 to 0, that returns a number, but at 1.0 "
             f"{schedule!r} fails: {type(error).__name__}: {error}"
         ) from error
-    check_value(f"{name}, {schedule!r}, at the begin", first, _SCHEDULED[name])
+    check_value(f"{name}, {schedule!r}, at the begin", first, AT_LEAST_0)
 
 
 def _check_names(policy_kwargs: Mapping[str, Any], policy: type) -> None:

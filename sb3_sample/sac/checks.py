@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import TrainFreq
+from stable_baselines3.common.utils import ConstantSchedule
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.arguments import NotAllowed, check_every, check_unused
@@ -235,6 +236,9 @@ def _check_schedule(agent: Any) -> None:
         names = ["final_learning_rate", "schedule_steps", "warm_up_steps", "warm_up_learning_rate"]
         check_unused(agent, names, "learning_rate_schedule=None")
         return
+    if isinstance(agent.learning_rate, ConstantSchedule):
+        # A number, as the zoo passes it on.
+        agent.learning_rate = agent.learning_rate.val
     if callable(agent.learning_rate):
         raise ValueError(
             f"learning_rate={agent.learning_rate!r} is a schedule, and so is "

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.utils import ConstantSchedule
 
 from sb3_sample.learner.schedules import LearningRateSchedule
 from sb3_sample.sac import SAC
@@ -79,6 +80,14 @@ def test_stable_baselines3s_arguments() -> None:
     model = sac(learning_rate_schedule="linear", train_freq=(1, "episode"), gradient_steps=5)
     with pytest.raises(ValueError, match="schedule_steps must be given"):
         model.learn(40)
+
+
+def test_the_zoos_numbers_are_numbers(tmp_path: Path) -> None:
+    """The zoo makes a schedule of every learning rate that it is given."""
+    model = sac(learning_rate_schedule="linear", learning_rate=ConstantSchedule(1e-3), schedule_steps=60).learn(40)
+    assert model.learning_rate == 1e-3 and model.learner.scheduled_rate == pytest.approx(1e-3 * 30 / 60)
+    model.save(tmp_path / "model")
+    assert SAC.load(tmp_path / "model", env=vec(), learning_rate=ConstantSchedule(2e-3)).learning_rate == 2e-3
 
 
 def test_resumed(tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def test_what_is_refused(kwargs: dict[str, Any], words: str) -> None:
         ({"gae_lambda": float("nan")}, r"gae_lambda must lie in \[0, 1\], not nan"),
         ({"clip_range": -1}, "clip_range must be above 0 and finite, or a schedule, not -1"),
         ({"clip_range": None}, "clip_range must be above 0 and finite, or a schedule, not None"),
-        ({"clip_range": lambda progress: 0}, "clip_range, .*, at the begin must be above 0 and finite, not 0.0"),
+        ({"clip_range": lambda progress: -1}, "clip_range, .*, at the begin must be at least 0 and finite, not -1.0"),
         ({"clip_range_vf": lambda: 0.2}, "clip_range_vf must be a function of the remaining progress, from 1 to 0"),
         ({"clip_range_vf": 0.0}, "clip_range_vf must be above 0 and finite, or a schedule, or None, not 0.0"),
         ({"ent_coef": "a"}, "ent_coef must be a finite number, not 'a'"),
