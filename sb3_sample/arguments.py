@@ -42,8 +42,8 @@ _ENVIRONMENT = Kind(
     "be an environment, a vectorised environment or the id of one",
     lambda value: isinstance(value, (str, VecEnv)) or (hasattr(value, "action_space") and hasattr(value, "step")),
 )
-#: Arguments that may be functions of the remaining progress, whose values are numbers of at least 0: the zoo passes such
-#: a one that is 0 where a model is loaded to act.
+#: Arguments that may be functions of the remaining progress, whose values are numbers of at least 0. The zoo passes one
+#: that is 0 where it loads a model to act.
 _SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf")
 #: Arguments of ``learn`` in both families.
 _LEARN: dict[str, Kind] = {
