@@ -13,6 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.replay.columns import HasColumns, columns_of
+from sb3_sample.replay.endings import leads_to
 from sb3_sample.saving import container, notice, paths
 from sb3_sample.saving.classes import PACKAGES, check_trusted, has_state, may_be_set, path_of, within
 from sb3_sample.saving.container import BadFile, PickledFile
@@ -87,8 +88,9 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
         Load a replay buffer, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it.
 
         :param path: file, or where ``save_replay_buffer`` wrote it; what it holds, and not its name, says what it is
-        :param truncate_last_traj: whether the last episode counts as ended, and the next ``learn`` begins with a reset
-            of the environment; False to go on with the episode in which the buffer was saved
+        :param truncate_last_traj: with ``HerReplayBuffer``, whether the last episode counts as ended; with every
+            buffer, whether the next ``learn`` begins with a reset of the environment if that is elsewhere than where
+            the buffer's last transitions led
         :param allow_pickle: whether a file in Stable-Baselines3's own, pickled format is loaded too, which can run any
             code that its author wanted
         :param trusted_modules: modules, or packages of modules, whose classes the file may name, besides those that the
@@ -119,8 +121,9 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
                     buffer.truncate_last_trajectory()
         self._check_replay_buffer(buffer, path)
         self.replay_buffer = buffer
-        if truncate_last_traj:
-            # What is under way is of another episode: the next ``learn`` resets the environment.
+        last: Any = self._last_obs if self.get_vec_normalize_env() is None else self._last_original_obs
+        if truncate_last_traj and last is not None and not leads_to(buffer, last):
+            # What is under way is another episode than the buffer's last: the next ``learn`` resets the environment.
             self._last_obs = None
 
     def _pickled_buffer(self, path: Any, name: str, truncate_last_traj: bool) -> ReplayBuffer:
