@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample import MBMAPPO, Dataset
 from sb3_sample.replay.weighted import WindowReplay
 from sb3_sample.srspr.replay import SPRReplayBuffer
 from tests.sac.common import MAKERS, sac, vec
+from tests.sac.test_spaces_and_wrappers import Reach
 from tests.srspr.common import tiny as srspr
 
 
@@ -129,6 +131,28 @@ def test_returns_after_a_buffer_was_loaded(tmp_path: Path) -> None:
     model.load_replay_buffer(tmp_path / "b")
     model.learn(20, reset_num_timesteps=False)
     assert_returns_lead_on(model)
+
+
+# ---------------------------------------------------------------- goals
+
+
+@pytest.mark.parametrize(
+    ("breaks", "starts"),
+    [
+        (lambda model: model.learn(20), {0, 10, 20, 25, 35}),
+        (lambda model: model.learn(20, reset_num_timesteps=False), {0, 10, 20, 30, 40}),
+        (lambda model: model.set_env(Reach()) or model.learn(20, reset_num_timesteps=False), {0, 10, 20, 25, 35}),
+    ],
+    ids=["another learn", "the same episode", "another environment"],
+)
+def test_goals_are_of_the_same_episode(breaks: Callable[[Any], Any], starts: set[int]) -> None:
+    model = sac(Reach(), policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer, learning_starts=20).learn(25)
+    breaks(model)
+    buffer = model.replay_buffer
+    ended = buffer.ep_length[: buffer.size(), 0] > 0
+    assert set(buffer.ep_start[: buffer.size(), 0][ended]) <= starts and buffer.ep_length.max() == 10
+    assert starts - set(buffer.ep_start[: buffer.size(), 0]) == set()
+    assert buffer.env is model.get_env()
 
 
 # ---------------------------------------------------------------- windows

@@ -1,5 +1,6 @@
 """Ends of episodes that the environment has not told of."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,9 @@ def end_episodes(replay_buffer: ReplayBuffer) -> None:
     if replay_buffer.size() == 0:
         return
     if hasattr(buffer, "truncate_last_trajectory"):
-        buffer.truncate_last_trajectory()
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "The last trajectory in the replay buffer will be truncated")
+            buffer.truncate_last_trajectory()
         return
     last = (buffer.pos - 1) % buffer.buffer_size
     goes_on = buffer.dones[last] == 0

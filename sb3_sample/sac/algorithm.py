@@ -22,7 +22,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import configure_logger
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.arguments import check_every, check_program, default_of
 from sb3_sample.constructor import Given
@@ -323,12 +324,19 @@ class SAC(  # type: ignore[misc]  # actor
         :param force_reset: whether it is reset before training goes on
         :raises ValueError: if its spaces or its number of environments differ
         """
+        venv, is_first = self._wrap_env(env, self.verbose), self.env is None
         if not hasattr(self, "observation_space"):
-            venv = self._wrap_env(env, self.verbose)
-            self.observation_space, self.action_space, self.n_envs = venv.observation_space, venv.action_space, 1
-            self.n_envs = venv.num_envs
+            self.observation_space, self.action_space = venv.observation_space, venv.action_space
+            self.n_envs, self.env, self._vec_normalize_env = venv.num_envs, venv, unwrap_vec_normalize(venv)
             self._setup_model()
-        super().set_env(env, force_reset)
+        checks.check_device_buffer(self, unwrap_vec_normalize(venv))
+        super().set_env(venv, force_reset)
+        if is_first and self.seed is not None:
+            # As where it is an argument.
+            venv.seed(self.seed)
+        if isinstance(self.replay_buffer, HerReplayBuffer):
+            # Its own ``set_env`` is for the first one.
+            self.replay_buffer.env = venv
 
     # ---------------------------------------------------------------- acting
 
@@ -614,8 +622,8 @@ class SAC(  # type: ignore[misc]  # actor
 
     def _on_environment_reset(self) -> None:
         self.learner.on_environment_reset()
-        if isinstance(self.replay_buffer, NStepReplayBuffer):
-            # Its returns would sum the rewards of the next episode.
+        if isinstance(self.replay_buffer, (NStepReplayBuffer, HerReplayBuffer)):
+            # Returns would sum the rewards of the next episode, and goals be those that it reaches.
             end_episodes(self.replay_buffer)
 
     def train(self, gradient_steps: int, batch_size: int | None = None) -> None:

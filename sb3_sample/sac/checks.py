@@ -86,7 +86,7 @@ def check(agent: Any) -> None:
     _check_replay(agent)
     _check_n_steps(agent)
     _check_memory_map(agent)
-    _check_device_buffer(agent)
+    check_device_buffer(agent, agent.get_vec_normalize_env())
     _check_train_freq(agent)
     _check_prior_data(agent)
 
@@ -446,11 +446,18 @@ def _check_memory_map(agent: Any) -> None:
         )
 
 
-def _check_device_buffer(agent: Any) -> None:
+def check_device_buffer(agent: Any, normalization: Any) -> None:
+    """
+    Check that a replay buffer on the device goes with the environment.
+
+    :param agent: an algorithm
+    :param normalization: the environment's ``VecNormalize``; None for none
+    :raises ValueError: if it does not, or with another argument
+    """
     cls = agent.replay_buffer_class
     if cls is None or not issubclass(cls, DeviceReplayBuffer):
         return
-    if agent.get_vec_normalize_env() is not None:
+    if normalization is not None:
         raise ValueError(
             "replay_buffer_class=DeviceReplayBuffer cannot be combined with VecNormalize, which normalises on the "
             "host: leave replay_buffer_class out"

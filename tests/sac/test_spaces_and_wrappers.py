@@ -24,12 +24,13 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
+from stable_baselines3.her import HerReplayBuffer
 
-from sb3_sample import evaluate_tasks
+from sb3_sample import DeviceReplayBuffer, evaluate_tasks
 from sb3_sample.replay.compact import CompactReplayBuffer
 from sb3_sample.sac import SAC
 from sb3_sample.sac.features import _preprocessed
-from tests.sac.common import MAKERS, Toy, bro, random_batch, sac, vec
+from tests.sac.common import MAKERS, TINY_SAC, Toy, bro, differing, random_batch, sac, state, vec
 
 BOX = spaces.Box(-10, 10, (3,), np.float32)
 DICT = spaces.Dict({"a": BOX, "b": spaces.Box(-5, 5, (2, 2), np.float64)})
@@ -308,6 +309,38 @@ def test_set_env() -> None:
 # ---------------------------------------------------------------- replay buffers
 
 
+class Random(Toy):
+    """Begins at random numbers."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        observation, info = super().reset(seed=seed)
+        return observation + np.float32(self.np_random.normal()), info
+
+
+def test_a_first_environment_is_that_of_the_constructor(tmp_path: Path) -> None:
+    """Seeded, known to the replay buffer, and asked for its frames."""
+    model = sac(Random()).learn(30)
+    later = SAC("MlpPolicy", None, seed=0, **TINY_SAC)
+    later.set_env(Random())
+    later.learn(30)
+    assert not differing(state(model), state(later))
+    sac(Random()).save(tmp_path / "m")
+    loaded, there = SAC.load(tmp_path / "m"), SAC.load(tmp_path / "m", env=Random())
+    loaded.set_env(Random())
+    np.testing.assert_array_equal(loaded.get_env().reset(), there.get_env().reset())
+    her = SAC("MultiInputPolicy", None, replay_buffer_class=HerReplayBuffer, **{**TINY_SAC, "learning_starts": 20})
+    her.set_env(Reach())
+    assert her.learn(30)._n_updates > 0
+
+
+def test_a_buffer_on_the_device_refuses_normalization_that_comes_later() -> None:
+    model = sac(replay_buffer_class=DeviceReplayBuffer, replay_buffer_kwargs={"sampling": "device"})
+    before = model.get_env()
+    with pytest.raises(ValueError, match="DeviceReplayBuffer cannot be combined with VecNormalize"):
+        model.set_env(VecNormalize(vec()))
+    assert model.get_env() is before
+
+
 def test_n_step_returns() -> None:
     model = bro(n_steps=3, gamma=0.5)
     batches = []
@@ -388,8 +421,6 @@ class Reach(gym.Env):
 @pytest.mark.parametrize("replay_ratio", [1, 10])
 def test_hindsight_is_mixed_into_every_batch(replay_ratio: int) -> None:
     """Every gradient step sees real and relabelled goals in the buffer's proportion, 1 : 4."""
-    from stable_baselines3 import HerReplayBuffer
-
     model = sac(
         Reach(), policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer, learning_starts=20, batch_size=50,
         replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"}, replay_ratio=replay_ratio,
@@ -410,8 +441,6 @@ def test_hindsight_is_mixed_into_every_batch(replay_ratio: int) -> None:
 
 def test_her_on_fetch_reach() -> None:
     robotics = pytest.importorskip("gymnasium_robotics", reason="needs gymnasium-robotics (extra robotics)")
-    from stable_baselines3 import HerReplayBuffer
-
     gym.register_envs(robotics)
     ids = [i for i in ("FetchReach-v4", "FetchReach-v3", "FetchReach-v2") if i in gym.registry]
     assert ids
