@@ -181,7 +181,7 @@ def differing(a: Any, b: Any) -> list[str]:
     return [name for name, x in ours.items() if not torch.allclose(x.double(), theirs[name].double(), atol=1e-5)]
 
 
-@pytest.mark.parametrize("compiles", [False, pytest.param(True, marks=COMPILES)])
+@pytest.mark.parametrize("compiles", [False, pytest.param(True, marks=[COMPILES, pytest.mark.slow])])
 @pytest.mark.parametrize("cls", [SAC, VPLSAC])
 def test_a_training_goes_on_bit_by_bit(cls: type[SAC], compiles: bool, tmp_path: Path) -> None:
     # Places are overwritten.

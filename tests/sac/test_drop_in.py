@@ -461,7 +461,8 @@ def test_critics_one_by_one(make: Any) -> None:
         torch.testing.assert_close(network(inputs), expected)
 
 
-@pytest.mark.parametrize("maker", ["SAC", pytest.param("BRO", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("maker", ["SAC", "BRO"])
 def test_own_parts_may_ask_critics_as_before(maker: str) -> None:
     """A part that calls ``agent.critic(...)`` as a tensor, run in each of the three ways."""
     states = []

@@ -149,7 +149,8 @@ def updates(model: Any, n: int, seed: int = 0, each: Callable[[int], None] = lam
         model.train(1, 8)
 
 
-FAST = ["BRO", "VPLSAC"]
+# BRO's compiled step is a fast test of test_golden.py.
+FAST = ["VPLSAC"]
 
 
 @COMPILES
@@ -528,6 +529,7 @@ def test_what_cannot_be_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @COMPILES
+@pytest.mark.slow
 def test_parts_of_ones_own_are_compiled_when_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     class Own(Pessimism):
         def __init__(self, agent: SAC):

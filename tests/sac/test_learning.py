@@ -82,6 +82,7 @@ def test_compiled_step_learns_pendulum(make: Callable[..., SAC]) -> None:
     assert score(model) > GOOD
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cls", [DAC, VPLSAC])
 def test_dac_and_vpl_sac_learn_pendulum(cls: type[SAC]) -> None:
     assert score(small_sac(0, cls).learn(3_000)) > GOOD
