@@ -24,8 +24,11 @@ _OF_THE_RUN = {
     "algo", "env", "seed", "trained_agent", "truncate_last_trajectory", "vec_env", "eval_env_kwargs", "eval_freq",
     "eval_episodes", "n_eval_envs", "save_freq", "n_timesteps", "callback",
 }  # fmt: skip
-#: Wrappers of the zoo's settings that hold an action for several steps, and for how many by default.
-_SKIPPING = {"FrameSkip": 4, "MaxAndSkipEnv": 4, "MaxAndSkipObservation": 4}
+#: Wrappers of the zoo's settings that hold an action for several steps, by default for 4: the argument for how many.
+_SKIPPING = {
+    **dict.fromkeys(("FrameSkip", "MaxAndSkipEnv", "MaxAndSkipObservation"), "skip"),
+    **dict.fromkeys(("AtariFrames", "AtariPreprocessing", "AtariWrapper"), "frame_skip"),
+}
 
 
 class RunSettings(NamedTuple):
@@ -99,9 +102,9 @@ def _skipped(wrappers: Any) -> int:
     skip = 1
     for entry in wrappers if isinstance(wrappers, list) else [wrappers]:
         ((path, arguments),) = entry.items() if isinstance(entry, dict) and len(entry) == 1 else [(entry, {})]
-        default = _SKIPPING.get(str(path).rpartition(".")[2])
-        if default is not None:
-            count = arguments.get("skip", default) if isinstance(arguments, dict) else default
+        name = _SKIPPING.get(str(path).rpartition(".")[2])
+        if name is not None:
+            count = arguments.get(name, 4) if isinstance(arguments, dict) else 4
             skip *= count if type(count) is int and count >= 1 else 1
     return skip
 
