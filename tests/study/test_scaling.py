@@ -397,6 +397,14 @@ def test_from_a_table_to_settings(tmp_path: Path) -> None:
     assert any("extrapolated" in limit for limit in found.limits)
     slow, fast = (again.predict(replay_ratio=4.0, task=task).steps.value for task in reversed(TASKS))
     assert slow / fast == pytest.approx(3, rel=0.15)
+    for task in (None, *TASKS):
+        found = again.predict(budget=5e15, task=task)
+        flops = 10 * 5.5e5 * found.batch_size.value * found.replay_ratio.value * found.steps.value
+        assert found.compute.value == pytest.approx(flops)
+        assert flops + again.delta * found.steps.value == pytest.approx(5e15)
+        assert any("replay ratio is that of all tasks" in limit for limit in found.limits) == (task is not None)
+    with pytest.raises(ValueError, match="task must be one of the laws', .*, not 'typo'"):
+        again.predict(budget=5e15, task="typo")
     for asked, words in (
         ({}, "exactly one"), ({"data": 1e5, "compute": 1e15}, "exactly one"), ({"budget": -1.0}, "budget must be"),
         ({"replay_ratio": 100.0}, "warrant 0.25 to 32"), ({"data": 10.0}, "steps must be above"),
