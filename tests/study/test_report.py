@@ -229,6 +229,17 @@ def test_runs_under_way_are_in_their_tasks_and_in_no_average(tmp_path: Path) -> 
     assert "late is in no average: no run of it was evaluated around 200 steps." in text
 
 
+def test_agents_that_share_a_task_of_the_second_group_only(tmp_path: Path) -> None:
+    other = "metaworld/reach-v3"
+    rows = [row for agent in ("A", "B") for row in runs(agent, CHEETAH, [600, 700, 800])]
+    for agent, task in (("A", PUSH), ("B", other)):
+        for seed in range(3):
+            rows += [(agent, {}, task, seed, step, "success_rate", 0.5) for step in (100, 200)]
+    page = written(tmp_path / "r.html", made_up(rows), all_tasks=True, groups=["metaworld", "dmc"])
+    averages = tables_of(page)["Averages by group of tasks"]
+    assert len(averages) > 4 and "no two agents have a task of the group metaworld in common" in text_of(page)
+
+
 def test_training_episodes_of_runs_that_end_at_other_steps(tmp_path: Path) -> None:
     for seed, lengths in enumerate([(100, 110, 90), (95, 100, 100), (105, 100, 105)]):
         write_monitor(tmp_path / "mine" / str(seed), CHEETAH, lengths, (1.0, 2.0, 30.0))
