@@ -14,13 +14,14 @@ from typing import Any
 
 import stable_baselines3
 import torch
+import yaml
 from agent_cost import Noise
 from stable_baselines3.common.logger import Logger
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_sample import study
 from sb3_sample.study.plan import constructor_value
-from sb3_sample.zoo import ALGORITHMS
+from sb3_sample.zoo import ALGORITHMS, HYPERPARAMS
 
 #: Gradient steps that are counted: a multiple of every ``policy_delay`` in use, 1, 2 and 3.
 STEPS = 6
@@ -50,6 +51,18 @@ def gflop(algo: str, arguments: dict[str, Any]) -> tuple[float, float]:
     return counter.get_total_flops() / STEPS / 1e9, model.replay_ratio
 
 
+def action_repeat(run: study.Run) -> int:
+    """
+    :param run: of a plan
+    :return: simulator steps of a step of it: the plan's or, where it has no ``env_kwargs``, those of
+        ``hyperparams/<algo>.yml``
+    """
+    entries = yaml.safe_load((HYPERPARAMS / f"{run.algo}.yml").read_text())
+    settings = entries.get(run.task) or entries.get("default") or {}
+    repeat: int = (run.env_kwargs or settings.get("env_kwargs") or {}).get("action_repeat", 1)
+    return repeat
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("plans", nargs="+", metavar="PLAN", help="files of plans")
@@ -64,7 +77,7 @@ def main() -> None:
             if options.agent and run.agent not in options.agent:
                 continue
             each, ratio = gflop(run.algo, run.arguments)
-            a_step = each * ratio / run.env_kwargs.get("action_repeat", 1)
+            a_step = each * ratio / action_repeat(run)
             print(f"{name:36}{each:17.3f}{ratio:16g}{a_step:24.2f}", flush=True)
 
 

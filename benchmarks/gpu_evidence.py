@@ -4,9 +4,9 @@ Learning curves of BRO Fast on a GPU, ten seeds at a time, as far as the time go
     python benchmarks/gpu_evidence.py FOLDER [--task cheetah-run] [--seconds 300] [--processes 3]
 
 The seeds are shared out to processes, each of which trains its own with ``train_many``: what is done on the host, and
-the environments, then take as many cores. Every ``--eval-freq`` environment steps (of which one is two of the
-simulation) the mean return of ``--episodes`` episodes is written to ``FOLDER/<task>.csv``, the columns of a study's
-table. ``benchmarks/learning_summary.py`` sets it beside the published curves.
+the environments, then take as many cores. Every ``--eval-freq`` environment steps (action repeat 1) the mean return of
+``--episodes`` episodes is written to ``FOLDER/<task>.csv``: columns ``task``, ``seed``, ``step``, ``return``,
+``episodes``, ``seconds`` and ``updates``.
 """
 
 import argparse
@@ -94,6 +94,9 @@ def main() -> None:
     if args.end is not None:
         train(args, args.seeds, args.end)
         return
+    # Each seed's rows are added to a file of its own; those of a call that was interrupted are not of this one.
+    for path in args.folder.glob(f"{args.task}-*.csv"):
+        path.unlink()
     end = time.time() + args.seconds
     shares = [args.seeds[i :: args.processes] for i in range(args.processes)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "TORCHINDUCTOR_COMPILE_THREADS": "5"}
@@ -113,7 +116,8 @@ def main() -> None:
     for path in args.folder.glob(f"{args.task}-*.csv"):
         path.unlink()
     print(f"{len(rows)} evaluations in {args.folder / f'{args.task}.csv'}")
-    raise SystemExit(max(codes))
+    # A process that was killed has a negative one.
+    raise SystemExit(int(any(codes)))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,8 @@ import pandas as pd
 from sb3_sample.envs import published_key
 from sb3_sample.exits import refuse
 from sb3_sample.extras import install
-from sb3_sample.run_logs import EVALUATIONS, monitor_files, monitor_head, read_evaluations, read_monitors
+from sb3_sample.run_logs import EVALUATIONS, monitor_files, read_evaluations, read_monitors
+from sb3_sample.run_settings import read_settings, run_env_id
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 DATA = Path(__file__).parent / "data" / "published_curves.csv.gz"
 #: The published algorithms that are drawn unless others are asked for.
 PUBLISHED = ("BRO", "BRO Fast", "SAC")
-#: What a table of a curve has, by environment step, over the seeds. The standard deviation is the sample's (n - 1).
+#: What a table of a curve has, by simulator step, over the seeds. The standard deviation is the sample's (n - 1).
 COLUMNS = ["env_step", "n_seeds", "mean", "std", "min", "max", "iqm"]
 #: The zoo's name of our algorithm, where it is not the published one's.
 ZOO_NAMES = {"flashsac": "flash_sac", "sac": "sac_sample"}
@@ -46,7 +47,7 @@ class Run:
 
     :param label: name of the curve that the run is a seed of
     :param path: the run's folder
-    :param steps: environment steps, increasing, (T,)
+    :param steps: simulator steps, increasing, (T,)
     :param values: mean over the episodes of the evaluation, or of the bin, at each of them, (T,)
     """
 
@@ -189,23 +190,15 @@ def find_runs(path: Path) -> list[Path]:
     return sorted(folders, key=lambda folder: (len(folder.name), str(folder)))
 
 
-def run_env_id(folder: Path) -> str | None:
-    """
-    :param folder: a run's folder
-    :return: the environment's id as Monitor wrote it into its files; None if there are none
-    """
-    ids = (monitor_head(file)["env_id"] for file in monitor_files(folder))
-    return next((env_id for env_id in ids if env_id is not None), None)
-
-
 def read_run(folder: Path, label: str, metric: str, bin_steps: int) -> Run:
     """
-    Read ``evaluations.npz``, or, where there is none, the training episodes in the Monitor files.
+    Read ``evaluations.npz``, or, where there is none, the training episodes in the Monitor files. Steps are of the
+    simulator, as those of the published curves, whatever the action repeat.
 
     :param folder: the run's folder
     :param label: name of its curve
     :param metric: "return" or "success_rate"
-    :param bin_steps: environment steps over which training episodes are averaged
+    :param bin_steps: simulator steps over which training episodes are averaged
     :return: the run
     :raises ValueError: the run did not record the metric, or has no episode
     """
@@ -215,7 +208,9 @@ def read_run(folder: Path, label: str, metric: str, bin_steps: int) -> Run:
         data = read_evaluations(file)
         if key not in data:
             raise ValueError(f"metric must be one that was recorded, not {metric!r}: {file} has no {key!r}")
-        return Run(label, folder, data["timesteps"], data[key].astype(float).reshape(len(data[key]), -1).mean(axis=1))
+        settings = read_settings(folder)
+        steps = data["timesteps"] * settings.repeat * settings.skip
+        return Run(label, folder, steps, data[key].astype(float).reshape(len(steps), -1).mean(axis=1))
     steps, values = _episodes(folder, metric)
     filled, bins = np.unique(np.ceil(steps / bin_steps).astype(int), return_inverse=True)
     means = np.bincount(bins, values) / np.bincount(bins)
@@ -223,14 +218,19 @@ def read_run(folder: Path, label: str, metric: str, bin_steps: int) -> Run:
 
 
 def _episodes(folder: Path, metric: str) -> tuple[np.ndarray, np.ndarray]:
-    """Environment step at the end of each training episode, and its return or success."""
+    """Simulator step at the end of each training episode, and its return or success."""
     episodes = read_monitors(folder)
     key = {"return": "r", "success_rate": "is_success"}[metric]
     if key not in episodes:
         raise ValueError(f"metric must be one that was recorded, not {metric!r}: {folder} has no column {key!r}")
     if not len(episodes):
         raise ValueError(f"runs must have at least one finished episode; {folder} has none")
-    return episodes["l"].cumsum().to_numpy(), episodes[key].to_numpy(float)
+    return _ends(folder, episodes), episodes[key].to_numpy(float)
+
+
+def _ends(folder: Path, episodes: pd.DataFrame) -> np.ndarray:
+    """Simulator step at the end of each episode of Monitor's."""
+    return episodes["l"].cumsum().to_numpy() * read_settings(folder).repeat
 
 
 def _with_episodes(labelled: Sequence[tuple[str, Path]]) -> list[tuple[str, Path]]:
@@ -253,7 +253,7 @@ def _with_episodes(labelled: Sequence[tuple[str, Path]]) -> list[tuple[str, Path
 
 def _default_bin(folders: Sequence[Path]) -> int:
     """The published curves' 25,000 steps; for short runs about a twentieth of the shortest, as a round number."""
-    lengths = [read_monitors(folder)["l"].sum() for folder in folders]
+    lengths = [_ends(folder, read_monitors(folder))[-1] for folder in folders]
     width = max(min(lengths, default=0) / 20, 1)
     if width >= 25_000:
         return 25_000
@@ -315,7 +315,7 @@ def draw(env_id: str, curves: Sequence[Curve], metric: str, xlim: tuple[float, f
     :param env_id: id of the environment, the title
     :param curves: what to draw; published ones are dashed
     :param metric: "return" or "success_rate"
-    :param xlim: first and last environment step; if None from 0 to the end of the longest curve that is not published
+    :param xlim: first and last simulator step; if None from 0 to the end of the longest curve that is not published
     :return: the picture: lines are means, shaded the range over seeds
     :raises ImportError: matplotlib is not installed
     """
@@ -360,7 +360,7 @@ def draw(env_id: str, curves: Sequence[Curve], metric: str, xlim: tuple[float, f
             zorder=2 if curve.published else 3,
         )
     axes.set_title(env_id)
-    axes.set_xlabel("environment steps")
+    axes.set_xlabel("simulator steps")
     axes.set_ylabel({"return": "undiscounted return", "success_rate": "success rate"}[metric])
     axes.set_xlim(*xlim)
     if metric == "success_rate":
@@ -439,13 +439,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--metric", choices=list(METRICS), help="default: that of the published curves, else return")
     parser.add_argument(
-        "--xlim", nargs="+", type=float, metavar="STEP", help="last, or first and last, environment step of the picture"
+        "--xlim", nargs="+", type=float, metavar="STEP", help="last, or first and last, simulator step of the picture"
     )
     parser.add_argument(
         "--bin",
         type=int,
         metavar="STEPS",
-        help="average training episodes over so many steps (runs without evaluations)",
+        help="average training episodes over so many simulator steps (runs without evaluations)",
     )
     parser.add_argument("--all-steps", action="store_true", help="print every step in the table")
     args = parser.parse_args(arguments)

@@ -77,12 +77,6 @@ class Evidence:
         self.root, self.results, self._python = root.resolve(), results, python
         self.root.mkdir(parents=True, exist_ok=True)
 
-    @contextlib.contextmanager
-    def _alone(self) -> Iterator[None]:
-        with (self.root / ".lock").open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            yield
-
     def tree(self, commit: str) -> Path:
         """
         :param commit: a commit
@@ -91,7 +85,7 @@ class Evidence:
         """
         path = self.root / TREES / commit
         complete = path / COMPLETE
-        with self._alone():
+        with alone(self.root):
             if not complete.exists():
                 git("worktree", "prune")
                 shutil.rmtree(path, ignore_errors=True)
@@ -109,7 +103,7 @@ class Evidence:
         version = f"{sys.version_info.major}.{sys.version_info.minor}"
         lock = (tree / "constraints" / f"{version}.txt").read_bytes()
         place = self.root / ENVIRONMENTS / f"{version}-{hashlib.sha256(lock).hexdigest()[:12]}"
-        with self._alone():
+        with alone(self.root):
             if not (place / ".all").exists():
                 shutil.rmtree(place, ignore_errors=True)
                 command = ["make", "--silent", "-C", str(tree), f"VENV={place}", f"PYTHON={sys.executable}"]
@@ -194,6 +188,18 @@ class Evidence:
             stdin=subprocess.PIPE,
             start_new_session=True,
         )
+
+
+@contextlib.contextmanager
+def alone(root: Path) -> Iterator[None]:
+    """
+    While no other process is in this block with the same folder.
+
+    :param root: folder of the evidence
+    """
+    with (root / ".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def script(tree: Path) -> str:
@@ -288,10 +294,12 @@ def found(root: Path, plan: str, run: Any) -> Found | None:
     :param run: one of its runs
     :return: the one that has ended, else the one that is farthest; None if there is nothing of it
     """
-    from sb3_sample.study.runs import StudyFolder
+    from sb3_sample.study.runs import LIST, StudyFolder
 
     places = []
     for path in sorted((root / STUDIES / plan).glob("*")):
+        if not (path / LIST).exists():  # a process was killed that was about to make the folder
+            continue
         folder = StudyFolder(path)
         listed = {each.name: each.as_json() for each in folder.runs()}
         if run.name in listed and same(listed[run.name], run.as_json()) and folder.place(run).is_dir():
@@ -378,12 +386,14 @@ def collect(root: Path, results: Path) -> None:
     import pandas as pd
 
     from sb3_sample import study
+    from sb3_sample.saving.temporary import becoming
     from sb3_sample.saving.training_state import processor
+    from sb3_sample.study.table import RUN
 
     for name in dict.fromkeys(name for name, _ in queue()):
         records = recorded(results, name)
         path = results / f"{name}.csv"
-        tables = [study.load(path)] if path.exists() else []
+        table = study.load(path) if path.exists() else None
         before = len(records)
         for run in plan_of(name).runs:
             here = found(root, name, run)
@@ -399,11 +409,18 @@ def collect(root: Path, results: Path) -> None:
                     "threads": outcome.threads,
                 }
             )
-            tables.append(study.read(f"{run.agent}={here.folder.place(run)}"))
-        if len(records) > before:
+            rows = study.read(f"{run.agent}={here.folder.place(run)}")
+            if table is not None:
+                # Rows of a run that is not among the records: the table was written, and then the process killed.
+                table = table[~table.set_index(RUN).index.isin(rows.set_index(RUN).index)]
+            table = rows if table is None else pd.concat([table, rows], ignore_index=True)
+        if table is not None and len(records) > before:
             results.mkdir(parents=True, exist_ok=True)
-            study.write(pd.concat(tables, ignore_index=True), path)
-            (results / f"{name}.json").write_text(json.dumps(records, indent=1) + "\n")
+            # The records last: a run that they have is in the table.
+            with becoming(path) as file:
+                file.write(table.to_csv(index=False).encode())
+            with becoming(results / f"{name}.json") as file:
+                file.write((json.dumps(records, indent=1) + "\n").encode())
 
 
 def prepare(plan: str) -> None:
@@ -449,8 +466,9 @@ def main() -> None:
         return run(*sys.argv[2:])
     if sys.argv[1:2] == ["next"]:
         root, results = map(Path, sys.argv[2:4])
-        collect(root, results)
-        order = choose(root, results, sys.argv[4:])
+        with alone(root):  # results are read, added to and written
+            collect(root, results)
+            order = choose(root, results, sys.argv[4:])
         return print(json.dumps(None if order is None else order._asdict()))
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="runs at once (default: 1)")

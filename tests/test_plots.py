@@ -1,6 +1,7 @@
 """Runs beside published curves, on made-up runs."""
 
 import itertools
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -154,6 +155,30 @@ def test_a_run_reads_its_evaluations_and_else_its_training_episodes(tmp_path: Pa
     assert (list(trained.steps), list(trained.values)) == ([20, 40, 60], [2, 5, 7])
     with pytest.raises(ValueError, match="metric must be one that was recorded, not 'success_rate'"):
         plots.read_run(folder, "a", "success_rate", 20)
+
+
+def test_steps_are_of_the_simulator_as_those_of_the_published_curves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    evaluated = write_run(tmp_path / "dr_q/x_1", [12_500, 25_000], [1, 2])
+    trained = write_monitor(tmp_path / "dr_q/x_2", [10, 10, 10, 30], [1, 3, 5, 7])
+    wrapped = write_run(tmp_path / "dr_q/x_3", [10], [1])
+    for folder in (evaluated, trained, wrapped):
+        settings = {"env_kwargs": "{'action_repeat': 2}"}
+        if folder is wrapped:
+            settings["env_wrapper"] = "{'rl_zoo3.wrappers.FrameSkip': {'skip': 3}}"
+        record = {"algo": "dr_q", "env": ENV, "seed": 0, "settings": settings}
+        (folder / "run.json").write_text(json.dumps(record))
+    assert list(plots.read_run(evaluated, "a", "return", 1).steps) == [25_000, 50_000]
+    assert list(plots.read_run(wrapped, "a", "return", 1).steps) == [60]
+    run = plots.read_run(trained, "a", "return", 40)
+    assert (list(run.steps), list(run.values)) == ([40, 80, 120], [2, 5, 7])
+    plots.main([str(trained), "-o", str(tmp_path / "x.png"), "-p", "none"])
+    # Bins of a twentieth of the 120 steps.
+    assert "| 120 | dr_q | 1 | 7 |" in capsys.readouterr().out
+    plots.main([str(evaluated), "-o", str(tmp_path / "x.png"), "-p", "DR.Q"])
+    output = capsys.readouterr().out
+    assert "| 50,000 | dr_q | 1 | 2 |" in output and "| 50,000 | DR.Q" in output and "| 12,500 |" not in output
 
 
 # ---------------------------------------------------------------- command

@@ -45,6 +45,13 @@ def test_without_a_folder_each_run_has_one_where_the_zoo_says(call: Call) -> Non
     folders = [Path(f"logs/sac_sample/Pendulum-v1_{i}") for i in (1, 2)]
     assert [json.loads((folder / "run.json").read_text())["seed"] for folder in folders] == [4, 7]
     assert [steps(folder)[-1] for folder in folders] == [120, 120]
+    # Each goes on with its own.
+    call("--seeds", "4", "7", "--log-folder", "logs", "--resume", "-n", "150")
+    assert [steps(folder)[-1] for folder in folders] == [150, 150]
+    call("--seed", "4", "--log-folder", "logs", "--resume", "-n", "180")
+    assert [steps(folder)[-1] for folder in folders] == [180, 150]
+    with pytest.raises(SystemExit, match="no run of sac_sample on Pendulum-v1 with seed 5 below logs has a checkpoint"):
+        call("--seeds", "4", "5", "--log-folder", "logs", "--resume", "-n", "150")
 
 
 CALLBACK = """

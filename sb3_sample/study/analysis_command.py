@@ -6,6 +6,7 @@ import math
 import sys
 import warnings
 from collections.abc import Callable, Iterator
+from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,12 +46,13 @@ def steps_of(text: str) -> int:
     digits = text.replace("_", "")
     factor = {"k": 1_000, "M": 1_000_000}.get(digits[-1:], 1)
     try:
-        number = float(digits if factor == 1 else digits[:-1]) * factor
-    except ValueError:
-        number = math.nan
-    if not number >= 0 or number != round(number):
+        # As it is written: the float 4.1 times a million is no whole number.
+        number = Decimal(digits if factor == 1 else digits[:-1]) * factor
+    except ArithmeticError:  # no number, or one beyond all of them
+        number = Decimal(-1)
+    if not (number.is_finite() and 0 <= number <= 2**53) or number != int(number):
         raise argparse.ArgumentTypeError(f"{text!r} is no number of steps, as 100000, 100k or 1M")
-    return round(number)
+    return int(number)
 
 
 def _score(text: str) -> tuple[str, Score]:

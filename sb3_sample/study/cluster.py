@@ -5,6 +5,7 @@ process that makes it, as without Ray.
 """
 
 import contextlib
+import dataclasses
 import importlib.util
 import math
 import os
@@ -19,6 +20,7 @@ from typing import Any
 
 from sb3_sample.extras import install
 from sb3_sample.kinds import check_value, number
+from sb3_sample.replay.reading import HDF5
 from sb3_sample.study.cores import free_cores, threads_of_libraries
 from sb3_sample.study.plan import Run
 from sb3_sample.study.runs import LIST, Outcome, StudyError, StudyFolder
@@ -162,7 +164,8 @@ class Slot:
         :param threads: of the task
         """
         self.runs, self.kind = runs, runs[0].kind
-        self._order = self._task.remote(self._folder, [run.as_json() for run in runs], options, threads)
+        orders = [_with_absolute_paths(run).as_json() for run in runs]
+        self._order = self._task.remote(self._folder, orders, options, threads)
         self._listener = threading.Thread(target=self._listen, args=(self._order,), daemon=True)
         self._listener.start()
 
@@ -229,6 +232,17 @@ def make(folder: str, runs: list[dict[str, Any]], options: list[str], threads: i
     with contextlib.suppress(KeyboardInterrupt, SystemExit):
         outcomes = attempt_all(StudyFolder(folder), [Run.of_json(run) for run in runs], options, threads)
     return [TAKEN if outcome is None else outcome._asdict() for outcome in outcomes]
+
+
+def _with_absolute_paths(run: Run) -> Run:
+    """A run whose data sets are named alike from any working directory, since a process of Ray's has another."""
+
+    def absolute(value: Any) -> Any:
+        is_path = isinstance(value, str) and (Path(value).suffix in HDF5 or Path(value).exists())
+        # A home is the machine's own; an id of Minari's is no path.
+        return str(Path(value).absolute()) if is_path and not value.startswith("~") else value
+
+    return dataclasses.replace(run, data={name: absolute(value) for name, value in run.data.items()})
 
 
 def _terminate(number: int, frame: Any) -> None:

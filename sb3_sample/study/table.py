@@ -5,25 +5,22 @@ Columns (:data:`COLUMNS`): ``agent``; ``arguments``, its hyperparameters as JSON
 environment's id; ``seed``; ``step``, in steps of the simulator whatever the action repeat; ``metric``; ``value``.
 """
 
-import ast
 import fnmatch
 import functools
 import json
-import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 
-from sb3_sample.envs.registration import PACKAGE
 from sb3_sample.envs.suites import published_id, published_key
 from sb3_sample.extras import install
-from sb3_sample.plots import DATA, all_published_curves, find_runs, named_algorithms, run_env_id
+from sb3_sample.plots import DATA, all_published_curves, find_runs, named_algorithms
 from sb3_sample.run_logs import EVALUATIONS, OFFLINE, read_evaluations, read_monitors
+from sb3_sample.run_settings import RECORD, RunSettings, plain_id, read_settings
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.warn import warn
 
@@ -41,23 +38,16 @@ _EVALUATED = {"return": "results", "success_rate": "successes", "episode_length"
 _MONITORED = {"return": "r", "success_rate": "is_success", "episode_length": "l"}
 #: Those of the training episodes, beside evaluations.
 ONLINE = {f"online_{metric}": _MONITORED[metric] for metric in ("return", "success_rate")}
-_RECORD, _LOG = "run.json", "progress.jsonl"
+_LOG = "progress.jsonl"
 _SECONDS = "time/time_elapsed"
 #: A line of the log, as far as the time.
 _TIMED = re.compile(rb'\{"step": (\d{1,15}), [^\n]*?"time/time_elapsed": (\d{1,15}(?:\.\d+)?)[,}]')
 #: In the folder of a study: its list of runs, and the folder of them, ``runs/<agent and grid>/<task>/<seed>``.
 _LIST, _RUNS = "study.json", "runs"
-#: Bytes of a run's log, of a file of settings, and values in such a file.
-_MAX_LOG, _MAX_SETTINGS, _MAX_VALUES = 256 * 2**20, 2**18, 5_000
+#: Bytes of a run's log.
+_MAX_LOG = 256 * 2**20
 #: Bytes of a study's list of runs.
 _MAX_LIST = 2**28
-#: Settings of a run that say nothing of the agent.
-_OF_THE_RUN = {
-    "algo", "env", "seed", "trained_agent", "truncate_last_trajectory", "vec_env", "eval_env_kwargs", "eval_freq",
-    "eval_episodes", "n_eval_envs", "save_freq", "n_timesteps", "callback",
-}  # fmt: skip
-#: Wrappers of the zoo's settings that hold an action for several steps, and for how many by default.
-_SKIPPING = {"FrameSkip": 4, "MaxAndSkipEnv": 4, "MaxAndSkipObservation": 4}
 
 
 class _Rows:
@@ -101,24 +91,6 @@ def to_json(arguments: Mapping[str, Any]) -> str:
 # ---------------------------------------------------------------- runs
 
 
-class _Run(NamedTuple):
-    """
-    :param agent: name; None if the run's files do not say
-    :param arguments: of the agent
-    :param task: id of the environment; None if the files do not say
-    :param seed: None if they do not say
-    :param repeat: simulator steps of a step of the environment
-    :param skip: steps of the environment, as Monitor counts them, of a step of the agent
-    """
-
-    agent: str | None
-    arguments: dict[str, Any]
-    task: str | None
-    seed: int | None
-    repeat: int = 1
-    skip: int = 1
-
-
 def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = METRICS) -> pd.DataFrame:
     """
     The table of runs: of this package (``--run-dir``), of the zoo, and of folders with Monitor files only.
@@ -154,10 +126,10 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
             tables.append(table if label is None else table.assign(agent=label))
             continue
         for folder in find_runs(path):
-            run = _described(folder)
+            run = read_settings(folder)
             if run.task is None:
                 raise ValueError(
-                    f"{folder} does not say which task it is of: it has no {_RECORD}, no args.yml of the zoo, and no "
+                    f"{folder} does not say which task it is of: it has no {RECORD}, no args.yml of the zoo, and no "
                     "environment's id in its Monitor files"
                 )
             agent = label or _agent_of_study(folder, named) or run.agent or folder.resolve().parent.name
@@ -230,7 +202,7 @@ def labelled(source: str | Path) -> tuple[str | None, Path]:
     return label, Path(path)
 
 
-def _measured(folder: Path, run: _Run, metrics: Sequence[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _measured(folder: Path, run: RunSettings, metrics: Sequence[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Simulator steps and values of a run by metric. Each of its files is read once, and only if it is needed."""
     found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     monitored: pd.DataFrame | None = None
@@ -322,119 +294,6 @@ def _logged(path: Path, repeat: int, metrics: Sequence[str]) -> dict[str, tuple[
     }
 
 
-# ---------------------------------------------------------------- what a run is of
-
-
-def _described(folder: Path) -> _Run:
-    if (folder / _RECORD).exists():
-        record = parse_json(read_regular(folder / _RECORD, _MAX_SETTINGS), str(folder / _RECORD))
-        if not isinstance(record, dict) or not isinstance(record.get("settings"), dict):
-            raise BadFile(f"{folder / _RECORD} is no record of a run")
-        settings = {name: _literal(text) for name, text in record["settings"].items()}
-        return _of_settings(settings, record, folder / _RECORD)
-    files = sorted(folder.glob("*/args.yml"))
-    if files:
-        arguments = _yaml(files[0])
-        config = files[0].with_name("config.yml")
-        settings = {"env_kwargs": arguments.get("env_kwargs"), **(_yaml(config) if config.exists() else {})}
-        return _of_settings(settings, arguments, files[0])
-    env_id = run_env_id(folder)
-    return _Run(None, {}, None if env_id is None else _task(env_id), None)
-
-
-def _of_settings(settings: dict[str, Any], head: Mapping[str, Any], path: Path) -> _Run:
-    """
-    :param settings: the agent's and those of ``_OF_THE_RUN``
-    :param head: has "algo", "env" and "seed"
-    :param path: the file, for messages
-    """
-    algo, env, seed = (head.get(name) for name in ("algo", "env", "seed"))
-    if not isinstance(algo, str) or not isinstance(env, str) or not (seed is None or type(seed) is int):
-        raise BadFile(f"{path} is no record of a run: algo is {algo!r:.50}, env {env!r:.50}, seed {seed!r:.50}")
-    arguments = {name: value for name, value in settings.items() if name not in _OF_THE_RUN and value is not None}
-    env_kwargs = settings.get("env_kwargs") or {}
-    repeat = env_kwargs.get("action_repeat", 1) if isinstance(env_kwargs, dict) else 1
-    if type(repeat) is not int or repeat < 1:
-        raise BadFile(f"{path}: action_repeat is {repeat!r:.50}, not a whole number from 1 on")
-    return _Run(algo, arguments, _task(env), seed, repeat, _skipped(settings.get("env_wrapper")))
-
-
-def _skipped(wrappers: Any) -> int:
-    skip = 1
-    for entry in wrappers if isinstance(wrappers, list) else [wrappers]:
-        ((path, arguments),) = entry.items() if isinstance(entry, dict) and len(entry) == 1 else [(entry, {})]
-        default = _SKIPPING.get(str(path).rpartition(".")[2])
-        if default is not None:
-            count = arguments.get("skip", default) if isinstance(arguments, dict) else default
-            skip *= count if type(count) is int and count >= 1 else 1
-    return skip
-
-
-def _task(env_id: str) -> str:
-    return env_id.removeprefix(f"{PACKAGE}:")
-
-
-def _literal(text: Any) -> Any:
-    """The value of a setting as ``repr`` has written it; the text itself where that is no plain value."""
-    try:
-        value = ast.literal_eval(text)
-        return _plain(value, [_MAX_VALUES])
-    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
-        return str(text)
-
-
-def _plain(value: Any, left: list[int]) -> Any:
-    """
-    :param value: of a file of settings
-    :param left: how many values there may still be, since an alias in YAML stands for many
-    :return: the same of what JSON knows
-    """
-    left[0] -= 1
-    if left[0] < 0:
-        raise BadFile(f"settings hold more than {_MAX_VALUES:,} values")
-    if isinstance(value, dict):
-        return {str(name): _plain(each, left) for name, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(each, left) for each in value]
-    if value is None or isinstance(value, (bool, int, str)) or (isinstance(value, float) and math.isfinite(value)):
-        return value
-    return str(value)
-
-
-class _Settings(yaml.CSafeLoader if hasattr(yaml, "CSafeLoader") else yaml.SafeLoader):  # type: ignore[misc]
-    """Makes plain values only: a class is its name, and nothing is imported or called."""
-
-
-def _named(_: Any, name: str, __: Any) -> str:
-    return name
-
-
-def _tuple(loader: Any, node: Any) -> list[Any]:
-    return loader.construct_sequence(node, deep=True)  # type: ignore[no-any-return]
-
-
-def _ordered(loader: Any, node: Any) -> dict[Any, Any]:
-    (pairs,) = loader.construct_sequence(node, deep=True)
-    return dict(pairs)
-
-
-_PYTHON = "tag:yaml.org,2002:python"
-_Settings.add_multi_constructor(f"{_PYTHON}/name:", _named)
-_Settings.add_constructor(f"{_PYTHON}/tuple", _tuple)
-_Settings.add_constructor(f"{_PYTHON}/object/apply:collections.OrderedDict", _ordered)
-
-
-def _yaml(path: Path) -> dict[str, Any]:
-    data = read_regular(path, _MAX_SETTINGS)
-    try:
-        settings = yaml.load(data, _Settings)  # a safe loader
-    except Exception as error:  # PyYAML's constructors raise whatever they meet
-        raise BadFile(f"{path} is no YAML file of the zoo: {type(error).__name__}: {error}") from error
-    if not isinstance(settings, dict):
-        raise BadFile(f"{path} does not hold settings by name")
-    return _plain(settings, [_MAX_VALUES])  # type: ignore[no-any-return]
-
-
 # ---------------------------------------------------------------- published
 
 
@@ -513,7 +372,7 @@ def _chosen_tasks(tasks: Sequence[str] | None, available: set[tuple[str, str]]) 
         key = published_key(task)
         if key not in available:
             raise ValueError(f"tasks must be of those that were published, not {task!r}")
-        chosen.setdefault(key, []).append(_task(task))
+        chosen.setdefault(key, []).append(plain_id(task))
     return chosen
 
 

@@ -256,9 +256,8 @@ def train_parser() -> argparse.ArgumentParser:
     group.add_argument(
         "--resume",
         action="store_true",
-        help="Go on, with the same arguments as before, with the run in --run-dir, or else with the run of --algo "
-        "and --env below the log folder that has "
-        "the latest checkpoint; an error if there is none",
+        help="Go on, with the same arguments as before, with the run in --run-dir, or else with the run of --algo, "
+        "--env and --seed (if given) below the log folder that has the latest checkpoint; an error if there is none",
     )
     group = parser.add_argument_group("many seeds in one process (our off-policy algorithms)")
     group.add_argument(
@@ -337,25 +336,29 @@ def _check_agent(arguments: Sequence[str]) -> None:
 
 
 def _latest(arguments: Sequence[str]) -> Path:
-    """The folder of the run with the latest checkpoint of the algorithm and environment in a command line."""
+    """The run with the latest checkpoint of a command line's algorithm, environment and, if it has one, seed."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--algo")
     parser.add_argument("--env")
+    parser.add_argument("--seed", type=int, default=-1)
     parser.add_argument("-f", "--log-folder", type=Path, default=Path("logs"))
     asked = parser.parse_known_args(arguments)[0]
     if asked.algo is None or asked.env is None:
         raise RunError("--resume needs --run-dir, or --algo and --env, to know which run to go on with")
+    is_given = asked.seed >= 0  # the zoo draws one else
     found = []
     for file in asked.log_folder.rglob(RECORD):
         made = all_checkpoints(file.parent)
         with contextlib.suppress(RunError):  # some other program's file of that name
             record = Record.read(file.parent)
-            if made and (record.algo, record.env) == (asked.algo, asked.env):
+            of_seed = not is_given or record.seed == asked.seed
+            if made and of_seed and (record.algo, record.env) == (asked.algo, asked.env):
                 found.append((made[-1].stat().st_mtime, file.parent))
     if not found:
         raise RunError(
-            f"--resume: no run of {asked.algo} on {asked.env} below {asked.log_folder} has a checkpoint. Runs have "
-            "checkpoints if they are started with --run-dir or --checkpoint-freq"
+            f"--resume: no run of {asked.algo} on {asked.env}{f' with seed {asked.seed}' if is_given else ''} below "
+            f"{asked.log_folder} has a checkpoint. Runs have checkpoints if they are started with --run-dir or "
+            "--checkpoint-freq"
         )
     return max(found)[1]
 
@@ -433,7 +436,7 @@ def train_seeds(options: argparse.Namespace, arguments: Sequence[str]) -> None:
         start = plan(argparse.Namespace(**{**vars(options), "run_dir": folder}), command)
         own = functools.partial(body, seed, start, command if start is None else start.arguments)
         seats.append(Seat(f"the run of seed {seed}", own, folder))
-    saves = options.run_dir is not None or options.checkpoint_freq is not None
+    saves = options.run_dir is not None or options.checkpoint_freq is not None or options.resume
     with training() as make:
         try:
             train_together(seats, (options.run_dir or Path("logs")) if saves else None)

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from sb3_sample import study
-from sb3_sample.study.analysis_command import COMMANDS, markdown
+from sb3_sample.study.analysis_command import COMMANDS, markdown, steps_of
 from sb3_sample.study.plan import Comparison, Plan
 from sb3_sample.study.plan import Run as Run_
 from sb3_sample.study.runs import StudyFolder
@@ -43,6 +43,23 @@ def test_the_commands_have_a_help_and_no_arguments_in_common_with_it() -> None:
         parser = argparse.ArgumentParser()
         add(parser)
         assert words and "--output" in parser.format_help()
+
+
+@pytest.mark.parametrize(
+    ("text", "steps"),
+    [
+        ("100000", 100_000), ("100_000", 100_000), ("1e5", 100_000), ("0", 0), ("100k", 100_000), ("1.5M", 1_500_000),
+        ("4.1M", 4_100_000), ("2.05M", 2_050_000), ("2.01M", 2_010_000), ("1.001M", 1_001_000), ("2.01k", 2_010),
+    ],
+)  # fmt: skip
+def test_numbers_of_steps(text: str, steps: int) -> None:
+    assert steps_of(text) == steps
+
+
+@pytest.mark.parametrize("text", ["", "k", "x", "-1", "1.5", "1.0005k", "nan", "inf", "1e999999999", "1kk"])
+def test_texts_that_are_no_numbers_of_steps(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match=f"'{text}' is no number of steps, as 100000, 100k or 1M"):
+        steps_of(text)
 
 
 def test_a_table_of_runs(run: Run, tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """The plans of the best agent: equal arithmetic, as their heads say, and candidates that train."""
 
+import dataclasses
+import importlib
 import re
 import sys
 from collections.abc import Callable
@@ -45,13 +47,18 @@ def screening(plan: Plan) -> dict[str, Run]:
 
 
 @pytest.fixture(scope="module")
-def gflop() -> Callable[[str, dict[str, Any]], tuple[float, float]]:
+def agent_flops() -> Any:
+    """The program in ``benchmarks``."""
     sys.path.insert(0, str(ROOT / "benchmarks"))
     try:
-        import agent_flops
+        return importlib.import_module("agent_flops")
     finally:
         sys.path.pop(0)
-    return agent_flops.gflop
+
+
+@pytest.fixture(scope="module")
+def gflop(agent_flops: Any) -> Callable[[str, dict[str, Any]], tuple[float, float]]:
+    return agent_flops.gflop  # type: ignore[no-any-return]
 
 
 def test_there_are_eight_candidates_and_bro(plan: Plan, screening: dict[str, Run]) -> None:
@@ -60,7 +67,19 @@ def test_there_are_eight_candidates_and_bro(plan: Plan, screening: dict[str, Run
     assert {(run.task, run.seed) for run in runs} == {
         (f"dmc/{task}-v0", seed) for task in ("cheetah-run", "walker-run") for seed in (0, 1)
     }
-    assert {run.steps for run in runs} == {50_000} and not any(run.env_kwargs for run in runs)
+    assert {run.steps for run in runs} == {50_000}
+
+
+@pytest.mark.parametrize("name", ["best_agent", "best_agent_final"])
+def test_all_agents_have_action_repeat_1(name: str, agent_flops: Any) -> None:
+    """Also those whose file of hyperparameters has another."""
+    for run in read_plan(EVIDENCE / f"{name}.yml").runs:
+        assert "action_repeat:1" in run.command(Path("run")) and agent_flops.action_repeat(run) == 1
+
+
+def test_action_repeat_of_a_plan_that_does_not_say_it_is_the_zoos(plan: Plan, agent_flops: Any) -> None:
+    repeats = {run.agent: agent_flops.action_repeat(dataclasses.replace(run, env_kwargs={})) for run in plan.runs}
+    assert repeats == {name: 2 if name == "DR.Q narrow" else 1 for name in names("best_agent")}
 
 
 def test_what_goes_into_the_final_is_as_it_was_screened(screening: dict[str, Run]) -> None:

@@ -1,12 +1,15 @@
 """A study whose runs a Ray cluster makes, of which a machine is lost, beside one that nobody disturbs."""
 
+import dataclasses
 import os
+import queue
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -58,6 +61,30 @@ def test_a_machine_that_does_not_see_the_folder_says_so(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="must be one that all machines of the cluster have"):
         cluster.make(str(tmp_path / "elsewhere"), [nothing.plan(1).runs[0].as_json()], [], 1)
     assert not (tmp_path / "elsewhere").exists()
+
+
+def test_data_sets_are_those_of_where_the_command_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process of Ray's has another working directory."""
+    (tmp_path / "data" / "pendulum").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    (run,) = nothing.plan(1).runs
+    orders = []
+
+    class Task:
+        def remote(self, folder: str, runs: list[dict[str, Any]], *_: Any) -> None:
+            orders.append(runs[0]["data"])
+
+    slot = cluster.Slot(Task(), "folder", queue.Queue())
+    monkeypatch.setattr(slot, "_listen", lambda order: None)
+    data = {"dataset": "data/pendulum", "prior_data": "other.hdf5", "offline_steps": 5}
+    for given in (data, {"dataset": "D4RL/pen/human-v2", "prior_data": "~/x.h5"}):
+        slot.give((dataclasses.replace(run, data=given),), [], 1)
+    slot.wait()
+    assert orders == [
+        {"dataset": f"{tmp_path}/data/pendulum", "prior_data": f"{tmp_path}/other.hdf5", "offline_steps": 5},
+        {"dataset": "D4RL/pen/human-v2", "prior_data": "~/x.h5"},
+    ]
+    assert slot.runs[0].data["dataset"] == "D4RL/pen/human-v2"
 
 
 def test_as_many_runs_at_once_as_the_machines_have_room_for(tmp_path: Path, monkeypatch) -> None:

@@ -1,5 +1,7 @@
 """The project's own evidence: which run is next, under which commit, and what is written of it."""
 
+import fcntl
+import importlib.util
 import json
 import os
 import runpy
@@ -9,12 +11,15 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 pytest.importorskip("rl_zoo3")
 
 from sb3_sample import study
+from sb3_sample.study.runs import StudyFolder
+from tests.study.made_up import write_run
 
 ROOT = Path(__file__).parents[2]
 pytestmark = [
@@ -138,6 +143,97 @@ def test_a_run_that_fails_is_tried_twice_and_named(checkout: Path, capfd: pytest
     errors = capfd.readouterr().err
     assert "full" in errors and "failed: small/SAC/Pendulum-v1/0, small/SAC/Pendulum-v1/1" in errors
     assert not results(checkout)
+
+
+@pytest.fixture
+def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The program as a module, with a small plan of one seed in the place of the plans."""
+    spec = importlib.util.spec_from_file_location("evidence", ROOT / "studies" / "evidence.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    plans = tmp_path / "plans"
+    plans.mkdir()
+    (plans / "small.yml").write_text(PLAN)
+    (plans / "QUEUE").write_text("small 2\n")
+    monkeypatch.setattr(module, "PLANS", plans)
+    monkeypatch.setattr(module, "is_at_hand", lambda root, commit: True)
+    (tmp_path / "root").mkdir()
+    return module
+
+
+def make_done(program: Any, root: Path, run: study.Run, commit: str = "abc") -> None:
+    folder = StudyFolder(root / "studies" / "small" / commit)
+    folder.enter(study.Plan("small", (run,)), keep=True)
+    write_run(folder.place(run), run.task, run.algo, run.seed, (200, 400, 600))
+    with folder.claim(run):
+        folder.write_outcome(run, study.Outcome(True, steps=run.steps))
+
+
+def test_results_are_whole_after_a_kill_between_their_files(
+    program: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, results = tmp_path / "root", tmp_path / "results"
+    first, second = program.plan_of("small").runs
+    make_done(program, root, first)
+    program.collect(root, results)
+    table, records = ((results / f"small.{ending}").read_bytes() for ending in ("csv", "json"))
+    make_done(program, root, second)
+
+    def collect_killed(n: int) -> None:
+        """Collect, and be killed when the n-th file would take its place."""
+        replace, left = os.replace, [None] * (n - 1)
+
+        def replace_some(*paths: Any) -> None:
+            if not left:
+                raise KeyboardInterrupt
+            left.pop()
+            replace(*paths)
+
+        with monkeypatch.context() as patch:
+            patch.setattr("sb3_sample.saving.temporary.os.replace", replace_some)
+            with pytest.raises(KeyboardInterrupt):
+                program.collect(root, results)
+
+    # In the midst of the first file: both are as they were.
+    collect_killed(1)
+    assert [(results / f"small.{ending}").read_bytes() for ending in ("csv", "json")] == [table, records]
+    # Between the two: the run comes to the table once.
+    collect_killed(2)
+    assert (results / "small.csv").read_bytes() != table and (results / "small.json").read_bytes() == records
+    program.collect(root, results)
+    assert [record["run"]["seed"] for record in program.recorded(results, "small")] == [0, 1]
+    found = study.read(results / "small.csv", ["return"])
+    evaluations = found[found["metric"] == "return"]
+    assert list(zip(evaluations["seed"], evaluations["step"], strict=True)) == [
+        (seed, step) for seed in (0, 1) for step in (200, 400, 600)
+    ]
+
+
+def test_a_folder_that_a_killed_process_has_begun_is_passed_over(program: Any, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    run, _ = program.plan_of("small").runs
+    make_done(program, root, run)
+    (root / "studies" / "small" / "abd" / "runs").mkdir(parents=True)
+    assert program.found(root, "small", run).commit == "abc"
+
+
+def test_no_two_processes_write_results_at_once(
+    program: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = tmp_path / "root"
+    locked = []
+
+    def is_locked(*_: Any) -> None:
+        with (root / ".lock").open("w") as file, pytest.raises(BlockingIOError):
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        locked.append(True)
+
+    monkeypatch.setattr(program, "collect", is_locked)
+    monkeypatch.setattr(program, "choose", is_locked)
+    monkeypatch.setattr(sys, "argv", ["evidence.py", "next", str(root), str(tmp_path / "results")])
+    program.main()
+    assert locked == [True, True] and capsys.readouterr().out == "null\n"
 
 
 def test_bad_numbers_are_refused(checkout: Path) -> None:

@@ -23,6 +23,7 @@ from sb3_sample.study.reporting import facts as facts_module
 from sb3_sample.study.reporting import figures, pieces, published
 from sb3_sample.study.reporting.content import build
 from sb3_sample.study.reporting.reading import gather
+from sb3_sample.study.reporting.summary import missing
 from sb3_sample.study.runs import Outcome, StudyFolder
 from tests.study.made_up import made_up, write_evaluations, write_monitor, write_run
 from tests.study.test_aggregate import TABLE_9
@@ -228,6 +229,17 @@ def test_runs_under_way_are_in_their_tasks_and_in_no_average(tmp_path: Path) -> 
     assert "late is in no average: no run of it was evaluated around 200 steps." in text
 
 
+def test_agents_that_share_a_task_of_the_second_group_only(tmp_path: Path) -> None:
+    other = "metaworld/reach-v3"
+    rows = [row for agent in ("A", "B") for row in runs(agent, CHEETAH, [600, 700, 800])]
+    for agent, task in (("A", PUSH), ("B", other)):
+        for seed in range(3):
+            rows += [(agent, {}, task, seed, step, "success_rate", 0.5) for step in (100, 200)]
+    page = written(tmp_path / "r.html", made_up(rows), all_tasks=True, groups=["metaworld", "dmc"])
+    averages = tables_of(page)["Averages by group of tasks"]
+    assert len(averages) > 4 and "no two agents have a task of the group metaworld in common" in text_of(page)
+
+
 def test_training_episodes_of_runs_that_end_at_other_steps(tmp_path: Path) -> None:
     for seed, lengths in enumerate([(100, 110, 90), (95, 100, 100), (105, 100, 105)]):
         write_monitor(tmp_path / "mine" / str(seed), CHEETAH, lengths, (1.0, 2.0, 30.0))
@@ -324,6 +336,22 @@ def test_a_real_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert made["processor"] == [" ".join(processor().split()), "2"] and made.get("commit", ["", "2"])[1] == "2"
     assert ["learning_starts", "20"] in tables_of(page)["Arguments"]
     assert len(tables_of(page)["Time in training and evaluating"]) == 2
+
+
+def test_planned_runs_are_known_by_the_plans_names(tmp_path: Path) -> None:
+    """A bracket in an agent's name is part of it."""
+    plan = tmp_path / "plan.yml"
+    agents = "agents: {SAC: {algo: sac_sample}, SAC (no resets): {algo: sac_sample, gamma: 0.9}}\n"
+    rest = "tasks: [Pendulum-v1]\nseeds: 2\nsteps: 200\nevaluation: {every: 100}\n"
+    plan.write_text(agents + rest)
+    found = gather([made_up(runs("SAC (no resets)", "Pendulum-v1", [-900, -800]))], plan=plan)
+    assert missing(found) == {("SAC", "Pendulum-v1"): [0, 1]}
+    plan.write_text("agents: {SAC (ours): {algo: sac_sample}}\ngrid: {gamma: [0.9, 0.99]}\n" + rest)
+    rows = [row for gamma in (0.9, 0.99) for row in runs("SAC (ours)", "Pendulum-v1", [-900, -800], gamma=gamma)]
+    assert missing(gather([made_up(rows)], plan=plan)) == {}
+    # A table that does not say seeds says of no planned run that it is here.
+    seedless = made_up(rows).assign(seed=pd.array([pd.NA] * len(rows), "Int64"))
+    assert len(missing(gather([seedless], plan=plan))) == 2
 
 
 def test_a_table_with_its_plan_and_the_records_beside_it(tmp_path: Path) -> None:

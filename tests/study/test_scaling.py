@@ -5,6 +5,7 @@ import math
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,7 @@ import pytest
 from scipy.optimize import minimize
 
 from sb3_sample.study import scaling
-from sb3_sample.study.scaling.crossings import first_crossing, kept_evaluations
+from sb3_sample.study.scaling.crossings import configurations, first_crossing, kept_evaluations
 from sb3_sample.study.scaling.intervals import interval
 from sb3_sample.study.table import COLUMNS, to_json
 
@@ -346,6 +347,26 @@ def test_crossings_leave_out_what_comes_after_a_reset() -> None:
         assert scaling.crossings(table, [350], **options)["step"].tolist() == [2_000]
 
 
+def test_gradient_steps_between_resets_count_from_the_warm_up_on() -> None:
+    head = {"task": "dmc/walker-run-v0", "seed": 0, "metric": "return", "step": np.arange(1, 11) * 1_000}
+    given = {"replay_ratio": 2, "reset_gradient_steps": 6_000}
+
+    def resets(agent: str, **more: Any) -> tuple[float, ...]:
+        table = pd.DataFrame({"agent": agent, "arguments": to_json(given | more), **head, "value": 1.0})
+        (found,) = configurations(table)
+        return found.resets
+
+    assert resets("a") == (3_000, 6_000, 9_000)
+    assert resets("a", learning_starts=1_000) == (4_000, 7_000, 10_000)
+    # The class's own 2,500.
+    assert resets("bro_fast") == resets("BRO Fast") == (5_500, 8_500)
+    assert resets("dr_q") == () and resets("drq") == (4_000, 7_000, 10_000)
+    assert resets("BRO", learning_starts=0) == (3_000, 6_000, 9_000)
+    # In steps of the simulator.
+    assert resets("a", learning_starts=1_000, env_kwargs={"action_repeat": 2}) == (8_000,)
+    assert resets("a", replay_ratio=7, learning_starts=0)[:2] == pytest.approx([6_000 / 7, 12_000 / 7])
+
+
 def test_the_best_batch_size_is_found() -> None:
     table = runs(TASKS, [1.0, 4.0, 16.0], [32, 64, 128, 256, 512])
     found = scaling.best_hyperparameters(table, 500)
@@ -397,6 +418,14 @@ def test_from_a_table_to_settings(tmp_path: Path) -> None:
     assert any("extrapolated" in limit for limit in found.limits)
     slow, fast = (again.predict(replay_ratio=4.0, task=task).steps.value for task in reversed(TASKS))
     assert slow / fast == pytest.approx(3, rel=0.15)
+    for task in (None, *TASKS):
+        found = again.predict(budget=5e15, task=task)
+        flops = 10 * 5.5e5 * found.batch_size.value * found.replay_ratio.value * found.steps.value
+        assert found.compute.value == pytest.approx(flops)
+        assert flops + again.delta * found.steps.value == pytest.approx(5e15)
+        assert any("replay ratio is that of all tasks" in limit for limit in found.limits) == (task is not None)
+    with pytest.raises(ValueError, match="task must be one of the laws', .*, not 'typo'"):
+        again.predict(budget=5e15, task="typo")
     for asked, words in (
         ({}, "exactly one"), ({"data": 1e5, "compute": 1e15}, "exactly one"), ({"budget": -1.0}, "budget must be"),
         ({"replay_ratio": 100.0}, "warrant 0.25 to 32"), ({"data": 10.0}, "steps must be above"),

@@ -215,6 +215,15 @@ def test_a_plan_is_one_that_study_takes(tmp_path: Path, capsys: pytest.CaptureFi
     cli.main([*command, "--full"])
     assert capsys.readouterr().out.startswith("81 runs")
     path.unlink()
+    # No digit is lost, in values or names.
+    rates = (1.2345678e-4, 1.2345679e-4, 3e-5)
+    command[6:9] = ["0.3333333", "2"]
+    cli.main([*command, "--measure", "1234567", "--batch-sizes", "64", "--learning-rates", *map(repr, rates)])
+    runs = study.read_plan(path).runs
+    assert {run.arguments["learning_rate"] for run in runs} == set(rates)
+    assert {run.grid["replay_ratio"] for run in runs} == {0.3333333, 2} and {run.measure for run in runs} == {1_234_567}
+    assert {run.agent for run in runs} == {"bro B64 lr0.00012345678", "bro B64 lr0.00012345679", "bro B64 lr3e-05"}
+    path.unlink()
     with pytest.raises(SystemExit):
         cli.main([*command, "-params", "model_size:7M"])
     assert "model_size" in capsys.readouterr().err and not path.exists()

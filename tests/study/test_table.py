@@ -3,6 +3,7 @@
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -67,6 +68,24 @@ def test_steps_are_of_the_simulator(tmp_path: Path) -> None:
         episodes = study.read(tmp_path, ["return", "episode_length"])
     assert list(only(episodes, "return")["step"]) == [4_000, 8_000, 12_000]
     assert list(only(episodes, "episode_length")["value"]) == [4_000.0] * 3
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "skip"),
+    [
+        ("sb3_sample.envs.atari.AtariFrames", 4),
+        ({"sb3_sample.envs.atari.AtariFrames": {"frame_skip": 3}}, 3),
+        ("stable_baselines3.common.atari_wrappers.AtariWrapper", 4),
+        ([{"gymnasium.wrappers.AtariPreprocessing": {"frame_skip": 2}}], 2),
+    ],
+)
+def test_atari_counts_frames(tmp_path: Path, wrapper: Any, skip: int) -> None:
+    """As Monitor does, below the wrapper."""
+    folder = write_run(tmp_path / "a", task="ALE/Pong-v5", algo="srspr", arguments={"env_wrapper": wrapper})
+    write_monitor(folder, "ALE/Pong-v5", [1_000 * skip] * 3)
+    table = study.read(tmp_path, ["return", "online_return"])
+    for metric in ("return", "online_return"):
+        assert list(only(table, metric)["step"]) == [1_000 * skip, 2_000 * skip, 3_000 * skip]
 
 
 def test_a_run_of_the_zoo(tmp_path: Path) -> None:

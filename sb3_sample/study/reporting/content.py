@@ -327,7 +327,7 @@ def _improvement(facts: Facts, agents: dict[str, Agent]) -> Section:
         return section
     if facts.improvement is None:
         n = facts.averages["agent"].nunique()
-        why = "there is one agent" if n == 1 else "no two agents have a task in common"
+        why = "there is one agent" if n == 1 else f"no two agents have a task of the group {facts.group} in common"
         section.parts.append(f"Left out: {why} to compare." if n == 1 else f"Left out: {why}.")
         return section
     rows = facts.improvement.to_dict("records")

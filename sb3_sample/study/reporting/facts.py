@@ -139,7 +139,8 @@ def compute(
         facts.profiles = performance_profiles(rows, facts.step, groups=first, **shared)
         facts.all_pairs = len(best) <= ALL_PAIRS
         pairs = itertools.combinations(best, 2) if facts.all_pairs else ((best[0], other) for other in best[1:])
-        tasks_of = {agent: set(found) for agent, found in reaching.groupby("agent")["task"]}
+        of_group = reaching[reaching["task"].isin(facts.groups[facts.group])]
+        tasks_of = {agent: set(found) for agent, found in of_group.groupby("agent")["task"]}
         chosen = [(x, y) for x, y in pairs if tasks_of[x] & tasks_of[y]]
         if chosen:
             facts.improvement = probability_of_improvement(rows, facts.step, first, pairs=chosen, **shared)

@@ -34,6 +34,7 @@ class Gathered:
     :param names: of the sources, as they were given
     :param titles: the same without their folders, or their labels
     :param table: runs, agents with different arguments named apart
+    :param runs: agent (as its source names it), arguments, task and seed of the sources' runs that have a seed
     :param published: the agents of it that others have measured
     :param asked: names by which every seed of a published agent was asked for
     :param curves: of others, of which there are statistics over seeds only, by task and metric
@@ -47,6 +48,7 @@ class Gathered:
     names: list[str]
     titles: list[str]
     table: pd.DataFrame
+    runs: pd.DataFrame
     published: list[str]
     asked: list[str]
     curves: dict[tuple[str, str], list[Curve]]
@@ -85,7 +87,8 @@ def gather(
     given: list[Source] = [sources] if isinstance(sources, (str, Path, pd.DataFrame)) else list(sources)
     if not given and not published:
         raise ValueError("sources must be at least one folder or table, or --published runs")
-    found = Gathered([], [], pd.DataFrame(columns=tables.COLUMNS), [], [], {}, [], {}, [], [], [])
+    none = pd.DataFrame(columns=tables.COLUMNS)
+    found = Gathered([], [], none, none[tables.RUN], [], [], {}, [], {}, [], [], [])
     parts: list[pd.DataFrame] = []
     paths: list[str | Path] = []
     for source in given:
@@ -104,6 +107,8 @@ def gather(
             warnings.simplefilter("always", UserWarning)
             parts.append(tables.read(paths))
         found.notes += [str(warning.message) for warning in told]
+    if parts:
+        found.runs = pd.concat(parts, ignore_index=True)[tables.RUN].dropna(subset="seed").drop_duplicates()
     own = _measured(parts, found)
     theirs = _measured([_published(name, found) for name in published], found)
     if given:

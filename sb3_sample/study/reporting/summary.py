@@ -119,19 +119,15 @@ def missing(gathered: Gathered) -> dict[tuple[str, str], list[int]]:
     :param gathered: runs
     :return: seeds of the given plan's runs that are not among them, by agent (with the grid's arguments) and task
     """
-    own = gathered.table[~gathered.table["agent"].isin(gathered.published)]
-    there = own[RUN].drop_duplicates()
-    # Agents of a table that differ in their arguments have these behind their names.
-    names = [name.partition(" (")[0] for name in there["agent"]]
-    arguments = [json.loads(text) for text in there["arguments"]]
-    known = list(zip(there["agent"], names, arguments, there["task"], there["seed"], strict=True))
+    runs = gathered.runs
+    arguments = [json.loads(text) for text in runs["arguments"]]
+    known = list(zip(runs["agent"], arguments, runs["task"], runs["seed"], strict=True))
     found: dict[tuple[str, str], list[int]] = {}
     for run in gathered.planned:
         if not any(
-            run.agent in (agent, name)
-            and (task, seed) == (run.task, run.seed)
+            (agent, task, seed) == (run.agent, run.task, run.seed)
             and all(given.get(key) == value for key, value in run.grid.items())
-            for agent, name, given, task, seed in known
+            for agent, given, task, seed in known
         ):
             found.setdefault((run.variant, run.task), []).append(run.seed)
     return found

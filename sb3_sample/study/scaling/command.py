@@ -86,6 +86,12 @@ def pairs(batch_sizes: Sequence[int], learning_rates: Sequence[float], full: boo
     return [(each, rate) for each in batch_sizes] + [(batch, each) for each in learning_rates if each != rate]
 
 
+def _written(value: float) -> str:
+    """A number with all its digits, short where it has few."""
+    short = f"{value:g}"
+    return short if float(short) == value else repr(value)
+
+
 def plan_text(options: argparse.Namespace) -> str:
     """
     :param options: of ``sb3-sample scaling plan``
@@ -109,10 +115,10 @@ def plan_text(options: argparse.Namespace) -> str:
     ]
     for batch, rate in pairs(sorted(set(options.batch_sizes)), sorted(set(options.learning_rates)), options.full):
         lines.append(
-            f"  {options.algo} B{batch} lr{rate:g}: "
-            f"{{algo: {options.algo}, batch_size: {batch}, learning_rate: {rate:g}{fixed}}}"
+            f"  {options.algo} B{batch} lr{_written(rate)}: "
+            f"{{algo: {options.algo}, batch_size: {batch}, learning_rate: {_written(rate)}{fixed}}}"
         )
-    ratios = ", ".join(f"{ratio:g}" for ratio in sorted(set(options.replay_ratios)))
+    ratios = ", ".join(_written(ratio) for ratio in sorted(set(options.replay_ratios)))
     lines += [
         "",
         "grid:",
@@ -124,7 +130,7 @@ def plan_text(options: argparse.Namespace) -> str:
         f"evaluation: {{every: {every}, episodes: {options.episodes}}}",
     ]
     if options.measure is not None:
-        lines.append(f"measure: {options.measure:g}")
+        lines.append(f"measure: {_written(options.measure)}")
     if options.gym_packages:
         lines.append(f"gym_packages: [{', '.join(options.gym_packages)}]")
     return "\n".join(lines) + "\n"

@@ -5,12 +5,14 @@ is at least the level ("Value-Based Deep RL Scales Predictably", Rybkin et al. 2
 
 import json
 import math
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from sb3_sample import sac
 from sb3_sample.study.aggregate import Scores, scored
 from sb3_sample.warn import warn
 
@@ -204,7 +206,7 @@ def configurations(
             )
         given = json.loads(arguments)
         repeat = (given.get("env_kwargs") or {}).get("action_repeat", 1)
-        at = () if keep_after_reset else _resets(given, resets, repeat, int(steps[-1]))
+        at = () if keep_after_reset else _resets(agent, given, resets, repeat, int(steps[-1]))
         found.append(Configuration(agent, arguments, task, steps, curves * SCALE, at, repeat))
     return found
 
@@ -226,21 +228,39 @@ def _common(seeds: np.ndarray, steps: np.ndarray, scores: np.ndarray) -> tuple[n
     return common, np.stack(kept)
 
 
-def _resets(arguments: dict[str, Any], given: int | Sequence[int] | None, repeat: int, last: int) -> tuple[float, ...]:
+def _resets(
+    agent: str, arguments: dict[str, Any], given: int | Sequence[int] | None, repeat: int, last: int
+) -> tuple[float, ...]:
     """Simulator steps of the resets of a run, up to its last evaluation."""
     gradient_steps = arguments.get("reset_gradient_steps")
     if given is None and gradient_steps is not None:
         ratio = number(arguments.get("replay_ratio"))
         if ratio is None:
             raise ValueError("runs with reset_gradient_steps must have a replay_ratio, which says when the resets are")
-        given = max(round(gradient_steps / ratio), 1)
-    elif given is None:
+        first, period = _warm_up(agent, arguments), max(gradient_steps / ratio, 1.0)
+        return tuple(float(step) for step in np.arange(first + period, last / repeat + 1e-6, period) * repeat)
+    if given is None:
         given = arguments.get("resets") or ()
     if isinstance(given, (int, float)):
         if given < 1:
             raise ValueError(f"resets must be at least one step apart, not {given!r}")
         return tuple(float(step) for step in np.arange(given * repeat, last + 1, given * repeat))
     return tuple(float(step * repeat) for step in sorted(given) if step * repeat <= last)
+
+
+def _warm_up(agent: str, arguments: dict[str, Any]) -> float:
+    """
+    Transitions before the first gradient step: what a run was given, else the default of the class that is called as
+    the agent is, else none.
+    """
+    given = number(arguments.get("learning_starts"))
+    if given is not None:
+        return given
+    of_name = {name.lower(): each for name, each in vars(sac).items() if isinstance(each, type)}
+    of_name["dr_q"] = sac.DebiasedRQ  # not DrQ, which is "drq"
+    named = of_name.get(agent.lower()) or of_name.get(re.sub(r"[\W_]", "", agent).lower())
+    declared = getattr(named, "constructor_arguments", {})
+    return float(declared["learning_starts"].default) if "learning_starts" in declared else 0.0
 
 
 def number(value: Any) -> float | None:
@@ -281,7 +301,8 @@ def crossings(
         before it count too. They do in the authors' crossings; by default they do not here
     :param resets: environment steps of the resets, or the steps between two; None for what the arguments of the runs
         say (``resets``, ``reset_gradient_steps``), and none where they say nothing: an agent's default (BRO's) is not
-        among the arguments of its runs
+        among the arguments of its runs. ``reset_gradient_steps`` are counted from ``learning_starts`` on: the run's,
+        else the default of the class that is called as the agent is ("bro_fast", "BRO Fast"), else 0
     :return: a row a configuration (agent, arguments, task) and level: ``agent``, ``arguments``, ``task``,
         ``replay_ratio``, ``batch_size``, ``learning_rate``, ``model_size`` as far as a run was given them, ``level``,
         ``step`` (simulator steps, NaN where the level is never reached), ``last_step`` (of the evaluations: a level

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sb3_sample.study.scaling.budget import BudgetLaw, ComputeLaw, fit_budget
+from sb3_sample.study.scaling.budget import FLOPS, BudgetLaw, ComputeLaw, fit_budget
 from sb3_sample.study.scaling.intervals import interval
 from sb3_sample.study.scaling.laws import DataLaw, HyperparameterLaw
 
@@ -353,12 +353,16 @@ class Laws:
             )
 
     def _at_budget(self, budget: float, task: str | None) -> Prediction:
+        if task is not None and task not in self.tasks:
+            raise ValueError(f"task must be one of the laws', {', '.join(self.tasks)}, not {task!r}")
         laws = self.budget_laws()
         ratios = [np.atleast_1d(law.replay_ratio(budget)) for law in laws]
         ratio = float(ratios[0][0])
         self._check_reach(ratio)
         table = self.budgets()
         limits = self._limits(ratio, task)
+        if task is not None:
+            limits.append("the replay ratio is that of all tasks together: a budget's law is not of one task")
         inside = table["budget"].min() <= budget <= table["budget"].max()
         if not inside:
             limits.append(
@@ -366,10 +370,11 @@ class Laws:
                 f"{table['budget'].max():.3g} FLOPs: the level is not known"
             )
         reached = float(table.loc[table["budget"] <= budget, "level"].max()) if inside else None
-        costs = self.compute_laws(self.levels[0].level)
+        sizes = self._values("batch_size", ratios, task)
+        assert self.critic_params is not None and sizes is not None  # else there are no laws of budgets
         steps = [
-            budget / (10 * law.critic_params * law.batch_size * each ** (1 + law.slope) + self.delta)
-            for law, each in zip(costs, ratios, strict=True)
+            budget / (FLOPS * self.critic_params * size * each + self.delta)
+            for size, each in zip(sizes, ratios, strict=True)
         ]
         compute = [budget - self.delta * each for each in steps]
         batch, rate = (self._hyperparameter(name, ratios, task) for name in ("batch_size", "learning_rate"))
@@ -397,11 +402,18 @@ class Laws:
         )  # fmt: skip
 
     def _hyperparameter(self, name: str, ratios: list[np.ndarray], task: str | None) -> Estimate | None:
+        values = self._values(name, ratios, task)
+        if values is None or name in self.hyperparameters:
+            return None if values is None else self.interval(values)
+        return Estimate(float(values[0][0]))
+
+    def _values(self, name: str, ratios: list[np.ndarray], task: str | None) -> list[np.ndarray] | None:
+        """Batch sizes or learning rates at replay ratios; None where they are not known."""
         if name in self.hyperparameters:
             law = self.hyperparameters[name]
-            return self.interval(law.at(ratios, task if task in law.tasks else None))
+            return law.at(ratios, task if task in law.tasks else None)
         fixed = self.batch_size if name == "batch_size" else self.learning_rate
-        return None if fixed is None else Estimate(fixed)
+        return None if fixed is None else [np.full(each.shape, fixed) for each in ratios]
 
     def _limits(self, ratio: float, task: str | None) -> list[str]:
         limits = []
