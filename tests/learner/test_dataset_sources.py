@@ -12,7 +12,7 @@ from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_sample import Dataset, record
+from sb3_sample import SAC, Dataset, record
 from tests.sac.common import Toy, sac, vec
 
 BOX = spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 6.0], np.float32))
@@ -245,6 +245,21 @@ def test_record_takes_original_observations_of_a_normalized_environment() -> Non
     np.testing.assert_array_equal(venv.obs_rms.mean, before)
     expected = np.clip(venv.normalize_obs(rows["observations"])[:, :2] / 10, -1, 1)
     np.testing.assert_allclose(rows["actions"], expected, rtol=1e-6)
+
+
+def test_record_refuses_original_observations_for_a_model_of_normalized_ones(tmp_path: Path) -> None:
+    venv = VecNormalize(vec())
+    model = sac(venv).learn(30)
+    assert len(record(model, venv, 1)) == 7
+    with pytest.raises(ValueError, match="env must be in a VecNormalize with the statistics"):
+        record(model, vec(), 1)
+    model.save(tmp_path / "model")
+    with pytest.raises(ValueError, match="env must be in a VecNormalize with the statistics"):
+        record(SAC.load(tmp_path / "model"), vec(), 1)
+    with pytest.warns(UserWarning, match="env must be in a VecNormalize with the statistics"):
+        record(SAC.load(tmp_path / "model", env=vec()), vec(), 1)
+    of_rewards = VecNormalize(vec(), norm_obs=False)
+    record(sac(of_rewards).learn(30), vec(), 1)
 
 
 def test_record_by_id_with_a_seed() -> None:
