@@ -188,6 +188,7 @@ class MultiTaskEvalCallback(EvalCallback):
         super()._init_callback()
 
     def _on_training_start(self) -> None:
+        super()._on_training_start()
         if self.at_start and self.num_timesteps == 0 and not self.evaluations_timesteps:
             self._evaluate()
 

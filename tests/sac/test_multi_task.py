@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -365,6 +365,24 @@ def test_callback_logs_and_writes_what_a_study_reads(tmp_path: Path, capsys: pyt
     assert evaluated[-1]["eval/mean_reward"] == pytest.approx(callback.last_mean_reward)
     assert (tmp_path / "best" / "best_model.zip").exists()
     assert f"{PENDULUM}: return " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("at_start", [True, False])
+def test_the_callback_after_an_evaluation_is_started(at_start: bool) -> None:
+    class After(BaseCallback):
+        def _on_training_start(self) -> None:
+            self.calls = [0]
+
+        def _on_step(self) -> bool:
+            self.calls.append(self.num_timesteps)
+            return True
+
+    after = After()
+    evaluation = MultiTaskEvalCallback(
+        tasks(seed=9), callback_after_eval=after, eval_freq=10, n_eval_episodes=1, verbose=0, at_start=at_start
+    )
+    make("SAC").learn(40, callback=evaluation)
+    assert after.calls == [0, *([0] if at_start else []), 20, 40]
 
 
 def test_runs_without_a_seed_are_numbered(tmp_path: Path) -> None:
