@@ -289,6 +289,31 @@ def test_goes_on_bit_by_bit(name: str, tmp_path: Path) -> None:
     assert first.equals(second) and set(first["task"]) == {PENDULUM, CAR}
 
 
+def test_an_evaluation_before_the_first_step_outlives_a_kill(tmp_path: Path) -> None:
+    """The run is cut off before the first evaluation that follows."""
+
+    class Counting(BaseCallback):
+        def _on_step(self) -> bool:
+            return True
+
+    def run(stop: int = 10**9) -> Any:
+        model = make("SAC", tasks(seed=3))
+        evaluation = MultiTaskEvalCallback(
+            tasks(seed=9), Counting(), Counting(), eval_freq=20, n_eval_episodes=1, verbose=0, log_path=tmp_path
+        )
+        stopping = ConvertCallback(lambda *_: model.num_timesteps < stop)
+        model.learn(48, callback=[evaluation, stopping], checkpoint=tmp_path, checkpoint_freq=8)
+        return evaluation
+
+    first = run(stop=20)
+    assert first.evaluations_timesteps == [0]
+    again = run()
+    assert again.evaluations_timesteps == [0, 20] and again.evaluations_results[0] == first.evaluations_results[0]
+    assert again.best_mean_reward >= first.best_mean_reward
+    assert again.callback.n_calls == 2 and again.callback_on_new_best.n_calls >= 1
+    assert study.read(tmp_path)["step"].tolist() == [0, 20] * 2
+
+
 def test_exported(tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     runtime = pytest.importorskip("onnxruntime")
