@@ -74,8 +74,12 @@ def record(
                 counts[i], under_way[i] = counts[i] + 1, []
         observations = following
     steps = [step for episode in done for step in episode]
+    arrays = {name: _stacked([step[name] for step in steps]) for name in steps[0]}
+    for name in ("observations", "next_observations"):
+        # The number of a Discrete space is a row of one.
+        arrays[name] = for_each(lambda part: part[:, None] if part.ndim == 1 else part, arrays[name])
     return Dataset.from_arrays(
-        **{name: _stacked([step[name] for step in steps]) for name in steps[0]},
+        **arrays,
         observation_space=venv.observation_space,
         action_space=venv.action_space,  # type: ignore[arg-type]
     )
@@ -112,6 +116,4 @@ def _below(venv: VecEnv, normalize: VecNormalize | None) -> VecEnv:
 def _stacked(values: list[Any]) -> Any:
     if isinstance(values[0], dict):
         return {key: _stacked([value[key] for value in values]) for key in values[0]}
-    array = np.stack([np.asarray(value) for value in values])
-    # The number of a Discrete space is a row of one, terminal observations included.
-    return array
+    return np.stack([np.asarray(value) for value in values])
