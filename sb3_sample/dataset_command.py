@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.env_util import make_vec_env
 
 import sb3_sample
 from sb3_sample.exits import refuse
@@ -20,6 +21,7 @@ from sb3_sample.replay.recording import record
 from sb3_sample.saving.classes import path_of
 from sb3_sample.saving.container import PickledFile
 from sb3_sample.saving.model import class_of
+from sb3_sample.saving.normalization import load_vec_normalize
 
 _SOURCE = "a folder or an id of Minari's, or an HDF5 file in D4RL's layout (.hdf5, .h5)"
 
@@ -34,6 +36,7 @@ def parser() -> argparse.ArgumentParser:
     recorded.add_argument("model", type=Path, help="file of a model of this package")
     recorded.add_argument("output", help="new folder of Minari's format, or an id")
     recorded.add_argument("--env", required=True, help="id of the environment")
+    recorded.add_argument("--vecnormalize", type=Path, metavar="FILE", help="saved VecNormalize of the model")
     recorded.add_argument("--episodes", type=int, default=100, help="number of episodes (100)")
     recorded.add_argument("--stochastic", action="store_true", help="sample the actions")
     recorded.add_argument("--seed", type=int, default=0, help="of the environment, and of sampled actions (0)")
@@ -87,7 +90,8 @@ def _recorded(args: argparse.Namespace) -> Dataset:
         raise ValueError(f"model {args.model} is of {name}, none of this package's algorithms")
     model = cls.load(args.model, device="cpu")
     model.set_random_seed(args.seed)
-    return record(model, args.env, args.episodes, deterministic=not args.stochastic, seed=args.seed)
+    env = args.env if args.vecnormalize is None else load_vec_normalize(args.vecnormalize, make_vec_env(args.env))
+    return record(model, env, args.episodes, deterministic=not args.stochastic, seed=args.seed)
 
 
 def _read(args: argparse.Namespace) -> Dataset:

@@ -5,9 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_sample import Dataset
 from sb3_sample.cli import main
+from sb3_sample.saving import save_vec_normalize
 from tests.sac.common import MAKERS, sac
 
 pytest.importorskip("minari", reason="needs the extra [offline]")
@@ -36,6 +39,25 @@ def test_models_of_all_algorithms_are_recorded(tmp_path: Path, capsys: pytest.Ca
         main(["dataset", "record", str(tmp_path / f"{maker}.zip"), str(tmp_path / f"{maker}-data"), "--env",
               "Pendulum-v1", "--episodes", "1"])  # fmt: skip
         assert "200 transitions of 1 episodes written to" in capsys.readouterr().out
+
+
+def test_a_model_of_normalized_observations_needs_their_statistics(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    venv = VecNormalize(make_vec_env("Pendulum-v1"))
+    model = sac(venv).learn(30)
+    model.save(tmp_path / "model")
+    save_vec_normalize(venv, tmp_path / "statistics")
+    arguments = ["dataset", "record", str(tmp_path / "model.zip"), str(tmp_path / "set"), "--env", "Pendulum-v1",
+                 "--episodes", "1"]  # fmt: skip
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == 2 and not (tmp_path / "set").exists()
+    assert "env must be in a VecNormalize with the statistics" in capsys.readouterr().err
+    main([*arguments, "--vecnormalize", str(tmp_path / "statistics")])
+    rows = Dataset.from_minari(tmp_path / "set").rows(slice(None))
+    seen = venv.normalize_obs(rows["observations"])
+    np.testing.assert_allclose(rows["actions"], model.predict(seen, deterministic=True)[0], atol=1e-5)
 
 
 def test_convert(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 from sb3_sample.kinds import check_value, integer
 from sb3_sample.learner.batch import for_each
 from sb3_sample.replay.dataset import Dataset
+from sb3_sample.saving.normalization import lacks_vec_normalize
+from sb3_sample.warn import warn
 
 
 def record(
@@ -27,7 +29,8 @@ def record(
     :param deterministic: whether the policy's mean action is taken instead of a sample
     :param seed: of the environment; None: as it is
     :return: the data set
-    :raises ValueError: if ``episodes`` is no number above 0, or the model is of other spaces than the environment's
+    :raises ValueError: if ``episodes`` is no number above 0, or the model is of other spaces than the environment's, or
+        learned from observations that a ``VecNormalize`` normalised, and ``env`` is in none
     """
     check_value("episodes", episodes, integer(1))
     made: Any = make_vec_env(env) if isinstance(env, str) else env
@@ -37,6 +40,8 @@ def record(
         if of_model is not None and of_model != theirs:
             raise ValueError(f"env: its {name} is {theirs}, and the model's is {of_model}")
     normalize = unwrap_vec_normalize(venv)
+    if normalize is None and isinstance(model, BaseAlgorithm):
+        _check_not_normalized(model)
     venv = _below(venv, normalize)
     if seed is not None:
         venv.seed(seed)
@@ -69,11 +74,34 @@ def record(
                 counts[i], under_way[i] = counts[i] + 1, []
         observations = following
     steps = [step for episode in done for step in episode]
+    arrays = {name: _stacked([step[name] for step in steps]) for name in steps[0]}
+    for name in ("observations", "next_observations"):
+        # The number of a Discrete space is a row of one.
+        arrays[name] = for_each(lambda part: part[:, None] if part.ndim == 1 else part, arrays[name])
     return Dataset.from_arrays(
-        **{name: _stacked([step[name] for step in steps]) for name in steps[0]},
+        **arrays,
         observation_space=venv.observation_space,
         action_space=venv.action_space,  # type: ignore[arg-type]
     )
+
+
+def _check_not_normalized(model: BaseAlgorithm) -> None:
+    """
+    :raises ValueError: it knows normalised observations, and would get the environment's own
+    """
+    own = model.get_vec_normalize_env()
+    if not (lacks_vec_normalize(model) if own is None else own.norm_obs):
+        return
+    message = (
+        "env must be in a VecNormalize with the statistics that the model has learned with, such as "
+        "load_vec_normalize(file, venv), on the command line --vecnormalize: without them its policy sees other "
+        "numbers than it knows"
+    )
+    if own is None and model.env is not None:
+        # It may have been trained on in an environment without one.
+        warn(message)
+    else:
+        raise ValueError(message)
 
 
 def _below(venv: VecEnv, normalize: VecNormalize | None) -> VecEnv:
@@ -88,6 +116,4 @@ def _below(venv: VecEnv, normalize: VecNormalize | None) -> VecEnv:
 def _stacked(values: list[Any]) -> Any:
     if isinstance(values[0], dict):
         return {key: _stacked([value[key] for value in values]) for key in values[0]}
-    array = np.stack([np.asarray(value) for value in values])
-    # The number of a Discrete space is a row of one, terminal observations included.
-    return array
+    return np.stack([np.asarray(value) for value in values])

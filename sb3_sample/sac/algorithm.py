@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, ProgressBarCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -576,9 +576,11 @@ class SAC(  # type: ignore[misc]  # actor
         self._num_timesteps_at_start = self.num_timesteps
         if not self._custom_logger:
             self._logger = configure_logger(self.verbose, self.tensorboard_log, name, reset_num_timesteps)
-        bar = [GradientStepBar()] if progress_bar else []
-        callbacks = callback if isinstance(callback, list) else [] if callback is None else [callback]
-        return self._total_timesteps, self._init_callback([*callbacks, *bar] if bar else callback)
+        if progress_bar:
+            # Beside one callback, as Stable-Baselines3 puts its own: checkpoints know the callback with and without it.
+            one = CallbackList(callback) if isinstance(callback, list) else callback
+            callback = [one if isinstance(one, BaseCallback) else ConvertCallback(one), GradientStepBar()]
+        return self._total_timesteps, self._init_callback(callback)
 
     def _described(self) -> Lenient:
         encoder = super()._described()

@@ -1,15 +1,16 @@
 """
 The state of callbacks: of those that give one (``state_dict`` and ``load_state_dict``), and of all others what of their
-attributes has changed since the training began, so that what was never changed stays as the present program says.
+attributes has changed in a training, so that what was never changed stays as the present program says.
 """
 
 import inspect
-from collections.abc import Iterator, Set
+from collections.abc import Iterator, MutableMapping, Set
 from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, ProgressBarCallback
 from stable_baselines3.common.vec_env import VecEnv
+from torch.utils.weak import WeakIdKeyDictionary
 
 from sb3_sample.envs.portable_states import pack, unpack
 from sb3_sample.saving import vec_envs
@@ -28,6 +29,9 @@ from sb3_sample.warn import warn
 
 #: What every callback has and that is not its own.
 _NOT_OWN = ("model", "parent", "locals", "globals", "verbose")
+#: Names of the attributes that this process's trainings have changed. The checkpoints of a second training of the same
+#: callback hold what only the first one has changed too.
+_CHANGED: MutableMapping[BaseCallback, set[str]] = WeakIdKeyDictionary()
 
 
 def without_progress_bar(callback: BaseCallback) -> BaseCallback:
@@ -88,7 +92,7 @@ class CallbackStates:
         self._callbacks = dict(walk(without_progress_bar(callback)))
         self._before = {path: self._attributes(each)[0] for path, each in self._callbacks.items()}
         # What an earlier part of the run has changed belongs to the state as well.
-        self._changed: dict[str, set[str]] = {path: set() for path in self._callbacks}
+        self._changed = {path: _CHANGED.setdefault(each, set()) for path, each in self._callbacks.items()}
 
     def _attributes(self, callback: BaseCallback) -> tuple[dict[str, Node], list[str]]:
         return Describer().attributes(callback, _skipped(callback))
@@ -111,11 +115,20 @@ class CallbackStates:
         """
         return {path: self._save(path, callback) for path, callback in self._callbacks.items()}
 
-    def _save(self, path: str, callback: BaseCallback) -> dict[str, Any]:
-        now, before = self._attributes(callback)[0], self._before[path]
+    def note_changes(self) -> None:
+        """Have what has changed since these states were made belong to the state in every training."""
+        for path, callback in self._callbacks.items():
+            self._note(path, self._attributes(callback)[0])
+
+    def _note(self, path: str, now: dict[str, Node]) -> None:
+        before = self._before[path]
         self._changed[path] |= {
             name for name, node in now.items() if name not in before or not same(node, before[name])
         }
+
+    def _save(self, path: str, callback: BaseCallback) -> dict[str, Any]:
+        now = self._attributes(callback)[0]
+        self._note(path, now)
         return {
             "class": class_name(callback),
             "attributes": with_what_they_refer_to(self._changed[path], now),

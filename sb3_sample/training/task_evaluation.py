@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 from sb3_sample.console import say
 from sb3_sample.kinds import TRUE_OR_FALSE, check_value, integer
 from sb3_sample.run_logs import EVALUATIONS
+from sb3_sample.saving.callbacks import CallbackStates
 
 
 class TaskEvaluation(NamedTuple):
@@ -188,8 +189,12 @@ class MultiTaskEvalCallback(EvalCallback):
         super()._init_callback()
 
     def _on_training_start(self) -> None:
+        super()._on_training_start()
         if self.at_start and self.num_timesteps == 0 and not self.evaluations_timesteps:
+            states = CallbackStates(self)
             self._evaluate()
+            # A run that goes on does not evaluate here again, and needs the results of its checkpoint.
+            states.note_changes()
 
     def _on_step(self) -> bool:
         return self._evaluate() if self.n_calls % self.eval_freq == 0 else True

@@ -424,20 +424,18 @@ def _model(args: argparse.Namespace, make: Callable[[], gym.Env], train_steps: i
             wanted = args.algo or f"one of {', '.join(ALGORITHMS)}"
             raise ValueError(f"model {args.model} holds a model of {name}, but algo is {wanted}")
         cls = ALGORITHMS[algo]
-    if issubclass(cls, SafeFiles):
-        model = cls.load(args.model, device="cpu", allow_pickle=args.allow_pickle)
-    elif args.allow_pickle:
-        model = cls.load(args.model, device="cpu")
-    else:
+    is_safe = issubclass(cls, SafeFiles)
+    if not is_safe and not args.allow_pickle:
         raise ValueError(
             f"model {args.model} is pickled, as those of {cls.__name__} are, and may run any code: pass --allow-pickle "
             "if you trust its author"
         )
+    venv = None
     if args.vecnormalize is not None:
         venv = load_vec_normalize(args.vecnormalize, DummyVecEnv([make]), allow_pickle=args.allow_pickle)
         venv.training = False
-        model.set_env(venv)
-    return model
+    # The model may have learned in another number of environments, which set_env would refuse.
+    return cls.load(args.model, env=venv, device="cpu", **({"allow_pickle": args.allow_pickle} if is_safe else {}))
 
 
 def _keyword_arguments(given: list[str]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_sample import Dataset, record
+from sb3_sample import SAC, Dataset, multi_task_env, record
 from tests.sac.common import Toy, sac, vec
 
 BOX = spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 6.0], np.float32))
@@ -245,6 +245,57 @@ def test_record_takes_original_observations_of_a_normalized_environment() -> Non
     np.testing.assert_array_equal(venv.obs_rms.mean, before)
     expected = np.clip(venv.normalize_obs(rows["observations"])[:, :2] / 10, -1, 1)
     np.testing.assert_allclose(rows["actions"], expected, rtol=1e-6)
+
+
+class Numbered(gym.Env):
+    """Observations that are the number of the step."""
+
+    observation_space, action_space = spaces.Discrete(9), spaces.Box(-1, 1, (2,))
+
+    def reset(self, **kwargs: Any) -> tuple[int, dict]:
+        super().reset(**kwargs)
+        self.at = 0
+        return self.at, {}
+
+    def step(self, action: Any) -> tuple[int, float, bool, bool, dict]:
+        self.at += 1
+        return self.at, 1.0, self.at == 3, False, {}
+
+
+def test_record_numbers_as_observations() -> None:
+    model = sac(Numbered())
+    data = record(model, Numbered(), 2)
+    rows = data.rows(slice(None))
+    assert data.observation_space == Numbered.observation_space
+    assert rows["observations"].ravel().tolist() == [0, 1, 2] * 2
+    assert rows["next_observations"].ravel().tolist() == [1, 2, 3] * 2
+    assert rows["rewards"].shape == rows["terminations"].shape == (6,)
+    assert sac(Numbered()).learn_offline(data, 2).num_timesteps == 2
+
+
+def test_record_several_tasks() -> None:
+    env = multi_task_env(("Pendulum-v1", "MountainCarContinuous-v0"), seed=0, env_kwargs={"max_episode_steps": 5})
+    model = sac(env, policy="MultiInputPolicy")
+    data = record(model, env, 4)
+    rows = data.rows(slice(None))
+    assert sorted(rows["observations"]["task"].ravel().tolist()) == [0] * 10 + [1] * 10
+    np.testing.assert_array_equal(rows["next_observations"]["task"], rows["observations"]["task"])
+    assert model.learn_offline(data, 2).num_timesteps == 2
+
+
+def test_record_refuses_original_observations_for_a_model_of_normalized_ones(tmp_path: Path) -> None:
+    venv = VecNormalize(vec())
+    model = sac(venv).learn(30)
+    assert len(record(model, venv, 1)) == 7
+    with pytest.raises(ValueError, match="env must be in a VecNormalize with the statistics"):
+        record(model, vec(), 1)
+    model.save(tmp_path / "model")
+    with pytest.raises(ValueError, match="env must be in a VecNormalize with the statistics"):
+        record(SAC.load(tmp_path / "model"), vec(), 1)
+    with pytest.warns(UserWarning, match="env must be in a VecNormalize with the statistics"):
+        record(SAC.load(tmp_path / "model", env=vec()), vec(), 1)
+    of_rewards = VecNormalize(vec(), norm_obs=False)
+    record(sac(of_rewards).learn(30), vec(), 1)
 
 
 def test_record_by_id_with_a_seed() -> None:

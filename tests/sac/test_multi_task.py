@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -289,6 +289,31 @@ def test_goes_on_bit_by_bit(name: str, tmp_path: Path) -> None:
     assert first.equals(second) and set(first["task"]) == {PENDULUM, CAR}
 
 
+def test_an_evaluation_before_the_first_step_outlives_a_kill(tmp_path: Path) -> None:
+    """The run is cut off before the first evaluation that follows."""
+
+    class Counting(BaseCallback):
+        def _on_step(self) -> bool:
+            return True
+
+    def run(stop: int = 10**9) -> Any:
+        model = make("SAC", tasks(seed=3))
+        evaluation = MultiTaskEvalCallback(
+            tasks(seed=9), Counting(), Counting(), eval_freq=20, n_eval_episodes=1, verbose=0, log_path=tmp_path
+        )
+        stopping = ConvertCallback(lambda *_: model.num_timesteps < stop)
+        model.learn(48, callback=[evaluation, stopping], checkpoint=tmp_path, checkpoint_freq=8)
+        return evaluation
+
+    first = run(stop=20)
+    assert first.evaluations_timesteps == [0]
+    again = run()
+    assert again.evaluations_timesteps == [0, 20] and again.evaluations_results[0] == first.evaluations_results[0]
+    assert again.best_mean_reward >= first.best_mean_reward
+    assert again.callback.n_calls == 2 and again.callback_on_new_best.n_calls >= 1
+    assert study.read(tmp_path)["step"].tolist() == [0, 20] * 2
+
+
 def test_exported(tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     runtime = pytest.importorskip("onnxruntime")
@@ -365,6 +390,24 @@ def test_callback_logs_and_writes_what_a_study_reads(tmp_path: Path, capsys: pyt
     assert evaluated[-1]["eval/mean_reward"] == pytest.approx(callback.last_mean_reward)
     assert (tmp_path / "best" / "best_model.zip").exists()
     assert f"{PENDULUM}: return " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("at_start", [True, False])
+def test_the_callback_after_an_evaluation_is_started(at_start: bool) -> None:
+    class After(BaseCallback):
+        def _on_training_start(self) -> None:
+            self.calls = [0]
+
+        def _on_step(self) -> bool:
+            self.calls.append(self.num_timesteps)
+            return True
+
+    after = After()
+    evaluation = MultiTaskEvalCallback(
+        tasks(seed=9), callback_after_eval=after, eval_freq=10, n_eval_episodes=1, verbose=0, at_start=at_start
+    )
+    make("SAC").learn(40, callback=evaluation)
+    assert after.calls == [0, *([0] if at_start else []), 20, 40]
 
 
 def test_runs_without_a_seed_are_numbered(tmp_path: Path) -> None:

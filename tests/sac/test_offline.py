@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_sample import BC, BRO, IQL, SAC, TD3BC, VPLSAC, Dataset, PrioritizedReplayBuffer, SimBa
@@ -376,6 +376,42 @@ def test_evaluation_and_log_without_an_environment(tmp_path: Path) -> None:
 def test_a_callback_ends_the_training() -> None:
     model = offline(SAC, vec()).learn_offline(data(), 10, callback=lambda local, all: local["self"].num_timesteps < 4)
     assert model.num_timesteps == 4
+
+
+@pytest.mark.parametrize("several", [True, False])
+def test_a_progress_bar_stands_beside_the_callback(
+    several: bool, tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    for bar, steps in ((True, 4), (False, 8), (True, 12)):
+        counting = Counting()
+        callback: Any = [counting] if several else counting
+        offline(SAC, vec()).learn_offline(data(), steps, callback, progress_bar=bar, checkpoint=tmp_path)
+        assert counting.n_calls == steps and counting.n_initialised == 1
+    assert not [each for each in recwarn if "callback" in str(each.message)]
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_function_is_called_beside_the_progress_bar(listed: bool) -> None:
+    steps = []
+
+    def note(names: dict[str, Any], _: Any) -> bool:
+        steps.append(names["self"].num_timesteps)
+        return True
+
+    callback: Any = [ConvertCallback(note)] if listed else note
+    offline(SAC, vec()).learn_offline(data(), 3, callback, progress_bar=True)
+    assert steps == [1, 2, 3]
+    offline(SAC, vec()).learn_offline(data(), 3, progress_bar=True)
+
+
+class Counting(BaseCallback):
+    n_initialised = 0
+
+    def _init_callback(self) -> None:
+        self.n_initialised += 1
+
+    def _on_step(self) -> bool:
+        return True
 
 
 @pytest.mark.parametrize("maker", SCALING)

@@ -113,6 +113,19 @@ def test_a_saved_model(normalized: bool, safe: bool, tmp_path: Path, capsys: pyt
             run(*arguments)
 
 
+@pytest.mark.parametrize("cls", [MBMAPPO, PPO])
+def test_statistics_of_a_model_that_learned_in_several_environments(
+    cls: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    venv = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")] * 4))
+    kwargs = {"n_steps": 32, "batch_size": 128, "device": "cpu", "policy_kwargs": {"net_arch": [8]}}
+    cls("MlpPolicy", venv, **kwargs).learn(256).save(tmp_path / "model.zip")
+    save_vec_normalize(venv, tmp_path / "statistics")
+    run("--model", str(tmp_path / "model.zip"), "--vecnormalize", str(tmp_path / "statistics"), "--allow-pickle",
+        "-o", str(tmp_path / "picture.png"))  # fmt: skip
+    assert "gradient of 42 parameters" in capsys.readouterr().out
+
+
 def test_what_is_trained_and_what_a_file_is_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = ["-o", str(tmp_path / "picture.png")]
     run("--algo", "a2c", "--train-steps", "10", *picture)
