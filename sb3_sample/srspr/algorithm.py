@@ -223,18 +223,8 @@ class SRSPR(  # type: ignore[misc]
         :return: actions, and ``state``
         :raises ValueError: if the observation is not one of the observation space
         """
-        self._silence()
         actions, state = self.policy.predict(observation, state, episode_start, deterministic=True)
         return (actions if deterministic else self._with_random(actions, self.evaluation_eps)), state
-
-    def _silence(self) -> None:
-        for layer in self._noisy_layers():
-            layer.silence()
-
-    def _noisy_layers(self) -> list[Any]:
-        """Those of the network that acts."""
-        policy: Any = self.policy
-        return list(policy.q_net_target.noisy_layers())
 
     def _with_random(self, actions: np.ndarray, rate: float) -> np.ndarray:
         """Put random actions in the place of some."""
@@ -249,10 +239,12 @@ class SRSPR(  # type: ignore[misc]
     ) -> tuple[np.ndarray, np.ndarray]:
         rate = self.exploration_rate
         if rate < 1:
-            for layer in self._noisy_layers():
+            policy: Any = self.policy
+            for layer in policy.q_net_target.noisy_layers():
                 layer.draw()
-            assert self._last_obs is not None
-            actions = self.policy.predict(self._last_obs, deterministic=True)[0]  # type: ignore[arg-type]
+            # Not by the policy's predict, which computes without noise.
+            with torch.no_grad():
+                actions = policy(policy.obs_to_tensor(self._last_obs)[0]).cpu().numpy()
         else:
             actions = np.zeros(n_envs, np.int64)
         actions = self._with_random(actions, rate)

@@ -87,6 +87,16 @@ class SPRPolicy(BasePolicy):
         assert shape is not None and isinstance(self.action_space, spaces.Discrete)
         return SPRNetwork(shape, int(self.action_space.n), **self._of_network)
 
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        :param mode: whether to train; else noisy layers of the network that acts compute by their means, until noise is
+            drawn again
+        """
+        super().set_training_mode(mode)
+        if not mode:
+            for layer in self.q_net_target.noisy_layers():
+                layer.silence()
+
     def q_values(self, observations: torch.Tensor) -> torch.Tensor:
         """
         Compute the values of all actions by the target network.

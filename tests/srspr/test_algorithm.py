@@ -147,6 +147,41 @@ def test_noisy_layers_are_silent_in_evaluation() -> None:
     assert len(set(map(int, first))) == 1 and all((layer.noise_in == 0).all() for layer in layers)
 
 
+def test_the_policy_alone_is_silent_and_training_is_not() -> None:
+    model = noisy()
+    observations = np.stack([Frames().reset(seed=seed)[0] for seed in range(40)])
+    expected = model.predict(observations, deterministic=True)[0]
+    model._last_obs = observations
+    explored = set()
+    for _ in range(10):
+        explored.add(tuple(model._sample_action(0)[0]))
+        assert np.array_equal(model.policy.predict(observations)[0], expected)
+    assert len(explored) > 3
+
+
+def test_noisy_layers_are_silent_in_exported_files(tmp_path: Path) -> None:
+    pytest.importorskip("onnxscript")
+    model = noisy()
+    observations = np.stack([Frames().reset(seed=seed)[0] for seed in range(40)])
+    expected = model.predict(observations, deterministic=True)[0]
+    model._last_obs = observations
+    # Until the noise shows.
+    while np.array_equal(model._sample_action(0)[0], expected):
+        pass
+    _, script = model.export(tmp_path / "policy")
+    assert np.array_equal(torch.jit.load(script)(torch.as_tensor(observations)).numpy(), expected)
+
+
+def noisy() -> SRSPR:
+    """A model without random actions, whose noise is loud."""
+    model = tiny(noisy=True, exploration_initial_eps=0.0, exploration_final_eps=0.0).learn(40)
+    with torch.no_grad():
+        for layer in model.policy.q_net_target.noisy_layers():
+            layer.weight_scale.fill_(2.0)
+            layer.bias_scale.fill_(2.0)
+    return model
+
+
 # ---------------------------------------------------------------- ways to run, files
 
 
