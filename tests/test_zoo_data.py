@@ -109,6 +109,16 @@ def test_a_fine_tuned_run_goes_on_wherever_it_was_interrupted(run: Run) -> None:
         check_equal(whole, outcome(name, "iql"))
 
 
+def test_evaluations_of_the_offline_phase_outlive_a_kill_before_the_next(run: Run) -> None:
+    arguments = (*FINE_TUNED, "-n", "110", "--eval-freq", "40", "--run-dir")
+    run(*arguments, "whole")
+    run(*FINE_TUNED, "-n", "70", "--eval-freq", "40", "--run-dir", "cut")
+    assert steps("cut") == [60, 70] and list(outcome("cut", "iql")["timesteps"]) == [40]
+    run(*arguments, "cut")
+    whole, again = outcome("whole", "iql"), outcome("cut", "iql")
+    assert list(again["timesteps"]) == list(whole["timesteps"]) == [40, 80]
+
+
 def test_prior_data_of_a_run_in_its_environment(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     online = ("--algo", "sac_sample", "-n", "60", "--run-dir", "run", "--checkpoint-freq", "30")
     cli.main([*COMMAND, *online, "--prior-data", "a.hdf5", *SMALL, "prior_share:0.25"])
