@@ -67,6 +67,7 @@ def _mypy(program: str, folder: Path) -> list[str]:
     return out.splitlines()
 
 
+@pytest.mark.slow
 def test_a_type_checker_sees_the_constructor_that_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Names, order, what is by name only and what has a default, without running anything."""
     monkeypatch.chdir(ROOT)  # where the cache of `make lint` is

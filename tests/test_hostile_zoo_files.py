@@ -115,8 +115,8 @@ def _throw_all(chosen: list[Case], good: Path, place: Path, watch: FolderWatch) 
 def test_some_hostile_files(
     file: str, good: Path, here: Path, tmp_path: Path, watch: FolderWatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One of sixteen."""
-    chosen = [case for case in cases() if case.file == file][len(file) % 5 :: 16]
+    """One of thirty-two."""
+    chosen = [case for case in cases() if case.file == file][len(file) % 5 :: 32]
     _throw_all(chosen, good, tmp_path, watch)
 
 

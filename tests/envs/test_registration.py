@@ -92,7 +92,7 @@ def test_an_id_given_to_an_algorithm() -> None:
     assert model.ep_success_buffer is not None and len(model.ep_success_buffer) == 1
 
 
-@pytest.mark.parametrize("start_method", ["spawn", "forkserver"])
+@pytest.mark.parametrize("start_method", ["spawn", pytest.param("forkserver", marks=pytest.mark.slow)])
 def test_workers_that_never_imported_the_package(start_method: str) -> None:
     # In a program given by -c a worker cannot import the main module again, as it would a script's.
     code = f"""

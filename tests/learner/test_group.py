@@ -202,7 +202,7 @@ def test_memory_is_that_of_as_many_learners() -> None:
     assert apart <= memory_of([*learners, group]) < 1.1 * apart
 
 
-@pytest.mark.parametrize("how", [pytest.param("compiled", marks=COMPILES), "captured"])
+@pytest.mark.parametrize("how", [pytest.param("compiled", marks=[COMPILES, pytest.mark.slow]), "captured"])
 def test_compiled_and_captured_groups(how: str) -> None:
     alone, others = models_of("SAC", 2), models_of("SAC", 2)
     for model in alone:

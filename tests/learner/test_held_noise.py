@@ -98,11 +98,12 @@ def test_saved(tmp_path: Path) -> None:
     model.save(tmp_path / "model")
     loaded = type(model).load(tmp_path / "model")
     assert isinstance(loaded.explorer, HeldNoise)
-    assert loaded.explorer.get_extra_state() == model.explorer.get_extra_state() != {"held": None}
+    assert loaded.explorer.get_extra_state() == model.explorer.get_extra_state()
+    assert model.explorer.get_extra_state()["held"] != []
 
 
 def test_starts_anew_at_a_reset() -> None:
     model = held_noise()
     model.learner.act(torch.zeros(1, 3))
     model.reinitialize()
-    assert model.explorer.get_extra_state() == {"held": None, "length": 0, "n_held": 0}
+    assert model.explorer.get_extra_state() == {"held": [], "length": 0, "n_held": 0}

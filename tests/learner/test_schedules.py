@@ -103,6 +103,7 @@ def test_resumed(tmp_path: Path) -> None:
     assert not differing(state(whole), state(resumed))
 
 
+@pytest.mark.slow
 @COMPILES
 def test_compiled_and_logged(tmp_path: Path) -> None:
     """A compiled step reads the rates of every step, and is compiled once."""

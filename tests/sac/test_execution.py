@@ -149,19 +149,11 @@ def updates(model: Any, n: int, seed: int = 0, each: Callable[[int], None] = lam
         model.train(1, 8)
 
 
-# BRO's compiled step is a fast test of test_golden.py.
-FAST = ["VPLSAC"]
-
-
+# BRO's compiled step is a fast test of test_golden.py; test_drq.py has those from pixels, with a tolerance for their
+# convolutions.
+@pytest.mark.slow
 @COMPILES
-@pytest.mark.parametrize(
-    "maker",
-    [
-        name if name in FAST else pytest.param(name, marks=pytest.mark.slow)
-        for name in OFF_POLICY
-        if name not in PIXEL_MAKERS  # test_drq.py, with a tolerance for its convolutions
-    ],
-)
+@pytest.mark.parametrize("maker", [name for name in OFF_POLICY if name not in PIXEL_MAKERS])
 def test_compiled_is_eager(maker: str) -> None:
     model, compiled = pair(maker, compile=True)
     n = FEW_STEPS.get(maker, 50)
@@ -314,6 +306,7 @@ def test_changes_on_the_way_are_noticed(how: str, change: Callable[[SAC], None])
     assert largest_difference(model, other) < TOLERANCE
 
 
+@pytest.mark.slow
 @COMPILES
 def test_moments_are_found_in_any_order_of_the_file() -> None:
     model, compiled = pair("SAC", compile=True, learning_rate=1e-3)
@@ -335,6 +328,7 @@ def test_diagnostics_do_not_have_steps_captured_anew() -> None:
     assert recorder.n_recordings == 1
 
 
+@pytest.mark.slow
 @COMPILES
 def test_a_gradient_step_of_ones_own() -> None:
     class OwnLearner(Learner):
@@ -359,6 +353,7 @@ def test_a_copied_model_trains_on_and_a_file_holds_no_transitions(tmp_path: Path
     assert sizes["data.json"] + sizes["tensors.safetensors"] < 30_000
 
 
+@pytest.mark.slow
 @COMPILES
 def test_learning_rates_of_a_schedule_compile_once() -> None:
     model, compiled = pair("SAC", compile=True)
@@ -370,6 +365,7 @@ def test_learning_rates_of_a_schedule_compile_once() -> None:
     assert largest_difference(model, compiled) < 1e-3
 
 
+@pytest.mark.slow
 @COMPILES
 def test_settings_changed_on_the_way_count_in_a_compiled_step() -> None:
     model, compiled = pair("SAC", compile=True, learning_rate=1e-3)
@@ -598,7 +594,9 @@ def test_says_how_long_it_takes(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @COMPILES
-@pytest.mark.parametrize("replay_ratio", [0.5, 1, 3])
+@pytest.mark.parametrize(
+    "replay_ratio", [pytest.param(0.5, marks=pytest.mark.slow), 1, pytest.param(3, marks=pytest.mark.slow)]
+)
 def test_diagnostics_find_gradients_of_a_compiled_model(replay_ratio: float) -> None:
     model = sac(compile=True, learning_starts=10, replay_ratio=replay_ratio)
     callback = DiagnosticsCallback(Toy(), every=20)

@@ -69,6 +69,7 @@ def test_sac_learns_pendulum() -> None:
     assert score(small_sac(0).learn(3_000)) > GOOD
 
 
+@pytest.mark.slow
 def test_bro_learns_pendulum() -> None:
     assert score(small_bro(0).learn(2_500)) > GOOD
 

@@ -407,6 +407,7 @@ class Match(gym.Env):
         return self._shown(), -float((action[0] - self.wanted) ** 2), True, False, {}
 
 
+@pytest.mark.slow
 def test_learns_from_images() -> None:
     """A mean squared distance that no constant action reaches: the actor sees through the critics' encoder."""
     kwargs = dict(features_extractor_kwargs=dict(features_dim=16), net_arch=[32], share_features_extractor=True)

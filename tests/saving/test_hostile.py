@@ -407,6 +407,7 @@ def test_states_of_generators(case: Any, empty: Path) -> None:
         refused(target, hostile_values.with_generator(original_of(target), place, case), case[3], empty)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", ["SAC", "buffer"])
 def test_more_than_the_bytes_of_a_file_say(target: str, empty: Path) -> None:
     most = container.MAX_JSON_OF["model"] if target == "SAC" else container.MAX_JSON

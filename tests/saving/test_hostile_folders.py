@@ -360,6 +360,7 @@ def test_a_worker_lives_on() -> None:
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["state.zip", ROWS[1]])
 def test_more_than_the_bytes_say(file: str, files_of_a_run: dict[str, bytes], tmp_path: Path) -> None:
     name = file if "/" in file else f"{NEW}/{file}"

@@ -76,7 +76,7 @@ def train(folder: Path, how: str, number: int) -> None:
     os._exit(0)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("how", HOW)
 def test_an_interrupt_that_nobody_reads_of_is_saved(how: str, number: int, tmp_path: Path) -> None:
     run(tmp_path, how, number, target=train)

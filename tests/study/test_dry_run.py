@@ -16,6 +16,7 @@ from sb3_sample.study.dry_run import Cost
 from sb3_sample.study.plan import Plan, Run
 
 
+@pytest.mark.slow
 def test_a_dry_run_measures_and_runs_nothing(tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(module, "SECONDS", 0.2)
     plan = tmp_path / "tiny.yml"

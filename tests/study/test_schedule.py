@@ -78,6 +78,7 @@ def test_a_process_that_dies_is_replaced(tmp_path: Path) -> None:
     assert run(plan, tmp_path, retries=0).counts["done"] == 3
 
 
+@pytest.mark.slow
 def test_two_schedulers_on_one_folder_share_the_runs(tmp_path: Path) -> None:
     program = (
         "import sys; from sb3_sample import study; from tests.study import nothing\n"
@@ -128,7 +129,7 @@ def _made_place(folder: StudyFolder, plan: Plan) -> Path:
     return folder.path / "state/Nothing/nothing-v0/0.lock"
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_processes_end_with_the_scheduler_and_the_same_command_goes_on(tmp_path: Path, number: int) -> None:
     program = (
         "import sys; from sb3_sample import study; from tests.study import nothing\n"
@@ -191,6 +192,7 @@ def test_lines_and_the_live_table(tmp_path: Path, capsys) -> None:
     assert capsys.readouterr().out == said
 
 
+@pytest.mark.slow
 def test_the_work_for_a_run_does_not_grow_with_the_number_of_runs(tmp_path: Path) -> None:
     """Files opened and locks taken, by the scheduler and by the process that makes the runs."""
     counts = {}

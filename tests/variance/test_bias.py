@@ -61,6 +61,7 @@ def test_squares_have_no_bias() -> None:
     assert left_out[2] == pytest.approx(jackknife_squares(np.delete(samples, 2, axis=0))[0])
 
 
+@pytest.mark.slow
 def test_intervals_cover_bias_and_variance() -> None:
     covered = np.zeros(4)
     for seed in range(300):

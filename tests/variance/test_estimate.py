@@ -95,6 +95,7 @@ def test_coverage_is_95_percent(limit: int | None) -> None:
         assert abs(error) < 3.5, name
 
 
+@pytest.mark.slow
 def test_noise_of_the_returns_adds_no_variance() -> None:
     # With one return for each action the square of Q keeps the noise's variance, and the policy's variance has it.
     truth = exact()
