@@ -433,11 +433,14 @@ class Restorer:
         self._inert |= {id(value) for value in inert}
         self._origin = origin
 
-    def attributes(self, owner: Any, described: dict[str, Node], skip: Collection[str] = ()) -> None:
+    def attributes(
+        self, owner: Any, described: dict[str, Node], skip: Collection[str] = (), anywhere: Collection[str] = ()
+    ) -> None:
         """
         :param owner: the object, made as the one that was described
         :param described: from :meth:`Describer.attributes`
         :param skip: names of attributes that were left out
+        :param anywhere: names of attributes whose texts are never taken as names of files
         :raises DoesNotFit: it is of another class, or was made in another way; or an attribute is described that never
             is
         """
@@ -446,17 +449,19 @@ class Restorer:
         for name in described:
             if name in skip or not _may_have(owner, name):
                 raise DoesNotFit(f"{name!r:.100} is not saved of a {type(owner).__name__}")
-        for name, value in self._restored(described, own, type(owner).__name__):
+        for name, value in self._restored(described, own, type(owner).__name__, anywhere):
             if name in slots:
                 slots[name].__set__(owner, value)
             else:
                 vars(owner)[name] = value
 
-    def _restored(self, described: dict[str, Node], own: dict[str, Any], place: str) -> Iterator[tuple[str, Any]]:
+    def _restored(
+        self, described: dict[str, Node], own: dict[str, Any], place: str, anywhere: Collection[str] = ()
+    ) -> Iterator[tuple[str, Any]]:
         """Restored attributes by name, without those that name other files than the object's present ones."""
         for name, node in described.items():
             present = own.get(name)
-            if not is_elsewhere(name, node, present):
+            if name in anywhere or not is_elsewhere(name, node, present):
                 yield name, self.restore(node, present, part_name(place, f".{name}"))
                 continue
             self.leave(node, present)

@@ -946,3 +946,42 @@ def test_a_folder_that_cannot_be_synced(tmp_path: Path, monkeypatch: Any) -> Non
         again = sac().learn(50, checkpoint=tmp_path / "run", **STEPS)
     assert ["cannot be synced" in str(w.message) for w in caught] == [True]
     assert steps_of(tmp_path / "run") == [40, 50] and not differing(state(sac().learn(50)), state(again))
+
+
+class Levels(gym.Wrapper):
+    """Tells the level of each step, as ids of tasks tell theirs."""
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, {**info, "level": "maps/3"}
+
+
+def _levels() -> Monitor:
+    return Monitor(Levels(gym.make("Pendulum-v1", max_episode_steps=10)), info_keywords=("level",))
+
+
+def test_what_monitor_tells_of_episodes_is_no_file(tmp_path: Path) -> None:
+    first = sac(env=DummyVecEnv([_levels]))
+    first.learn(32, checkpoint=tmp_path / "run", **STEPS)
+    assert [each["level"] for each in first.ep_info_buffer] == ["maps/3"] * 3
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        second = sac(env=DummyVecEnv([_levels])).learn(38, checkpoint=tmp_path / "run", **STEPS)
+    assert list(second.ep_info_buffer) == list(first.ep_info_buffer)
+
+
+class Exporting(SAC):
+    """Writes somewhere that no argument says."""
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.export_path = "here"
+
+
+def test_where_an_attribute_writes_is_said_by_the_program(tmp_path: Path) -> None:
+    first = sac(cls=Exporting)
+    first.export_path = "elsewhere/model.onnx"  # type: ignore[attr-defined]
+    first.learn(32, checkpoint=tmp_path / "run", **STEPS)
+    with pytest.warns(UserWarning, match=r"Exporting.export_path of the checkpoint may name files"):
+        second = sac(cls=Exporting).learn(32, checkpoint=tmp_path / "run", **STEPS)
+    assert second.num_timesteps == 32 and second.export_path == "here"
