@@ -29,6 +29,13 @@ class _Comparable(Encoder):
         except NotPortable:
             return {"of": path_of(value if isinstance(value, NAMED) else type(value))}
 
+    def _plain(self, value: Any, name: str, depth: int) -> dict[str, Any] | None:
+        found = super()._plain(value, name, depth)
+        if found is not None and type(value) in (set, frozenset):
+            # Their order is that of hashes, which differ between processes.
+            return {tag: sorted(items, key=json.dumps) for tag, items in found.items()}
+        return found
+
     def _generator(self, value: Any, name: str, depth: int) -> dict[str, Any] | None:
         return {"generator": path_of(type(value))} if isinstance(value, GENERATORS) else None
 

@@ -29,8 +29,8 @@ from sb3_sample.saving.kept import Kept, declared
 from sb3_sample.version import __version__
 from sb3_sample.warn import warn
 
-#: What Monitor tells of the last episodes. Its texts name tasks and levels ("metaworld/reach-v3"), and never say where a
-#: program writes.
+#: What Monitor tells of the last episodes. Its texts name tasks and levels ("metaworld/reach-v3"), and never say where
+#: a program writes.
 _OF_EPISODES = ("ep_info_buffer", "ep_success_buffer")
 #: Arguments that may differ between the parts of a run: where it computes, and what it prints.
 HARMLESS = ("verbose", "device", "tensorboard_log", "compile", "_init_setup_model")
@@ -46,7 +46,8 @@ def argument_names(cls: type) -> set[str]:
 
 
 def _not_saved(model: BaseAlgorithm) -> set[str]:
-    modules = {name.split(".")[0] for name in model._get_torch_save_params()[0]}
+    # The variables, too, are with the parameters.
+    modules = {name.split(".")[0] for names in model._get_torch_save_params() for name in names}
     where = declared(type(model))
     kept = {name for name, places in where.items() if Kept.IN_CHECKPOINTS in places}
     return {*modules, *model._excluded_save_params(), *argument_names(type(model)), *where} - kept
