@@ -262,7 +262,7 @@ class Checkpointer:
         segments = self._folder.segments(self._manifest)
         with self._restoring(state):
             with self._folder.opened(f"{state['path'].name}/{MODEL}") as file, importing_nothing():
-                safe_files.set_parameters(file, trusted_modules=_own_modules())
+                safe_files.set_parameters(file, trusted_modules=_own_modules(model))
             training_state.restore_attributes(model, state["attributes"])
             check_counts(model, "the checkpoint")
             if model.num_timesteps != self._manifest["steps"]:
@@ -577,6 +577,11 @@ def _check_parts(state: Any, path: Path) -> None:
         raise BadFile(f"{path} is damaged or hostile: {wrong or sorted(map(str, parts))!r:.200} is not what it must be")
 
 
-def _own_modules() -> tuple[str, ...]:
-    """Whose classes a checkpoint's parameters may name: those of this program, which wrote them."""
-    return tuple(sorted({name.split(".")[0] for name in sys.modules}))
+def _own_modules(model: BaseAlgorithm) -> tuple[str, ...]:
+    """
+    Whose classes a checkpoint's parameters may name: of the packages that the parts of the model are of. Not whatever
+    the program has imported: objects of some classes do harm by being there, or by going away.
+    """
+    parts = [model, *vars(model).values(), *model.policy.modules()]
+    packages = {cls.__module__.partition(".")[0] for part in parts for cls in type(part).__mro__}
+    return tuple(sorted(packages - sys.stdlib_module_names))

@@ -199,6 +199,8 @@ class _Decoder:
         module = tree.partition(":")[0]
         if not isinstance(cls, type) or not within(module, self.trusted):
             raise NotTrusted(f"{name}: {tree!r:.300} is no class of a module that is trusted", tree)
+        if hasattr(cls, "__del__"):
+            raise BadFile(f"{name}: an object of {tree} does something when it goes away, and none is made from a file")
         attributes = whole["attributes"]
         made: Any = object.__new__(cls)
         for key, item in attributes.items():

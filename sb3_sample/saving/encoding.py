@@ -282,7 +282,8 @@ class Encoder:
         """An object of a class of the user's own by its attributes, if it consists of nothing else."""
         cls = type(value)
         is_plain = cls.__basicsize__ == _Plain.__basicsize__ and cls.__dictoffset__ != 0
-        has_more = issubclass(cls, _OF_TRAINING) or hasattr(cls, "state_dict") or within(cls.__module__, PACKAGES)
+        has_more = issubclass(cls, _OF_TRAINING) or within(cls.__module__, PACKAGES)
+        has_more |= hasattr(cls, "state_dict") or hasattr(cls, "__del__")
         if not is_plain or has_more:
             return None
         attributes = {}

@@ -4,7 +4,6 @@ import json
 from hashlib import sha256
 from typing import Any
 
-import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
@@ -55,7 +54,7 @@ def identity_of(model: BaseAlgorithm, env: VecEnv) -> dict[str, list[str]]:
         digest = sha256(json.dumps(tree, sort_keys=True).encode())
         for key in sorted(tensors):
             digest.update(key.encode())
-            digest.update(np.ascontiguousarray(tensors[key].cpu().numpy()).tobytes())
+            digest.update(tensors[key].cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
         identity[name] = [digest.hexdigest(), _shown(value, name in schedules)]
     return identity
 

@@ -3,6 +3,7 @@
 import collections
 import enum
 import errno
+import gc
 import json
 import os
 import resource
@@ -31,9 +32,11 @@ from sb3_sample.sac.policies import MlpPolicy
 from sb3_sample.saving import container, run_folder, training_state
 from sb3_sample.saving.attributes import Describer, same
 from sb3_sample.saving.callbacks import CallbackStates
+from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.encoding import NotPortable, decode, encode
 from sb3_sample.saving.identity import identity_of
 from sb3_sample.saving.kept import Kept, declared
+from sb3_sample.saving.normalization import load_vec_normalize, save_vec_normalize
 from sb3_sample.saving.model_tree import Description
 from sb3_sample.saving.run_folder import RunFolder
 from tests.agents import OFF_POLICY, env_of
@@ -1152,3 +1155,52 @@ def test_sets_in_arguments_are_the_same_whatever_their_order() -> None:
         model.policy_kwargs = {"features_extractor_kwargs": {"keys": keys}}
         digests.add(identity_of(model, model.env)["policy_kwargs"][0])
     assert len(digests) == 1
+
+
+class Closing:
+    """Removes a file when it goes away."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = str(path)
+
+    def __del__(self) -> None:
+        Path(self.path).unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("path", ["tempfile:_TemporaryFileCloser", f"{__name__}:Closing"])
+def test_a_checkpoint_makes_no_object_that_does_something_when_it_goes_away(path: str, tmp_path: Path) -> None:
+    victim = tmp_path / "thesis.tex"
+    victim.write_text("years")
+    sac().learn(20, checkpoint=tmp_path / "run", **STEPS)
+    attributes = {"file": 1, "name": str(victim), "delete": True, "path": str(victim)}
+    for folder in (tmp_path / "run").glob("checkpoint-*"):
+        file = folder / "model.zip"
+        tree, tensors = container.read(file, "model")
+        tree["parameters"]["x"] = {"instance": path, "attributes": attributes}
+        container.write(file, "model", tree, tensors)
+        rewritten(
+            folder / "manifest.json", lambda m, f=file: m["files"].update({"model.zip": facts_of(f.read_bytes())})
+        )
+    with pytest.raises(BadFile, match="Closing goes away|does something when|may not be named|is no class|not trusted"):
+        sac().learn(40, checkpoint=tmp_path / "run", **STEPS)
+    gc.collect()
+    assert victim.read_text() == "years"
+
+
+def test_numbers_that_numpy_has_not_are_compared() -> None:
+    model = sac()
+    digests = []
+    for value in (1.0, 2.0, 1.0):
+        model.policy_kwargs = {"x": torch.full((), value, dtype=torch.bfloat16)}
+        digests.append(identity_of(model, model.env)["policy_kwargs"][0])
+    assert digests[0] == digests[2] != digests[1]
+
+
+def test_statistics_of_observations_that_are_not_normalised_any_more(tmp_path: Path) -> None:
+    venv = VecNormalize(vec())
+    sac(env=venv).learn(20)
+    venv.norm_obs = False
+    save_vec_normalize(venv, tmp_path / "statistics")
+    loaded = load_vec_normalize(tmp_path / "statistics", vec())
+    assert not loaded.norm_obs and loaded.obs_rms.count == venv.obs_rms.count > 20
+    np.testing.assert_array_equal(loaded.obs_rms.mean, venv.obs_rms.mean)
