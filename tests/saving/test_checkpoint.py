@@ -36,8 +36,8 @@ from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.encoding import NotPortable, decode, encode
 from sb3_sample.saving.identity import identity_of
 from sb3_sample.saving.kept import Kept, declared
-from sb3_sample.saving.normalization import load_vec_normalize, save_vec_normalize
 from sb3_sample.saving.model_tree import Description
+from sb3_sample.saving.normalization import load_vec_normalize, save_vec_normalize
 from sb3_sample.saving.run_folder import RunFolder
 from tests.agents import OFF_POLICY, env_of
 from tests.ppo.common import EVERY, tiny
