@@ -17,6 +17,7 @@ import pathlib
 import random
 import re
 import struct
+import sys
 import types
 import uuid
 import weakref
@@ -27,7 +28,8 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from sb3_sample.saving.classes import may_be_set
+from sb3_sample.saving.classes import may_be_set, member_of, of_member
+from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.functions import FUNCTIONS, OtherKind, held, holding, name_of
 from sb3_sample.saving.hashes import distinct_hashes, part_name
 from sb3_sample.saving.moments import check_moments
@@ -68,6 +70,12 @@ Node = dict[str, Any]
 
 #: What the attributes of a class were when they were first looked at in this process, by name.
 _FIRST: weakref.WeakKeyDictionary[type, dict[str, Node]] = weakref.WeakKeyDictionary()
+
+
+#: Kinds of dict that can be made anew.
+_DICTS: dict[str, type[dict[Any, Any]]] = {
+    f"{cls.__module__}.{cls.__qualname__}": cls for cls in (dict, collections.OrderedDict, collections.Counter)
+}
 
 
 class Opaque(ValueError):
@@ -196,6 +204,18 @@ def _may_have(owner: Any, name: str) -> bool:
     return known or may_be_set(type(owner), name) or kept
 
 
+def _enumeration(name: Any) -> type[enum.Enum] | None:
+    """The enumeration of a name that this program has, if there is one; nothing is imported for it."""
+    parts = name.split(".") if isinstance(name, str) else []
+    for i in range(len(parts) - 1, 0, -1):
+        found: Any = sys.modules.get(".".join(parts[:i]))
+        for part in parts[i:]:
+            found = vars(found).get(part) if isinstance(found, (types.ModuleType, type)) else None
+        if isinstance(found, type) and issubclass(found, enum.Enum):
+            return found
+    return None
+
+
 class Describer:
     """
     Makes trees of the attributes of several objects that may share values.
@@ -251,7 +271,7 @@ class Describer:
             known, n_arrays = len(self._seen), len(self._arrays)
             try:
                 described[name] = self.describe(value)
-            except Opaque as error:
+            except (Opaque, RecursionError) as error:
                 opaque.append(f"{name} ({error})")
                 # What was described half way is not there to be referred to.
                 for key in list(self._seen)[known:]:
@@ -332,7 +352,7 @@ class Describer:
         :raises Opaque: it cannot be described; the message names the class of what cannot
         """
         if isinstance(value, enum.Enum):
-            return {"enum": value.name}
+            return {"enum": member_of(value), "of": class_name(value)}
         if isinstance(value, _CONSTANTS):
             return {"value": value}
         if id(value) in self._seen:
@@ -368,7 +388,7 @@ class Describer:
                 return {"value": list(value)}
             return {"list": [self.describe(item) for item in value]}
         if type(value) in (set, frozenset):
-            if not all(isinstance(item, _CONSTANTS) for item in value):
+            if not all(isinstance(item, _CONSTANTS) and not isinstance(item, enum.Enum) for item in value):
                 raise Opaque(class_name(value))
             return {"value": set(value) if type(value) is set else frozenset(value)}
         if isinstance(value, tuple):
@@ -433,11 +453,14 @@ class Restorer:
         self._inert |= {id(value) for value in inert}
         self._origin = origin
 
-    def attributes(self, owner: Any, described: dict[str, Node], skip: Collection[str] = ()) -> None:
+    def attributes(
+        self, owner: Any, described: dict[str, Node], skip: Collection[str] = (), anywhere: Collection[str] = ()
+    ) -> None:
         """
         :param owner: the object, made as the one that was described
         :param described: from :meth:`Describer.attributes`
         :param skip: names of attributes that were left out
+        :param anywhere: names of attributes whose texts are never taken as names of files
         :raises DoesNotFit: it is of another class, or was made in another way; or an attribute is described that never
             is
         """
@@ -446,17 +469,19 @@ class Restorer:
         for name in described:
             if name in skip or not _may_have(owner, name):
                 raise DoesNotFit(f"{name!r:.100} is not saved of a {type(owner).__name__}")
-        for name, value in self._restored(described, own, type(owner).__name__):
+        for name, value in self._restored(described, own, type(owner).__name__, anywhere):
             if name in slots:
                 slots[name].__set__(owner, value)
             else:
                 vars(owner)[name] = value
 
-    def _restored(self, described: dict[str, Node], own: dict[str, Any], place: str) -> Iterator[tuple[str, Any]]:
+    def _restored(
+        self, described: dict[str, Node], own: dict[str, Any], place: str, anywhere: Collection[str] = ()
+    ) -> Iterator[tuple[str, Any]]:
         """Restored attributes by name, without those that name other files than the object's present ones."""
         for name, node in described.items():
             present = own.get(name)
-            if not is_elsewhere(name, node, present):
+            if name in anywhere or not is_elsewhere(name, node, present):
                 yield name, self.restore(node, present, part_name(place, f".{name}"))
                 continue
             self.leave(node, present)
@@ -510,7 +535,12 @@ class Restorer:
             # Counted up when it was written, so that each has a hash of its own.
             if type(node.get("id", 0)) is not int or not 0 <= node.get("id", 0) < 2**60:
                 raise DoesNotFit(f"{name} cannot have the number {node['id']!r:.50}")
-            value = self._restore(node, present, name)
+            try:
+                value = self._restore(node, present, name)
+            except (DoesNotFit, BadFile):
+                raise
+            except Exception as error:
+                raise DoesNotFit(f"{name}: {type(error).__name__}: {error!s:.300}") from error
         # A function may be bound to another object of the same kind.
         rebound = isinstance(present, FUNCTIONS) and type(value) is type(present) and id(present) not in self._inert
         if self._is_inert(present) and value is not present and not rebound:
@@ -531,6 +561,14 @@ class Restorer:
             return value
 
         match node:
+            case {"value": torch.Tensor() as value} if isinstance(present, torch.Tensor):
+                fits = present.shape == value.shape and present.dtype == value.dtype
+                need(fits or not present.requires_grad, f"a tensor of {tuple(value.shape)} and {value.dtype}")
+                if present.requires_grad:
+                    # It is learned: an optimizer has it.
+                    present.data.copy_(value)
+                    return present
+                return value.clone().to(present.device)
             case {"value": value}:
                 return copy.deepcopy(value)
             case {"numbers": array}:
@@ -546,8 +584,10 @@ class Restorer:
                 need(fits, f"a view of the simulator's memory at {place}")
                 return present
             case {"enum": member}:
-                need(isinstance(present, enum.Enum), f"the member {member} of an enumeration")
-                return type(present)[member]
+                cls = type(present) if isinstance(present, enum.Enum) else _enumeration(node.get("of"))
+                if cls is None:
+                    raise DoesNotFit(f"{name} is {class_name(present)}, but was the member {member} of an enumeration")
+                return of_member(cls, member)
             case {"torch_generator": state}:
                 need(isinstance(present, torch.Generator), "a torch.Generator")
                 present.set_state(state)
@@ -561,13 +601,15 @@ class Restorer:
                 need(what == "builtins.tuple" or class_name(present) == what, what)
                 parts = present if isinstance(present, tuple) and len(present) == len(items) else (None,) * len(items)
                 values = [self.restore(item, parts[i], part_name(name, f"[{i}]")) for i, item in enumerate(items)]
-                # Named tuples take their items one by one.
-                return tuple(values) if what == "builtins.tuple" else type(present)(*values)
+                if what == "builtins.tuple":
+                    return tuple(values)
+                # Named tuples take their items one by one, torch.Size and the like all together.
+                return type(present)(*values) if hasattr(present, "_fields") else type(present)(values)
             case {"deque": items, "maxlen": maxlen}:
                 return collections.deque((self.restore(item, None, name) for item in items), maxlen)
             case {"dict": items, "of": what}:
                 before = present if isinstance(present, dict) else {}
-                mapping: Any = collections.OrderedDict() if what == "collections.OrderedDict" else {}
+                mapping: Any = _DICTS.get(what, dict)()
                 if class_name(mapping) != what:
                     # One with a default of its own.
                     need(class_name(present) == what, what)
@@ -587,7 +629,7 @@ class Restorer:
                 return present
             case {"state_dict": state}:
                 need(_has_state_dict(present), "something with load_state_dict")
-                restored = self.restore(state, None, name)
+                restored = self.restore(state, present.state_dict(), name)
                 if isinstance(present, torch.optim.Optimizer):
                     check_moments(present, restored, name)
                 present.load_state_dict(restored)

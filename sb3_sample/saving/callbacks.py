@@ -18,6 +18,7 @@ from sb3_sample.saving.attributes import (
     Describer,
     DoesNotFit,
     Node,
+    Opaque,
     Restorer,
     class_name,
     same,
@@ -81,6 +82,16 @@ def _gives_state(callback: BaseCallback) -> bool:
     return hasattr(callback, "state_dict") and hasattr(callback, "load_state_dict")
 
 
+def _state_of(callback: BaseCallback) -> tuple[Node | None, list[str]]:
+    """The state that a callback gives, if it gives one; and why it cannot be held, if it cannot."""
+    if not _gives_state(callback):
+        return None, []
+    try:
+        return Describer().describe(callback.state_dict()), []  # type: ignore[attr-defined]
+    except (Opaque, RecursionError) as error:
+        return None, [f"state_dict ({error})"]
+
+
 class CallbackStates:
     """
     The states of the callbacks of one training.
@@ -91,6 +102,8 @@ class CallbackStates:
     def __init__(self, callback: BaseCallback):
         self._callbacks = dict(walk(without_progress_bar(callback)))
         self._before = {path: self._attributes(each)[0] for path, each in self._callbacks.items()}
+        # Those of which it was told that something is lost.
+        self._told: set[str] = set()
         # What an earlier part of the run has changed belongs to the state as well.
         self._changed = {path: _CHANGED.setdefault(each, set()) for path, each in self._callbacks.items()}
 
@@ -103,9 +116,10 @@ class CallbackStates:
         """
         lost = []
         for path, callback in self._callbacks.items():
-            what = list(self._attributes(callback)[1])
+            what = [*self._attributes(callback)[1], *_state_of(callback)[1]]
             for name, env in environments(callback):
                 what += [f"{name}, {reason}" for reason in _save_env(env)[1]]
+            self._told |= {path} if what else set()
             lost += [f"{type(callback).__name__} ({path}): {each}" for each in what]
         return lost
 
@@ -129,10 +143,14 @@ class CallbackStates:
     def _save(self, path: str, callback: BaseCallback) -> dict[str, Any]:
         now = self._attributes(callback)[0]
         self._note(path, now)
+        state, opaque = _state_of(callback)
+        if opaque and path not in self._told:
+            self._told.add(path)
+            warn(f"A checkpoint does not hold the state of {type(callback).__name__} ({path}): {opaque[0]}")
         return {
             "class": class_name(callback),
             "attributes": with_what_they_refer_to(self._changed[path], now),
-            "state": Describer().describe(callback.state_dict()) if _gives_state(callback) else None,  # type: ignore[attr-defined]
+            "state": state,
             "environments": {name: _save_env(env)[0] for name, env in environments(callback)},
         }
 
@@ -171,7 +189,8 @@ class CallbackStates:
             warn(f"{', '.join(kept)} of the checkpoint may name files, and stay as they are ({path})")
         self._changed[path] |= attributes.keys()
         if state["state"] is not None:
-            callback.load_state_dict(Restorer().restore(state["state"], None, path))  # type: ignore[attr-defined]
+            own_state = callback.state_dict()  # type: ignore[attr-defined]
+            callback.load_state_dict(Restorer().restore(state["state"], own_state, path))  # type: ignore[attr-defined]
         for name, env in environments(callback):
             if name in state["environments"]:
                 _restore_env(env, state["environments"][name], f"{type(callback).__name__}.{name}")

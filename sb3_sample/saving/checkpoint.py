@@ -8,6 +8,7 @@ update yet.
 """
 
 import contextlib
+import json
 import os
 import sys
 import time
@@ -115,6 +116,8 @@ class Checkpointer:
         self._resumed: dict[str, Any] | None = None
         self._manifest: dict[str, Any] = {"segments": {}}
         self._saved_at: int | None = None
+        #: What it was said of that no checkpoint holds it.
+        self._left_out: set[str] = set()
         self._whole_at: int | None = None
         self._interrupts: Interrupts | None = None
         # How many times every steps there were when it was last asked.
@@ -259,7 +262,7 @@ class Checkpointer:
         segments = self._folder.segments(self._manifest)
         with self._restoring(state):
             with self._folder.opened(f"{state['path'].name}/{MODEL}") as file, importing_nothing():
-                safe_files.set_parameters(file, trusted_modules=_own_modules())
+                safe_files.set_parameters(file, trusted_modules=_own_modules(model))
             training_state.restore_attributes(model, state["attributes"])
             check_counts(model, "the checkpoint")
             if model.num_timesteps != self._manifest["steps"]:
@@ -482,7 +485,29 @@ class Checkpointer:
             STATE: lambda file: _write(file, KIND, state),
         }
         about = {"circumstances": training_state.circumstances(model.device)}
-        self._folder.write(model.num_timesteps, files, segments, about)
+        try:
+            self._folder.write(model.num_timesteps, files, segments, about)
+        except (NotPortable, container.TooLarge):
+            if not self._leave_out(state):
+                raise
+            self._folder.write(model.num_timesteps, files, segments, about)
+
+    def _leave_out(self, state: dict[str, Any]) -> bool:
+        """
+        Take out of a state the episodes in progress and the callbacks that no file holds, and say so once: better
+        without them than no checkpoint. Whether anything was taken out.
+        """
+        reasons = {path: reason for path, each in state["callbacks"].items() if (reason := _refusal(each, path))}
+        for path in reasons:
+            del state["callbacks"][path]
+        if reason := _refusal(state["env"]["environments"], "env"):
+            reasons["env"] = reason
+            state["env"]["environments"] = None
+        for name in reasons.keys() - self._left_out:
+            what = "episodes in progress" if name == "env" else f"state of {name}"
+            warn(f"A checkpoint does not hold the {what}: {reasons[name]}. They start anew when the run goes on")
+        self._left_out |= reasons.keys()
+        return bool(reasons)
 
     def _save_rows(self, name: str, ring: Ring, known: dict[str, Any]) -> dict[str, Any]:
         """Write the rows that the files lack. What the manifest says of all that are needed then."""
@@ -523,6 +548,23 @@ def _write(file: IO[bytes], kind: str, value: Any) -> None:
     container.write(file, kind, encode(value, kind, tensors), tensors)
 
 
+def _refusal(value: Any, name: str) -> str:
+    """Why a value has no place in a checkpoint, or takes more than half of it; empty if it has one."""
+    tensors: dict[str, torch.Tensor] = {}
+    try:
+        text = json.dumps(encode(value, name, tensors)).encode()
+    except NotPortable as error:
+        return str(error)
+    for n, most, what in (
+        (len(text), container.MAX_JSON, "bytes of JSON"),
+        (container.n_values(text), container.MAX_VALUES, "values"),
+        (len(tensors), container.MAX_TENSORS, "arrays"),
+    ):
+        if n > most // 2:
+            return f"{name} takes {n:,} {what}"
+    return ""
+
+
 def _check_parts(state: Any, path: Path) -> None:
     parts = state if isinstance(state, dict) else {}
     wrong = [name for name, kind in _PARTS.items() if type(parts.get(name)) is not kind]
@@ -535,6 +577,11 @@ def _check_parts(state: Any, path: Path) -> None:
         raise BadFile(f"{path} is damaged or hostile: {wrong or sorted(map(str, parts))!r:.200} is not what it must be")
 
 
-def _own_modules() -> tuple[str, ...]:
-    """Whose classes a checkpoint's parameters may name: those of this program, which wrote them."""
-    return tuple(sorted({name.split(".")[0] for name in sys.modules}))
+def _own_modules(model: BaseAlgorithm) -> tuple[str, ...]:
+    """
+    Whose classes a checkpoint's parameters may name: of the packages that the parts of the model are of. Not whatever
+    the program has imported: objects of some classes do harm by being there, or by going away.
+    """
+    parts = [model, *vars(model).values(), *model.policy.modules()]
+    packages = {cls.__module__.partition(".")[0] for part in parts for cls in type(part).__mro__}
+    return tuple(sorted(packages - sys.stdlib_module_names))

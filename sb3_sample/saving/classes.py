@@ -91,6 +91,27 @@ def path_of(value: Any) -> str:
     return f"{value.__module__}:{value.__qualname__}"
 
 
+def member_of(value: enum.Enum) -> str | int:
+    """
+    :param value: a member of an enumeration, or flags of one
+    :return: its name; of flags that are several together, or none, their number
+    """
+    if isinstance(value, enum.Flag) and value.name not in type(value).__members__:
+        return int(value.value)
+    return value.name
+
+
+def of_member(cls: type[enum.Enum], member: Any) -> enum.Enum:
+    """
+    :param cls: an enumeration
+    :param member: from :func:`member_of`
+    :return: the member
+    :raises KeyError: it has no such member
+    :raises ValueError: it has no such flags
+    """
+    return cls(member) if type(member) is int and issubclass(cls, enum.Flag) else cls[member]
+
+
 def is_importable(value: Any) -> bool:
     """
     :param value: a class or a function

@@ -27,6 +27,7 @@ from sb3_sample.saving.classes import (
     check_trusted,
     class_of,
     may_be_set,
+    of_member,
     resolve,
     torch_has,
     within,
@@ -175,7 +176,7 @@ class _Decoder:
         cls: Any = class_of(tree, ENUMERATIONS, name) if known else self._import(tree, whole, name, depth)
         if not issubclass(cls, enum.Enum):
             raise BadFile(f"{name}: {tree!r:.100} is no enumeration")
-        return cls[whole["member"]]
+        return of_member(cls, whole["member"])
 
     def _named_tuple(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
         cls = class_of(tree, NAMED_TUPLES, name)
@@ -198,6 +199,8 @@ class _Decoder:
         module = tree.partition(":")[0]
         if not isinstance(cls, type) or not within(module, self.trusted):
             raise NotTrusted(f"{name}: {tree!r:.300} is no class of a module that is trusted", tree)
+        if hasattr(cls, "__del__"):
+            raise BadFile(f"{name}: an object of {tree} does something when it goes away, and none is made from a file")
         attributes = whole["attributes"]
         made: Any = object.__new__(cls)
         for key, item in attributes.items():
@@ -270,7 +273,8 @@ def _read_dtype(text: Any, name: str) -> np.dtype:
 
 
 def _read_torch_dtype(text: Any, name: str) -> torch.dtype:
-    dtype = getattr(torch, text) if isinstance(text, str) and text.isidentifier() else None
+    # Not by getattr, which imports what torch leaves to a later import.
+    dtype = vars(torch).get(text) if isinstance(text, str) else None
     if not isinstance(dtype, torch.dtype):
         raise BadFile(f"{name}: {text!r} is no kind of number of torch")
     return dtype

@@ -39,6 +39,7 @@ from sb3_sample.saving.classes import (
     check_attribute,
     is_importable,
     may_be_set,
+    member_of,
     object_path,
     path_of,
     resolve,
@@ -236,13 +237,13 @@ class Encoder:
 
     def _objects(self, value: Any, name: str, depth: int) -> dict[str, Any] | None:
         if isinstance(value, type) and issubclass(value, np.generic):
-            return {"numpy_type": np.dtype(value).str}
+            return {"numpy_type": _checked(np.dtype(value), name).str}
         if isinstance(value, NAMED):
             return {"import": self._path(value, name)}
         if isinstance(value, enum.Enum):
             if object_path(value, ENUMERATIONS) is None:
                 self.foreign[name] = path_of(type(value))
-            return {"enum": path_of(type(value)), "member": value.name}
+            return {"enum": path_of(type(value)), "member": member_of(value)}
         if path := object_path(value, NAMED_TUPLES):
             return {"named_tuple": path, "items": self._items(value, name, depth)}
         if path := object_path(value, OBJECTS):
@@ -281,7 +282,8 @@ class Encoder:
         """An object of a class of the user's own by its attributes, if it consists of nothing else."""
         cls = type(value)
         is_plain = cls.__basicsize__ == _Plain.__basicsize__ and cls.__dictoffset__ != 0
-        has_more = issubclass(cls, _OF_TRAINING) or hasattr(cls, "state_dict") or within(cls.__module__, PACKAGES)
+        has_more = issubclass(cls, _OF_TRAINING) or within(cls.__module__, PACKAGES)
+        has_more |= hasattr(cls, "state_dict") or hasattr(cls, "__del__")
         if not is_plain or has_more:
             return None
         attributes = {}
@@ -299,6 +301,8 @@ class Encoder:
                 arguments = {"low": space.low, "high": space.high, "dtype": space.dtype}
             case spaces.Discrete():
                 arguments = {"n": int(space.n), "start": int(space.start)}
+                if space.dtype != np.int64:
+                    arguments["dtype"] = space.dtype
             case spaces.MultiDiscrete():
                 arguments = {"nvec": space.nvec, "start": space.start, "dtype": space.dtype}
             case spaces.MultiBinary():

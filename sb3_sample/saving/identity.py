@@ -4,7 +4,6 @@ import json
 from hashlib import sha256
 from typing import Any
 
-import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
@@ -29,6 +28,13 @@ class _Comparable(Encoder):
         except NotPortable:
             return {"of": path_of(value if isinstance(value, NAMED) else type(value))}
 
+    def _plain(self, value: Any, name: str, depth: int) -> dict[str, Any] | None:
+        found = super()._plain(value, name, depth)
+        if found is not None and type(value) in (set, frozenset):
+            # Their order is that of hashes, which differ between processes.
+            return {tag: sorted(items, key=json.dumps) for tag, items in found.items()}
+        return found
+
     def _generator(self, value: Any, name: str, depth: int) -> dict[str, Any] | None:
         return {"generator": path_of(type(value))} if isinstance(value, GENERATORS) else None
 
@@ -48,7 +54,7 @@ def identity_of(model: BaseAlgorithm, env: VecEnv) -> dict[str, list[str]]:
         digest = sha256(json.dumps(tree, sort_keys=True).encode())
         for key in sorted(tensors):
             digest.update(key.encode())
-            digest.update(np.ascontiguousarray(tensors[key].cpu().numpy()).tobytes())
+            digest.update(tensors[key].cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
         identity[name] = [digest.hexdigest(), _shown(value, name in schedules)]
     return identity
 

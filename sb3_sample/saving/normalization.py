@@ -38,7 +38,8 @@ def save_vec_normalize(venv: VecEnv, path: str | pathlib.Path) -> None:
         raise ValueError(f"venv must be a VecNormalize, not a {type(venv).__name__}")
     tensors: dict[str, torch.Tensor] = {}
     state = {name: getattr(venv, name) for name in ARGUMENTS}
-    state.update(obs_rms=venv.obs_rms if venv.norm_obs else None, ret_rms=venv.ret_rms)
+    # There are statistics of observations, too, where these are not normalised any more.
+    state.update(obs_rms=getattr(venv, "obs_rms", None), ret_rms=venv.ret_rms)
     check_normalization(state, "venv")
     tree = encode(state, "VecNormalize", tensors)
     container.write(path, KIND, tree, tensors)
@@ -69,7 +70,8 @@ def load_vec_normalize(path: str | pathlib.Path, venv: VecEnv, *, allow_pickle: 
     check_normalization(state, str(path))
     arguments = {name: state[name] for name in ARGUMENTS}
     try:
-        wanted = VecNormalize(venv, **arguments)
+        wanted = VecNormalize(venv, **{**arguments, "norm_obs": state["obs_rms"] is not None or arguments["norm_obs"]})
+        wanted.norm_obs = arguments["norm_obs"]
     except (ValueError, TypeError, AssertionError) as error:
         raise BadFile(f"{path} does not fit to the environment: {error}") from error
     for name in ("obs_rms", "ret_rms"):

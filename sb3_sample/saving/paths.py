@@ -16,17 +16,19 @@ from sb3_sample.warn import warn
 PathOrFile = str | pathlib.Path | io.BufferedIOBase
 
 
-def to_write(path: PathOrFile, suffix: str) -> Any:
+def to_write(path: PathOrFile, suffix: str, *only: str) -> Any:
     """
     :param path: a path, to which the suffix is added if it has none, or a binary file open for writing
     :param suffix: without its dot
+    :param only: if given, what else counts as a suffix: a name with a dot in it, "lr0.001", may be a model's as well,
+        which is not to be overwritten
     :return: the path, in a folder that was made if it was not there, or the file
     :raises ValueError: if a file is not open for writing
     """
     if not isinstance(path, (str, pathlib.Path)):
         return open_path(path, "w")
     path = pathlib.Path(path)
-    if path.suffix == "":
+    if path.suffix == "" or (only and path.suffix[1:] not in only):
         path = path.with_name(f"{path.name}.{suffix}")
     while path.is_dir():
         other = path.with_name(f"{path.name}_2")
@@ -36,17 +38,21 @@ def to_write(path: PathOrFile, suffix: str) -> Any:
     return path
 
 
-def find(path: PathOrFile, *suffixes: str) -> Any:
+def find(path: PathOrFile, *suffixes: str, first: bool = False) -> Any:
     """
     :param path: a path, with or without a suffix, or a binary file open for reading
     :param suffixes: those that may have been added to it, without their dots, the likeliest first
+    :param first: whether a file with one of them is likelier than one of the path alone
     :return: the path of the file that is there, or the file
     :raises FileNotFoundError: if there is none
     :raises ValueError: if a file is not open for reading
     """
     if not isinstance(path, (str, pathlib.Path)):
         return open_path(path, "r")
-    candidates = [pathlib.Path(path), *(pathlib.Path(f"{path}.{suffix}") for suffix in suffixes)]
+    path = pathlib.Path(path)
+    candidates = [path, *(path.with_name(f"{path.name}.{suffix}") for suffix in suffixes)]
+    if first:
+        candidates = [*candidates[1:], path]
     for candidate in candidates:
         if candidate.exists() and not candidate.is_dir():
             return candidate

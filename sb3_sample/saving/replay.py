@@ -25,6 +25,8 @@ from sb3_sample.saving.untrusted import MAX_MESSAGE
 KIND = "replay buffer"
 #: What is added to a path that is written, and what else may have been, by those who expect a pickle.
 SUFFIX, PICKLES_SUFFIX = "buffer.zip", "pkl"
+#: The suffixes of a name that stays as it is.
+OWN_SUFFIXES = ("zip", PICKLES_SUFFIX)
 #: Transitions that a model's file can ask memory for, which is not touched before they come; and of a HerReplayBuffer,
 #: which makes an object for each.
 MAX_TRANSITIONS, MAX_HER_TRANSITIONS = 100_000_000, 5_000_000
@@ -57,7 +59,8 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
         Save the replay buffer, as in Stable-Baselines3, but to a file that runs no code when it is loaded. The rows
         that were never filled take no space. What no file can hold is left out, with a warning.
 
-        :param path: path, to which ".buffer.zip" is added if it has no suffix, or a binary file open for writing
+        :param path: path, to which ".buffer.zip" is added unless it ends in ".zip" or ".pkl", or a binary file open for
+            writing
         :param allow_pickle: whether to write Stable-Baselines3's own, pickled format instead (".pkl")
         :param trusted_modules: modules, or packages of modules, that will be named when it is loaded, so that it needs
             no warning
@@ -69,12 +72,12 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
         if buffer is None:
             raise ValueError("there is no replay buffer to save")
         if allow_pickle:
-            super().save_replay_buffer(path)
+            super().save_replay_buffer(paths.to_write(path, PICKLES_SUFFIX, *OWN_SUFFIXES))
             return
         encoder = Lenient({})
         tree = encode_buffer(buffer, encoder)
         notice.say_once(self, encoder, trusted)
-        container.write(paths.to_write(path, SUFFIX), KIND, tree, encoder.tensors)
+        container.write(paths.to_write(path, SUFFIX, *OWN_SUFFIXES), KIND, tree, encoder.tensors)
 
     def load_replay_buffer(
         self,
@@ -100,7 +103,8 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
             another share of its transitions than ``validation_proportion``
         """
         trusted = (*self._trusted_modules, *check_trusted(trusted_modules))  # type: ignore[attr-defined]
-        found = paths.find(path, SUFFIX, PICKLES_SUFFIX)
+        named = isinstance(path, (str, pathlib.Path)) and pathlib.Path(path).suffix[1:] in OWN_SUFFIXES
+        found = paths.find(path, SUFFIX, PICKLES_SUFFIX, first=not named)
         name = str(getattr(found, "name", "the file")) if not isinstance(found, pathlib.Path) else str(found)
         try:
             with paths.opened(found) as file:

@@ -95,7 +95,8 @@ class RunFolder:
     """
 
     def __init__(self, path: str | Path):
-        self.path = Path(path)
+        # Where it was when the training began, wherever the program goes to.
+        self.path = Path(os.path.abspath(path))
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"checkpoint must name a folder, but {self.path} is a file")
         self.path.mkdir(parents=True, exist_ok=True)

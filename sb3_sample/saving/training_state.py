@@ -22,12 +22,16 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 
 from sb3_sample.replay.dataset import Dataset
-from sb3_sample.saving.attributes import Describer, DoesNotFit, Node, Opaque, Restorer, without_generators
+from sb3_sample.saving.attributes import Describer, Node, Opaque, Restorer, without_generators
 from sb3_sample.saving.classes import NotPortable
 from sb3_sample.saving.generators import check_python_state, set_numpy_state
 from sb3_sample.saving.kept import Kept, declared
 from sb3_sample.version import __version__
+from sb3_sample.warn import warn
 
+#: What Monitor tells of the last episodes. Its texts name tasks and levels ("metaworld/reach-v3"), and never say where
+#: a program writes.
+_OF_EPISODES = ("ep_info_buffer", "ep_success_buffer")
 #: Arguments that may differ between the parts of a run: where it computes, and what it prints.
 HARMLESS = ("verbose", "device", "tensorboard_log", "compile", "_init_setup_model")
 
@@ -42,7 +46,8 @@ def argument_names(cls: type) -> set[str]:
 
 
 def _not_saved(model: BaseAlgorithm) -> set[str]:
-    modules = {name.split(".")[0] for name in model._get_torch_save_params()[0]}
+    # The variables, too, are with the parameters.
+    modules = {name.split(".")[0] for names in model._get_torch_save_params() for name in names}
     where = declared(type(model))
     kept = {name for name, places in where.items() if Kept.IN_CHECKPOINTS in places}
     return {*modules, *model._excluded_save_params(), *argument_names(type(model)), *where} - kept
@@ -69,9 +74,9 @@ def restore_attributes(model: BaseAlgorithm, described: dict[str, Node]) -> None
         # How it is run is said by the present program; what "auto" once decided stays.
         described = {name: node for name, node in described.items() if name != "compiled"}
     restorer = Restorer()
-    restorer.attributes(model, described, _not_saved(model))
+    restorer.attributes(model, described, _not_saved(model), anywhere=_OF_EPISODES)
     if restorer.kept:
-        raise DoesNotFit(f"{', '.join(restorer.kept)} name other files than this program")
+        warn(f"{', '.join(restorer.kept)} of the checkpoint may name files, and stay as they are")
 
 
 # ---------------------------------------------------------------- generators

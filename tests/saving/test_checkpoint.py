@@ -1,6 +1,9 @@
 """What a checkpoint holds, what it refuses, and what happens when it cannot be written or read."""
 
+import collections
+import enum
 import errno
+import gc
 import json
 import os
 import resource
@@ -29,9 +32,12 @@ from sb3_sample.sac.policies import MlpPolicy
 from sb3_sample.saving import container, run_folder, training_state
 from sb3_sample.saving.attributes import Describer, same
 from sb3_sample.saving.callbacks import CallbackStates
+from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.encoding import NotPortable, decode, encode
+from sb3_sample.saving.identity import identity_of
 from sb3_sample.saving.kept import Kept, declared
 from sb3_sample.saving.model_tree import Description
+from sb3_sample.saving.normalization import load_vec_normalize, save_vec_normalize
 from sb3_sample.saving.run_folder import RunFolder
 from tests.agents import OFF_POLICY, env_of
 from tests.ppo.common import EVERY, tiny
@@ -946,3 +952,255 @@ def test_a_folder_that_cannot_be_synced(tmp_path: Path, monkeypatch: Any) -> Non
         again = sac().learn(50, checkpoint=tmp_path / "run", **STEPS)
     assert ["cannot be synced" in str(w.message) for w in caught] == [True]
     assert steps_of(tmp_path / "run") == [40, 50] and not differing(state(sac().learn(50)), state(again))
+
+
+class Levels(gym.Wrapper):
+    """Tells the level of each step, as ids of tasks tell theirs."""
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, {**info, "level": "maps/3"}
+
+
+def _levels() -> Monitor:
+    return Monitor(Levels(gym.make("Pendulum-v1", max_episode_steps=10)), info_keywords=("level",))
+
+
+def test_what_monitor_tells_of_episodes_is_no_file(tmp_path: Path) -> None:
+    first = sac(env=DummyVecEnv([_levels]))
+    first.learn(32, checkpoint=tmp_path / "run", **STEPS)
+    assert [each["level"] for each in first.ep_info_buffer] == ["maps/3"] * 3
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        second = sac(env=DummyVecEnv([_levels])).learn(38, checkpoint=tmp_path / "run", **STEPS)
+    assert list(second.ep_info_buffer) == list(first.ep_info_buffer)
+
+
+class Exporting(SAC):
+    """Writes somewhere that no argument says."""
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.export_path = "here"
+
+
+def test_where_an_attribute_writes_is_said_by_the_program(tmp_path: Path) -> None:
+    first = sac(cls=Exporting)
+    first.export_path = "elsewhere/model.onnx"  # type: ignore[attr-defined]
+    first.learn(32, checkpoint=tmp_path / "run", **STEPS)
+    with pytest.warns(UserWarning, match=r"Exporting.export_path of the checkpoint may name files"):
+        second = sac(cls=Exporting).learn(32, checkpoint=tmp_path / "run", **STEPS)
+    assert second.num_timesteps == 32 and second.export_path == "here"
+
+
+class Colour(enum.Enum):
+    RED, BLUE = 1, 2
+
+
+class Mode(enum.Flag):
+    FAST, LOUD = enum.auto(), enum.auto()
+
+
+class Learned(SAC):
+    """A multiplier of its own that it learns, and values of kinds that a list of numbers is not."""
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.log_multiplier = torch.zeros(1, requires_grad=True)
+        self.multiplier_optimizer = torch.optim.SGD([self.log_multiplier], lr=0.5)
+        self.halving = torch.optim.lr_scheduler.MultiStepLR(self.multiplier_optimizer, [1000])
+        self.unnamed = torch.zeros(2, requires_grad=True)
+        self.shape, self.mode, self.rest = torch.Size([1]), Mode.FAST, Mode.FAST
+        self.seen: list[Any] = []
+        self.counts: Any = {}
+
+    def _get_torch_save_params(self) -> Any:
+        names, variables = super()._get_torch_save_params()
+        return [*names, "multiplier_optimizer"], [*variables, "log_multiplier"]
+
+
+def test_values_of_other_kinds_and_what_is_learned_besides(tmp_path: Path) -> None:
+    first = sac(cls=Learned)
+    first.shape, first.mode, first.rest = torch.Size([3, 4]), Mode.FAST | Mode.LOUD, Mode(0)
+    first.seen, first.counts = [Colour.RED, Colour.BLUE], collections.Counter(a=2)
+    with torch.no_grad():
+        first.log_multiplier += 3
+        first.unnamed += 5
+    first.learn(32, checkpoint=tmp_path / "run", **STEPS)
+    second = sac(cls=Learned)
+    learned, unnamed = second.log_multiplier, second.unnamed
+    second.learn(38, checkpoint=tmp_path / "run", **STEPS)
+    assert (second.shape, second.mode, second.rest) == (torch.Size([3, 4]), Mode.FAST | Mode.LOUD, Mode(0))
+    assert second.seen == [Colour.RED, Colour.BLUE] and second.counts == collections.Counter(a=2)
+    assert type(second.shape) is torch.Size and type(second.counts) is collections.Counter
+    # The optimizer goes on with the tensor that it has.
+    assert second.log_multiplier is learned and learned.requires_grad and learned.item() == 3
+    assert second.unnamed is unnamed and unnamed.tolist() == [5, 5]
+    (2 * second.log_multiplier).backward()
+    second.multiplier_optimizer.step()
+    assert second.log_multiplier.item() == 2
+
+    second.save(tmp_path / "model")
+    loaded = Learned.load(tmp_path / "model", trusted_modules=[__name__])
+    assert loaded.log_multiplier.item() == 2
+
+
+class Visits(BaseCallback):
+    """Gives a state that no file holds from some step on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.visited: set[Any] = set()
+        self.counts = collections.Counter[str]()
+
+    def _on_step(self) -> bool:
+        self.counts["steps"] += 1
+        if self.num_timesteps > 20:
+            self.visited.add((0, self.num_timesteps))
+        return True
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"counts": self.counts} | ({"visited": self.visited} if self.visited else {})
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.counts = state["counts"]
+
+
+def test_a_callback_whose_state_comes_to_be_more_than_a_file_holds(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match=r"does not hold the state of Visits \(callback\): state_dict") as told:
+        sac().learn(60, callback=Visits(), checkpoint=tmp_path / "run", **STEPS)
+    assert len([each for each in told if "Visits" in str(each.message)]) == 1
+    assert steps_of(tmp_path / "run")[-1] == 60
+    first, second = Visits(), Visits()
+    sac().learn(20, callback=first, checkpoint=tmp_path / "other", **STEPS)
+    sac().learn(20, callback=second, checkpoint=tmp_path / "other", **STEPS)
+    assert second.counts == first.counts and type(second.counts) is collections.Counter
+
+
+class Moving(gym.Wrapper):
+    """Changes the folder that the process is in."""
+
+    def __init__(self, env: gym.Env, folder: Path) -> None:
+        super().__init__(env)
+        self._folder = str(folder)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        os.chdir(self._folder)
+        return self.env.step(action)
+
+
+def test_a_relative_folder_is_that_of_the_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+    model = sac(env=DummyVecEnv([lambda: Monitor(Moving(gym.make("Pendulum-v1"), tmp_path / "elsewhere"))]))
+    model.learn(40, checkpoint="run", **STEPS)
+    assert steps_of(tmp_path / "run")[-1] == 40 and not (tmp_path / "elsewhere/run").exists()
+
+
+class Prices(gym.Wrapper):
+    """Keeps what no file holds, from the beginning or in the course of time."""
+
+    def __init__(self, env: gym.Env, folder: Path, kind: str) -> None:
+        super().__init__(env)
+        np.save(folder / "p.npy", np.arange(3.0))
+        self._kind, self.visits = kind, dict[Any, int]()
+        self.prices = np.load(folder / "p.npy", mmap_mode="r") if kind == "on disk" else None
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        if self._kind == "many":
+            self.visits.update({(len(self.visits), i): 0 for i in range(1500)})
+        return self.env.step(action)
+
+
+@pytest.mark.parametrize("kind", ["on disk", "many"])
+def test_a_checkpoint_without_the_episodes_is_better_than_none(kind: str, tmp_path: Path) -> None:
+    def learn(steps: int) -> Any:
+        env = DummyVecEnv([lambda: Monitor(Prices(gym.make("Pendulum-v1"), tmp_path, kind))])
+        return sac(env=env).learn(steps, checkpoint=tmp_path / "run", **STEPS)
+
+    with pytest.warns(UserWarning, match="does not hold the episodes in progress: env") as told:
+        learn(40)
+    assert len([each for each in told if "episodes in progress" in str(each.message)]) == 1
+    assert steps_of(tmp_path / "run")[-1] == 40
+    with pytest.warns(UserWarning, match="The episodes in progress start anew"):
+        assert learn(60).num_timesteps == 60
+
+
+class Log(BaseCallback):
+    """Notes more than a file holds."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.notes: list[Any] = []
+
+    def _on_step(self) -> bool:
+        self.notes += [(i, "note") for i in range(2000)]
+        return True
+
+
+def test_a_checkpoint_without_a_callbacks_state_is_better_than_none(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="does not hold the state of callback: callback takes"):
+        sac().learn(40, callback=Log(), checkpoint=tmp_path / "run", **STEPS)
+    assert steps_of(tmp_path / "run")[-1] == 40
+    with pytest.warns(UserWarning, match=r"Log \(callback\) starts anew: it is not in the checkpoint"):
+        assert sac().learn(60, callback=Log(), checkpoint=tmp_path / "run", **STEPS).num_timesteps == 60
+
+
+def test_sets_in_arguments_are_the_same_whatever_their_order() -> None:
+    one, other = {0, 8}, {8, 0}
+    assert list(one) != list(other)
+    model = sac()
+    digests = set()
+    for keys in (one, other):
+        model.policy_kwargs = {"features_extractor_kwargs": {"keys": keys}}
+        digests.add(identity_of(model, model.env)["policy_kwargs"][0])
+    assert len(digests) == 1
+
+
+class Closing:
+    """Removes a file when it goes away."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = str(path)
+
+    def __del__(self) -> None:
+        Path(self.path).unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("path", ["tempfile:_TemporaryFileCloser", f"{__name__}:Closing"])
+def test_a_checkpoint_makes_no_object_that_does_something_when_it_goes_away(path: str, tmp_path: Path) -> None:
+    victim = tmp_path / "thesis.tex"
+    victim.write_text("years")
+    sac().learn(20, checkpoint=tmp_path / "run", **STEPS)
+    attributes = {"file": 1, "name": str(victim), "delete": True, "path": str(victim)}
+    for folder in (tmp_path / "run").glob("checkpoint-*"):
+        file = folder / "model.zip"
+        tree, tensors = container.read(file, "model")
+        tree["parameters"]["x"] = {"instance": path, "attributes": attributes}
+        container.write(file, "model", tree, tensors)
+        rewritten(
+            folder / "manifest.json", lambda m, f=file: m["files"].update({"model.zip": facts_of(f.read_bytes())})
+        )
+    with pytest.raises(BadFile, match="Closing goes away|does something when|may not be named|is no class|not trusted"):
+        sac().learn(40, checkpoint=tmp_path / "run", **STEPS)
+    gc.collect()
+    assert victim.read_text() == "years"
+
+
+def test_numbers_that_numpy_has_not_are_compared() -> None:
+    model = sac()
+    digests = []
+    for value in (1.0, 2.0, 1.0):
+        model.policy_kwargs = {"x": torch.full((), value, dtype=torch.bfloat16)}
+        digests.append(identity_of(model, model.env)["policy_kwargs"][0])
+    assert digests[0] == digests[2] != digests[1]
+
+
+def test_statistics_of_observations_that_are_not_normalised_any_more(tmp_path: Path) -> None:
+    venv = VecNormalize(vec())
+    sac(env=venv).learn(20)
+    venv.norm_obs = False
+    save_vec_normalize(venv, tmp_path / "statistics")
+    loaded = load_vec_normalize(tmp_path / "statistics", vec())
+    assert not loaded.norm_obs and loaded.obs_rms.count == venv.obs_rms.count > 20
+    np.testing.assert_array_equal(loaded.obs_rms.mean, venv.obs_rms.mean)

@@ -437,3 +437,33 @@ def test_depth_is_bounded() -> None:
             tree = wrap(tree)
         with pytest.raises(BadFile, match="nested more than"):
             decode(tree, {}, "v")
+
+
+class Bits(enum.Flag):
+    ONE, TWO = enum.auto(), enum.auto()
+
+
+@pytest.mark.parametrize("value", [Bits.ONE, Bits.ONE | Bits.TWO, Bits(0)])
+def test_flags(value: Bits) -> None:
+    tree = encode(value, "x", {})
+    assert decode(json.loads(json.dumps(tree)), {}, "x", (__name__,)) is value
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.int64, np.uint8])
+def test_actions_of_another_kind_of_number(dtype: Any) -> None:
+    space = spaces.Discrete(4, start=1, dtype=dtype)
+    tensors: dict[str, torch.Tensor] = {}
+    read = decode(json.loads(json.dumps(encode(space, "x", tensors))), tensors, "x")
+    assert read == space and read.dtype == dtype
+
+
+@pytest.mark.parametrize("kind", [np.object_, np.str_, np.bytes_, np.void])
+def test_kinds_of_numpy_that_are_no_numbers(kind: type) -> None:
+    with pytest.raises(NotPortable, match="^x: an array of"):
+        encode(kind, "x", {})
+
+
+def test_no_part_of_torch_is_imported_by_a_name() -> None:
+    with pytest.raises(BadFile, match="no kind of number of torch"):
+        decode({"torch_dtype": "_inductor"}, {}, "x")
+    assert decode({"torch_dtype": "float16"}, {}, "x") is torch.float16

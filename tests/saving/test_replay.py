@@ -343,3 +343,14 @@ def test_a_buffer_far_larger_than_the_models_own(tmp_path: Path) -> None:
         container.write(tmp_path / "c.buffer.zip", "replay buffer", tree, tensors)
         with pytest.raises(BadFile, match=f"{size} rows of 1 environments, at most {size - 1} transitions in all"):
             model.load_replay_buffer(tmp_path / "c")
+
+
+@pytest.mark.parametrize("allow_pickle", [False, True])
+def test_a_name_with_a_dot_is_that_of_a_model_too(allow_pickle: bool, tmp_path: Path) -> None:
+    model = sac()
+    model.learn(20)
+    model.save(tmp_path / "sac-lr0.001")
+    model.save_replay_buffer(tmp_path / "sac-lr0.001", allow_pickle=allow_pickle)
+    loaded = SAC.load(tmp_path / "sac-lr0.001")
+    loaded.load_replay_buffer(tmp_path / "sac-lr0.001", allow_pickle=allow_pickle)
+    assert loaded.replay_buffer.size() == 20
