@@ -871,6 +871,7 @@ class Learner(Executable):
         metrics = {"train/actor_loss": actor_loss}
         if self.networks.actor_target is not None:
             self._follow(self.networks.actor_target, self.actor)
+            self.networks.actor_target.trunk.follow_directions()
 
         # Explorer, on the critics and the new actor.
         metrics.update(logged(self.explorer, "update", self.explorer.update(self, batch, noise.exploration)))

@@ -101,6 +101,15 @@ class Network(nn.Module):
         """
         return list(self.parameters())
 
+    def follow_directions(self) -> None:
+        """
+        Have the directions of spectral norms follow the weights by one power iteration, where no forward pass does: in
+        a target that is never in training mode.
+        """
+        for layer in self.modules():
+            if isinstance(layer, SpectralNorm) and not layer.training:
+                layer.find_direction(1)
+
     def statistics(self) -> list[torch.Tensor]:
         """
         :return: running statistics that a target takes over whole; here all buffers but the directions of spectral

@@ -13,8 +13,8 @@ class SpectralNorm(nn.Module):
 
     The largest singular value is ``sigma = u' weight v``. Its vectors u and v follow the kernel by one power iteration
     at each forward pass in training mode; in evaluation mode they stay. They are buffers, saved with the layer, and
-    constants to the gradient. A network whose weights follow another's (a target) follows with its own vectors, as long
-    as it is in training mode.
+    constants to the gradient. A network whose weights follow another's (a target) follows with its own vectors: those
+    that are in training mode in their forward passes, others by ``Network.follow_directions``.
     """
 
     weight: torch.Tensor

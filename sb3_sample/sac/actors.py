@@ -19,7 +19,7 @@ from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
 from sb3_sample.networks import Network, RunningNorm, project_weights
 from sb3_sample.sac.features import TensorFeatures, share
-from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
+from sb3_sample.sac.trunks import check_saved_alone, keep_at_rest, make_trunk, with_plain_sizes
 
 # The log standard deviation is squashed into this interval by a tanh.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
@@ -132,6 +132,16 @@ class Actor(TensorFeatures, BasePolicy):
         own = {"features_extractor": self.features_extractor, "shares_encoder": self.shares_encoder}
         own |= {name: getattr(self, name) for name in LOG_STD_ARGUMENTS}
         return {**super()._get_constructor_parameters(), **self._network_args, **own}
+
+    def save(self, path: str) -> None:
+        """
+        Save it alone, as in Stable-Baselines3.
+
+        :param path: of the file
+        :raises ValueError: observations are normalised by the policy
+        """
+        check_saved_alone(self)
+        super().save(path)
 
     def share(self, encoder: nn.Module) -> None:
         """
@@ -462,6 +472,8 @@ class NoisyActor(DeterministicActor):
         self.noise_clip = check_value("noise_clip", noise_clip, AT_LEAST_0)
         self._noise_args = {"noise_clip": noise_clip}
         self.register_buffer("noise_std", torch.ones(()))
+        # With the above.
+        keep_at_rest(self)
 
     def gaussian(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         mean = self.mean(self.trunk(features))

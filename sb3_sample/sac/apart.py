@@ -75,7 +75,13 @@ class Apart:
         learner = self._model.learner
         needs_critics = type(learner.explorer) not in _WITHOUT_CRITICS
         theirs, ours = _tensors(learner), _tensors(self._learner)
-        names = [name for name in ours if needs_critics or not name.startswith("networks.critic")]
+        # Where it is shared, the encoder that the actor reads is the critics'.
+        shared = "networks.critic.features_extractor." if learner.networks.share_features_extractor else None
+        names = [
+            name
+            for name in ours
+            if needs_critics or not name.startswith("networks.critic") or (shared and name.startswith(shared))
+        ]
         return [ours[name].data for name in names], [theirs[name].data for name in names]
 
     def _hand_over(self) -> None:

@@ -18,7 +18,7 @@ from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.q_values import QValues
 from sb3_sample.networks import Network, RunningNorm, project_weights
 from sb3_sample.sac.features import TensorFeatures, share
-from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
+from sb3_sample.sac.trunks import check_saved_alone, keep_at_rest, make_trunk, with_plain_sizes
 
 
 class CriticEnsemble(TensorFeatures, BaseModel):
@@ -101,6 +101,16 @@ class CriticEnsemble(TensorFeatures, BaseModel):
         own["shares_encoder"] = self.shares_encoder
         return {**super()._get_constructor_parameters(), **own}
 
+    def save(self, path: str) -> None:
+        """
+        Save it alone, as in Stable-Baselines3.
+
+        :param path: of the file
+        :raises ValueError: observations are normalised by the policy
+        """
+        check_saved_alone(self)
+        super().save(path)
+
     def q_values(self, obs: PyTorchObs, actions: torch.Tensor) -> torch.Tensor:
         """
         :param obs: observations, (B, O), or a dict of them
@@ -124,7 +134,8 @@ class CriticEnsemble(TensorFeatures, BaseModel):
 
         :param obs: observations, (B, O), or a dict of them
         :param actions: actions in [-1, 1], (B, A)
-        :return: the first critic's value, the mean of its quantiles if it has some, (B, 1)
+        :return: the first critic's value, the mean of its quantiles if it has some, (B, 1). Of critics that are
+            classifiers it is the mean of logits, no value: ``learner.head.values`` of :meth:`q_values` has theirs
         """
         return self.q_values(obs, actions)[0].mean(dim=1, keepdim=True)
 

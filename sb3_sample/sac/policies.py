@@ -210,6 +210,11 @@ class SACPolicy(BasePolicy):
         parameters: Any = list(self.critic.parameters())
         if encoder_learning_rate is not None:
             n = len(list(self.encoders()[0].parameters()))
+            if n == 0:
+                raise ValueError(
+                    f"encoder_learning_rate={encoder_learning_rate!r} is of an encoder with parameters, and "
+                    f"{type(self.encoders()[0]).__name__} has none: leave it out"
+                )
             of_encoder = {"params": parameters[:n], "lr": encoder_learning_rate, "scheduled": False}
             parameters = [of_encoder, {"params": parameters[n:]}]
         self.critic.optimizer = self.make_optimizer(parameters, lr_schedule(1), **(critic_optimizer_kwargs or {}))

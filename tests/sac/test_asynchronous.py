@@ -13,6 +13,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_sample import SAC
@@ -22,6 +23,7 @@ from sb3_sample.saving.checkpoint import Checkpointer
 from sb3_sample.training import acting
 from sb3_sample.training.acting import ActingThread, Chosen
 from tests.sac.common import MAKERS, Toy, sac, vec
+from tests.sac.pixels import drq
 
 
 class Counter(gym.Env):
@@ -388,3 +390,29 @@ def goals() -> DummyVecEnv:
 def test_what_is_refused(make: Callable[..., Any], given: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         make().learn(10, **given)
+
+
+@pytest.mark.parametrize("maker", ["DrQ", "SAC", "DAC"])
+def test_a_shared_encoder_is_handed_over(maker: str, clock: Made) -> None:
+    """It is among the critics' parameters, which who acts without them does not get otherwise."""
+    if maker == "DrQ":
+        model = drq(replay_ratio=1)
+    else:
+        shared = {"features_extractor_class": Embedding, "share_features_extractor": True}
+        model = MAKERS[maker](env=vec(), policy_kwargs={"net_arch": [8], **shared})
+    model.learn(40, asynchronous=True, control_frequency=20)
+    apart = Apart(model, None)
+    theirs, ours = (each.networks.critic.features_extractor.state_dict() for each in (model.learner, apart._learner))
+    assert ours and all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    acting, learning = (each.networks.actor for each in (apart._learner, model.learner))
+    observations = torch.as_tensor(model._last_obs)
+    assert torch.equal(acting.features(observations), learning.features(observations))
+
+
+class Embedding(BaseFeaturesExtractor):
+    def __init__(self, observation_space: Any):
+        super().__init__(observation_space, 4)
+        self.layer = torch.nn.Linear(observation_space.shape[0], 4)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        return self.layer(observations)

@@ -11,6 +11,7 @@ import torch
 from sb3_sample import BROTD3
 from sb3_sample.learner.batch import Noise
 from sb3_sample.learner.exploration import Exploration, OptimisticShift
+from sb3_sample.networks.spectral_norm import SpectralNorm
 from sb3_sample.sac.actors import DeterministicActor
 from tests.sac.common import bro, differing, random_batch, sac, state, vec
 
@@ -309,3 +310,21 @@ def test_bad_arguments_at_loading(name: str, value: Any, tmp_path: Path) -> None
     td3().save(tmp_path / "m")
     with pytest.raises(ValueError, match=name):
         BROTD3.load(tmp_path / "m", env=vec(), **{name: value})
+
+
+def test_a_target_actor_follows_with_directions_of_its_own() -> None:
+    """It is never in training mode, and its kernels are the average of others'."""
+    kwargs = {"actor_network_kwargs": {"hidden_sizes": [8, 8], "spectral_norm": True}}
+    model = bro(cls=BROTD3, learning_starts=8, policy_kwargs={"actor_network": "mlp", **kwargs}, tau=0.5)
+    target = model.policy.actor_target
+    (layer,) = (each for each in target.modules() if isinstance(each, SpectralNorm))
+    with torch.no_grad():
+        for each in model.policy.actor.modules():
+            if isinstance(each, SpectralNorm):
+                # Another kernel altogether, of one strong direction.
+                each.weight.copy_(torch.outer(torch.arange(8.0), torch.linspace(-1, 2, 8)))
+                each.find_direction()
+    model.learn(40)
+    assert not layer.training
+    norm = torch.linalg.matrix_norm(layer.normalized_weight(), 2)
+    torch.testing.assert_close(norm, torch.ones(()), rtol=0.02, atol=0)

@@ -389,6 +389,16 @@ def test_actor_and_critic_are_saved_and_loaded_alone(maker: str, tmp_path: Path)
     np.testing.assert_array_equal(*(a.predict(observation, deterministic=True)[0] for a in (actor, model.policy)))
 
 
+def test_what_reads_through_the_policys_statistics_is_not_saved_alone(tmp_path: Path) -> None:
+    model = MAKERS["SimBa"]()
+    for module in (model.actor, model.critic):
+        with pytest.raises(ValueError, match="would be without the statistics"):
+            module.save(tmp_path / "alone")
+    model.policy.save(tmp_path / "policy")
+    loaded = type(model.policy).load(tmp_path / "policy", device="cpu")
+    assert loaded.observation_norm is not None
+
+
 # ---------------------------------------------------------------- critics
 
 

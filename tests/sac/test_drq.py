@@ -527,3 +527,9 @@ def test_compiled(make: Any) -> None:
     assert a.keys() == b.keys()
     for name in a:
         torch.testing.assert_close(a[name], b[name], rtol=1e-3, atol=1e-4, msg=name)
+
+
+def test_drqv2_with_a_batch_normed_actor() -> None:
+    """Its view in evaluation mode has the noise, too."""
+    model = drqv2(policy_kwargs={**TINY, "actor_network": "crossq"}).learn(60)
+    assert model._n_updates > 0 and model.policy.actor.at_rest.noise_clip == model.policy.actor.noise_clip

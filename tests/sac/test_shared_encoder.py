@@ -422,3 +422,8 @@ def test_learns_from_images() -> None:
     actions = model.predict(shown, deterministic=True)[0][:, 0]
     # A constant action has at least the variance, 0.31.
     assert np.square(actions - wanted).mean() < 0.1
+
+
+def test_a_learning_rate_of_an_encoder_without_parameters() -> None:
+    with pytest.raises(ValueError, match="encoder_learning_rate=0.0001 is of an encoder with parameters, and Flatten"):
+        sac(policy_kwargs={"net_arch": [8], "share_features_extractor": True, "encoder_learning_rate": 1e-4})
