@@ -80,6 +80,6 @@ def check_saved_alone(owner: Any) -> None:
     """
     if owner.observation_norm is not None:
         raise ValueError(
-            f"the file of a {type(owner).__name__} would be without the statistics that its observations are normalised "
-            "by, which are the policy's: save the policy (model.policy.save) or the model"
+            f"the file of a {type(owner).__name__} would be without the statistics that its observations are "
+            "normalised by, which are the policy's: save the policy (model.policy.save) or the model"
         )
