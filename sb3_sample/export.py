@@ -242,8 +242,14 @@ def _described(name: str, space: spaces.Space) -> dict[str, Any]:
 
 
 def _action_dtype(space: spaces.Space) -> Any:
-    """Type of the actions that ``predict`` gives: the policy's float32 numbers, scaled to the bounds of a Box."""
-    return np.result_type(np.float32, space.dtype) if isinstance(space, spaces.Box) else space.dtype
+    """
+    Type of the actions that ``predict`` gives: the policy's numbers, whatever the space's, scaled to the bounds of a
+    Box.
+    """
+    if isinstance(space, spaces.Box):
+        return np.result_type(np.float32, space.dtype)
+    # Of Bernoulli distributions the mode is a float.
+    return np.dtype(np.float32 if isinstance(space, spaces.MultiBinary) else np.int64)
 
 
 def _apart(work: Callable[[], Any]) -> Any:

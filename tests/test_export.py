@@ -128,6 +128,8 @@ def test_action_spaces(action_space: spaces.Space, tmp_path: Path) -> None:
     proto = check(shake(ppo(vec(action_space=action_space))), tmp_path)
     (output,) = json.loads(next(entry.value for entry in proto.metadata_props if entry.key == "outputs"))
     assert output["shape"] == ["batch", *action_space.shape]
+    (given,) = proto.graph.output
+    assert output["dtype"] == str(onnx.helper.tensor_dtype_to_np_dtype(given.type.tensor_type.elem_type))
 
 
 @pytest.mark.slow
