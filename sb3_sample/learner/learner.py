@@ -45,6 +45,7 @@ from sb3_sample.learner.scalars import FixedScalar, LogScalar, TaskLogScalar
 from sb3_sample.learner.schedules import LearningRateSchedule
 from sb3_sample.learner.target import next_step, online_outputs, step_outputs, td_target
 from sb3_sample.learner.transforms import BatchTransform
+from sb3_sample.networks.batch_norm import running_moments
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
 from sb3_sample.networks.unit_norm import project_weights
@@ -1047,12 +1048,14 @@ class Learner(Executable):
 
         :param module: the module
         :param fresh: a module of the same kind
-        :param shrink: share of the old parameters that stays
+        :param shrink: share of the old parameters that stays; above 0 the running moments of batch norms stay whole
         """
         state = fresh.state_dict()
         if shrink > 0:
             for name, parameter in module.named_parameters():
                 state[name] = torch.lerp(state[name].to(parameter.device), parameter.detach(), shrink)
+            # Fresh moments would be those of no network, neither the old one nor the mixed.
+            state.update({name: moment for name, moment in running_moments(module) if name in state})
         module.load_state_dict(state)
         if shrink > 0:
             project_weights(module)
