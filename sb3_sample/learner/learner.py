@@ -48,6 +48,7 @@ from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.networks.batch_norm import running_moments
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
+from sb3_sample.networks.projected import Projected
 from sb3_sample.networks.unit_norm import project_weights
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 
@@ -64,6 +65,11 @@ def check_is_batch(batch: Any) -> None:
     """
     if not isinstance(batch, Batch):
         raise ValueError(f"batch must be a Batch, not {batch!r:.100}: data.sample(n) of a Dataset gives one")
+
+
+def _chosen(trunk: Network) -> Network:
+    """The network that was chosen for a trunk, which stands behind a projection where there is one."""
+    return trunk.network if isinstance(trunk, Projected) else trunk
 
 
 class Counts:
@@ -504,8 +510,8 @@ class Learner(Executable):
             "exploration": self.explorer,
             "pessimism": self.pessimism_rule,
             "value_head": self.head,
-            "actor_network": self.actor.trunk,
-            "critic_network": self.critic.trunk,
+            "actor_network": _chosen(self.actor.trunk),
+            "critic_network": _chosen(self.critic.trunk),
         }
 
     @property
