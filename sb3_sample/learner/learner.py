@@ -934,6 +934,8 @@ class Learner(Executable):
         assert self.sam_radius is not None
         parameters = list(self.critic.parameters())
         copied = {id(p) for p in self.critic.copied_parameters()}
+        statistics = self.critic.statistics()
+        before = [each.clone() for each in statistics]
         gradients = sharpness_aware_gradients(
             loss,
             lambda: self._critic_loss(online_outputs(self, batch, next_actions)[0], target),
@@ -941,6 +943,10 @@ class Learner(Executable):
             self.sam_radius,
             [len(p) if id(p) in copied else None for p in parameters],
         )
+        with torch.no_grad():
+            # They are of the critics as they are, whose own pass has moved them, and not of those uphill.
+            for each, value in zip(statistics, before, strict=True):
+                each.copy_(value)
         descend(self.critic.optimizer, gradients)
 
     @staticmethod
