@@ -175,6 +175,17 @@ def test_noise_schedule() -> None:
         sac(exploration="scheduled_noise")
 
 
+def test_noise_of_another_exploration_is_the_schedules_first() -> None:
+    """In exploration, TD target and actor's loss, also after a reset."""
+    model = drqv2(exploration="actor", noise_schedule=(0.5, 0.1, 100))
+    for _ in range(2):
+        assert model.actor.noise_std == 0.5
+        model.learner.on_step(np.zeros(1), np.zeros(1, bool), [{}])
+        model.reinitialize()
+    with pytest.raises(ValueError, match="argument noise_schedule"):
+        drqv2(policy_kwargs={**TINY, "actor_kwargs": {"noise_std": 0.2}})
+
+
 def test_the_update_of_drqv2() -> None:
     """Clipped noise in target and actor's loss, features of one encoder from before its step, no target encoder."""
     model = drqv2(augmentation_kwargs={"pad": 0}, noise_schedule=(0.5, 0.1, 100), tau=0.25)
