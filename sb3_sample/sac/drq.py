@@ -54,12 +54,12 @@ class _FromPixels(SAC):
         for name in "actor", "critic":
             if kwargs.get(f"{name}_network", "mlp") == "mlp":
                 key = f"{name}_network_kwargs"
-                own = {"gain": 1.0} | ({"layer_norm": True} if self.layer_norm and name == "critic" else {})
+                own: dict[str, Any] = {"gain": 1.0}
+                if self.layer_norm and name == "critic":
+                    own["layer_norm"] = True
+                if kwargs.get("net_arch") is None:
+                    own["hidden_sizes"] = (1024, 1024)
                 kwargs[key] = {**own, **(kwargs.get(key) or {})}
-        if not {"net_arch", "actor_network", "critic_network"} & kwargs.keys():
-            hidden = {"hidden_sizes": (1024, 1024)}
-            for key in "actor_network_kwargs", "critic_network_kwargs":
-                kwargs[key] = {**hidden, **kwargs[key]}
         return kwargs
 
     def _encoder_kwargs(self) -> dict[str, Any]:

@@ -337,6 +337,18 @@ def test_defaults_of_the_published_codes(make: Any) -> None:
     assert normed.actor.trunk.hidden_units(None)[0].norm is None
 
 
+@pytest.mark.parametrize("make", [drq, drqv2])
+@pytest.mark.parametrize(("own", "other"), [("critic", "actor"), ("actor", "critic")])
+def test_another_network_of_one_leaves_the_sizes_of_the_other(make: Any, own: str, other: str) -> None:
+    small = {key: value for key, value in TINY.items() if key != "net_arch"}
+    chosen = {f"{own}_network": "bronet", f"{own}_network_kwargs": {"width": 8, "n_blocks": 1}}
+    model = make(policy_kwargs={**small, **chosen})
+    sizes = [each.dense.weight.shape[-2] for each in model.actor.trunk.hidden_units(None)]
+    if other == "critic":
+        sizes = [each.dense.weight.shape[-1] for each in model.critic.trunk.hidden_units(None)]
+    assert sizes == [1024, 1024]
+
+
 def test_any_features_extractor_can_be_the_encoder() -> None:
     kwargs = {"net_arch": [8], "features_extractor_class": NatureCNN, "features_extractor_kwargs": {"features_dim": 9}}
     model = drq(frames(size=36), policy_kwargs=kwargs).learn(12)
