@@ -398,7 +398,8 @@ class OptimisticShift(OptimisticExploration):
     :param initial_kl_weight: weight of the divergence at the start and after a reset
     :param adjustment_learning_rate: of optimism and weight, by Adam with beta1 = 0.5
     :param network: trunk of the shift network, one of ``NETWORKS``
-    :param network_kwargs: its arguments; None: one block, 256 wide, for "bronet", the network's own otherwise
+    :param network_kwargs: its arguments, those that are not given one block, 256 wide, for "bronet", the network's own
+        otherwise
     :param width_factor: by which its hidden layers are wider than that
     :raises ValueError: if an argument is out of range
     """
@@ -422,8 +423,8 @@ class OptimisticShift(OptimisticExploration):
             raise ValueError(f"network must be one of {sorted(NETWORKS)}, not {network!r}")
         actor = learner.actor
         action_dim = actor.action_dim
-        if network_kwargs is None:
-            network_kwargs = {"width": 256, "n_blocks": 1} if network == "bronet" else {}
+        own = {"width": 256, "n_blocks": 1} if network == "bronet" else {}
+        network_kwargs = {**own, **(network_kwargs or {})}
         made = NETWORKS[network]
         network_kwargs = widened(made, network_kwargs, width_factor)
         if isinstance(actor.trunk, Projected):
