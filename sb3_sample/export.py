@@ -31,6 +31,7 @@ from sb3_sample.faults import check_finite_parameters
 from sb3_sample.saving.container import replacing
 from sb3_sample.saving.normalization import lacks_vec_normalize
 from sb3_sample.version import __version__
+from sb3_sample.warn import warn
 
 #: The ONNX operator set of exported files; onnxruntime has had it since 1.14.
 OPSET = 18
@@ -57,7 +58,7 @@ class Exportable:
 
         :param path: where to write; ``.onnx`` and ``.pt`` are appended
         :param vec_normalize: whose normalisation of the observations is put inside; None: that of the model's own
-            environment, if there is one
+            environment, if there is one; that it is missing in an environment without one is warned of
         :return: the two files
         :raises ImportError: if the extra is missing, or torch is too old
         :raises TrainingDiverged: if a parameter is not finite
@@ -75,11 +76,15 @@ class Exportable:
             )
         if vec_normalize is not None and not isinstance(vec_normalize, VecNormalize):
             raise ValueError(f"vec_normalize must be a VecNormalize, or None, not {vec_normalize!r}")
-        if vec_normalize is None and self.env is None and lacks_vec_normalize(self):
-            raise ValueError(
-                "vec_normalize must be given: this model learned from normalised observations, and was loaded without "
-                "its environment, which has their statistics"
+        if vec_normalize is None and lacks_vec_normalize(self):
+            message = (
+                "vec_normalize must be given, such as load_vec_normalize(file, venv): this model learned from "
+                "normalised observations, and without their statistics its policy sees other numbers than it knows"
             )
+            if self.env is None:
+                raise ValueError(message)
+            # It may have been trained on in an environment without one.
+            warn(message)
         check_finite_parameters(self)
         path = Path(path)
         if path.suffix in (".onnx", ".pt"):
@@ -237,8 +242,14 @@ def _described(name: str, space: spaces.Space) -> dict[str, Any]:
 
 
 def _action_dtype(space: spaces.Space) -> Any:
-    """Type of the actions that ``predict`` gives: the policy's float32 numbers, scaled to the bounds of a Box."""
-    return np.result_type(np.float32, space.dtype) if isinstance(space, spaces.Box) else space.dtype
+    """
+    Type of the actions that ``predict`` gives: the policy's numbers, whatever the space's, scaled to the bounds of a
+    Box.
+    """
+    if isinstance(space, spaces.Box):
+        return np.result_type(np.float32, space.dtype)
+    # Of Bernoulli distributions the mode is a float.
+    return np.dtype(np.float32 if isinstance(space, spaces.MultiBinary) else np.int64)
 
 
 def _apart(work: Callable[[], Any]) -> Any:

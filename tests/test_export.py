@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import resource
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 
-from sb3_sample import MBMAPPO, TrainingDiverged, export
+from sb3_sample import MBMAPPO, SAC, TrainingDiverged, export
 from sb3_sample.export import OPSET
 from tests.agents import OFF_POLICY
 from tests.ppo.common import ALGORITHMS, tiny
@@ -127,6 +128,8 @@ def test_action_spaces(action_space: spaces.Space, tmp_path: Path) -> None:
     proto = check(shake(ppo(vec(action_space=action_space))), tmp_path)
     (output,) = json.loads(next(entry.value for entry in proto.metadata_props if entry.key == "outputs"))
     assert output["shape"] == ["batch", *action_space.shape]
+    (given,) = proto.graph.output
+    assert output["dtype"] == str(onnx.helper.tensor_dtype_to_np_dtype(given.type.tensor_type.elem_type))
 
 
 @pytest.mark.slow
@@ -347,6 +350,18 @@ def test_statistics_that_are_missing_are_asked_for(family: str, tmp_path: Path) 
         loaded.export(tmp_path / "policy")
     loaded.export(tmp_path / "policy", vec_normalize=env)
     assert (tmp_path / "policy.onnx").exists()
+
+
+def test_statistics_that_a_plain_environment_lacks_are_warned_of(tmp_path: Path) -> None:
+    sac(VecNormalize(vec())).learn(12).save(tmp_path / "m")
+    loaded = SAC.load(tmp_path / "m", env=vec())
+    with pytest.warns(UserWarning, match="vec_normalize must be given"):
+        loaded.export(tmp_path / "policy")
+    assert (tmp_path / "policy.onnx").exists()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loaded.export(tmp_path / "policy", vec_normalize=VecNormalize(vec()))
+        sac().export(tmp_path / "policy")
 
 
 @pytest.mark.parametrize("family", ["sac", "ppo"])

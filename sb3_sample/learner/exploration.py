@@ -16,7 +16,7 @@ from sb3_sample.learner.parts import Learning, Part
 from sb3_sample.learner.pessimism import epistemic_std
 from sb3_sample.learner.scalars import BoundedLogScalar, FixedScalar, LogScalar
 from sb3_sample.learner.target import at_rest, values
-from sb3_sample.networks import NETWORKS, Projected, linear, widened
+from sb3_sample.networks import NETWORKS, Projected, linear, project_weights, widened
 from sb3_sample.optim import AdamW
 
 
@@ -311,6 +311,10 @@ class OptimisticExploration(Exploration):
         """
         raise NotImplementedError
 
+    def _project(self) -> None:
+        """Called after every step of the optimistic actor's optimizer: weights of unit norm are brought back to it."""
+        project_weights(self)
+
     def _kl(self, learner: Learning, optimistic: Any, pessimistic: Any) -> torch.Tensor:
         """Divergence of the two Gaussians, (B, 1)."""
         return learner.actor.kl(*optimistic, *pessimistic)
@@ -358,6 +362,7 @@ class OptimisticExploration(Exploration):
         upper_value = q_mean + optimism.detach() * q_std
         actor_loss = losses.optimistic_actor_loss(upper_value, kl, self._penalty(kl_weight))
         learner.minimize(self.actor_optimizer, actor_loss)
+        self._project()
 
         kl_gap = kl.detach().mean() / mean.shape[1] - self.kl_target
         optimism_loss = self._optimism_loss(learner, optimism, kl_gap)
@@ -393,7 +398,8 @@ class OptimisticShift(OptimisticExploration):
     :param initial_kl_weight: weight of the divergence at the start and after a reset
     :param adjustment_learning_rate: of optimism and weight, by Adam with beta1 = 0.5
     :param network: trunk of the shift network, one of ``NETWORKS``
-    :param network_kwargs: its arguments; None: one block, 256 wide, for "bronet", the network's own otherwise
+    :param network_kwargs: its arguments, those that are not given one block, 256 wide, for "bronet", the network's own
+        otherwise
     :param width_factor: by which its hidden layers are wider than that
     :raises ValueError: if an argument is out of range
     """
@@ -417,8 +423,8 @@ class OptimisticShift(OptimisticExploration):
             raise ValueError(f"network must be one of {sorted(NETWORKS)}, not {network!r}")
         actor = learner.actor
         action_dim = actor.action_dim
-        if network_kwargs is None:
-            network_kwargs = {"width": 256, "n_blocks": 1} if network == "bronet" else {}
+        own = {"width": 256, "n_blocks": 1} if network == "bronet" else {}
+        network_kwargs = {**own, **(network_kwargs or {})}
         made = NETWORKS[network]
         network_kwargs = widened(made, network_kwargs, width_factor)
         if isinstance(actor.trunk, Projected):
@@ -440,6 +446,9 @@ class OptimisticShift(OptimisticExploration):
         self, observations: Any, features: torch.Tensor, mean: torch.Tensor, std: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         return mean + self.shift(self.trunk(torch.cat((features, mean), dim=1))), std
+
+    def _project(self) -> None:
+        self.trunk.project()
 
     def _optimism(self, learner: Learning) -> torch.Tensor:
         return self.optimism()
@@ -552,6 +561,9 @@ class OptimisticActor(OptimisticExploration):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         mean, log_std = self.actor.gaussian(self.actor.features(observations))
         return (mean, std) if self.deterministic else (mean, log_std.exp())
+
+    def _project(self) -> None:
+        self.actor.project()
 
     def sampled(self, learner: Learning, observations: Any, noise: torch.Tensor) -> torch.Tensor:
         mean, log_std = self.actor.gaussian(self.actor.features(observations))

@@ -45,8 +45,10 @@ from sb3_sample.learner.scalars import FixedScalar, LogScalar, TaskLogScalar
 from sb3_sample.learner.schedules import LearningRateSchedule
 from sb3_sample.learner.target import next_step, online_outputs, step_outputs, td_target
 from sb3_sample.learner.transforms import BatchTransform
+from sb3_sample.networks.batch_norm import running_moments
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
+from sb3_sample.networks.projected import Projected
 from sb3_sample.networks.unit_norm import project_weights
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 
@@ -63,6 +65,11 @@ def check_is_batch(batch: Any) -> None:
     """
     if not isinstance(batch, Batch):
         raise ValueError(f"batch must be a Batch, not {batch!r:.100}: data.sample(n) of a Dataset gives one")
+
+
+def _chosen(trunk: Network) -> Network:
+    """The network that was chosen for a trunk, which stands behind a projection where there is one."""
+    return trunk.network if isinstance(trunk, Projected) else trunk
 
 
 class Counts:
@@ -503,8 +510,8 @@ class Learner(Executable):
             "exploration": self.explorer,
             "pessimism": self.pessimism_rule,
             "value_head": self.head,
-            "actor_network": self.actor.trunk,
-            "critic_network": self.critic.trunk,
+            "actor_network": _chosen(self.actor.trunk),
+            "critic_network": _chosen(self.critic.trunk),
         }
 
     @property
@@ -928,6 +935,8 @@ class Learner(Executable):
         assert self.sam_radius is not None
         parameters = list(self.critic.parameters())
         copied = {id(p) for p in self.critic.copied_parameters()}
+        statistics = self.critic.statistics()
+        before = [each.clone() for each in statistics]
         gradients = sharpness_aware_gradients(
             loss,
             lambda: self._critic_loss(online_outputs(self, batch, next_actions)[0], target),
@@ -935,6 +944,10 @@ class Learner(Executable):
             self.sam_radius,
             [len(p) if id(p) in copied else None for p in parameters],
         )
+        with torch.no_grad():
+            # They are of the critics as they are, whose own pass has moved them, and not of those uphill.
+            for each, value in zip(statistics, before, strict=True):
+                each.copy_(value)
         descend(self.critic.optimizer, gradients)
 
     @staticmethod
@@ -1048,12 +1061,14 @@ class Learner(Executable):
 
         :param module: the module
         :param fresh: a module of the same kind
-        :param shrink: share of the old parameters that stays
+        :param shrink: share of the old parameters that stays; above 0 the running moments of batch norms stay whole
         """
         state = fresh.state_dict()
         if shrink > 0:
             for name, parameter in module.named_parameters():
                 state[name] = torch.lerp(state[name].to(parameter.device), parameter.detach(), shrink)
+            # Fresh moments would be those of no network, neither the old one nor the mixed.
+            state.update({name: moment for name, moment in running_moments(module) if name in state})
         module.load_state_dict(state)
         if shrink > 0:
             project_weights(module)

@@ -1,7 +1,10 @@
 """Batch norm of one network or of a stack of independent ones, and batch renormalisation."""
 
+from collections.abc import Iterator
+
 import torch
 from torch import nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from sb3_sample.kinds import ABOVE_0, Kind, check_value, is_number
 
@@ -135,3 +138,15 @@ class BatchRenorm(BatchNorm):
         is_flat = var == 0
         std = torch.where(is_flat, 0.0, torch.where(is_flat, 1.0, var).sqrt())
         return mean - distance * std / ratio, var / ratio.square()
+
+
+def running_moments(module: nn.Module) -> Iterator[tuple[str, torch.Tensor]]:
+    """
+    Find the buffers of batch norms, torch's own among them: running moments and counts of passes.
+
+    :param module: a network, or whatever has some
+    :return: the buffers, with the names that they have in the module's state
+    """
+    for prefix, layer in module.named_modules():
+        if isinstance(layer, (BatchNorm, _BatchNorm)):
+            yield from layer.named_buffers(prefix, recurse=False)

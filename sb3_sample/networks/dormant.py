@@ -9,7 +9,6 @@ from torch import nn
 
 from sb3_sample.networks.activations import width_factor
 from sb3_sample.networks.ensemble import Dense, EnsembleLinear
-from sb3_sample.networks.initialization import draw_orthogonal
 from sb3_sample.networks.network import Network
 from sb3_sample.networks.spectral_norm import SpectralNorm
 
@@ -68,10 +67,10 @@ def recycle(
     incoming weights and no outgoing ones, so that a neuron that was silent leaves the output as it was and can learn
     again. Each copy has its own dormant neurons.
 
-    The incoming weights are columns of a kernel drawn as at initialisation; the bias is 0, scale and shift of a
-    layer norm 1 and 0. All layers are judged first, and a weight between two dormant neurons ends at 0, as in the
-    published code. The output does move where a layer norm follows, which sees the new neuron among the others, and
-    where a spectral norm is that of a kernel which has changed.
+    The incoming weights are columns of a kernel drawn as at initialisation (``HiddenUnits.draw``); the bias is 0, scale
+    and shift of a layer norm 1 and 0. All layers are judged first, and a weight between two dormant neurons ends at 0,
+    as in the published code. The output does move where a layer norm follows, which sees the new neuron among the
+    others, and where a spectral norm is that of a kernel which has changed.
 
     Nothing is copied to the host.
 
@@ -92,7 +91,7 @@ def recycle(
     for units, dormant in layers:
         n_recycled += dormant.sum()
         weight = units.dense.weight
-        _overwrite(weight, _columns(dormant, units.dense), draw_orthogonal(torch.empty_like(weight)), optimizer)
+        _overwrite(weight, _columns(dormant, units.dense), units.draw(torch.empty_like(weight)), optimizer)
         per_neuron = dormant if dormant.dim() == 1 else dormant.unsqueeze(-2)
         if units.dense.bias is not None:
             _overwrite(units.dense.bias, per_neuron, 0.0, optimizer)

@@ -43,17 +43,28 @@ def init_orthogonal(layer: Dense, gain: float = DEFAULT_GAIN) -> None:
         layer.project()
 
 
+def draw_he_normal(weight: torch.Tensor, fan_in: int) -> torch.Tensor:
+    """
+    Draw kernels from a normal distribution of variance 2 / fan-in, truncated at two standard deviations (of which the
+    variance is what is left), in place.
+
+    :param weight: kernel, or a stack of some
+    :param fan_in: inputs of the layer
+    :return: the same tensor
+    """
+    # Standard deviation of the standard normal distribution truncated to [-2, 2].
+    std = math.sqrt(2 / fan_in) / 0.8796256610342398
+    return nn.init.trunc_normal_(weight, 0.0, std, -2 * std, 2 * std)
+
+
 @torch.no_grad()
 def init_he_normal(layer: Dense) -> None:
     """
-    Draw a kernel from a normal distribution of variance 2 / fan-in, truncated at two standard deviations (of which the
-    variance is what is left), and set the bias to zero, in place.
+    Draw a kernel by :func:`draw_he_normal`, and set the bias to zero, in place.
 
     :param layer: the layer to initialise
     """
-    # Standard deviation of the standard normal distribution truncated to [-2, 2].
-    std = math.sqrt(2 / layer.in_features) / 0.8796256610342398
-    nn.init.trunc_normal_(layer.weight, 0.0, std, -2 * std, 2 * std)
+    draw_he_normal(layer.weight, layer.in_features)
     if layer.bias is not None:
         nn.init.zeros_(layer.bias)
 

@@ -1,5 +1,6 @@
 """The plain multi-layer perceptron of SAC, with optional layer norm, spectral norm and dropout."""
 
+import functools
 from collections.abc import Sequence
 
 import torch
@@ -8,7 +9,7 @@ from torch import nn
 from sb3_sample.networks.activations import width_factor
 from sb3_sample.networks.ensemble import Dense, Norm
 from sb3_sample.networks.ensemble import layer_norm as make_layer_norm
-from sb3_sample.networks.initialization import DEFAULT_GAIN, linear
+from sb3_sample.networks.initialization import DEFAULT_GAIN, draw_orthogonal, linear
 from sb3_sample.networks.network import HiddenUnits, Network
 
 
@@ -40,7 +41,7 @@ class MLP(Network):
         gain: float = DEFAULT_GAIN,
     ):
         super().__init__()
-        self.head_gain = gain
+        self.gain = self.head_gain = gain
         if any(width < 1 for width in hidden_sizes):
             raise ValueError(f"the widths in hidden_sizes must be at least 1, not {list(hidden_sizes)}")
         if spectral_norm and not hidden_sizes:
@@ -78,4 +79,5 @@ class MLP(Network):
         :return: every hidden layer, in the order of the forward pass
         """
         outgoing = [*(dense for _, dense, _, _ in self._hidden[1:]), head]
-        return [HiddenUnits(*layer, reader) for layer, reader in zip(self._hidden, outgoing, strict=False)]
+        draw = functools.partial(draw_orthogonal, gain=self.gain)
+        return [HiddenUnits(*layer, reader, draw) for layer, reader in zip(self._hidden, outgoing, strict=False)]

@@ -2,14 +2,14 @@
 
 import inspect
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import nn
 
 from sb3_sample.networks.ensemble import Dense, Norm
-from sb3_sample.networks.initialization import DEFAULT_GAIN, linear
+from sb3_sample.networks.initialization import DEFAULT_GAIN, draw_orthogonal, linear
 from sb3_sample.networks.spectral_norm import SpectralNorm
 
 
@@ -26,6 +26,8 @@ class HiddenUnits(NamedTuple):
     activation: nn.Module
     #: The one layer that reads the activation; None if others read it too, and the neurons cannot be recycled
     outgoing: Dense | None
+    #: Draws a kernel like the dense layer's as at initialisation, in place, and returns it
+    draw: Callable[[torch.Tensor], torch.Tensor] = draw_orthogonal
 
 
 class Network(nn.Module):

@@ -1,8 +1,10 @@
 """Multi-layer perceptron of MR.Q and DR.Q, whose layer norms have nothing to learn."""
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -10,6 +12,18 @@ from torch import nn
 
 from sb3_sample.networks.ensemble import Dense, EnsembleLinear
 from sb3_sample.networks.network import HiddenUnits, Network
+
+
+def draw_xavier(weight: torch.Tensor, fans: int) -> torch.Tensor:
+    """
+    Draw kernels from Xavier's uniform distribution, gain √2, in place.
+
+    :param weight: kernel, or a stack of some
+    :param fans: inputs and outputs of the layer together
+    :return: the same tensor
+    """
+    bound = math.sqrt(2) * math.sqrt(6 / fans)
+    return nn.init.uniform_(weight, -bound, bound)
 
 
 def xavier_linear(in_features: int, out_features: int, n_copies: int | None = None) -> Dense:
@@ -25,8 +39,7 @@ def xavier_linear(in_features: int, out_features: int, n_copies: int | None = No
         layer = nn.Linear(in_features, out_features)
     else:
         layer = EnsembleLinear(n_copies, in_features, out_features)
-    bound = math.sqrt(2) * math.sqrt(6 / (in_features + out_features))
-    nn.init.uniform_(layer.weight, -bound, bound)
+    draw_xavier(layer.weight, in_features + out_features)
     assert layer.bias is not None
     nn.init.zeros_(layer.bias)
     return layer
@@ -74,8 +87,10 @@ class NormedMLP(Network):
         :param head: the layer that reads the network's output, None if several do
         :return: every hidden layer, in the order of the forward pass
         """
-        outgoing = [*list(self.layers)[1:], head]
-        return [
-            HiddenUnits(f"layers.{i}", layer, None, activation, reader)  # type: ignore[arg-type]
-            for i, (layer, activation, reader) in enumerate(zip(self.layers, self.activations, outgoing, strict=True))
-        ]
+        units = []
+        readers: list[Any] = [*list(self.layers)[1:], head]
+        layers: list[Any] = list(self.layers)
+        for i, (layer, activation, reader) in enumerate(zip(layers, self.activations, readers, strict=True)):
+            draw = functools.partial(draw_xavier, fans=layer.in_features + layer.out_features)
+            units.append(HiddenUnits(f"layers.{i}", layer, None, activation, reader, draw))
+        return units

@@ -1,10 +1,12 @@
 """SimBa's residual network (Lee et al. 2024)."""
 
+import functools
+
 import torch
 from torch import nn
 
 from sb3_sample.networks.ensemble import Dense, layer_norm
-from sb3_sample.networks.initialization import linear
+from sb3_sample.networks.initialization import draw_he_normal, linear
 from sb3_sample.networks.network import HiddenUnits, Network
 
 
@@ -76,5 +78,7 @@ class SimbaNet(Network):
         units = []
         for k, block in enumerate(self.blocks):
             assert isinstance(block, SimbaBlock)
-            units.append(HiddenUnits(f"blocks.{k}.dense1", block.dense1, None, block.activation, block.dense2))
+            layers = (block.dense1, None, block.activation, block.dense2)
+            draw = functools.partial(draw_he_normal, fan_in=block.dense1.in_features)
+            units.append(HiddenUnits(f"blocks.{k}.dense1", *layers, draw))
         return units

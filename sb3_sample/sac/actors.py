@@ -458,20 +458,22 @@ class NoisyActor(DeterministicActor):
 
     :param args: as of :class:`DeterministicActor`
     :param noise_clip: bound of the noise but in exploration
+    :param noise_std: its standard deviation at the start, in actions of [-1, 1]
     :param kwargs: as of :class:`DeterministicActor`, but for the noise
-    :raises ValueError: if the bound is out of range
+    :raises ValueError: if one of the two is out of range
     """
 
     has_target: ClassVar[bool] = False
-    ARGUMENTS: ClassVar[tuple[str, ...]] = ("noise_clip",)
+    ARGUMENTS: ClassVar[tuple[str, ...]] = ("noise_clip", "noise_std")
     #: Standard deviation of the noise in actions of [-1, 1], ().
     noise_std: torch.Tensor
 
-    def __init__(self, *args: Any, noise_clip: float = 0.3, **kwargs: Any):
+    def __init__(self, *args: Any, noise_clip: float = 0.3, noise_std: float = 1.0, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.noise_clip = check_value("noise_clip", noise_clip, AT_LEAST_0)
-        self._noise_args = {"noise_clip": noise_clip}
-        self.register_buffer("noise_std", torch.ones(()))
+        check_value("noise_std", noise_std, ABOVE_0)
+        self._noise_args = {"noise_clip": noise_clip, "noise_std": noise_std}
+        self.register_buffer("noise_std", torch.tensor(float(noise_std)))
         # With the above.
         keep_at_rest(self)
 

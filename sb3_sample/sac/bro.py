@@ -109,7 +109,11 @@ class BRO(SAC):
             **super()._full_policy_kwargs(),
         }
         if kwargs["actor_network"] == "bronet":
-            kwargs.setdefault("actor_network_kwargs", {"width": 256, "n_blocks": 1})
+            kwargs["actor_network_kwargs"] = {
+                "width": 256,
+                "n_blocks": 1,
+                **(kwargs.get("actor_network_kwargs") or {}),
+            }
         if self.model_size is not None:
             kwargs["critic_network_kwargs"] = dict(
                 zip(("n_blocks", "width"), _model_size(self.model_size), strict=True)

@@ -261,6 +261,17 @@ def _check_tasks(agent: Any) -> None:
                 f"{name}=True needs observations that tell the task, as those of multi_task_env do, not "
                 f"{agent.observation_space}: leave it out"
             )
+    if agent.n_tasks > 1 and agent.observation_space["task"].start != 0:
+        # They look up what they have of each task by its number.
+        for name, value, by_task in (
+            ("task_temperatures", agent.task_temperatures, agent.task_temperatures),
+            ("reward_scale", agent.reward_scale, agent.reward_scale == "brc"),
+        ):
+            if by_task:
+                raise ValueError(
+                    f"{name}={value!r} needs tasks that count from 0, not {agent.observation_space['task']}: have the "
+                    "environment give them so"
+                )
     if not agent.task_temperatures:
         return
     if agent.backbone == "td3":

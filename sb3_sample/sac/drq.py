@@ -54,12 +54,12 @@ class _FromPixels(SAC):
         for name in "actor", "critic":
             if kwargs.get(f"{name}_network", "mlp") == "mlp":
                 key = f"{name}_network_kwargs"
-                own = {"gain": 1.0} | ({"layer_norm": True} if self.layer_norm and name == "critic" else {})
+                own: dict[str, Any] = {"gain": 1.0}
+                if self.layer_norm and name == "critic":
+                    own["layer_norm"] = True
+                if kwargs.get("net_arch") is None:
+                    own["hidden_sizes"] = (1024, 1024)
                 kwargs[key] = {**own, **(kwargs.get(key) or {})}
-        if not {"net_arch", "actor_network", "critic_network"} & kwargs.keys():
-            hidden = {"hidden_sizes": (1024, 1024)}
-            for key in "actor_network_kwargs", "critic_network_kwargs":
-                kwargs[key] = {**hidden, **kwargs[key]}
         return kwargs
 
     def _encoder_kwargs(self) -> dict[str, Any]:
@@ -124,7 +124,7 @@ class DrQv2Policy(CnnPolicy):
     The networks of DrQ-v2: a deterministic actor whose noise moves with the training.
 
     :param args: as of ``CnnPolicy``
-    :param kwargs: as of ``CnnPolicy``; ``actor_kwargs`` has ``noise_clip``
+    :param kwargs: as of ``CnnPolicy``; ``actor_kwargs`` has ``noise_clip`` and ``noise_std``
     """
 
     backbones: ClassVar[dict[str, type[Actor]]] = {"td3": NoisyActor}
@@ -163,7 +163,8 @@ class DrQv2(_FromPixels):
     noise_clip: float = argument(default=0.3, kind=AT_LEAST_0)
     """bound of the noise in the critics' target and in the actor's loss"""
     exploration: str | type[Exploration] = argument(default="scheduled_noise")
-    """policy that acts while training: "scheduled_noise", which moves the noise; another leaves it at its beginning"""
+    """policy that acts while training: "scheduled_noise", which moves the noise; with another it stays at the first
+    standard deviation of ``noise_schedule``"""
     backbone: str = argument(default="td3")
     """"td3"; no other"""
 
@@ -171,9 +172,8 @@ class DrQv2(_FromPixels):
         super()._check_arguments()
         if self.backbone != "td3":
             raise ValueError(f"DrQv2 has backbone='td3', not {self.backbone!r}: use DrQ")
-        checks.check_once(
-            "policy_kwargs['actor_kwargs']", self.policy_kwargs.get("actor_kwargs"), {"noise_clip": "noise_clip"}
-        )
+        same = {"noise_clip": "noise_clip", "noise_std": "noise_schedule"}
+        checks.check_once("policy_kwargs['actor_kwargs']", self.policy_kwargs.get("actor_kwargs"), same)
         checks.check_once("exploration_kwargs", self.exploration_kwargs, {"schedule": "noise_schedule"})
 
     def _encoder_kwargs(self) -> dict[str, Any]:
@@ -181,7 +181,8 @@ class DrQv2(_FromPixels):
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         kwargs = super()._full_policy_kwargs()
-        noise = {"noise_clip": self.noise_clip, **(kwargs.get("actor_kwargs") or {})}
+        own = {"noise_clip": self.noise_clip, "noise_std": float(self.noise_schedule[0])}
+        noise = {**own, **(kwargs.get("actor_kwargs") or {})}
         choices = {"target_encoder": "online", "actor_features": "before"} if kwargs["share_features_extractor"] else {}
         return {**choices, **kwargs, "actor_kwargs": noise}
 

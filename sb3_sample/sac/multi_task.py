@@ -94,10 +94,11 @@ def told_task(space: spaces.Dict, observation: Mapping[str, Any]) -> dict[str, A
     """
     if observation.keys() != {"observation", "task"}:
         raise ValueError(f"observation must have the entries 'observation' and 'task', not {sorted(observation)}")
-    task, n_tasks = np.asarray(observation["task"]), number_of_tasks(space)
-    if task.dtype.kind not in "iu" or ((task < 0) | (task >= n_tasks)).any():
+    task, first = np.asarray(observation["task"]), int(space["task"].start)  # type: ignore[attr-defined]
+    last = first + number_of_tasks(space) - 1
+    if task.dtype.kind not in "iu" or ((task < first) | (task > last)).any():
         raise ValueError(
-            f"the task of an observation must be its number, an integer from 0 to {n_tasks - 1}, not "
+            f"the task of an observation must be its number, an integer from {first} to {last}, not "
             f"{observation['task']!r}"
         )
     vectors = np.asarray(observation["observation"])

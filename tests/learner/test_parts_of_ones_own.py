@@ -307,6 +307,10 @@ class Refusing(Rule):
         ({"policy_kwargs": {"critic_network": BatchNorm}}, ["critic_network=BatchNorm"]),
         ({"policy_kwargs": {"actor_network": BatchNorm}}, ["actor_network=BatchNorm"]),
         ({"value_head": TwoHot}, []),
+        # Behind a projection too.
+        ({"policy_kwargs": {"critic_network": Unit, "projection": 4}}, []),
+        ({"policy_kwargs": {"critic_network": BatchNorm, "projection": 4}}, ["critic_network=BatchNorm"]),
+        ({"policy_kwargs": {"actor_network": BatchNorm, "projection": 4}}, ["actor_network=BatchNorm"]),
     ],
 )
 def test_which_parts_are_compiled_unasked(

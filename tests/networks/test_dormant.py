@@ -8,7 +8,18 @@ import pytest
 import torch
 from torch import nn
 
-from sb3_sample.networks import MLP, BroNet, CReLU, SpectralLinear, SpectralNet, linear, neuron_scores, recycle
+from sb3_sample.networks import (
+    MLP,
+    BroNet,
+    CReLU,
+    SimbaNet,
+    SpectralLinear,
+    SpectralNet,
+    linear,
+    neuron_scores,
+    recycle,
+)
+from sb3_sample.networks.normed_mlp import NormedMLP
 from sb3_sample.networks.spectral_norm import SpectralNorm
 from sb3_sample.optim import AdamW
 from tests.networks.common import randomize, take_copy
@@ -110,7 +121,8 @@ def test_hidden_units_of_a_copied_network_are_its_own() -> None:
 
 def test_hidden_units_with_dropout_and_without_layers() -> None:
     net = MLP(3, (6,), layer_norm=True, dropout=0.5)
-    assert net.hidden_units(None) == [("layers.0", net.layers[0], net.layers[2], net.layers[3], None)]
+    (units,) = net.hidden_units(None)
+    assert units[:5] == ("layers.0", net.layers[0], net.layers[2], net.layers[3], None)
     assert MLP(3, ()).hidden_units(None) == []
 
 
@@ -265,6 +277,32 @@ def test_new_kernels_are_orthogonal_with_root_two(n_copies: int | None) -> None:
     torch.testing.assert_close(norms, torch.full_like(norms, 2**0.5), rtol=1e-4, atol=1e-5)
     if n_copies is not None:
         assert not torch.allclose(weight[0], weight[1])
+
+
+@pytest.mark.parametrize("n_copies", [None, E])
+@pytest.mark.parametrize("name", ["mlp", "simba", "normed"])
+def test_new_kernels_are_drawn_as_at_initialisation(name: str, n_copies: int | None) -> None:
+    """Each network as it draws them itself: the same sizes, from the same distribution."""
+    torch.manual_seed(0)
+    # A layer of 40 x 160 numbers, whose standard deviation is known to some percent.
+    nets: dict[str, Callable[[], Any]] = {
+        "mlp": lambda: MLP(40, (160,), gain=1.0, n_copies=n_copies),
+        "simba": lambda: SimbaNet(3, 40, 1, 4, n_copies=n_copies),
+        "normed": lambda: NormedMLP(40, (160,), n_copies=n_copies),
+    }
+    net, original = nets[name](), nets[name]()
+    head = linear(net.out_features, 2, n_copies)
+    randomize(net)
+    assert recycle(net, head, torch.randn(B, 3 if name == "simba" else 40), 1e6) == 160 * (n_copies or 1)
+    drawn, made = (recyclable(each, head)[0].dense.weight.detach() for each in (net, original))
+    assert not torch.equal(drawn, made)
+    assert drawn.std().item() == pytest.approx(made.std().item(), rel=0.05)
+    assert drawn.abs().max().item() == pytest.approx(made.abs().max().item(), rel=0.25)
+    if name == "mlp":
+        norms = torch.linalg.svdvals(drawn)
+        torch.testing.assert_close(norms, torch.ones_like(norms), rtol=1e-4, atol=1e-5)
+    if n_copies is not None:
+        assert not torch.allclose(drawn[0], drawn[1])
 
 
 def test_zero_wins_between_two_dormant_neurons() -> None:

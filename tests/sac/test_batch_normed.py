@@ -18,9 +18,19 @@ from torch import nn
 from sb3_sample import SAC, XQC, CrossQ
 from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.learner.target import values
-from sb3_sample.networks import BatchNorm, BatchRenorm, CrossQNet, EnsembleLinear, FlashNet, UnitLinear, XQCNet
+from sb3_sample.networks import (
+    BatchNorm,
+    BatchRenorm,
+    CrossQNet,
+    EnsembleLinear,
+    FlashNet,
+    UnitEnsembleLinear,
+    UnitLinear,
+    XQCNet,
+)
 from sb3_sample.networks.flash import UnitBatchNorm, UnitRMSNorm
 from sb3_sample.networks.unit_norm import UnitNorm
+from tests.learner.test_group import together
 from tests.sac.common import MAKERS, differing, random_batch, state, vec
 
 AGENTS = ["CrossQ", "CrossQ+WN", "XQC", "FlashSAC"]
@@ -121,10 +131,23 @@ def test_an_explorer_that_learns_leaves_the_actors_statistics(agent: str, explor
 # ---------------------------------------------------------------- unit norm
 
 
-def of_unit_norm(model: Any) -> list[tuple[str, nn.Module]]:
-    networks = {"actor": model.actor, "critic": model.critic}
+def of_unit_norm(**networks: nn.Module) -> list[tuple[str, nn.Module]]:
     found = [(f"{of}.{name}", m) for of, network in networks.items() for name, m in network.named_modules()]
     return [(name, module) for name, module in found if isinstance(module, UnitNorm)]
+
+
+def assert_unit_norm(layers: list[tuple[str, Any]]) -> None:
+    for name, layer in layers:
+        if isinstance(layer, UnitBatchNorm):
+            size = (layer.weight.square() + layer.bias.square()).sum(-1) / layer.n_features
+        elif isinstance(layer, UnitRMSNorm):
+            size = layer.weight.square().mean(-1)
+        else:
+            size = layer.weight.square().sum(1)
+            if layer.joint_bias:
+                assert layer.bias.abs().max() > 0
+                size = size + layer.bias.square().reshape(size.shape)
+        torch.testing.assert_close(size.sqrt(), torch.ones_like(size), rtol=0, atol=1e-6, msg=name)
 
 
 @pytest.mark.parametrize("agent", ["CrossQ+WN", "XQC", "FlashSAC"])
@@ -132,21 +155,51 @@ def test_projection_keeps_norms_at_one(agent: str) -> None:
     model = MAKERS[agent](learning_rate=0.1)
     for i in range(7):
         model.learner.update(random_batch(model, 16, seed=i))
-        layers = of_unit_norm(model)
+        layers = of_unit_norm(actor=model.actor, critic=model.critic)
         heads = {"CrossQ+WN": 2 + 2 + 3, "XQC": 2 + 2 + 3, "FlashSAC": 1}[agent]
         assert len(layers) >= heads
         for name, layer in layers:
-            if isinstance(layer, UnitBatchNorm):
-                size = (layer.weight.square() + layer.bias.square()).sum(-1) / layer.n_features
-            elif isinstance(layer, UnitRMSNorm):
-                size = layer.weight.square().mean(-1)
-            else:
-                size = layer.weight.square().sum(1)
+            if isinstance(layer, (UnitLinear, UnitEnsembleLinear)):
                 assert layer.joint_bias == (agent == "CrossQ+WN" and ".dense." in name)
-                if layer.joint_bias:
-                    assert layer.bias.abs().max() > 0
-                    size = size + layer.bias.square().reshape(size.shape)
-            torch.testing.assert_close(size.sqrt(), torch.ones_like(size), rtol=0, atol=1e-6, msg=name)
+        assert_unit_norm(layers)
+
+
+@pytest.mark.parametrize(
+    ("agent", "exploration", "kwargs", "n_layers"),
+    [
+        # Two hidden layers, mean and log standard deviation.
+        ("CrossQ+WN", "optimistic_actor", None, 4),
+        ("XQC", "optimistic_actor", None, 4),
+        ("FlashSAC", "optimistic_actor", None, 1),
+        ("SimbaV2", "optimistic_actor", None, 1),
+        ("SAC", "optimistic_shift", {"network": "simbav2", "network_kwargs": {"width": 8, "n_blocks": 1}}, 1),
+        ("SAC", "optimistic_shift", {"network": "xqc", "network_kwargs": {"hidden_sizes": (8, 8)}}, 2),
+    ],
+)
+def test_optimistic_actors_are_projected_too(
+    agent: str, exploration: str, kwargs: dict[str, Any] | None, n_layers: int
+) -> None:
+    """Output layers included, also where many learners take their gradient steps as one."""
+    for n_models in 1, 2:
+        models = [
+            MAKERS[agent](learning_rate=0.1, exploration=exploration, exploration_kwargs=kwargs, seed=seed)
+            for seed in range(n_models)
+        ]
+        before = state(models[0])
+
+        def learn(i: int, models: list[Any] = models) -> None:
+            for step in range(5):
+                models[i].learner.update(random_batch(models[i], 16, seed=step))
+
+        if n_models == 1:
+            learn(0)
+        else:
+            together([model.learner for model in models], learn)
+        for model in models:
+            layers = of_unit_norm(explorer=model.explorer)
+            assert len(layers) >= n_layers
+            assert_unit_norm(layers)
+        assert [name for name in differing(before, state(models[0])) if "explorer" in name and "weight" in name]
 
 
 def test_joint_projection_by_hand() -> None:

@@ -175,6 +175,17 @@ def test_noise_schedule() -> None:
         sac(exploration="scheduled_noise")
 
 
+def test_noise_of_another_exploration_is_the_schedules_first() -> None:
+    """In exploration, TD target and actor's loss, also after a reset."""
+    model = drqv2(exploration="actor", noise_schedule=(0.5, 0.1, 100))
+    for _ in range(2):
+        assert model.actor.noise_std == 0.5
+        model.learner.on_step(np.zeros(1), np.zeros(1, bool), [{}])
+        model.reinitialize()
+    with pytest.raises(ValueError, match="argument noise_schedule"):
+        drqv2(policy_kwargs={**TINY, "actor_kwargs": {"noise_std": 0.2}})
+
+
 def test_the_update_of_drqv2() -> None:
     """Clipped noise in target and actor's loss, features of one encoder from before its step, no target encoder."""
     model = drqv2(augmentation_kwargs={"pad": 0}, noise_schedule=(0.5, 0.1, 100), tau=0.25)
@@ -324,6 +335,18 @@ def test_defaults_of_the_published_codes(make: Any) -> None:
     normed = make(layer_norm=True)
     assert normed.critic.trunk.hidden_units(normed.critic.head)[0].norm is not None
     assert normed.actor.trunk.hidden_units(None)[0].norm is None
+
+
+@pytest.mark.parametrize("make", [drq, drqv2])
+@pytest.mark.parametrize(("own", "other"), [("critic", "actor"), ("actor", "critic")])
+def test_another_network_of_one_leaves_the_sizes_of_the_other(make: Any, own: str, other: str) -> None:
+    small = {key: value for key, value in TINY.items() if key != "net_arch"}
+    chosen = {f"{own}_network": "bronet", f"{own}_network_kwargs": {"width": 8, "n_blocks": 1}}
+    model = make(policy_kwargs={**small, **chosen})
+    sizes = [each.dense.weight.shape[-2] for each in model.actor.trunk.hidden_units(None)]
+    if other == "critic":
+        sizes = [each.dense.weight.shape[-1] for each in model.critic.trunk.hidden_units(None)]
+    assert sizes == [1024, 1024]
 
 
 def test_any_features_extractor_can_be_the_encoder() -> None:

@@ -199,6 +199,21 @@ def test_warm_up_is_uniformly_random() -> None:
     assert abs(taken.std() - 1 / np.sqrt(3)) < 0.05
 
 
+def test_partial_arguments_of_the_actors_networks_leave_their_depth() -> None:
+    """One residual block, 256 wide, but for what is given."""
+    for given, sizes in (
+        ({"width": 8}, (8, 1)),
+        ({"width": 8, "n_blocks": 2}, (8, 2)),
+        ({"first_layer_norm": False}, (256, 1)),
+        ({}, (256, 1)),
+        (None, (256, 1)),
+    ):
+        model = bro(policy_kwargs={"actor_network_kwargs": given}, exploration_kwargs={"network_kwargs": given})
+        for trunk in (model.actor.trunk, model.explorer.trunk):
+            assert (trunk.out_features, len(trunk.blocks)) == sizes
+            assert (trunk.norm is None) == (given == {"first_layer_norm": False})
+
+
 def test_without_an_optimistic_actor() -> None:
     model = bro(exploration="actor", exploration_kwargs={})
     assert type(model.explorer) is Exploration

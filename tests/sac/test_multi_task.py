@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -13,6 +14,7 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her import HerReplayBuffer
 
@@ -23,7 +25,7 @@ from sb3_sample.learner.target import next_step
 from sb3_sample.networks import MLP, BroNet, Network, widened
 from sb3_sample.sac import BRC, BRO
 from sb3_sample.sac.multi_task import TaskEmbedding, TaskOneHot
-from tests.sac.common import COMPILES, MAKERS, bro, differing, sac, state, vec
+from tests.sac.common import COMPILES, MAKERS, Toy, bro, differing, sac, state, vec
 
 ROOT = Path(__file__).parents[2]
 PENDULUM, CAR = "Pendulum-v1", "MountainCarContinuous-v0"
@@ -246,6 +248,35 @@ def test_predict_is_told_the_task() -> None:
             model.predict(told(task))
     with pytest.raises(ValueError, match=r"entries 'observation' and 'task', not \['observation'\]"):
         model.predict({"observation": told(0)["observation"]})
+
+
+class FromFive(gym.ObservationWrapper):
+    """Two tasks, numbered 5 and 6."""
+
+    def __init__(self) -> None:
+        super().__init__(Toy())
+        self.observation_space = spaces.Dict({"observation": self.env.observation_space, "task": TASKS_FROM_FIVE})
+
+    def observation(self, observation: Any) -> Any:
+        return {"observation": observation, "task": 5 + int(observation[0]) % 2}
+
+
+TASKS_FROM_FIVE = spaces.Discrete(2, start=5)
+
+
+def test_tasks_that_do_not_count_from_0() -> None:
+    env = DummyVecEnv([lambda: Monitor(FromFive())])
+    model = make("SAC", env, learning_starts=4).learn(12)
+    vector = np.ones(3, np.float32)
+    actions = [model.predict({"observation": vector, "task": task}, deterministic=True)[0] for task in (5, 6)]
+    assert not np.array_equal(*actions)
+    for task in (0, 1, 4, 7):
+        with pytest.raises(ValueError, match="an integer from 5 to 6, not"):
+            model.predict({"observation": vector, "task": task})
+    for name, kwargs in ("BRC", {}), ("SAC", {"reward_scale": "brc"}), ("SAC", {"task_temperatures": True}):
+        with pytest.raises(ValueError, match="needs tasks that count from 0, not Discrete"):
+            make(name, env, **kwargs)
+    make("BRC", env, reward_scale=None, learning_starts=4).learn(12)
 
 
 # ---------------------------------------------------------------- files

@@ -9,8 +9,9 @@ import torch
 
 from sb3_sample import BRO, BROTD3, DAC, SRSAC, BROFast
 from sb3_sample.learner.plasticity import Resets
+from sb3_sample.networks.batch_norm import running_moments
 from sb3_sample.sac.bro import BRO_FAST_RESETS, BRO_RESETS
-from tests.sac.common import MAKERS, bro, sac, vec
+from tests.sac.common import MAKERS, bro, random_batch, sac, vec
 
 
 class Recorder:
@@ -420,6 +421,27 @@ def test_shrink_and_perturb_by_hand(maker: str, shrink: float) -> None:
     assert model.temperature.log_value.item() == pytest.approx(shrink * log_alpha, rel=1e-5, abs=1e-7)
     assert [id(p) for p in model.policy.parameters()] == identities
     assert not any(optimizer.state for optimizer in model._optimizers().values())
+
+
+@pytest.mark.parametrize("shrink", [0.0, 0.8])
+@pytest.mark.parametrize("maker", ["CrossQ", "XQC", "FlashSAC"])
+def test_running_moments_outlive_a_shrink(maker: str, shrink: float) -> None:
+    """They are of weights most of which stay; a full reset starts them anew."""
+    model = MAKERS[maker](exploration="optimistic_actor", exploration_kwargs=None)
+    fresh = dict(running_moments(model.policy))
+    fresh = {name: moment.clone() for name, moment in fresh.items()}
+    for i in range(3):
+        model.learner.update(random_batch(model, 16, seed=i))
+    owners = (model.policy, model.explorer)
+    before = [{name: moment.clone() for name, moment in running_moments(owner)} for owner in owners]
+    assert all(not torch.equal(before[0][name], fresh[name]) for name in fresh if name.startswith("critic."))
+    model.reinitialize(shrink)
+    for owner, old in zip(owners, before, strict=True):
+        new = dict(running_moments(owner))
+        assert len(new) > 0
+        assert all(torch.equal(new[name], old[name]) for name in new) == (shrink > 0)
+    if shrink == 0:
+        assert all(torch.equal(moment, fresh[name]) for name, moment in running_moments(model.policy))
 
 
 def test_shrinks_the_explorers_numbers() -> None:

@@ -11,7 +11,8 @@ from gymnasium import spaces
 
 from sb3_sample import SAC
 from sb3_sample.learner.batch import Batch, Noise
-from tests.sac.common import bro, differing, random_batch, sac, state, vec
+from sb3_sample.networks.batch_norm import running_moments
+from tests.sac.common import MAKERS, bro, differing, random_batch, sac, state, vec
 from tests.sac.test_update import NoSynchronisation
 
 IMAGE = spaces.Box(0, 255, (36, 36, 3), np.uint8)
@@ -95,6 +96,22 @@ def test_the_loss_reported_is_the_one_at_the_parameters() -> None:
     losses = [model._update(random_batch(model), noise)["train/critic_loss"] for model in (with_sam, without)]
     assert torch.equal(*losses)
     assert differing(state(with_sam), state(without))
+
+
+@pytest.mark.parametrize("maker", ["CrossQ", "CrossQ+WN", "XQC", "FlashSAC"])
+def test_the_pass_uphill_leaves_running_moments_alone(maker: str) -> None:
+    """A gradient step moves them once, and by the same as a step without a pass uphill."""
+    noise = Noise(*torch.randn(3, 16, 2))
+    moments = []
+    for radius in (0.5, None):
+        model = MAKERS[maker](sam_radius=radius)
+        before = {name: each.clone() for name, each in running_moments(model.critic)}
+        model.learner.update(random_batch(model, 16), noise)
+        moments.append({name: each.clone() for name, each in running_moments(model.critic)})
+        assert all(not torch.equal(each, before[name]) for name, each in moments[-1].items())
+    assert not differing(*moments)
+    passes = [each.item() for name, each in moments[0].items() if name.endswith("n_passes")]
+    assert set(passes) == ({1} if maker == "CrossQ" else set())
 
 
 def test_a_tiny_radius_is_no_radius() -> None:
