@@ -58,12 +58,23 @@ def test_from_runs_to_settings(table: Path, tmp_path: Path, capsys: pytest.Captu
 def test_errors_are_one_line(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     laws = tmp_path / "laws.json"
     laws.write_text("{}")
+    plan = ["plan", str(tmp_path / "plan.yml"), "--tasks", "Pendulum-v1", "--steps"]
     for command, words in (
         (["fit", str(table), *LEVELS], "agent must be given"),
         (["fit", f"BRO={table}", "--levels", "5000"], "give a level that they reach"),
         (["fit"], "sources must be at least one folder"),
         (["fit", f"BRO={table}", "--delta", "-1", *LEVELS], "delta above 0"),
         (["predict", str(laws), "--budget", "1e15"], "is no file of scaling laws"),
+        (
+            ["predict", "nowhere.json", "--budget", "1e15"],
+            "laws must be a file that sb3-sample scaling fit -o has written, and 'nowhere.json' is not there",
+        ),
+        ([*plan, "1e4", "--evaluations", "0"], "evaluations must be at least 1, not 0"),
+        ([*plan, "1e4", "--episodes", "0"], "episodes must be at least 1, not 0"),
+        ([*plan, "1e4", "--seeds", "-1"], "seeds must be at least 1, not -1"),
+        ([*plan, "inf"], "steps must be a finite number, at least that of the evaluations, 40, not inf"),
+        ([*plan, "nan"], "steps must be a finite number, at least that of the evaluations, 40, not nan"),
+        ([*plan, "39"], "steps must be a finite number, at least that of the evaluations, 40, not 39"),
     ):
         with pytest.raises(SystemExit) as error:
             cli.main(["scaling", *command])
