@@ -1,5 +1,6 @@
 """Scaling laws: the paper's numbers, laws that are known, and bad input."""
 
+import dataclasses
 import json
 import math
 import re
@@ -258,10 +259,13 @@ def test_bad_points_are_refused() -> None:
 def test_what_is_not_determined_is_said() -> None:
     assert CHEETAH.doubts(RATIOS) == []
     power = scaling.fit_data(RATIOS, 1e6 * RATIOS**-0.5)
-    assert any("d_min is not determined" in doubt for doubt in power.doubts(RATIOS))
+    assert any("d_min and beta are not determined" in doubt for doubt in power.doubts(RATIOS))
+    assert power.undetermined(RATIOS) == {"d_min", "beta"} and CHEETAH.undetermined(RATIOS) == set()
     assert power.steps(RATIOS) == pytest.approx(1e6 * RATIOS**-0.5, rel=1e-3)
     flat = scaling.fit_data(RATIOS, np.full(6, 1e6))
     assert any("hardly depend" in doubt for doubt in flat.doubts(RATIOS))
+    assert flat.undetermined(RATIOS) >= {"alpha", "beta"} and "d_min" not in flat.undetermined(RATIOS)
+    assert scaling.DataLaw(1e5, 2.0, 20.0).undetermined([1.0, 2.0, 4.0]) == {"alpha"}
     assert flat.steps(RATIOS) == pytest.approx(1e6, rel=1e-3)
 
 
@@ -462,6 +466,21 @@ def test_a_task_that_fails_at_one_ratio_gives_a_bound_and_one_that_fails_at_most
     most = ~table["arguments"].str.contains('"replay_ratio": 8.0') & (table["task"] == "dmc/walker-run-v0")
     laws = scaling.fit(table.assign(value=table["value"].where(~most, 0.0)), [400], reps=10)
     assert laws.levels[0].left_out == ["dmc/walker-run-v0"]
+
+
+def test_what_is_not_determined_has_no_number_and_the_rest_has_one() -> None:
+    laws = scaling.fit(runs({"dmc/cheetah-run-v0": 1e5}, [1.0, 2.0, 4.0], [256], seeds=2), [400], reps=4)
+    for (d_min, beta, alpha), told in (
+        ((1e5, 1.5, 0.8), {"d_min", "beta", "alpha"}),
+        ((1e5, 1e-6, 2.0), {"d_min"}),  # flat
+        ((1.0, 1e10, 0.5), {"alpha"}),  # a power
+    ):
+        stages = [scaling.DataLaw(*(np.full(n, value) for value in (d_min, beta, alpha))) for n in (1, 4)]
+        (level,) = laws.levels
+        found = dataclasses.replace(laws, levels=[dataclasses.replace(level, laws=stages)])
+        (row,) = scaling.summary(found)["data"]
+        assert {name for name in ("d_min", "beta", "alpha") if row[name] is not None} == told
+        assert (row["d_min"] or {}).get("value") == (d_min if "d_min" in told else None)
 
 
 # ---------------------------------------------------------------- intervals
