@@ -483,6 +483,23 @@ def test_what_is_not_determined_has_no_number_and_the_rest_has_one() -> None:
         assert (row["d_min"] or {}).get("value") == (d_min if "d_min" in told else None)
 
 
+def test_the_steps_of_wrappers_that_skip_frames_are_the_agents() -> None:
+    table = runs({"dmc/cheetah-run-v0": 1e5}, [1.0, 2.0, 4.0], [256], seeds=2)
+
+    def given(**more: Any) -> pd.DataFrame:
+        return table.assign(arguments=[to_json(json.loads(text) | more) for text in table["arguments"]])
+
+    frames = "sb3_sample.envs.AtariFrames"
+    for more, repeat in (
+        ({"env_wrapper": frames}, 4), ({"env_wrapper": [{frames: {"frame_skip": 3}}]}, 3),
+        ({"env_wrapper": frames, "env_kwargs": {"action_repeat": 2}}, 8), ({"env_wrapper": "a.Other"}, 1),
+    ):  # fmt: skip
+        found = configurations(given(**more, resets=[1_000]))
+        assert {each.repeat for each in found} == {repeat} and {each.resets for each in found} == {(1_000 * repeat,)}
+        points = scaling.fit(given(**more), [400], reps=2).levels[0].points
+        assert points == pytest.approx(scaling.fit(table, [400], reps=2).levels[0].points / repeat)
+
+
 # ---------------------------------------------------------------- intervals
 
 

@@ -122,7 +122,10 @@ def fit(
         raise ValueError(f"runs must have at least two replay ratios, three for the data law; all have {ratios[0]:g}")
     repeats = {each.repeat for each in found}
     if len(repeats) > 1:
-        raise ValueError(f"runs must have one action_repeat, not {sorted(repeats)}: replay ratios do not compare")
+        raise ValueError(
+            "runs must have one action repeat (action_repeat times frames that env_wrapper skips), not "
+            f"{sorted(repeats)}: replay ratios do not compare"
+        )
     rng = np.random.default_rng(seed)
     n_seeds = {len(each.curves) for each in found}
     fewest = min(n_seeds)
