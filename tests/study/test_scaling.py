@@ -5,6 +5,7 @@ import json
 import math
 import re
 import shlex
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -481,6 +482,57 @@ def test_what_is_not_determined_has_no_number_and_the_rest_has_one() -> None:
         (row,) = scaling.summary(found)["data"]
         assert {name for name in ("d_min", "beta", "alpha") if row[name] is not None} == told
         assert (row["d_min"] or {}).get("value") == (d_min if "d_min" in told else None)
+
+
+def test_the_median_of_a_task_does_not_depend_on_how_long_it_was_tried_in_vain() -> None:
+    steps = np.array([[10.0, math.inf, 20.0, 30.0], [100.0, 200.0, 300.0, 400.0]])[..., None]
+    for last in (5.0, 1_000.0):
+        lasts = np.full((2, 4), last)
+        mean, bounded, factors = scaling.normalize(steps, lasts)
+        # Medians of 10, 20, 30, inf and of 100, 200, 300, 400; their median is 137.5.
+        assert factors[:, 0] == pytest.approx([25 / 137.5, 250 / 137.5])
+        assert bounded[:, 0].tolist() == [False, True, False, False]
+        assert mean[[0, 2, 3], 0] == pytest.approx([55, 137.5, 192.5])
+        assert mean[1, 0] == pytest.approx((last * 137.5 / 25 + 110) / 2)
+    # A sample in which half is not reached has no median: it alone has no value.
+    worse = steps.copy()
+    worse[0, 0] = math.inf
+    mean, _, factors = scaling.normalize(np.stack([steps, worse]), np.full((2, 4), 5.0))
+    assert np.isfinite(mean[0]).all() and np.isnan(mean[1]).all() and np.isnan(factors[1]).all()
+
+
+def test_a_run_that_ended_early_is_no_quick_one() -> None:
+    table = runs(TASKS, [1.0, 2.0, 4.0, 8.0], [256], model_size="0.55M")
+    slow = table["arguments"].str.contains('"replay_ratio": 1.0') & (table["task"] == "dmc/walker-run-v0")
+    short = table[~slow | (table["step"] <= 60_000)]
+    whole, found = (scaling.fit(each, [400, 450, 500], reps=40) for each in (table, short))
+    for one, other in zip(whole.levels, found.levels, strict=True):
+        assert other.censored.tolist() == [True, False, False, False] and one.censored.sum() == 0
+        ratio = [each.factors[1] / each.factors[0] for each in (one, other)]
+        # Of three steps that are reached the median is the middle one of three, not of four with a small one below.
+        assert ratio[1] == pytest.approx(ratio[0], rel=0.1)
+        assert other.points[1:] == pytest.approx(one.points[1:], rel=0.1) and other.points[0] <= one.points[0]
+
+
+def test_samples_without_a_median_have_no_value_and_the_others_an_interval() -> None:
+    table = runs({"dmc/cheetah-run-v0": 1e5}, [1.0, 2.0, 4.0, 8.0, 16.0], [256], seeds=4, model_size="0.55M")
+    # Two ratios fail in all seeds, a third in three of four: a third of the samples lacks the seed that does not.
+    given = table["arguments"].map(lambda text: json.loads(text)["replay_ratio"])
+    table = table.assign(value=table["value"].where(given < 8, 0.0))
+    table = table.assign(value=table["value"].where((given != 4) | (table["seed"] == 0), 0.0))
+    levels = [60, 90, 120, 150]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        laws = scaling.fit(table, levels, reps=60)
+        lost = [np.isnan(level.laws[1].d_min) for level in laws.levels]
+        assert sum(each.sum() for each in lost) > 0 and all(np.isfinite(each.points).all() for each in laws.levels)
+        for level, missing in zip(laws.levels, lost, strict=True):
+            assert all(np.array_equal(np.isnan(each), missing) for each in level.laws[1])
+        scaling.summary(laws)
+        found = laws.predict(replay_ratio=2.0, level=laws.levels[0].level)
+    assert found.steps.low <= found.steps.value <= found.steps.high
+    best = scaling.ComputeLaw(laws.levels[-1].laws[1], 256.0, 0.0, 5e5).best()
+    assert np.array_equal(np.isnan(best.replay_ratio), lost[-1])
 
 
 def test_the_steps_of_wrappers_that_skip_frames_are_the_agents() -> None:

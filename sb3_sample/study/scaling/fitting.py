@@ -21,7 +21,7 @@ from sb3_sample.study.scaling.crossings import (
     sorted_levels,
 )
 from sb3_sample.study.scaling.intervals import draw
-from sb3_sample.study.scaling.laws import fit_logs, fit_squared, shared_slope
+from sb3_sample.study.scaling.laws import DataLaw, fit_logs, fit_squared, shared_slope
 from sb3_sample.study.scaling.result import HELD_OUT, Hyperparameter, Laws, Level
 
 #: Bootstrap samples of the intervals.
@@ -36,16 +36,18 @@ def normalize(
     ratios, times the median of these medians.
 
     :param steps: (..., tasks, S, L), inf where a level is not reached
-    :param last: (tasks, S) steps of the last evaluation, in the place of what is not reached
+    :param last: (tasks, S) steps of the last evaluation, in the place of what is not reached in the means: a lower
+        bound. In the medians it is later than all that is reached, however early its runs ended
     :param across_levels: whether the median is over replay ratios and levels together, as in the authors' code; of the
         replay ratios at each level, as in the paper, otherwise
     :return: means (..., S, L), where one of a task is not reached (..., S, L), and the factors by which the means are
-        those of a task (..., tasks, L)
+        those of a task (..., tasks, L). NaN where half or more of a task is not reached, which leaves no median
     """
     bounded = ~np.isfinite(steps)
     filled = np.where(bounded, last[..., None], steps)
     axes = (-2, -1) if across_levels else (-2,)
-    medians = np.median(filled, axis=axes, keepdims=True)
+    medians = np.median(np.where(bounded, np.inf, steps), axis=axes, keepdims=True)
+    medians = np.where(np.isfinite(medians), medians, np.nan)
     middle = np.median(medians, axis=-3, keepdims=True)
     scaled = filled * (middle / medians)
     factors = np.broadcast_to((medians / middle)[..., 0, :], (*filled.shape[:-2], filled.shape[-1]))
@@ -326,10 +328,11 @@ def _data(
     ]  # (R, tasks, S, L)
     x = np.array(ratios)
     found = []
+    there = np.isfinite(steps[0][0])  # (tasks, S, L)
+    # A median of the replay ratios is there if more than half reach the level.
+    known = there.all(axis=1) if loss == "squared" else 2 * there.sum(axis=1) > len(ratios)  # (tasks, L)
     for i, level in enumerate(levels):
-        reached = np.isfinite(steps[0][0, :, :, i])
-        # A median of the replay ratios is there if more than half reach the level.
-        kept = np.asarray(reached.all(axis=1) if loss == "squared" else 2 * reached.sum(axis=1) > len(ratios))
+        reached, kept = there[:, :, i], known[:, i]
         enough = reached[kept].all(axis=0).sum() if kept.any() else 0
         if enough < 3:
             notes.append(
@@ -337,21 +340,20 @@ def _data(
                 "a data law needs three, and there is none"
             )
             continue
-        left_out = [task for task, there in zip(tasks, kept.tolist(), strict=True) if not there]
+        # Levels without a median would leave none across levels.
+        used = np.flatnonzero(known[kept].all(axis=0)) if across_levels else np.array([i])
         fits, means = [], []
         for each in steps:
-            of = each[:, kept] if across_levels else each[:, kept, :, i : i + 1]
-            mean, bounded, factors = normalize(of, last[kept], across_levels=across_levels)
-            j = i if across_levels else 0
+            mean, bounded, factors = normalize(each[:, kept][..., used], last[kept], across_levels=across_levels)
+            j = int(np.searchsorted(used, i))
             y = mean[:, :, j]
-            law = fit_logs(x, y, bounded[:, :, j]) if loss == "log" else fit_squared(x, y)
-            fits.append(law)
+            fits.append(_fits(x, y, bounded[:, :, j], loss))
             means.append((y, bounded[:, :, j], factors[:, :, j]))
         found.append(
             Level(
                 level=float(level),
-                tasks=[task for task, there in zip(tasks, kept.tolist(), strict=True) if there],
-                left_out=left_out,
+                tasks=[task for task, has in zip(tasks, kept.tolist(), strict=True) if has],
+                left_out=[task for task, has in zip(tasks, kept.tolist(), strict=True) if not has],
                 points=means[0][0][0],
                 censored=means[0][1][0],
                 factors=means[0][2][0],
@@ -364,3 +366,14 @@ def _data(
             f"{', '.join(f'{level:g}' for level in levels)} is. {' '.join(notes)}"
         )
     return found
+
+
+def _fits(ratios: np.ndarray, steps: np.ndarray, censored: np.ndarray, loss: str) -> DataLaw:
+    """Laws (R,) of samples; NaN of those without a median, or with bounds alone."""
+    law = DataLaw(*np.full((3, len(steps)), np.nan))
+    known = np.isfinite(steps).all(axis=1) & ~censored.all(axis=1)
+    if known.any():
+        found = fit_logs(ratios, steps[known], censored[known]) if loss == "log" else fit_squared(ratios, steps[known])
+        for all_of, own in zip(law, found, strict=True):
+            all_of[known] = own
+    return law
