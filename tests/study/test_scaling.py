@@ -15,7 +15,9 @@ import pytest
 from scipy.optimize import minimize
 
 from sb3_sample.study import scaling
-from sb3_sample.study.scaling.crossings import configurations, first_crossing, kept_evaluations
+from sb3_sample.study.scaling.best import Cell
+from sb3_sample.study.scaling.crossings import Configuration, configurations, first_crossing, kept_evaluations
+from sb3_sample.study.scaling.fitting import _pick
 from sb3_sample.study.scaling.intervals import interval
 from sb3_sample.study.table import COLUMNS, to_json
 
@@ -550,6 +552,55 @@ def test_the_steps_of_wrappers_that_skip_frames_are_the_agents() -> None:
         assert {each.repeat for each in found} == {repeat} and {each.resets for each in found} == {(1_000 * repeat,)}
         points = scaling.fit(given(**more), [400], reps=2).levels[0].points
         assert points == pytest.approx(scaling.fit(table, [400], reps=2).levels[0].points / repeat)
+
+
+def swept(more: dict[float, tuple[float, ...]], ratios: tuple[float, ...] = (1.0, 2.0, 4.0)) -> pd.DataFrame:
+    """Three batch sizes at the learning rate 3e-4; the middle one at further learning rates too, which come first."""
+    parts = []
+    for ratio in ratios:
+        best = round(256 * ratio**-0.5)
+        for rate in more.get(ratio, ()):
+            parts.append(runs({"dmc/cheetah-run-v0": 1e5}, [ratio], [best], seeds=2, learning_rate=rate))
+        parts.append(
+            runs({"dmc/cheetah-run-v0": 1e5}, [ratio], [best // 2, best, 2 * best], seeds=2, learning_rate=3e-4)
+        )
+    return pd.concat(parts, ignore_index=True)
+
+
+def test_the_data_law_is_of_one_learning_rate() -> None:
+    plain = scaling.fit(swept({}), [400], reps=2, draws=10)
+    table = swept({1.0: (1.5e-4, 6e-4)})
+    laws = scaling.fit(table, [400], reps=2, draws=10)
+    # Swept at one replay ratio only: without a law, so that it has no part in what is nearest.
+    assert list(laws.hyperparameters) == ["batch_size"] and laws.learning_rate == plain.learning_rate == 3e-4
+    assert laws.levels[0].points == pytest.approx(plain.levels[0].points)
+    (said,) = [limit for limit in laws.predict(replay_ratio=2.0).limits if limit.startswith("learning_rate")]
+    assert said == "learning_rate was swept, but has no law: it is that of the runs"
+    (said,) = [limit for limit in plain.predict(replay_ratio=2.0).limits if limit.startswith("learning_rate")]
+    assert said == "learning_rate was not swept: it is that of the runs"
+    # One batch size throughout: the learning rate of all runs, though neither has a law.
+    batch = table["arguments"].map(lambda text: json.loads(text)["batch_size"])
+    ratio = table["arguments"].map(lambda text: json.loads(text)["replay_ratio"])
+    middle = table[batch == (256 * ratio**-0.5).round()]
+    assert scaling.fit(middle, [400], reps=2, draws=10).learning_rate == 3e-4
+
+
+def test_without_a_learning_rate_that_all_have_it_is_the_chosen_one_or_none() -> None:
+    def cell(ratio: float, rates: list[float]) -> Cell:
+        made = Configuration("a", "{}", "t", np.array([1]), np.ones((1, 1)))
+        return Cell("t", ratio, np.full(len(rates), 128.0), np.array(rates), [made] * len(rates))
+
+    def rates(grid: list[Cell], values: list[float]) -> list[float]:
+        chosen = {"learning_rate": pd.DataFrame({"task": "t", "replay_ratio": [1.0], "value": values})}
+        return [float(one.learning_rates[0]) for one in _pick(grid, {}, chosen).values()]
+
+    apart = [cell(1.0, [1e-4, 4e-4]), cell(2.0, [3e-4])]
+    assert rates(apart, [3.5e-4]) == [4e-4, 3e-4] and rates(apart, [1.2e-4]) == [1e-4, 3e-4]
+    assert rates([cell(1.0, [1e-4, 4e-4, 3e-4]), cell(2.0, [3e-4])], [1e-4]) == [3e-4, 3e-4]
+    # Runs that were not given it have the default, which is one value too.
+    assert np.isnan(rates([cell(1.0, [1e-4, math.nan]), cell(2.0, [math.nan])], [1e-4])).all()
+    with pytest.raises(ValueError, match=r"on t at replay ratio 1 have 2 values of learning_rate, .* \(choice_level="):
+        rates(apart, [math.nan])
 
 
 # ---------------------------------------------------------------- intervals

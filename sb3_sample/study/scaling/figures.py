@@ -383,7 +383,7 @@ def critical_and_best(laws: Laws, table: pd.DataFrame) -> "Figure":
     :raises ValueError: there is no best batch size, or no critical one beside it
     """
     if "batch_size" not in laws.hyperparameters:
-        raise ValueError("batch size was not swept")
+        raise ValueError("batch size has no law")
     best = laws.hyperparameters["batch_size"].values.set_index(["task", "replay_ratio"])["value"].dropna()
     points: dict[str, list[tuple[float, float]]] = {}
     for key, means in squares(table).items():

@@ -123,8 +123,9 @@ def read_laws(path: str | Path) -> Laws:
         rest = {
             field.name: found[field.name]
             for field in dataclasses.fields(Laws)
-            # Files of before have no "others".
-            if field.name not in ("hyperparameters", "levels") and (field.name in found or field.name != "others")
+            # Older files do not have the last two.
+            if field.name not in ("hyperparameters", "levels")
+            and (field.name in found or field.name not in ("others", "without_law"))
         }
         return Laws(hyperparameters=hyperparameters, levels=levels, **rest)
     except (KeyError, TypeError, ValueError, AttributeError) as error:

@@ -1,5 +1,6 @@
 """From a table of runs to its laws, with intervals by the bootstrap over seeds."""
 
+import functools
 import json
 import math
 import warnings
@@ -83,8 +84,10 @@ def fit(
     Batch size and learning rate: where runs of a task and replay ratio differ in them, the best by
     :func:`best_hyperparameters`, then :func:`fit_hyperparameter`. Data: of each task and replay ratio the only
     configuration, or the one nearest to these laws (not the one that happened to be first, whose steps would be too
-    few); tasks are averaged by :func:`normalize`, then :func:`fit_data`. A level that a run does not reach enters as a
-    lower bound; a task that reaches it at less than half of the replay ratios has no median and is left out, by name.
+    few). Of those that differ in one without a law it is that with a value that all replay ratios have, so that the
+    data law mixes none, else that nearest to the best one there. Tasks are averaged by :func:`normalize`, then
+    :func:`fit_data`. A level that a run does not reach enters as a lower bound; a task that reaches it at half of
+    the replay ratios or fewer has no median and is left out, by name.
     Compute and budget follow from these.
 
     Intervals are of the bootstrap over seeds (:mod:`sb3_sample.study.scaling.intervals`): everything from the choice of
@@ -144,7 +147,7 @@ def fit(
         notes.append(f"{fewest} seeds a configuration: the intervals are wide{unknown}")
 
     choice = float(wanted[-1] if choice_level is None else check_levels([choice_level])[0])
-    hyperparameters = _hyperparameters(grid, choice, stages, draws, rng, notes)
+    hyperparameters, chosen = _hyperparameters(grid, choice, stages, draws, rng, notes)
     for name, each in hyperparameters.items():
         at_edge = each.values[each.values["edge"] > 0.5]
         if len(at_edge):
@@ -152,7 +155,7 @@ def fit(
                 f"{name}: the best is the smallest or largest that was tried in most draws of {len(at_edge)} of "
                 f"{len(each.values)} choices; the law is too flat there"
             )
-    picked = _pick(grid, hyperparameters)
+    picked = _pick(grid, hyperparameters, chosen)
     data = _data(picked, ratios, wanted, stages, loss, across_levels, int(repeats.pop()), notes)
     params = critic_params
     if params is None:
@@ -170,7 +173,7 @@ def fit(
             raise ValueError(f"batch_size must be a positive number, not {batch_size!r}")
         fixed = float(batch_size)
     if params is not None and "batch_size" not in hyperparameters and fixed is None:
-        notes.append("batch sizes differ or are not known, and were not swept: there is no law of compute and budget")
+        notes.append("batch sizes differ or are not known, and have no law: there is no law of compute and budget")
     laws = Laws(
         tasks=list(dict.fromkeys(cell.task for cell in grid)),
         replay_ratios=ratios,
@@ -185,6 +188,7 @@ def fit(
         choice_level=choice,
         notes=notes,
         others=_others(found),
+        without_law=[name for name in chosen if name not in hyperparameters],
     )
     if laws.has_compute and len(data) <= HELD_OUT + 1:
         notes.append(
@@ -231,7 +235,8 @@ def _of_one(found: list[Configuration], agent: str | None, model_size: Any) -> l
 
 def _hyperparameters(
     grid: list[Cell], level: float, stages: list[_Samples], draws: int, rng: np.random.Generator, notes: list[str]
-) -> dict[str, Hyperparameter]:
+) -> tuple[dict[str, Hyperparameter], dict[str, pd.DataFrame]]:
+    """The laws, and what was chosen of all that was swept: some of it may have no law."""
     rows: dict[str, list[dict[str, object]]] = {}
     values: dict[str, list[list[np.ndarray]]] = {}
     for cell in grid:
@@ -244,10 +249,8 @@ def _hyperparameters(
                     warnings.simplefilter("ignore", RuntimeWarning)  # samples without any choice
                     values[name][-1].append(np.nanmean(chosen, axis=(1, 2)))
     found = {}
-    for name in NAMES:
-        if name not in rows:
-            continue
-        table = pd.DataFrame(rows[name])
+    tables = {name: pd.DataFrame(rows[name]) for name in NAMES if name in rows}
+    for name, table in tables.items():
         known = table["value"].notna().to_numpy()
         for row in table[~known].itertuples():
             notes.append(
@@ -269,11 +272,16 @@ def _hyperparameters(
             slopes.append(slope)
             intercepts.append(np.exp(intercept))
         found[name] = Hyperparameter(table, list(tasks), slopes, intercepts)
-    return found
+    return found, tables
 
 
-def _pick(grid: list[Cell], hyperparameters: dict[str, Hyperparameter]) -> dict[tuple[str, float], Cell]:
+def _pick(
+    grid: list[Cell], hyperparameters: dict[str, Hyperparameter], chosen: dict[str, pd.DataFrame]
+) -> dict[tuple[str, float], Cell]:
     """Of each cell the configuration nearest to the laws, a cell of one."""
+    # A hyperparameter without a law, swept at one replay ratio only, say, has no part in the distance.
+    values = {name: [_values(cell, name) for cell in grid] for name in NAMES if name not in hyperparameters}
+    common = {name: functools.reduce(np.intersect1d, of_cells) for name, of_cells in values.items()}
     picked = {}
     for cell in grid:
         distance = np.zeros(len(cell.members))
@@ -285,18 +293,44 @@ def _pick(grid: list[Cell], hyperparameters: dict[str, Hyperparameter]) -> dict[
                 else law.law().mean(cell.replay_ratio)
             )
             distance += np.abs(np.log(np.where(np.isfinite(own), own, at) / at))
-        if len(cell.members) > 1 and not hyperparameters:
-            raise ValueError(
-                f"runs on {cell.task} at replay ratio {cell.replay_ratio:g} have {len(cell.members)} batch sizes or "
-                "learning rates, of which none could be chosen: give a level that they reach (choice_level=, "
-                "--choice-level)"
-            )
-        i = int(distance.argmin())
+        nearest = np.flatnonzero(distance <= distance.min() + 1e-9)
+        for name, shared in common.items():
+            nearest = _one_value(cell, name, nearest, shared, chosen.get(name))
+        i = int(nearest[0])
         one = cell.members[i : i + 1]
         picked[cell.task, cell.replay_ratio] = Cell(
             cell.task, cell.replay_ratio, cell.batch_sizes[i : i + 1], cell.learning_rates[i : i + 1], one
         )
     return picked
+
+
+def _values(cell: Cell, name: str) -> np.ndarray:
+    """One a configuration; -1 where the runs were not given it, which is a value too, the default."""
+    return np.nan_to_num(cell.batch_sizes if name == "batch_size" else cell.learning_rates, nan=-1.0)
+
+
+def _one_value(
+    cell: Cell, name: str, members: np.ndarray, common: np.ndarray, chosen: pd.DataFrame | None
+) -> np.ndarray:
+    """Those of the configurations that have one value of a hyperparameter without a law: all cells', else the best."""
+    own = _values(cell, name)
+    if np.isin(own[members], common).any():
+        members = members[np.isin(own[members], common)]
+    tried = np.unique(own[members])
+    if len(tried) < 2:
+        return members
+    best = math.nan
+    if chosen is not None:
+        here = (chosen["task"] == cell.task) & (chosen["replay_ratio"] == cell.replay_ratio)
+        best = float(chosen.loc[here, "value"].mean())
+    given = tried[tried > 0]
+    if math.isnan(best) or not len(given):
+        raise ValueError(
+            f"runs on {cell.task} at replay ratio {cell.replay_ratio:g} have {len(tried)} values of {name}, of which "
+            "none could be chosen, and the data law is of one: give a level that they reach (choice_level=, "
+            f"--choice-level), or runs of one {name} only"
+        )
+    return members[own[members] == given[np.abs(np.log(given / best)).argmin()]]
 
 
 def _data(
