@@ -1,5 +1,6 @@
 """``sb3-sample scaling`` on made-up runs."""
 
+import argparse
 import json
 from pathlib import Path
 from unittest import mock
@@ -41,9 +42,9 @@ LEVELS = ["--levels", "300", "400", "500", "600", "700", "--reps", "40"]
 
 
 def test_from_runs_to_settings(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    laws, page = tmp_path / "laws.json", tmp_path / "page.md"
-    cli.main(["scaling", "fit", f"BRO={table}", *LEVELS, "-o", str(laws), "--page", str(page)])
-    text = page.read_text()
+    laws, file = tmp_path / "laws.json", tmp_path / "page.md"
+    cli.main(["scaling", "fit", f"BRO={table}", *LEVELS, "-o", str(laws), "--page", str(file)])
+    text = file.read_text()
     for words in ("batch_size: intercept", "learning_rate: intercept", "d_min", "held out", "one task", "3 seeds"):
         assert words in text, words
     assert "nan" not in text
@@ -105,6 +106,28 @@ def test_the_figures(measured: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     names = {path.stem.rpartition("figure_")[2].partition("_")[0] for path in (tmp_path / "figures").iterdir()}
     assert names == {"1", "2", "3", "4", "5", "6", "7", "9", "10", "11"}
     assert "not drawn" not in capsys.readouterr().out
+
+
+def options(**more: object) -> argparse.Namespace:
+    """Of ``scaling plot``, as far as the figures need them."""
+    names = ("resets", "choice_level", "critic_params", "agent", "size", "batch_size")
+    given = {"delta": 1e10, "loss": "log", "score": [], "keep_after_reset": False, "seed": 0}
+    return argparse.Namespace(**dict.fromkeys(names), **given | more)
+
+
+def test_figures_have_environment_steps(measured: Path) -> None:
+    pytest.importorskip("matplotlib")
+    rows = study.read(f"BRO={measured}")
+    rows = rows[rows["arguments"].str.contains('"replay_ratio": [12].0')]
+    texts = {text: to_json(json.loads(text) | {"env_kwargs": {"action_repeat": 2}}) for text in rows["arguments"]}
+    repeated = rows.assign(arguments=rows["arguments"].map(texts))
+    laws = mock.Mock(choice_level=500.0)
+    for draw in (lambda table: figures.choice(laws, table, options()), figures.critical):
+        one, other = (draw(each).axes[0] for each in (rows, repeated))
+        assert one.get_xlabel() == "environment steps"
+        one, other = (axes.get_lines()[0].get_xdata() for axes in (one, other))
+        np.testing.assert_allclose(one, 10_000 * np.arange(1, 61))
+        np.testing.assert_allclose(other, one / 2)
 
 
 def test_what_was_not_recorded_is_not_drawn(table: Path) -> None:

@@ -1,6 +1,7 @@
 """The paper's figures 1 to 7 and 9 to 11, of runs of one's own."""
 
 import argparse
+import json
 import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ import pandas as pd
 
 from sb3_sample.diagnostics.gradient_noise import LARGE, SMALL
 from sb3_sample.diagnostics.measures import noise_scale
+from sb3_sample.run_settings import simulator_steps
 from sb3_sample.study.analysis import argument
 from sb3_sample.study.analysis_command import new_figure
 from sb3_sample.study.scaling.best import cells, choose
@@ -301,9 +303,10 @@ def choice(laws: Laws, table: pd.DataFrame, options: argparse.Namespace) -> "Fig
     figure, axes = _axes(1 + len(chosen))
     member = cell.members[0]
     mean = member.curves.mean(axis=0)
-    axes[0].plot(member.steps, member.curves.T, color="gray", linewidth=0.5)
-    axes[0].plot(member.steps, mean, label="mean over the seeds")
-    axes[0].plot(member.steps, isotonic(mean), label="isotonic")
+    steps = member.steps / member.repeat
+    axes[0].plot(steps, member.curves.T, color="gray", linewidth=0.5)
+    axes[0].plot(steps, mean, label="mean over the seeds")
+    axes[0].plot(steps, isotonic(mean), label="isotonic")
     axes[0].axhline(laws.choice_level, linestyle="--", color="black")
     axes[0].set_title(f"{cell.task}, sigma = {cell.replay_ratio:g}")
     axes[0].set_xlabel("environment steps")
@@ -334,14 +337,19 @@ def levels(laws: Laws) -> "Figure":
 def squares(table: pd.DataFrame) -> dict[tuple[str, float], pd.DataFrame]:
     """
     :param table: of runs that have recorded the norms of their gradients (NoiseScaleCallback)
-    :return: by task and replay ratio the squared norms by step (rows) and batch size (columns 64 and 1,024), the mean
-        over the seeds and over whatever else the runs differ in
+    :return: by task and replay ratio the squared norms by environment step (rows) and batch size (columns 64 and
+        1,024), the mean over the seeds and over whatever else the runs differ in
     :raises ValueError: the runs have recorded none, or do not say their replay ratio
     """
     rows = table[table["metric"].isin(list(_SQUARES.values()))].dropna(subset=["value"])
     if not len(rows):
         raise ValueError(f"the runs have not recorded {' and '.join(_SQUARES.values())} (NoiseScaleCallback)")
-    rows = rows.assign(ratio=pd.to_numeric(pd.Series(argument(rows, "replay_ratio"), index=rows.index), "coerce"))
+    repeats = {text: simulator_steps(json.loads(text)) for text in rows["arguments"].unique()}
+    rows = rows.assign(
+        ratio=pd.to_numeric(pd.Series(argument(rows, "replay_ratio"), index=rows.index), "coerce"),
+        # A table has steps of the simulator.
+        step=rows["step"] / rows["arguments"].map(repeats),
+    )
     if rows["ratio"].isna().any():
         raise ValueError("runs must have been given a replay_ratio")
     found = {}
