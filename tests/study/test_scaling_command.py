@@ -1,8 +1,10 @@
 """``sb3-sample scaling`` on made-up runs."""
 
 import argparse
+import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -14,7 +16,7 @@ from sb3_sample.study import scaling
 from sb3_sample.study.reporting import figures as report_figures
 from sb3_sample.study.reporting import laws as report_laws
 from sb3_sample.study.reporting import pieces
-from sb3_sample.study.scaling import figures
+from sb3_sample.study.scaling import figures, page
 from sb3_sample.study.table import COLUMNS, to_json
 
 
@@ -113,6 +115,49 @@ def options(**more: object) -> argparse.Namespace:
     names = ("resets", "choice_level", "critic_params", "agent", "size", "batch_size")
     given = {"delta": 1e10, "loss": "log", "score": [], "keep_after_reset": False, "seed": 0}
     return argparse.Namespace(**dict.fromkeys(names), **given | more)
+
+
+def test_bounds_are_told_from_data(table: Path) -> None:
+    pytest.importorskip("matplotlib")
+    rows = study.read(f"BRO={table}")
+    first = rows["arguments"].str.contains('"replay_ratio": 1.0')
+    # At the smallest replay ratio the runs end before the level.
+    rows = rows[~first | (rows["step"] <= 60_000)].reset_index(drop=True)
+    rows = rows[rows["arguments"].str.contains('"batch_size": 128') & rows["arguments"].str.contains("0.0003")]
+    # A fifth replay ratio: three are reached without the largest too.
+    fifth = rows[rows["arguments"].str.contains('"replay_ratio": 8.0')]
+    fifth = fifth.assign(arguments=fifth["arguments"].str.replace('"replay_ratio": 8.0', '"replay_ratio": 16.0'))
+    rows = pd.concat([rows, fifth], ignore_index=True)
+    laws = scaling.fit(rows, [300, 500, 700], reps=4)
+    last = laws.levels[-1]
+    assert last.censored.tolist() == [True, False, False, False, False]
+    fitted = last.law().steps(np.array(laws.replay_ratios))
+    assert fitted[0] > 2 * last.points[0]
+    worst = page.parts(laws)[0].table["worst fit"].iloc[-1]
+    assert worst == f"{np.abs(fitted / last.points - 1)[1:].max():.1%}"
+    # A law below a bound is in error.
+    low = dataclasses.replace(last, points=np.where(last.censored, 2 * fitted, last.points))
+    below = dataclasses.replace(laws, levels=[*laws.levels[:-1], low])
+    assert page.parts(below)[0].table["worst fit"].iloc[-1] == "50.0%"
+
+    def drawn(axes: Any) -> dict[str, tuple[str, list[float]]]:
+        found = [line for line in axes.get_lines() if line.get_marker() not in (None, "None", "")]
+        return {line.get_label(): (line.get_marker(), list(line.get_xdata())) for line in found}
+
+    assert drawn(figures.steps_and_compute(laws).axes[0]) == {
+        "runs": ("o", [2.0, 4.0, 8.0, 16.0]), "a lower bound": ("^", [1.0]),
+    }  # fmt: skip
+    nine = figures.levels(laws).axes[0]
+    legend = [text.get_text() for text in nine.get_legend().get_texts()]
+    assert legend == ["300", "500", "700", "a lower bound"]
+    left, right = figures.extrapolation(laws, rows, options()).axes
+    assert left.get_title() == "J = 700, sigma = 1 held out: above the bound" and "%" in right.get_title()
+    assert drawn(left)["held out, a bound"] == ("^", [1.0]) and drawn(right)["held out"] == ("x", [16.0])
+    figure = report_laws.scaling(laws).parts[1]
+    assert isinstance(figure, pieces.Figure) and "lower bounds hollow triangles" in figure.caption
+    points = [line for line in figure.panels[0].lines if len(line.x) == 1][-5:]
+    assert [line.bound for line in points] == [True, False, False, False, False]
+    assert report_figures.png(figure).startswith(b"\x89PNG")
 
 
 def test_figures_have_environment_steps(measured: Path) -> None:

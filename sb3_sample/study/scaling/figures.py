@@ -83,6 +83,23 @@ def _log(axes: Any, x: str, y: str) -> None:
     axes.set_ylabel(y)
 
 
+def _points(
+    axes: Any,
+    x: Any,
+    y: np.ndarray,
+    censored: np.ndarray,
+    color: Any = "C1",
+    label: str = "runs",
+    bound: str = "a lower bound",
+) -> None:
+    """Steps of runs: dots; hollow triangles for lower bounds, of a level that not every task reaches."""
+    x = np.asarray(x, float)
+    if not censored.all():
+        axes.plot(x[~censored], y[~censored], "o", color=color, label=label)
+    if censored.any():
+        axes.plot(x[censored], y[censored], "^", color=color, mfc="none", label=bound)
+
+
 def _fine(laws: Laws) -> np.ndarray:
     return np.geomspace(laws.replay_ratios[0] / 2, laws.replay_ratios[-1] * 2, 200)
 
@@ -99,10 +116,8 @@ def frontier(laws: Laws) -> "Figure":
     line = law.at(_fine(laws))
     left.plot(line.compute, line.steps)
     compute = law.at(ratios).compute / level.law().steps(ratios) * level.points
-    for hit, marker, label in ((~level.censored, "o", "runs"), (level.censored, "^", "a bound")):
-        if hit.any():
-            left.plot(compute[hit], level.points[hit], marker, label=label)
-    if not level.law().doubts(ratios):
+    _points(left, compute, level.points, level.censored)
+    if "d_min" not in level.law().undetermined(ratios):
         left.axhline(level.law().d_min, linestyle="--", color="gray", label="d_min")
     for ratio, x, y in zip(ratios, compute, level.points, strict=True):
         left.annotate(f"{ratio:g}", (x, y))
@@ -135,8 +150,9 @@ def steps_and_compute(laws: Laws) -> "Figure":
     figure, (left, right) = _axes(2)
     level, fine = laws.levels[-1], _fine(laws)
     law = laws.compute_laws(level.level)[0]
-    left.plot(laws.replay_ratios, level.points, "o")
-    left.plot(fine, level.law().steps(fine))
+    _points(left, laws.replay_ratios, level.points, level.censored)
+    left.plot(fine, level.law().steps(fine), label="law")
+    left.legend(frameon=False)
     right.plot(fine, law.at(fine).compute)
     _log(left, "replay ratio", "D (environment steps)")
     _log(right, "replay ratio", "C (FLOPs)")
@@ -252,7 +268,8 @@ def extrapolation(laws: Laws, table: pd.DataFrame, options: argparse.Namespace) 
     :param laws: of all runs
     :param table: the runs
     :param options: of the fit
-    :return: figure 6: steps at the smallest and at the largest replay ratio, as fitted without it
+    :return: figure 6: steps at the smallest and at the largest replay ratio, as fitted without it; no error where they
+        are a lower bound that the law is above
     :raises ValueError: there are fewer than four replay ratios
     """
     if len(laws.replay_ratios) < 4:
@@ -269,11 +286,14 @@ def extrapolation(laws: Laws, table: pd.DataFrame, options: argparse.Namespace) 
         # The mean over the tasks is by their medians, which are others without one replay ratio.
         kept = np.array([ratio != held for ratio in laws.replay_ratios])
         factor = float(np.exp(np.mean(np.log(level.points[kept] / rest.levels[-1].points))))
-        each.plot(np.array(laws.replay_ratios)[kept], level.points[kept], "o")
-        each.plot(held, level.points[at], "rx", label="held out")
+        _points(each, np.array(laws.replay_ratios)[kept], level.points[kept], level.censored[kept])
+        bound = bool(level.censored[at])
+        each.plot(held, level.points[at], "r^" if bound else "rx", mfc="none", label="held out" + ", a bound" * bound)
         each.plot(fine, factor * law.steps(fine))
-        error = factor * law.steps(held) / level.points[at] - 1
-        each.set_title(f"J = {level.level:.0f}, sigma = {held:g} held out: {error:+.0%}")
+        error = f"{factor * law.steps(held) / level.points[at] - 1:+.0%}"
+        if bound:
+            error = "above the bound" if factor * law.steps(held) >= level.points[at] else f"{error} of the bound"
+        each.set_title(f"J = {level.level:.0f}, sigma = {held:g} held out: {error}")
         each.legend(frameon=False)
         _log(each, "replay ratio", "D (environment steps)")
     return figure
@@ -327,8 +347,10 @@ def levels(laws: Laws) -> "Figure":
     figure, (axes,) = _axes(1, 6)
     fine = _fine(laws)
     for each in laws.levels:
-        color = axes.plot(laws.replay_ratios, each.points, "o")[0].get_color()
-        axes.plot(fine, each.law().steps(fine), color=color, label=f"{each.level:.0f}")
+        color = axes.plot(fine, each.law().steps(fine), label=f"{each.level:.0f}")[0].get_color()
+        _points(axes, laws.replay_ratios, each.points, each.censored, color, label="_runs", bound="_bound")
+    if any(each.censored.any() for each in laws.levels):
+        axes.plot([], [], "^", color="gray", mfc="none", label="a lower bound")
     axes.legend(title="J", frameon=False, fontsize=7)
     _log(axes, "replay ratio", "D (environment steps)")
     return figure
