@@ -91,11 +91,24 @@ def _of_settings(settings: dict[str, Any], head: Mapping[str, Any], path: Path) 
     if not isinstance(algo, str) or not isinstance(env, str) or not (seed is None or type(seed) is int):
         raise BadFile(f"{path} is no record of a run: algo is {algo!r:.50}, env {env!r:.50}, seed {seed!r:.50}")
     arguments = {name: value for name, value in settings.items() if name not in _OF_THE_RUN and value is not None}
-    env_kwargs = settings.get("env_kwargs") or {}
-    repeat = env_kwargs.get("action_repeat", 1) if isinstance(env_kwargs, dict) else 1
+    repeat = _action_repeat(settings)
     if type(repeat) is not int or repeat < 1:
         raise BadFile(f"{path}: action_repeat is {repeat!r:.50}, not a whole number from 1 on")
     return RunSettings(algo, arguments, plain_id(env), seed, repeat, _skipped(settings.get("env_wrapper")))
+
+
+def simulator_steps(arguments: Mapping[str, Any]) -> int:
+    """
+    :param arguments: of a run, as a table of runs has them
+    :return: simulator steps of a step of the agent: what its environment repeats an action for, times what its wrappers
+        hold one for
+    """
+    return int(_action_repeat(arguments)) * _skipped(arguments.get("env_wrapper"))
+
+
+def _action_repeat(settings: Mapping[str, Any]) -> Any:
+    env_kwargs = settings.get("env_kwargs")
+    return env_kwargs.get("action_repeat", 1) if isinstance(env_kwargs, dict) else 1
 
 
 def _skipped(wrappers: Any) -> int:

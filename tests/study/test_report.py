@@ -22,6 +22,7 @@ from sb3_sample.study.plan import Plan, Run
 from sb3_sample.study.reporting import facts as facts_module
 from sb3_sample.study.reporting import figures, pieces, published
 from sb3_sample.study.reporting.content import build
+from sb3_sample.study.reporting.curves import _repeats as repeats_of
 from sb3_sample.study.reporting.reading import gather
 from sb3_sample.study.reporting.summary import missing
 from sb3_sample.study.runs import Outcome, StudyFolder
@@ -500,6 +501,13 @@ def test_differences_are_named() -> None:
     ]  # fmt: skip
     assert named("FlashSAC", "myosuite/pose-v0", "success_rate") == ["success at any or the last step: not stated"]
     assert named("TD-MPC2", "myosuite/pose-v0", "success_rate")[:1] == ["3 seeds only"]
+
+
+def test_frames_that_wrappers_skip_are_an_action_repeat() -> None:
+    given = {"env_wrapper": "sb3_sample.envs.AtariFrames"}
+    assert repeats_of(made_up(runs("a", CHEETAH, [1]) + runs("b", OWN, [1], **given))) == {CHEETAH: {1}, OWN: {4}}
+    both = runs("a", OWN, [1], env_kwargs={"action_repeat": 3}, env_wrapper=[{"my.FrameSkip": {"skip": 2}}])
+    assert repeats_of(made_up(both)) == {OWN: {6}}
 
 
 def test_the_published_runs_of_other_tasks_are_left_out(tmp_path: Path) -> None:

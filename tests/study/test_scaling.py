@@ -1,9 +1,11 @@
 """Scaling laws: the paper's numbers, laws that are known, and bad input."""
 
+import dataclasses
 import json
 import math
 import re
 import shlex
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,9 @@ import pytest
 from scipy.optimize import minimize
 
 from sb3_sample.study import scaling
-from sb3_sample.study.scaling.crossings import configurations, first_crossing, kept_evaluations
+from sb3_sample.study.scaling.best import Cell
+from sb3_sample.study.scaling.crossings import Configuration, configurations, first_crossing, kept_evaluations
+from sb3_sample.study.scaling.fitting import _pick
 from sb3_sample.study.scaling.intervals import interval
 from sb3_sample.study.table import COLUMNS, to_json
 
@@ -258,10 +262,13 @@ def test_bad_points_are_refused() -> None:
 def test_what_is_not_determined_is_said() -> None:
     assert CHEETAH.doubts(RATIOS) == []
     power = scaling.fit_data(RATIOS, 1e6 * RATIOS**-0.5)
-    assert any("d_min is not determined" in doubt for doubt in power.doubts(RATIOS))
+    assert any("d_min and beta are not determined" in doubt for doubt in power.doubts(RATIOS))
+    assert power.undetermined(RATIOS) == {"d_min", "beta"} and CHEETAH.undetermined(RATIOS) == set()
     assert power.steps(RATIOS) == pytest.approx(1e6 * RATIOS**-0.5, rel=1e-3)
     flat = scaling.fit_data(RATIOS, np.full(6, 1e6))
     assert any("hardly depend" in doubt for doubt in flat.doubts(RATIOS))
+    assert flat.undetermined(RATIOS) >= {"alpha", "beta"} and "d_min" not in flat.undetermined(RATIOS)
+    assert scaling.DataLaw(1e5, 2.0, 20.0).undetermined([1.0, 2.0, 4.0]) == {"alpha"}
     assert flat.steps(RATIOS) == pytest.approx(1e6, rel=1e-3)
 
 
@@ -462,6 +469,138 @@ def test_a_task_that_fails_at_one_ratio_gives_a_bound_and_one_that_fails_at_most
     most = ~table["arguments"].str.contains('"replay_ratio": 8.0') & (table["task"] == "dmc/walker-run-v0")
     laws = scaling.fit(table.assign(value=table["value"].where(~most, 0.0)), [400], reps=10)
     assert laws.levels[0].left_out == ["dmc/walker-run-v0"]
+
+
+def test_what_is_not_determined_has_no_number_and_the_rest_has_one() -> None:
+    laws = scaling.fit(runs({"dmc/cheetah-run-v0": 1e5}, [1.0, 2.0, 4.0], [256], seeds=2), [400], reps=4)
+    for (d_min, beta, alpha), told in (
+        ((1e5, 1.5, 0.8), {"d_min", "beta", "alpha"}),
+        ((1e5, 1e-6, 2.0), {"d_min"}),  # flat
+        ((1.0, 1e10, 0.5), {"alpha"}),  # a power
+    ):
+        stages = [scaling.DataLaw(*(np.full(n, value) for value in (d_min, beta, alpha))) for n in (1, 4)]
+        (level,) = laws.levels
+        found = dataclasses.replace(laws, levels=[dataclasses.replace(level, laws=stages)])
+        (row,) = scaling.summary(found)["data"]
+        assert {name for name in ("d_min", "beta", "alpha") if row[name] is not None} == told
+        assert (row["d_min"] or {}).get("value") == (d_min if "d_min" in told else None)
+
+
+def test_the_median_of_a_task_does_not_depend_on_how_long_it_was_tried_in_vain() -> None:
+    steps = np.array([[10.0, math.inf, 20.0, 30.0], [100.0, 200.0, 300.0, 400.0]])[..., None]
+    for last in (5.0, 1_000.0):
+        lasts = np.full((2, 4), last)
+        mean, bounded, factors = scaling.normalize(steps, lasts)
+        # Medians of 10, 20, 30, inf and of 100, 200, 300, 400; their median is 137.5.
+        assert factors[:, 0] == pytest.approx([25 / 137.5, 250 / 137.5])
+        assert bounded[:, 0].tolist() == [False, True, False, False]
+        assert mean[[0, 2, 3], 0] == pytest.approx([55, 137.5, 192.5])
+        assert mean[1, 0] == pytest.approx((last * 137.5 / 25 + 110) / 2)
+    # A sample in which half is not reached has no median: it alone has no value.
+    worse = steps.copy()
+    worse[0, 0] = math.inf
+    mean, _, factors = scaling.normalize(np.stack([steps, worse]), np.full((2, 4), 5.0))
+    assert np.isfinite(mean[0]).all() and np.isnan(mean[1]).all() and np.isnan(factors[1]).all()
+
+
+def test_a_run_that_ended_early_is_no_quick_one() -> None:
+    table = runs(TASKS, [1.0, 2.0, 4.0, 8.0], [256], model_size="0.55M")
+    slow = table["arguments"].str.contains('"replay_ratio": 1.0') & (table["task"] == "dmc/walker-run-v0")
+    short = table[~slow | (table["step"] <= 60_000)]
+    whole, found = (scaling.fit(each, [400, 450, 500], reps=40) for each in (table, short))
+    for one, other in zip(whole.levels, found.levels, strict=True):
+        assert other.censored.tolist() == [True, False, False, False] and one.censored.sum() == 0
+        ratio = [each.factors[1] / each.factors[0] for each in (one, other)]
+        # Of three steps that are reached the median is the middle one of three, not of four with a small one below.
+        assert ratio[1] == pytest.approx(ratio[0], rel=0.1)
+        assert other.points[1:] == pytest.approx(one.points[1:], rel=0.1) and other.points[0] <= one.points[0]
+
+
+def test_samples_without_a_median_have_no_value_and_the_others_an_interval() -> None:
+    table = runs({"dmc/cheetah-run-v0": 1e5}, [1.0, 2.0, 4.0, 8.0, 16.0], [256], seeds=4, model_size="0.55M")
+    # Two ratios fail in all seeds, a third in three of four: a third of the samples lacks the seed that does not.
+    given = table["arguments"].map(lambda text: json.loads(text)["replay_ratio"])
+    table = table.assign(value=table["value"].where(given < 8, 0.0))
+    table = table.assign(value=table["value"].where((given != 4) | (table["seed"] == 0), 0.0))
+    levels = [60, 90, 120, 150]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        laws = scaling.fit(table, levels, reps=60)
+        lost = [np.isnan(level.laws[1].d_min) for level in laws.levels]
+        assert sum(each.sum() for each in lost) > 0 and all(np.isfinite(each.points).all() for each in laws.levels)
+        for level, missing in zip(laws.levels, lost, strict=True):
+            assert all(np.array_equal(np.isnan(each), missing) for each in level.laws[1])
+        scaling.summary(laws)
+        found = laws.predict(replay_ratio=2.0, level=laws.levels[0].level)
+    assert found.steps.low <= found.steps.value <= found.steps.high
+    best = scaling.ComputeLaw(laws.levels[-1].laws[1], 256.0, 0.0, 5e5).best()
+    assert np.array_equal(np.isnan(best.replay_ratio), lost[-1])
+
+
+def test_the_steps_of_wrappers_that_skip_frames_are_the_agents() -> None:
+    table = runs({"dmc/cheetah-run-v0": 1e5}, [1.0, 2.0, 4.0], [256], seeds=2)
+
+    def given(**more: Any) -> pd.DataFrame:
+        return table.assign(arguments=[to_json(json.loads(text) | more) for text in table["arguments"]])
+
+    frames = "sb3_sample.envs.AtariFrames"
+    for more, repeat in (
+        ({"env_wrapper": frames}, 4), ({"env_wrapper": [{frames: {"frame_skip": 3}}]}, 3),
+        ({"env_wrapper": frames, "env_kwargs": {"action_repeat": 2}}, 8), ({"env_wrapper": "a.Other"}, 1),
+    ):  # fmt: skip
+        found = configurations(given(**more, resets=[1_000]))
+        assert {each.repeat for each in found} == {repeat} and {each.resets for each in found} == {(1_000 * repeat,)}
+        points = scaling.fit(given(**more), [400], reps=2).levels[0].points
+        assert points == pytest.approx(scaling.fit(table, [400], reps=2).levels[0].points / repeat)
+
+
+def swept(more: dict[float, tuple[float, ...]], ratios: tuple[float, ...] = (1.0, 2.0, 4.0)) -> pd.DataFrame:
+    """Three batch sizes at the learning rate 3e-4; the middle one at further learning rates too, which come first."""
+    parts = []
+    for ratio in ratios:
+        best = round(256 * ratio**-0.5)
+        for rate in more.get(ratio, ()):
+            parts.append(runs({"dmc/cheetah-run-v0": 1e5}, [ratio], [best], seeds=2, learning_rate=rate))
+        parts.append(
+            runs({"dmc/cheetah-run-v0": 1e5}, [ratio], [best // 2, best, 2 * best], seeds=2, learning_rate=3e-4)
+        )
+    return pd.concat(parts, ignore_index=True)
+
+
+def test_the_data_law_is_of_one_learning_rate() -> None:
+    plain = scaling.fit(swept({}), [400], reps=2, draws=10)
+    table = swept({1.0: (1.5e-4, 6e-4)})
+    laws = scaling.fit(table, [400], reps=2, draws=10)
+    # Swept at one replay ratio only: without a law, so that it has no part in what is nearest.
+    assert list(laws.hyperparameters) == ["batch_size"] and laws.learning_rate == plain.learning_rate == 3e-4
+    assert laws.levels[0].points == pytest.approx(plain.levels[0].points)
+    (said,) = [limit for limit in laws.predict(replay_ratio=2.0).limits if limit.startswith("learning_rate")]
+    assert said == "learning_rate was swept, but has no law: it is that of the runs"
+    (said,) = [limit for limit in plain.predict(replay_ratio=2.0).limits if limit.startswith("learning_rate")]
+    assert said == "learning_rate was not swept: it is that of the runs"
+    # One batch size throughout: the learning rate of all runs, though neither has a law.
+    batch = table["arguments"].map(lambda text: json.loads(text)["batch_size"])
+    ratio = table["arguments"].map(lambda text: json.loads(text)["replay_ratio"])
+    middle = table[batch == (256 * ratio**-0.5).round()]
+    assert scaling.fit(middle, [400], reps=2, draws=10).learning_rate == 3e-4
+
+
+def test_without_a_learning_rate_that_all_have_it_is_the_chosen_one_or_none() -> None:
+    def cell(ratio: float, rates: list[float]) -> Cell:
+        made = Configuration("a", "{}", "t", np.array([1]), np.ones((1, 1)))
+        return Cell("t", ratio, np.full(len(rates), 128.0), np.array(rates), [made] * len(rates))
+
+    def rates(grid: list[Cell], values: list[float]) -> list[float]:
+        chosen = {"learning_rate": pd.DataFrame({"task": "t", "replay_ratio": [1.0], "value": values})}
+        return [float(one.learning_rates[0]) for one in _pick(grid, {}, chosen).values()]
+
+    apart = [cell(1.0, [1e-4, 4e-4]), cell(2.0, [3e-4])]
+    assert rates(apart, [3.5e-4]) == [4e-4, 3e-4] and rates(apart, [1.2e-4]) == [1e-4, 3e-4]
+    assert rates([cell(1.0, [1e-4, 4e-4, 3e-4]), cell(2.0, [3e-4])], [1e-4]) == [3e-4, 3e-4]
+    # Runs that were not given it have the default, which is one value too.
+    assert np.isnan(rates([cell(1.0, [1e-4, math.nan]), cell(2.0, [math.nan])], [1e-4])).all()
+    with pytest.raises(ValueError, match=r"on t at replay ratio 1 have 2 values of learning_rate, .* \(choice_level="):
+        rates(apart, [math.nan])
 
 
 # ---------------------------------------------------------------- intervals

@@ -1,7 +1,10 @@
 """``sb3-sample scaling`` on made-up runs."""
 
+import argparse
+import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -13,7 +16,7 @@ from sb3_sample.study import scaling
 from sb3_sample.study.reporting import figures as report_figures
 from sb3_sample.study.reporting import laws as report_laws
 from sb3_sample.study.reporting import pieces
-from sb3_sample.study.scaling import figures
+from sb3_sample.study.scaling import figures, page
 from sb3_sample.study.table import COLUMNS, to_json
 
 
@@ -41,9 +44,9 @@ LEVELS = ["--levels", "300", "400", "500", "600", "700", "--reps", "40"]
 
 
 def test_from_runs_to_settings(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    laws, page = tmp_path / "laws.json", tmp_path / "page.md"
-    cli.main(["scaling", "fit", f"BRO={table}", *LEVELS, "-o", str(laws), "--page", str(page)])
-    text = page.read_text()
+    laws, file = tmp_path / "laws.json", tmp_path / "page.md"
+    cli.main(["scaling", "fit", f"BRO={table}", *LEVELS, "-o", str(laws), "--page", str(file)])
+    text = file.read_text()
     for words in ("batch_size: intercept", "learning_rate: intercept", "d_min", "held out", "one task", "3 seeds"):
         assert words in text, words
     assert "nan" not in text
@@ -58,12 +61,23 @@ def test_from_runs_to_settings(table: Path, tmp_path: Path, capsys: pytest.Captu
 def test_errors_are_one_line(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     laws = tmp_path / "laws.json"
     laws.write_text("{}")
+    plan = ["plan", str(tmp_path / "plan.yml"), "--tasks", "Pendulum-v1", "--steps"]
     for command, words in (
         (["fit", str(table), *LEVELS], "agent must be given"),
         (["fit", f"BRO={table}", "--levels", "5000"], "give a level that they reach"),
         (["fit"], "sources must be at least one folder"),
         (["fit", f"BRO={table}", "--delta", "-1", *LEVELS], "delta above 0"),
         (["predict", str(laws), "--budget", "1e15"], "is no file of scaling laws"),
+        (
+            ["predict", "nowhere.json", "--budget", "1e15"],
+            "laws must be a file that sb3-sample scaling fit -o has written, and 'nowhere.json' is not there",
+        ),
+        ([*plan, "1e4", "--evaluations", "0"], "evaluations must be at least 1, not 0"),
+        ([*plan, "1e4", "--episodes", "0"], "episodes must be at least 1, not 0"),
+        ([*plan, "1e4", "--seeds", "-1"], "seeds must be at least 1, not -1"),
+        ([*plan, "inf"], "steps must be a finite number, at least that of the evaluations, 40, not inf"),
+        ([*plan, "nan"], "steps must be a finite number, at least that of the evaluations, 40, not nan"),
+        ([*plan, "39"], "steps must be a finite number, at least that of the evaluations, 40, not 39"),
     ):
         with pytest.raises(SystemExit) as error:
             cli.main(["scaling", *command])
@@ -94,6 +108,71 @@ def test_the_figures(measured: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     names = {path.stem.rpartition("figure_")[2].partition("_")[0] for path in (tmp_path / "figures").iterdir()}
     assert names == {"1", "2", "3", "4", "5", "6", "7", "9", "10", "11"}
     assert "not drawn" not in capsys.readouterr().out
+
+
+def options(**more: object) -> argparse.Namespace:
+    """Of ``scaling plot``, as far as the figures need them."""
+    names = ("resets", "choice_level", "critic_params", "agent", "size", "batch_size")
+    given = {"delta": 1e10, "loss": "log", "score": [], "keep_after_reset": False, "seed": 0}
+    return argparse.Namespace(**dict.fromkeys(names), **given | more)
+
+
+def test_bounds_are_told_from_data(table: Path) -> None:
+    pytest.importorskip("matplotlib")
+    rows = study.read(f"BRO={table}")
+    first = rows["arguments"].str.contains('"replay_ratio": 1.0')
+    # At the smallest replay ratio the runs end before the level.
+    rows = rows[~first | (rows["step"] <= 60_000)].reset_index(drop=True)
+    rows = rows[rows["arguments"].str.contains('"batch_size": 128') & rows["arguments"].str.contains("0.0003")]
+    # A fifth replay ratio: three are reached without the largest too.
+    fifth = rows[rows["arguments"].str.contains('"replay_ratio": 8.0')]
+    fifth = fifth.assign(arguments=fifth["arguments"].str.replace('"replay_ratio": 8.0', '"replay_ratio": 16.0'))
+    rows = pd.concat([rows, fifth], ignore_index=True)
+    laws = scaling.fit(rows, [300, 500, 700], reps=4)
+    last = laws.levels[-1]
+    assert last.censored.tolist() == [True, False, False, False, False]
+    fitted = last.law().steps(np.array(laws.replay_ratios))
+    assert fitted[0] > 2 * last.points[0]
+    worst = page.parts(laws)[0].table["worst fit"].iloc[-1]
+    assert worst == f"{np.abs(fitted / last.points - 1)[1:].max():.1%}"
+    # A law below a bound is in error.
+    low = dataclasses.replace(last, points=np.where(last.censored, 2 * fitted, last.points))
+    below = dataclasses.replace(laws, levels=[*laws.levels[:-1], low])
+    assert page.parts(below)[0].table["worst fit"].iloc[-1] == "50.0%"
+
+    def drawn(axes: Any) -> dict[str, tuple[str, list[float]]]:
+        found = [line for line in axes.get_lines() if line.get_marker() not in (None, "None", "")]
+        return {line.get_label(): (line.get_marker(), list(line.get_xdata())) for line in found}
+
+    assert drawn(figures.steps_and_compute(laws).axes[0]) == {
+        "runs": ("o", [2.0, 4.0, 8.0, 16.0]), "a lower bound": ("^", [1.0]),
+    }  # fmt: skip
+    nine = figures.levels(laws).axes[0]
+    legend = [text.get_text() for text in nine.get_legend().get_texts()]
+    assert legend == ["300", "500", "700", "a lower bound"]
+    left, right = figures.extrapolation(laws, rows, options()).axes
+    assert left.get_title() == "J = 700, sigma = 1 held out: above the bound" and "%" in right.get_title()
+    assert drawn(left)["held out, a bound"] == ("^", [1.0]) and drawn(right)["held out"] == ("x", [16.0])
+    figure = report_laws.scaling(laws).parts[1]
+    assert isinstance(figure, pieces.Figure) and "lower bounds hollow triangles" in figure.caption
+    points = [line for line in figure.panels[0].lines if len(line.x) == 1][-5:]
+    assert [line.bound for line in points] == [True, False, False, False, False]
+    assert report_figures.png(figure).startswith(b"\x89PNG")
+
+
+def test_figures_have_environment_steps(measured: Path) -> None:
+    pytest.importorskip("matplotlib")
+    rows = study.read(f"BRO={measured}")
+    rows = rows[rows["arguments"].str.contains('"replay_ratio": [12].0')]
+    texts = {text: to_json(json.loads(text) | {"env_kwargs": {"action_repeat": 2}}) for text in rows["arguments"]}
+    repeated = rows.assign(arguments=rows["arguments"].map(texts))
+    laws = mock.Mock(choice_level=500.0)
+    for draw in (lambda table: figures.choice(laws, table, options()), figures.critical):
+        one, other = (draw(each).axes[0] for each in (rows, repeated))
+        assert one.get_xlabel() == "environment steps"
+        one, other = (axes.get_lines()[0].get_xdata() for axes in (one, other))
+        np.testing.assert_allclose(one, 10_000 * np.arange(1, 61))
+        np.testing.assert_allclose(other, one / 2)
 
 
 def test_what_was_not_recorded_is_not_drawn(table: Path) -> None:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from sb3_sample.plots import Curve, Run, summarize
+from sb3_sample.run_settings import simulator_steps
 from sb3_sample.study.aggregate import Scores, score_for
 from sb3_sample.study.reporting.facts import spacing
 from sb3_sample.study.reporting.pieces import N_COLORS, Agent, counted, range_text
@@ -136,10 +137,9 @@ def _difference_words(found: Sequence[tuple[Curves, Curve]], repeats: Mapping[st
 
 
 def _repeats(table: pd.DataFrame) -> dict[str, set[int]]:
-    """Action repeats of the runs of each task."""
+    """Action repeats of the runs of each task, with the frames that wrappers skip."""
     found: dict[str, set[int]] = {}
     for task, rows in table.groupby("task", sort=False):
         for text in rows["arguments"].unique():
-            kwargs = json.loads(text).get("env_kwargs")
-            found.setdefault(task, set()).add(kwargs.get("action_repeat", 1) if isinstance(kwargs, dict) else 1)
+            found.setdefault(task, set()).add(simulator_steps(json.loads(text)))
     return found

@@ -159,14 +159,15 @@ def _draw_lines(axes: "Axes", panel: Lines, band: str) -> None:
     from matplotlib.ticker import EngFormatter
 
     for line in panel.lines:
-        agent, x, y, low, high, thin = _until(line, panel.x_end)
+        agent, x, y, low, high, thin, bound = _until(line, panel.x_end)
         look = _look(agent)
         if low is not None and high is not None:
             color = band if agent.published else look["color"]
             axes.fill_between(x, low, high, color=color, alpha=0.2, linewidth=0, zorder=1)
         width = 0.8 if thin else 1.5 if agent.published else 2
-        marker = _MARKERS[min(agent.turn, 2)] if len(x) == 1 else None
-        axes.plot(x, y, linewidth=width, marker=marker, zorder=2 if agent.published else 3, **look)
+        marker = None if len(x) != 1 else "^" if bound else _MARKERS[min(agent.turn, 2)]
+        face = "none" if bound else look["color"]
+        axes.plot(x, y, linewidth=width, marker=marker, mfc=face, zorder=2 if agent.published else 3, **look)
     axes.set_xlim(0, panel.x_end or 1)
     if panel.y_range is not None:
         axes.set_ylim(*panel.y_range)

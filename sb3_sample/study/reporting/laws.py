@@ -36,7 +36,7 @@ def _figure(laws: Laws) -> Figure:
     lines = []
     for level, agent in zip(laws.levels, looks, strict=True):
         lines.append(Line(agent, fine.tolist(), level.law().steps(fine).tolist()))
-        lines += _dots(agent, laws.replay_ratios, level.points)
+        lines += _dots(agent, laws.replay_ratios, level.points, level.censored)
     panels = [Lines("Steps to a level", "replay ratio", "environment steps", lines, end)]
     tasks = dict(zip(laws.tasks, _looks(laws.tasks, len(looks)), strict=True))
     for name, law in laws.hyperparameters.items():
@@ -48,13 +48,15 @@ def _figure(laws: Laws) -> Figure:
             lines += _dots(tasks[task], own["replay_ratio"].to_numpy(), own["value"].to_numpy())
         panels.append(Lines(f"Best {name}", "replay ratio", name, lines, end))
     shown = looks + (list(tasks.values()) if laws.hyperparameters else [])
-    return Figure("scaling", "Laws (lines) and what they were fitted to (points)", panels, shown)
+    bounds = ", of these lower bounds hollow triangles" if any(each.censored.any() for each in laws.levels) else ""
+    return Figure("scaling", f"Laws (lines) and what they were fitted to (points{bounds})", panels, shown)
 
 
 def _looks(names: Sequence[str], first: int = 0) -> list[Agent]:
     return [Agent(name, i % N_COLORS, i // N_COLORS, label=name) for i, name in enumerate(names, first)]
 
 
-def _dots(agent: Agent, x: Sequence[float] | np.ndarray, y: np.ndarray) -> list[Line]:
+def _dots(agent: Agent, x: Sequence[float] | np.ndarray, y: np.ndarray, bounds: np.ndarray | None = None) -> list[Line]:
     """A line of one point has a marker."""
-    return [Line(agent, [float(a)], [float(b)]) for a, b in zip(x, y, strict=True)]
+    hits = np.zeros(len(y), bool) if bounds is None else bounds
+    return [Line(agent, [float(a)], [float(b)], bound=bool(hit)) for a, b, hit in zip(x, y, hits, strict=True)]

@@ -98,6 +98,7 @@ class Line(NamedTuple):
     :param low: lower end of the band, if there is one
     :param high: upper end
     :param thin: whether it is a run by itself
+    :param bound: whether it is a point that is a lower bound, which is a hollow triangle
     """
 
     agent: Agent
@@ -106,6 +107,7 @@ class Line(NamedTuple):
     low: Sequence[float] | None = None
     high: Sequence[float] | None = None
     thin: bool = False
+    bound: bool = False
 
 
 class Lines(NamedTuple):

@@ -172,7 +172,9 @@ class ComputeLaw(NamedTuple):
             left, right = low + (high - low) / 3, high - (high - low) / 3
             less = total(left) < total(right)
             low, high = np.where(less, low, left), np.where(less, right, high)
-        return self.at(np.exp((low + high) / 2)[()])
+        middle = (low + high) / 2
+        # A search by comparisons ends somewhere even where there is no law.
+        return self.at(np.exp(np.where(np.isfinite(total(middle)), middle, np.nan))[()])
 
     def frontier(self, low: float, high: float, n: int = 100) -> Point:
         """
@@ -217,7 +219,7 @@ def fit_budget(budget: Sequence[float] | np.ndarray, replay_ratio: Sequence[floa
 
     :param budget: (..., L) FLOPs
     :param replay_ratio: (..., L)
-    :return: the law, of shape (...)
+    :return: the law, of shape (...); NaN of samples with a level without a law
     :raises ValueError: there are not two different budgets, or a number is not positive
     """
     budgets, ratios = np.asarray(budget, float), np.asarray(replay_ratio, float)
@@ -228,7 +230,8 @@ def fit_budget(budget: Sequence[float] | np.ndarray, replay_ratio: Sequence[floa
     x, y = np.log(budgets), np.log(ratios)
     centred = x - x.mean(axis=-1, keepdims=True)
     spread = (centred**2).sum(axis=-1)
-    if not (spread > 1e-12).all():
+    known = np.isfinite(spread)
+    if not known.any() or not (spread[known] > 1e-12).all():
         raise ValueError("budgets must differ: an exponent cannot be had from one")
     exponent = (centred * y).sum(axis=-1) / spread
     return BudgetLaw((y.mean(axis=-1) - exponent * x.mean(axis=-1))[()], exponent[()])

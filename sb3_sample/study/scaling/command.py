@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -96,13 +97,17 @@ def plan_text(options: argparse.Namespace) -> str:
     """
     :param options: of ``sb3-sample scaling plan``
     :return: the plan
+    :raises ValueError: a number is out of range
     """
-    every = int(options.steps) // options.evaluations
-    if every < 1 or options.seeds < 1 or options.evaluations < 1:
+    for name in ("evaluations", "episodes", "seeds"):
+        if getattr(options, name) < 1:
+            raise ValueError(f"{name} must be at least 1, not {getattr(options, name)}")
+    if not options.evaluations <= options.steps < math.inf:
         raise ValueError(
-            f"steps, evaluations and seeds must be at least 1, and no fewer steps than evaluations, not "
-            f"{options.steps:g}, {options.evaluations}, {options.seeds}"
+            f"steps must be a finite number, at least that of the evaluations, {options.evaluations}, not "
+            f"{options.steps:g}"
         )
+    every = int(options.steps) // options.evaluations
     given = [each.partition(":")[::2] for each in options.hyperparams]
     fixed = "".join(f", {name}: {value}" for name, value in given)
     lines = [
@@ -271,7 +276,7 @@ def _run_fit(options: argparse.Namespace) -> None:
 
 
 def _add_predict(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("laws", type=Path, metavar="LAWS", help="file that fit has written")
+    parser.add_argument("laws", type=Path, metavar="LAWS", help="file that fit -o has written")
     asked = parser.add_mutually_exclusive_group(required=True)
     asked.add_argument("--replay-ratio", type=float, metavar="R", help="settings for this replay ratio")
     asked.add_argument("--compute", type=float, metavar="FLOPS", help="fewest environment steps within this compute")
@@ -283,7 +288,12 @@ def _add_predict(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_predict(options: argparse.Namespace) -> None:
-    laws = read_laws(options.laws)
+    try:
+        laws = read_laws(options.laws)
+    except FileNotFoundError as error:
+        raise ValueError(
+            f"laws must be a file that sb3-sample scaling fit -o has written, and {str(options.laws)!r} is not there"
+        ) from error
     found = laws.predict(
         replay_ratio=options.replay_ratio,
         compute=options.compute,

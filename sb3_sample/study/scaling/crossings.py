@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_sample import sac
+from sb3_sample.run_settings import simulator_steps
 from sb3_sample.study.aggregate import Scores, scored
 from sb3_sample.warn import warn
 
@@ -125,7 +126,7 @@ class Configuration(NamedTuple):
     :param steps: (T,) simulator steps of the evaluations that all seeds have
     :param curves: (n, T) returns of the seeds, of 0 to 1000
     :param resets: simulator steps at which the agent was reset, as far as the runs reach
-    :param repeat: simulator steps of a step of the environment
+    :param repeat: simulator steps of a step of the agent
     """
 
     agent: str
@@ -205,7 +206,7 @@ def configurations(
                 f"{len(curves)} runs and are left out"
             )
         given = json.loads(arguments)
-        repeat = (given.get("env_kwargs") or {}).get("action_repeat", 1)
+        repeat = simulator_steps(given)
         at = () if keep_after_reset else _resets(agent, given, resets, repeat, int(steps[-1]))
         found.append(Configuration(agent, arguments, task, steps, curves * SCALE, at, repeat))
     return found

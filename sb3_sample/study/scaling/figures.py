@@ -1,6 +1,7 @@
 """The paper's figures 1 to 7 and 9 to 11, of runs of one's own."""
 
 import argparse
+import json
 import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ import pandas as pd
 
 from sb3_sample.diagnostics.gradient_noise import LARGE, SMALL
 from sb3_sample.diagnostics.measures import noise_scale
+from sb3_sample.run_settings import simulator_steps
 from sb3_sample.study.analysis import argument
 from sb3_sample.study.analysis_command import new_figure
 from sb3_sample.study.scaling.best import cells, choose
@@ -81,6 +83,23 @@ def _log(axes: Any, x: str, y: str) -> None:
     axes.set_ylabel(y)
 
 
+def _points(
+    axes: Any,
+    x: Any,
+    y: np.ndarray,
+    censored: np.ndarray,
+    color: Any = "C1",
+    label: str = "runs",
+    bound: str = "a lower bound",
+) -> None:
+    """Steps of runs: dots; hollow triangles for lower bounds, of a level that not every task reaches."""
+    x = np.asarray(x, float)
+    if not censored.all():
+        axes.plot(x[~censored], y[~censored], "o", color=color, label=label)
+    if censored.any():
+        axes.plot(x[censored], y[censored], "^", color=color, mfc="none", label=bound)
+
+
 def _fine(laws: Laws) -> np.ndarray:
     return np.geomspace(laws.replay_ratios[0] / 2, laws.replay_ratios[-1] * 2, 200)
 
@@ -97,10 +116,8 @@ def frontier(laws: Laws) -> "Figure":
     line = law.at(_fine(laws))
     left.plot(line.compute, line.steps)
     compute = law.at(ratios).compute / level.law().steps(ratios) * level.points
-    for hit, marker, label in ((~level.censored, "o", "runs"), (level.censored, "^", "a bound")):
-        if hit.any():
-            left.plot(compute[hit], level.points[hit], marker, label=label)
-    if not level.law().doubts(ratios):
+    _points(left, compute, level.points, level.censored)
+    if "d_min" not in level.law().undetermined(ratios):
         left.axhline(level.law().d_min, linestyle="--", color="gray", label="d_min")
     for ratio, x, y in zip(ratios, compute, level.points, strict=True):
         left.annotate(f"{ratio:g}", (x, y))
@@ -133,8 +150,9 @@ def steps_and_compute(laws: Laws) -> "Figure":
     figure, (left, right) = _axes(2)
     level, fine = laws.levels[-1], _fine(laws)
     law = laws.compute_laws(level.level)[0]
-    left.plot(laws.replay_ratios, level.points, "o")
-    left.plot(fine, level.law().steps(fine))
+    _points(left, laws.replay_ratios, level.points, level.censored)
+    left.plot(fine, level.law().steps(fine), label="law")
+    left.legend(frameon=False)
     right.plot(fine, law.at(fine).compute)
     _log(left, "replay ratio", "D (environment steps)")
     _log(right, "replay ratio", "C (FLOPs)")
@@ -250,7 +268,8 @@ def extrapolation(laws: Laws, table: pd.DataFrame, options: argparse.Namespace) 
     :param laws: of all runs
     :param table: the runs
     :param options: of the fit
-    :return: figure 6: steps at the smallest and at the largest replay ratio, as fitted without it
+    :return: figure 6: steps at the smallest and at the largest replay ratio, as fitted without it; no error where they
+        are a lower bound that the law is above
     :raises ValueError: there are fewer than four replay ratios
     """
     if len(laws.replay_ratios) < 4:
@@ -267,11 +286,14 @@ def extrapolation(laws: Laws, table: pd.DataFrame, options: argparse.Namespace) 
         # The mean over the tasks is by their medians, which are others without one replay ratio.
         kept = np.array([ratio != held for ratio in laws.replay_ratios])
         factor = float(np.exp(np.mean(np.log(level.points[kept] / rest.levels[-1].points))))
-        each.plot(np.array(laws.replay_ratios)[kept], level.points[kept], "o")
-        each.plot(held, level.points[at], "rx", label="held out")
+        _points(each, np.array(laws.replay_ratios)[kept], level.points[kept], level.censored[kept])
+        bound = bool(level.censored[at])
+        each.plot(held, level.points[at], "r^" if bound else "rx", mfc="none", label="held out" + ", a bound" * bound)
         each.plot(fine, factor * law.steps(fine))
-        error = factor * law.steps(held) / level.points[at] - 1
-        each.set_title(f"J = {level.level:.0f}, sigma = {held:g} held out: {error:+.0%}")
+        error = f"{factor * law.steps(held) / level.points[at] - 1:+.0%}"
+        if bound:
+            error = "above the bound" if factor * law.steps(held) >= level.points[at] else f"{error} of the bound"
+        each.set_title(f"J = {level.level:.0f}, sigma = {held:g} held out: {error}")
         each.legend(frameon=False)
         _log(each, "replay ratio", "D (environment steps)")
     return figure
@@ -301,9 +323,10 @@ def choice(laws: Laws, table: pd.DataFrame, options: argparse.Namespace) -> "Fig
     figure, axes = _axes(1 + len(chosen))
     member = cell.members[0]
     mean = member.curves.mean(axis=0)
-    axes[0].plot(member.steps, member.curves.T, color="gray", linewidth=0.5)
-    axes[0].plot(member.steps, mean, label="mean over the seeds")
-    axes[0].plot(member.steps, isotonic(mean), label="isotonic")
+    steps = member.steps / member.repeat
+    axes[0].plot(steps, member.curves.T, color="gray", linewidth=0.5)
+    axes[0].plot(steps, mean, label="mean over the seeds")
+    axes[0].plot(steps, isotonic(mean), label="isotonic")
     axes[0].axhline(laws.choice_level, linestyle="--", color="black")
     axes[0].set_title(f"{cell.task}, sigma = {cell.replay_ratio:g}")
     axes[0].set_xlabel("environment steps")
@@ -324,8 +347,10 @@ def levels(laws: Laws) -> "Figure":
     figure, (axes,) = _axes(1, 6)
     fine = _fine(laws)
     for each in laws.levels:
-        color = axes.plot(laws.replay_ratios, each.points, "o")[0].get_color()
-        axes.plot(fine, each.law().steps(fine), color=color, label=f"{each.level:.0f}")
+        color = axes.plot(fine, each.law().steps(fine), label=f"{each.level:.0f}")[0].get_color()
+        _points(axes, laws.replay_ratios, each.points, each.censored, color, label="_runs", bound="_bound")
+    if any(each.censored.any() for each in laws.levels):
+        axes.plot([], [], "^", color="gray", mfc="none", label="a lower bound")
     axes.legend(title="J", frameon=False, fontsize=7)
     _log(axes, "replay ratio", "D (environment steps)")
     return figure
@@ -334,14 +359,19 @@ def levels(laws: Laws) -> "Figure":
 def squares(table: pd.DataFrame) -> dict[tuple[str, float], pd.DataFrame]:
     """
     :param table: of runs that have recorded the norms of their gradients (NoiseScaleCallback)
-    :return: by task and replay ratio the squared norms by step (rows) and batch size (columns 64 and 1,024), the mean
-        over the seeds and over whatever else the runs differ in
+    :return: by task and replay ratio the squared norms by environment step (rows) and batch size (columns 64 and
+        1,024), the mean over the seeds and over whatever else the runs differ in
     :raises ValueError: the runs have recorded none, or do not say their replay ratio
     """
     rows = table[table["metric"].isin(list(_SQUARES.values()))].dropna(subset=["value"])
     if not len(rows):
         raise ValueError(f"the runs have not recorded {' and '.join(_SQUARES.values())} (NoiseScaleCallback)")
-    rows = rows.assign(ratio=pd.to_numeric(pd.Series(argument(rows, "replay_ratio"), index=rows.index), "coerce"))
+    repeats = {text: simulator_steps(json.loads(text)) for text in rows["arguments"].unique()}
+    rows = rows.assign(
+        ratio=pd.to_numeric(pd.Series(argument(rows, "replay_ratio"), index=rows.index), "coerce"),
+        # A table has steps of the simulator.
+        step=rows["step"] / rows["arguments"].map(repeats),
+    )
     if rows["ratio"].isna().any():
         raise ValueError("runs must have been given a replay_ratio")
     found = {}
@@ -383,7 +413,7 @@ def critical_and_best(laws: Laws, table: pd.DataFrame) -> "Figure":
     :raises ValueError: there is no best batch size, or no critical one beside it
     """
     if "batch_size" not in laws.hyperparameters:
-        raise ValueError("batch size was not swept")
+        raise ValueError("batch size has no law")
     best = laws.hyperparameters["batch_size"].values.set_index(["task", "replay_ratio"])["value"].dropna()
     points: dict[str, list[tuple[float, float]]] = {}
     for key, means in squares(table).items():

@@ -44,8 +44,9 @@ def summary(laws: Laws) -> dict[str, Any]:
     for level in laws.levels:
         row: dict[str, Any] = {"level": level.level, "tasks": level.tasks, "left_out": level.left_out}
         row["doubts"] = level.law().doubts(laws.replay_ratios)
+        unknown = level.law().undetermined(laws.replay_ratios)
         for name in DataLaw._fields:
-            told = name == "alpha" or not any("determined" in doubt for doubt in row["doubts"])
+            told = name not in unknown
             row[name] = _json(laws.interval([getattr(law, name) for law in level.laws])) if told else None
         row["replay_ratios"], row["steps"] = laws.replay_ratios, _clean(level.points.tolist())
         row["fitted"] = _clean(level.law().steps(np.array(laws.replay_ratios)).tolist())
@@ -122,8 +123,9 @@ def read_laws(path: str | Path) -> Laws:
         rest = {
             field.name: found[field.name]
             for field in dataclasses.fields(Laws)
-            # Files of before have no "others".
-            if field.name not in ("hyperparameters", "levels") and (field.name in found or field.name != "others")
+            # Older files do not have the last two.
+            if field.name not in ("hyperparameters", "levels")
+            and (field.name in found or field.name not in ("others", "without_law"))
         }
         return Laws(hyperparameters=hyperparameters, levels=levels, **rest)
     except (KeyError, TypeError, ValueError, AttributeError) as error:

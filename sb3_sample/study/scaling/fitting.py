@@ -1,5 +1,6 @@
 """From a table of runs to its laws, with intervals by the bootstrap over seeds."""
 
+import functools
 import json
 import math
 import warnings
@@ -21,7 +22,7 @@ from sb3_sample.study.scaling.crossings import (
     sorted_levels,
 )
 from sb3_sample.study.scaling.intervals import draw
-from sb3_sample.study.scaling.laws import fit_logs, fit_squared, shared_slope
+from sb3_sample.study.scaling.laws import DataLaw, fit_logs, fit_squared, shared_slope
 from sb3_sample.study.scaling.result import HELD_OUT, Hyperparameter, Laws, Level
 
 #: Bootstrap samples of the intervals.
@@ -36,16 +37,18 @@ def normalize(
     ratios, times the median of these medians.
 
     :param steps: (..., tasks, S, L), inf where a level is not reached
-    :param last: (tasks, S) steps of the last evaluation, in the place of what is not reached
+    :param last: (tasks, S) steps of the last evaluation, in the place of what is not reached in the means: a lower
+        bound. In the medians it is later than all that is reached, however early its runs ended
     :param across_levels: whether the median is over replay ratios and levels together, as in the authors' code; of the
         replay ratios at each level, as in the paper, otherwise
     :return: means (..., S, L), where one of a task is not reached (..., S, L), and the factors by which the means are
-        those of a task (..., tasks, L)
+        those of a task (..., tasks, L). NaN where half or more of a task is not reached, which leaves no median
     """
     bounded = ~np.isfinite(steps)
     filled = np.where(bounded, last[..., None], steps)
     axes = (-2, -1) if across_levels else (-2,)
-    medians = np.median(filled, axis=axes, keepdims=True)
+    medians = np.median(np.where(bounded, np.inf, steps), axis=axes, keepdims=True)
+    medians = np.where(np.isfinite(medians), medians, np.nan)
     middle = np.median(medians, axis=-3, keepdims=True)
     scaled = filled * (middle / medians)
     factors = np.broadcast_to((medians / middle)[..., 0, :], (*filled.shape[:-2], filled.shape[-1]))
@@ -81,8 +84,10 @@ def fit(
     Batch size and learning rate: where runs of a task and replay ratio differ in them, the best by
     :func:`best_hyperparameters`, then :func:`fit_hyperparameter`. Data: of each task and replay ratio the only
     configuration, or the one nearest to these laws (not the one that happened to be first, whose steps would be too
-    few); tasks are averaged by :func:`normalize`, then :func:`fit_data`. A level that a run does not reach enters as a
-    lower bound; a task that reaches it at less than half of the replay ratios has no median and is left out, by name.
+    few). Of those that differ in one without a law it is that with a value that all replay ratios have, so that the
+    data law mixes none, else that nearest to the best one there. Tasks are averaged by :func:`normalize`, then
+    :func:`fit_data`. A level that a run does not reach enters as a lower bound; a task that reaches it at half of
+    the replay ratios or fewer has no median and is left out, by name.
     Compute and budget follow from these.
 
     Intervals are of the bootstrap over seeds (:mod:`sb3_sample.study.scaling.intervals`): everything from the choice of
@@ -122,7 +127,10 @@ def fit(
         raise ValueError(f"runs must have at least two replay ratios, three for the data law; all have {ratios[0]:g}")
     repeats = {each.repeat for each in found}
     if len(repeats) > 1:
-        raise ValueError(f"runs must have one action_repeat, not {sorted(repeats)}: replay ratios do not compare")
+        raise ValueError(
+            "runs must have one action repeat (action_repeat times frames that env_wrapper skips), not "
+            f"{sorted(repeats)}: replay ratios do not compare"
+        )
     rng = np.random.default_rng(seed)
     n_seeds = {len(each.curves) for each in found}
     fewest = min(n_seeds)
@@ -139,7 +147,7 @@ def fit(
         notes.append(f"{fewest} seeds a configuration: the intervals are wide{unknown}")
 
     choice = float(wanted[-1] if choice_level is None else check_levels([choice_level])[0])
-    hyperparameters = _hyperparameters(grid, choice, stages, draws, rng, notes)
+    hyperparameters, chosen = _hyperparameters(grid, choice, stages, draws, rng, notes)
     for name, each in hyperparameters.items():
         at_edge = each.values[each.values["edge"] > 0.5]
         if len(at_edge):
@@ -147,7 +155,7 @@ def fit(
                 f"{name}: the best is the smallest or largest that was tried in most draws of {len(at_edge)} of "
                 f"{len(each.values)} choices; the law is too flat there"
             )
-    picked = _pick(grid, hyperparameters)
+    picked = _pick(grid, hyperparameters, chosen)
     data = _data(picked, ratios, wanted, stages, loss, across_levels, int(repeats.pop()), notes)
     params = critic_params
     if params is None:
@@ -165,7 +173,7 @@ def fit(
             raise ValueError(f"batch_size must be a positive number, not {batch_size!r}")
         fixed = float(batch_size)
     if params is not None and "batch_size" not in hyperparameters and fixed is None:
-        notes.append("batch sizes differ or are not known, and were not swept: there is no law of compute and budget")
+        notes.append("batch sizes differ or are not known, and have no law: there is no law of compute and budget")
     laws = Laws(
         tasks=list(dict.fromkeys(cell.task for cell in grid)),
         replay_ratios=ratios,
@@ -180,6 +188,7 @@ def fit(
         choice_level=choice,
         notes=notes,
         others=_others(found),
+        without_law=[name for name in chosen if name not in hyperparameters],
     )
     if laws.has_compute and len(data) <= HELD_OUT + 1:
         notes.append(
@@ -226,7 +235,8 @@ def _of_one(found: list[Configuration], agent: str | None, model_size: Any) -> l
 
 def _hyperparameters(
     grid: list[Cell], level: float, stages: list[_Samples], draws: int, rng: np.random.Generator, notes: list[str]
-) -> dict[str, Hyperparameter]:
+) -> tuple[dict[str, Hyperparameter], dict[str, pd.DataFrame]]:
+    """The laws, and what was chosen of all that was swept: some of it may have no law."""
     rows: dict[str, list[dict[str, object]]] = {}
     values: dict[str, list[list[np.ndarray]]] = {}
     for cell in grid:
@@ -239,10 +249,8 @@ def _hyperparameters(
                     warnings.simplefilter("ignore", RuntimeWarning)  # samples without any choice
                     values[name][-1].append(np.nanmean(chosen, axis=(1, 2)))
     found = {}
-    for name in NAMES:
-        if name not in rows:
-            continue
-        table = pd.DataFrame(rows[name])
+    tables = {name: pd.DataFrame(rows[name]) for name in NAMES if name in rows}
+    for name, table in tables.items():
         known = table["value"].notna().to_numpy()
         for row in table[~known].itertuples():
             notes.append(
@@ -264,11 +272,16 @@ def _hyperparameters(
             slopes.append(slope)
             intercepts.append(np.exp(intercept))
         found[name] = Hyperparameter(table, list(tasks), slopes, intercepts)
-    return found
+    return found, tables
 
 
-def _pick(grid: list[Cell], hyperparameters: dict[str, Hyperparameter]) -> dict[tuple[str, float], Cell]:
+def _pick(
+    grid: list[Cell], hyperparameters: dict[str, Hyperparameter], chosen: dict[str, pd.DataFrame]
+) -> dict[tuple[str, float], Cell]:
     """Of each cell the configuration nearest to the laws, a cell of one."""
+    # A hyperparameter without a law, swept at one replay ratio only, say, has no part in the distance.
+    values = {name: [_values(cell, name) for cell in grid] for name in NAMES if name not in hyperparameters}
+    common = {name: functools.reduce(np.intersect1d, of_cells) for name, of_cells in values.items()}
     picked = {}
     for cell in grid:
         distance = np.zeros(len(cell.members))
@@ -280,18 +293,44 @@ def _pick(grid: list[Cell], hyperparameters: dict[str, Hyperparameter]) -> dict[
                 else law.law().mean(cell.replay_ratio)
             )
             distance += np.abs(np.log(np.where(np.isfinite(own), own, at) / at))
-        if len(cell.members) > 1 and not hyperparameters:
-            raise ValueError(
-                f"runs on {cell.task} at replay ratio {cell.replay_ratio:g} have {len(cell.members)} batch sizes or "
-                "learning rates, of which none could be chosen: give a level that they reach (choice_level=, "
-                "--choice-level)"
-            )
-        i = int(distance.argmin())
+        nearest = np.flatnonzero(distance <= distance.min() + 1e-9)
+        for name, shared in common.items():
+            nearest = _one_value(cell, name, nearest, shared, chosen.get(name))
+        i = int(nearest[0])
         one = cell.members[i : i + 1]
         picked[cell.task, cell.replay_ratio] = Cell(
             cell.task, cell.replay_ratio, cell.batch_sizes[i : i + 1], cell.learning_rates[i : i + 1], one
         )
     return picked
+
+
+def _values(cell: Cell, name: str) -> np.ndarray:
+    """One a configuration; -1 where the runs were not given it, which is a value too, the default."""
+    return np.nan_to_num(cell.batch_sizes if name == "batch_size" else cell.learning_rates, nan=-1.0)
+
+
+def _one_value(
+    cell: Cell, name: str, members: np.ndarray, common: np.ndarray, chosen: pd.DataFrame | None
+) -> np.ndarray:
+    """Those of the configurations that have one value of a hyperparameter without a law: all cells', else the best."""
+    own = _values(cell, name)
+    if np.isin(own[members], common).any():
+        members = members[np.isin(own[members], common)]
+    tried = np.unique(own[members])
+    if len(tried) < 2:
+        return members
+    best = math.nan
+    if chosen is not None:
+        here = (chosen["task"] == cell.task) & (chosen["replay_ratio"] == cell.replay_ratio)
+        best = float(chosen.loc[here, "value"].mean())
+    given = tried[tried > 0]
+    if math.isnan(best) or not len(given):
+        raise ValueError(
+            f"runs on {cell.task} at replay ratio {cell.replay_ratio:g} have {len(tried)} values of {name}, of which "
+            "none could be chosen, and the data law is of one: give a level that they reach (choice_level=, "
+            f"--choice-level), or runs of one {name} only"
+        )
+    return members[own[members] == given[np.abs(np.log(given / best)).argmin()]]
 
 
 def _data(
@@ -323,10 +362,11 @@ def _data(
     ]  # (R, tasks, S, L)
     x = np.array(ratios)
     found = []
+    there = np.isfinite(steps[0][0])  # (tasks, S, L)
+    # A median of the replay ratios is there if more than half reach the level.
+    known = there.all(axis=1) if loss == "squared" else 2 * there.sum(axis=1) > len(ratios)  # (tasks, L)
     for i, level in enumerate(levels):
-        reached = np.isfinite(steps[0][0, :, :, i])
-        # A median of the replay ratios is there if more than half reach the level.
-        kept = np.asarray(reached.all(axis=1) if loss == "squared" else 2 * reached.sum(axis=1) > len(ratios))
+        reached, kept = there[:, :, i], known[:, i]
         enough = reached[kept].all(axis=0).sum() if kept.any() else 0
         if enough < 3:
             notes.append(
@@ -334,21 +374,20 @@ def _data(
                 "a data law needs three, and there is none"
             )
             continue
-        left_out = [task for task, there in zip(tasks, kept.tolist(), strict=True) if not there]
+        # Levels without a median would leave none across levels.
+        used = np.flatnonzero(known[kept].all(axis=0)) if across_levels else np.array([i])
         fits, means = [], []
         for each in steps:
-            of = each[:, kept] if across_levels else each[:, kept, :, i : i + 1]
-            mean, bounded, factors = normalize(of, last[kept], across_levels=across_levels)
-            j = i if across_levels else 0
+            mean, bounded, factors = normalize(each[:, kept][..., used], last[kept], across_levels=across_levels)
+            j = int(np.searchsorted(used, i))
             y = mean[:, :, j]
-            law = fit_logs(x, y, bounded[:, :, j]) if loss == "log" else fit_squared(x, y)
-            fits.append(law)
+            fits.append(_fits(x, y, bounded[:, :, j], loss))
             means.append((y, bounded[:, :, j], factors[:, :, j]))
         found.append(
             Level(
                 level=float(level),
-                tasks=[task for task, there in zip(tasks, kept.tolist(), strict=True) if there],
-                left_out=left_out,
+                tasks=[task for task, has in zip(tasks, kept.tolist(), strict=True) if has],
+                left_out=[task for task, has in zip(tasks, kept.tolist(), strict=True) if not has],
                 points=means[0][0][0],
                 censored=means[0][1][0],
                 factors=means[0][2][0],
@@ -361,3 +400,14 @@ def _data(
             f"{', '.join(f'{level:g}' for level in levels)} is. {' '.join(notes)}"
         )
     return found
+
+
+def _fits(ratios: np.ndarray, steps: np.ndarray, censored: np.ndarray, loss: str) -> DataLaw:
+    """Laws (R,) of samples; NaN of those without a median, or with bounds alone."""
+    law = DataLaw(*np.full((3, len(steps)), np.nan))
+    known = np.isfinite(steps).all(axis=1) & ~censored.all(axis=1)
+    if known.any():
+        found = fit_logs(ratios, steps[known], censored[known]) if loss == "log" else fit_squared(ratios, steps[known])
+        for all_of, own in zip(law, found, strict=True):
+            all_of[known] = own
+    return law

@@ -129,15 +129,29 @@ class DataLaw(NamedTuple):
         :param replay_ratio: those of the fit
         :return: what they did not determine
         """
-        found = []
+        return [words for words, _ in self._doubts(replay_ratio)]
+
+    def undetermined(self, replay_ratio: Sequence[float] | np.ndarray) -> set[str]:
+        """
+        :param replay_ratio: those of the fit
+        :return: names of the parameters that they did not determine
+        """
+        return {name for _, names in self._doubts(replay_ratio) for name in names}
+
+    def _doubts(self, replay_ratio: Sequence[float] | np.ndarray) -> list[tuple[str, tuple[str, ...]]]:
+        """What was not determined, in words and by name."""
+        found: list[tuple[str, tuple[str, ...]]] = []
         ratios = _positive(replay_ratio, "replay_ratio")
         if not ALPHA[0] * 1.01 < self.alpha < ALPHA[1] * 0.99:
-            found.append(f"alpha is at the end of what is searched, {ALPHA[0]} to {ALPHA[1]}")
+            found.append((f"alpha is at the end of what is searched, {ALPHA[0]} to {ALPHA[1]}", ("alpha",)))
         falling = (self.beta / ratios) ** self.alpha
         if falling.min() > 20:
-            found.append("d_min is not determined: at the largest replay ratio the steps still fall as a power of it")
+            # Of a power only the product d_min * beta ** alpha is known.
+            words = "d_min and beta are not determined: at the largest replay ratio steps still fall as a power of it"
+            found.append((words, ("d_min", "beta")))
         if falling.max() < 0.02:
-            found.append("alpha and beta are not determined: the steps hardly depend on the replay ratio")
+            words = "alpha and beta are not determined: the steps hardly depend on the replay ratio"
+            found.append((words, ("alpha", "beta")))
         return found
 
 

@@ -51,7 +51,7 @@ def parts(laws: Laws) -> list[Part]:
         {
             "level": f"{row['level']:.0f}", "d_min": _words(row["d_min"]), "beta": _words(row["beta"]),
             "alpha": _words(row["alpha"]), "tasks": f"{len(row['tasks'])}",
-            "worst fit": f"{max(abs(f / s - 1) for f, s in zip(row['fitted'], row['steps'], strict=True)):.1%}",
+            "worst fit": f"{_worst(row):.1%}",
         }
         for row in found["data"]
     ]  # fmt: skip
@@ -70,6 +70,12 @@ def parts(laws: Laws) -> list[Part]:
         ]
         pieces.append(Part("Budget: least C + δ D", pd.DataFrame(rows), _budget(laws, found)))
     return pieces
+
+
+def _worst(row: dict[str, Any]) -> float:
+    """Largest relative error of a fit; a law above a lower bound is in none."""
+    errors = [fitted / steps - 1 for fitted, steps in zip(row["fitted"], row["steps"], strict=True)]
+    return max(max(-error, 0.0) if hit else abs(error) for error, hit in zip(errors, row["censored"], strict=True))
 
 
 def _budget(laws: Laws, found: dict[str, Any]) -> str:

@@ -115,8 +115,8 @@ class Prediction(NamedTuple):
     Settings, and what they take.
 
     :param replay_ratio: gradient steps an environment step
-    :param batch_size: rows, a multiple of 16; None where it was not swept
-    :param learning_rate: to three digits; None where it was not swept
+    :param batch_size: rows, a multiple of 16; None where it has no law and differs
+    :param learning_rate: to three digits; None where it has no law and differs
     :param steps: environment steps to the level, as the mean over the tasks or of one
     :param compute: FLOPs; None without the size of the critics
     :param level: of the return; None for a budget between levels
@@ -177,6 +177,7 @@ class Laws:
     :param choice_level: at which batch sizes and learning rates were chosen
     :param notes: limits of all this, in words
     :param others: further arguments that all runs have
+    :param without_law: batch size or learning rate, where it was swept at too few replay ratios for a law
     """
 
     tasks: list[str]
@@ -192,6 +193,7 @@ class Laws:
     choice_level: float
     notes: list[str]
     others: dict[str, Any] = dataclasses.field(default_factory=dict)
+    without_law: list[str] = dataclasses.field(default_factory=list)
 
     # ------------------------------------------------ numbers
 
@@ -427,7 +429,8 @@ class Laws:
         for name in ("batch_size", "learning_rate"):
             if name not in self.hyperparameters:
                 fixed = self.batch_size if name == "batch_size" else self.learning_rate
-                limits.append(f"{name} was not swept" + ("" if fixed is None else ": it is that of the runs"))
+                why = "was swept, but has no law" if name in self.without_law else "was not swept"
+                limits.append(f"{name} {why}" + ("" if fixed is None else ": it is that of the runs"))
         return limits
 
 
