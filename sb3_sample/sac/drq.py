@@ -54,12 +54,12 @@ class _FromPixels(SAC):
         for name in "actor", "critic":
             if kwargs.get(f"{name}_network", "mlp") == "mlp":
                 key = f"{name}_network_kwargs"
-                own: dict[str, Any] = {"gain": 1.0}
+                of_mlp: dict[str, Any] = {"gain": 1.0}
                 if self.layer_norm and name == "critic":
-                    own["layer_norm"] = True
+                    of_mlp["layer_norm"] = True
                 if kwargs.get("net_arch") is None:
-                    own["hidden_sizes"] = (1024, 1024)
-                kwargs[key] = {**own, **(kwargs.get(key) or {})}
+                    of_mlp["hidden_sizes"] = (1024, 1024)
+                kwargs[key] = {**of_mlp, **(kwargs.get(key) or {})}
         return kwargs
 
     def _encoder_kwargs(self) -> dict[str, Any]:
