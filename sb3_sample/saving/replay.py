@@ -103,8 +103,9 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
             another share of its transitions than ``validation_proportion``
         """
         trusted = (*self._trusted_modules, *check_trusted(trusted_modules))  # type: ignore[attr-defined]
-        named = isinstance(path, (str, pathlib.Path)) and pathlib.Path(path).suffix[1:] in OWN_SUFFIXES
-        found = paths.find(path, SUFFIX, PICKLES_SUFFIX, first=not named)
+        # A name with a dot in it may be that of the model.
+        dotted = isinstance(path, (str, pathlib.Path)) and pathlib.Path(path).suffix[1:] not in ("", *OWN_SUFFIXES)
+        found = paths.find(path, SUFFIX, PICKLES_SUFFIX, first=dotted)
         name = str(getattr(found, "name", "the file")) if not isinstance(found, pathlib.Path) else str(found)
         try:
             with paths.opened(found) as file:
