@@ -326,11 +326,12 @@ def bootstrap(
     :param reps: bootstrap samples
     :param confidence: share of them in the interval
     :param seed: of the samples
-    :return: statistic, lower and upper end, (n,) each; the ends NaN where no task has a second run
+    :return: statistic, lower and upper end, (n,) each; the ends NaN where a task has one run only
     :raises ImportError: rliable is not installed
     """
     point = statistic(*blocks)
-    if all(len(block) < 2 for block in blocks):
+    # A single run is redrawn as itself: its task would add nothing to the interval, however noisy its runs are.
+    if any(len(block) < 2 for block in blocks):
         return point, np.full_like(point, np.nan), np.full_like(point, np.nan)
     library = _rliable()
     score = blocks[0] if len(blocks) == 1 else list(blocks)
@@ -405,7 +406,7 @@ def aggregate(
     :param seed: of the bootstrap
     :return: a row an agent, group and step: ``agent``, ``group``, ``step``; ``iqm`` with its interval ``low`` and
         ``high``; ``mean``, ``median`` and ``optimality_gap`` with theirs (``mean_low``, ...); ``tasks`` and ``runs``,
-        how many it is over. Intervals are NaN where no task has a second run
+        how many it is over. Intervals are NaN where a task has one run only
     :raises ValueError: a task has no score, an argument is out of range, or no run reaches a step
     :raises ImportError: rliable is not installed
     """
@@ -501,10 +502,16 @@ def probability_of_improvement(
     How likely a run of one agent scores more than a run of another on the same task, averaged over the tasks that both
     have; a tie counts a half (rliable's ``probability_of_improvement``).
 
+    The bootstrap's interval is too narrow where tasks have few runs: of n runs it has (n - 1) / n of the variance. So
+    there is a p besides, of a permutation test, which holds at any number of runs.
+
     :param table: see :func:`aggregate`, also for the other arguments
     :param step: simulator step
     :param pairs: agents x and y; every pair once, in the table's order, if None
-    :return: columns ``x``, ``y``, ``group``, ``step``, ``probability``, ``low``, ``high``, ``tasks``
+    :param reps: bootstrap samples, and permutations where not all are taken
+    :return: columns ``x``, ``y``, ``group``, ``step``, ``probability``, ``low``, ``high``, ``p`` (two-sided, of runs
+        exchanged between the two agents within each task) and ``tasks``. Intervals are NaN where a task has one run
+        only of either agent
     :raises ValueError: an agent of a pair is not in the table, or the two have no task in common
     """
     check_samples(reps, confidence)
@@ -537,7 +544,7 @@ def probability_of_improvement(
             rows.append(
                 {
                     "x": x, "y": y, "group": group, "step": step, "probability": probability[0], "low": low[0],
-                    "high": high[0], "tasks": len(tasks),
+                    "high": high[0], "p": _permutation_p(arrays, reps, seed), "tasks": len(tasks),
                 }
             )  # fmt: skip
     if not rows:
@@ -556,6 +563,41 @@ def _improvement(*arrays: np.ndarray) -> np.ndarray:
         difference = ours[:, None] - theirs[None]
         shares.append(((difference > 0) + (difference == 0) / 2).mean(axis=(0, 1)))
     return np.array([np.concatenate(shares).mean()])
+
+
+def _permutation_p(arrays: Sequence[np.ndarray], reps: int, seed: int) -> float:
+    """
+    :param arrays: see :func:`_improvement`
+    :param reps: permutations, where there are more than these and :data:`REPS`; otherwise all are taken
+    :param seed: of the permutations
+    :return: how likely the probability of improvement is as far from a half, either way, if the two agents are alike:
+        any run of a task may then be of either
+    """
+    half = len(arrays) // 2
+    pairs = [(np.concatenate([x, y]), len(x)) for x, y in zip(arrays[:half], arrays[half:], strict=True)]
+    # Mann and Whitney: a sum of ranks is the number of pairs won, ties a half, plus a constant.
+    ranks = [(pd.DataFrame(values).rank().to_numpy(), n) for values, n in pairs]
+    n_tasks = sum(values.shape[1] for values, _ in ranks)
+    weights = [1 / (n * (len(values) - n) * n_tasks) for values, n in ranks]
+    middle = [n * (len(values) + 1) / 2 for values, n in ranks]
+    observed = sum(
+        w * (values[:n].sum(axis=0) - m).sum() for (values, n), w, m in zip(ranks, weights, middle, strict=True)
+    )
+    labelings = math.prod(math.comb(len(values), n) ** values.shape[1] for values, n in ranks)
+    is_exact = labelings <= max(reps, REPS)
+    sums = np.zeros(1 if is_exact else reps)
+    rng = np.random.default_rng(seed)
+    for (values, n), weight, mean in zip(ranks, weights, middle, strict=True):
+        for of_task in values.T:
+            if is_exact:
+                chosen = np.array(list(itertools.combinations(of_task, n))).sum(axis=1)
+                sums = (sums[:, None] + weight * (chosen - mean)).ravel()
+            else:
+                drawn = rng.permuted(np.tile(of_task, (reps, 1)), axis=1)[:, :n].sum(axis=1)
+                sums += weight * (drawn - mean)
+    extreme = int((np.abs(sums) >= abs(observed) - 1e-9).sum())
+    # The labels as they are count as one of those that are drawn: p is never 0.
+    return extreme / len(sums) if is_exact else (extreme + 1) / (reps + 1)
 
 
 def _at_step(

@@ -1,6 +1,7 @@
 """Scores over tasks and seeds: BRO's table 9, rliable called directly, and tables worked by hand."""
 
 import warnings
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -273,3 +274,70 @@ def test_improvement_by_hand() -> None:
     assert other["probability"] == pytest.approx(1 - 2.5 / 6)
     with pytest.raises(ValueError, match="pairs must be of x, y, not 'z'"):
         study.probability_of_improvement(made_up(rows), 10, pairs=[("x", "z")])
+
+
+def test_a_single_run_of_any_task_leaves_no_interval() -> None:
+    """Nine tasks with one run each would else be as if they had no noise, and the interval nearly a point."""
+    tasks = [f"dmc/{i}" for i in range(9)]
+    rows = [row for agent, score in (("x", 501), ("y", 500)) for task in tasks for row in runs_of(agent, task, [score])]
+    rows += [*runs_of("x", CHEETAH, [500, 510]), *runs_of("y", CHEETAH, [505, 495])]
+    assert study.aggregate(made_up(rows), [10], ["all"], reps=20)[["low", "high", "mean_low"]].isna().all(axis=None)
+    assert study.performance_profiles(made_up(rows), 10, [0.5], ["all"], reps=20)["low"].isna().all()
+    found = study.probability_of_improvement(made_up(rows), 10, ["all"], reps=20).iloc[0]
+    assert found["probability"] > 0.9 and np.isnan(found["low"]) and np.isnan(found["high"])
+    # A single run of one side suffices.
+    rows = [*runs_of("x", CHEETAH, [5, 6]), *runs_of("y", CHEETAH, [1])]
+    assert np.isnan(study.probability_of_improvement(made_up(rows), 10, ["all"], reps=20).iloc[0]["low"])
+
+
+def p_of(x: np.ndarray, y: np.ndarray, **arguments: Any) -> float:
+    """x and y (runs, tasks)."""
+    rows = [
+        row
+        for agent, values in (("x", x), ("y", y))
+        for task, scores in enumerate(values.T)
+        for row in runs_of(agent, f"dmc/{task}", list(scores))
+    ]
+    found = study.probability_of_improvement(made_up(rows), 10, ["all"], **{"reps": 20, **arguments})
+    return float(found["p"].iloc[0])
+
+
+def test_p_of_improvement_is_that_of_mann_and_whitney_on_one_task() -> None:
+    mannwhitneyu = pytest.importorskip("scipy.stats").mannwhitneyu
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(0.8, 1, 5), rng.normal(0, 1, 4)
+    assert p_of(x[:, None], y[:, None]) == pytest.approx(mannwhitneyu(x, y, method="exact").pvalue)
+
+
+def test_p_of_improvement_by_hand() -> None:
+    # Two runs each of two tasks: 36 labelings, of which one and its opposite are as extreme.
+    best, worst = np.array([[3.0, 3], [4, 4]]), np.array([[1.0, 1], [2, 2]])
+    assert p_of(best, worst) == p_of(worst, best) == pytest.approx(2 / 36)
+    assert p_of(best, best) == 1
+    # 252 to the power of three: drawn, and the labels as they are are one of them.
+    many = np.arange(5.0)[:, None].repeat(3, axis=1)
+    assert p_of(many + 10, many, reps=500) == 1 / 501
+    middling = many + [0.5, 1.5, -1.0]
+    assert p_of(middling, many, reps=4_000) == pytest.approx(p_of(middling, many, reps=4_000, seed=1), abs=0.03)
+    # Tasks with different numbers of runs: 3 * 6 labelings.
+    rows = [*runs_of("x", CHEETAH, [5]), *runs_of("y", CHEETAH, [1, 2])]
+    rows += [*runs_of("x", WALKER, [5, 6]), *runs_of("y", WALKER, [1, 2])]
+    found = study.probability_of_improvement(made_up(rows), 10, ["all"], reps=5)
+    assert found["p"].iloc[0] == pytest.approx(2 / 18)
+
+
+def test_two_seeds_of_equal_agents_are_seldom_told_apart() -> None:
+    """The interval alone tells them apart in more than a tenth of the cases, with p in a twentieth at most."""
+    rng = np.random.default_rng(0)
+    interval = both = 0
+    for _ in range(150):
+        rows = [
+            row
+            for agent in "xy"
+            for task in range(4)
+            for row in runs_of(agent, f"dmc/{task}", list(rng.normal(500, 100, 2)))
+        ]
+        found = study.probability_of_improvement(made_up(rows), 10, ["all"], reps=100).iloc[0]
+        apart = found["low"] > 0.5 or found["high"] < 0.5
+        interval, both = interval + apart, both + (apart and found["p"] < 0.05)
+    assert interval > 15 and both <= 11

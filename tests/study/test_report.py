@@ -188,6 +188,27 @@ def test_agents_that_cannot_be_told_apart(tmp_path: Path) -> None:
     assert "a and b cannot be told apart." in text_of(written(tmp_path / "r.html", made_up(rows)))
 
 
+def test_a_verdict_needs_enough_runs(tmp_path: Path) -> None:
+    """The interval is [1, 1] in both cases; of 36 ways to part two by two runs on two tasks two are as extreme."""
+    rows = runs("a", CHEETAH, [500, 600]) + runs("a", WALKER, [500, 600])
+    rows += runs("b", CHEETAH, [100, 200]) + runs("b", WALKER, [100, 200])
+    text = text_of(written(tmp_path / "r.html", made_up(rows)))
+    assert "a is ahead of b, without certainty." in text and "better than" not in text
+    assert "p = 0.056." in text and "p of the permutation test must be below 0.05" in text
+    page = written(tmp_path / "r.html", made_up(rows), confidence=0.9)
+    assert "a is better than b." in text_of(page)
+    assert tables_of(page)["Probability of improvement"][1][3] == "0.056"
+
+
+def test_single_runs_are_no_evidence(tmp_path: Path) -> None:
+    tasks = [f"dmc/task-{i}-v0" for i in range(9)]
+    rows = [row for agent, end in (("a", 501), ("b", 500)) for task in tasks for row in runs(agent, task, [end])]
+    rows += runs("a", CHEETAH, [500, 510]) + runs("b", CHEETAH, [495, 505])
+    text = text_of(written(tmp_path / "r.html", made_up(rows)))
+    assert "a is ahead of b, without certainty." in text and "better than" not in text
+    assert "There is no interval where a task has a single run: a, b." in text and "no task has a second" not in text
+
+
 def test_tasks_without_a_score_have_curves_and_are_named(tmp_path: Path) -> None:
     table = pd.concat([two_agents(), made_up(runs("good", OWN, [-5, -6]) + runs("bad", OWN, [-7, -8]))])
     page = written(tmp_path / "r.html", table)

@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 
 from sb3_sample.study.reporting.facts import Facts
-from sb3_sample.study.reporting.pieces import STEPS, Interval, counted, cut, interval_text, range_text
+from sb3_sample.study.reporting.pieces import STEPS, Interval, counted, cut, interval_text, p_text, range_text
 from sb3_sample.study.reporting.reading import Gathered
 from sb3_sample.study.states import DONE
 from sb3_sample.study.table import RUN
@@ -61,22 +61,32 @@ def _result(facts: Facts) -> list[str]:
         verdict = ["There is one agent." if len(found) == 1 else f"{found[0][0]} has the highest average."]
     else:
         best = facts.improvement.iloc[0]
-        verdict = _verdict(cut(best["x"]), cut(best["y"]), Interval(best["probability"], best["low"], best["high"]))
-    if all(math.isnan(value.low) for _, value in found):
+        chance = Interval(best["probability"], best["low"], best["high"])
+        verdict = _verdict(cut(best["x"]), cut(best["y"]), chance, best["p"], 1 - facts.confidence)
+    if (rows["runs"] == rows["tasks"]).all():
         verdict.append("There are no intervals, since no task has a second run: nothing is certain here.")
+    elif single := [agent for agent, value in found if math.isnan(value.low)]:
+        verdict.append(f"There is no interval where a task has a single run: {_listed(single)}.")
     return [*verdict, words]
 
 
-def _verdict(x: str, y: str, chance: Interval) -> list[str]:
-    """Probability of improvement, in words, of the two agents with the highest averages."""
-    why = f"A run of {x} beats one of {y} on the same task with probability {interval_text(chance)}."
+def _verdict(x: str, y: str, chance: Interval, p: float, level: float) -> list[str]:
+    """
+    Probability of improvement, in words, of the two agents with the highest averages. A verdict needs the permutation
+    test beside the interval, which is too narrow where there are few runs.
+    """
+    why = f"A run of {x} beats one of {y} on the same task with probability {interval_text(chance)}, p = {p_text(p)}."
+    if chance.low <= 0.5 <= chance.high:
+        return [f"{x} and {y} cannot be told apart.", why]
+    unsure = f"{x} is ahead of {y}, without certainty."
     if math.isnan(chance.low):
-        return [f"{x} is ahead of {y}, without certainty.", why]
+        return [unsure, why, "This probability has no interval, since a task has a single run of one of them."]
+    if p >= level:
+        few = f"Too few runs for a verdict: p of the permutation test must be below {level:.3g}."
+        return [unsure, why, few]
     if chance.low > 0.5:
         return [f"{x} is better than {y}.", why]
-    if chance.high < 0.5:
-        return [f"{x} has the highest average, but is worse than {y} on most tasks.", why]
-    return [f"{x} and {y} cannot be told apart.", why]
+    return [f"{x} has the highest average, but is worse than {y} on most tasks.", why]
 
 
 def _missing(gathered: Gathered, facts: Facts) -> list[str]:
