@@ -317,7 +317,7 @@ def test_p_of_improvement_by_hand() -> None:
     # 252 to the power of three: drawn, and the labels as they are are one of them.
     many = np.arange(5.0)[:, None].repeat(3, axis=1)
     assert p_of(many + 10, many, reps=500) == 1 / 501
-    middling = many + [0.5, 1.5, -1.0]
+    middling = many + np.array([0.5, 1.5, -1.0])
     assert p_of(middling, many, reps=4_000) == pytest.approx(p_of(middling, many, reps=4_000, seed=1), abs=0.03)
     # Tasks with different numbers of runs: 3 * 6 labelings.
     rows = [*runs_of("x", CHEETAH, [5]), *runs_of("y", CHEETAH, [1, 2])]
