@@ -115,8 +115,12 @@ def _by_task(table: pd.DataFrame, scores: Scores | None) -> tuple[list[pd.DataFr
                 f"(--score {task}=LOW:HIGH)"
             )
             continue
-        if score.high == score.low:
-            raise ValueError(f"scores must have a high that is not low, not {task} {score}")
+        # With a negative return alone, -150 over a low of 0, the worst run would have the highest score.
+        if not (math.isfinite(score.high) and math.isfinite(score.low) and score.high > score.low):
+            raise ValueError(
+                f"scores must have a finite high above the low, not {score.low:g}:{score.high:g} of {task}: where "
+                f"returns are negative give both, Score(metric, high, low) (--score {task}=LOW:HIGH, as Pendulum-v1=-1500:-150)"
+            )
         found = rows[rows["metric"] == score.metric]
         without = rows.merge(found[RUN].drop_duplicates(), how="left", indicator=True)
         without = without[without["_merge"] == "left_only"]

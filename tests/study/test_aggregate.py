@@ -222,8 +222,10 @@ def test_tasks_without_a_score_need_the_users() -> None:
     found = study.aggregate(table, [10], scores={"Pendulum-v1": study.Score("return", -150, -1_200)}, reps=5)
     assert found["mean"].iloc[0] == pytest.approx(0.5)
     np.testing.assert_allclose(scored(table, {"Pendulum-v1": 300})["score"], [-4, -0.5])
-    with pytest.raises(ValueError, match="high that is not low"):
-        study.aggregate(table, [10], scores={"Pendulum-v1": 0.0})
+    # A low of 0 is above a negative high: the worse run would score more.
+    for bad in (0.0, -150, float("nan"), float("inf"), study.Score("return", 1, -float("inf"))):
+        with pytest.raises(ValueError, match=r"finite high above the low, .*--score Pendulum-v1=LOW:HIGH"):
+            study.aggregate(table, [10], scores={"Pendulum-v1": bad})
 
 
 def test_returns_do_not_stand_for_success() -> None:
