@@ -119,7 +119,8 @@ def _by_task(table: pd.DataFrame, scores: Scores | None) -> tuple[list[pd.DataFr
         if not (math.isfinite(score.high) and math.isfinite(score.low) and score.high > score.low):
             raise ValueError(
                 f"scores must have a finite high above the low, not {score.low:g}:{score.high:g} of {task}: where "
-                f"returns are negative give both, Score(metric, high, low) (--score {task}=LOW:HIGH, as Pendulum-v1=-1500:-150)"
+                f"returns are negative give both, Score(metric, high, low) "
+                f"(--score {task}=LOW:HIGH, as Pendulum-v1=-1500:-150)"
             )
         found = rows[rows["metric"] == score.metric]
         without = rows.merge(found[RUN].drop_duplicates(), how="left", indicator=True)
@@ -232,12 +233,16 @@ def at_steps(scores: pd.DataFrame, steps: Sequence[int] | None) -> tuple[pd.Data
     return matrix, [int(step) for step in steps]
 
 
-def _warn_of_gaps(matrix: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> None:
-    """Say where an average is not over the same tasks, or the same runs, for all agents and steps."""
+def _warn_of_runs(matrix: pd.DataFrame) -> None:
+    """Say where an average is not over all runs."""
     for step in matrix:
         left_out = int(matrix[step].isna().sum())
         if left_out:
             warn(f"{left_out} of {len(matrix)} runs have no evaluations around step {step:,} and are left out there")
+
+
+def _warn_of_tasks(matrix: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> None:
+    """Say where an average is not over the same tasks for all agents."""
     by_agent = {agent: set(rows.index.get_level_values("task")) for agent, rows in matrix.groupby("agent", sort=False)}
     for name, members in groups.items():
         counts = {agent: len(tasks & set(members)) for agent, tasks in by_agent.items() if tasks & set(members)}
@@ -255,6 +260,49 @@ def _common_tasks(scores: pd.DataFrame) -> pd.DataFrame:
     if not common:
         raise ValueError("common: there is no task that all agents have")
     return scores[scores["task"].isin(common)]
+
+
+def compared(
+    scores: pd.DataFrame, steps: Sequence[int] | None, groups: Groups | None, common: bool
+) -> tuple[pd.DataFrame, list[int], dict[str, list[str]]]:
+    """
+    :param scores: of :func:`scored`, agents named apart
+    :param steps: see :func:`at_steps`
+    :param groups: see :func:`group_tasks`
+    :param common: at each step only the tasks that all agents have that reach it; a warning says what is left out
+    :return: what :func:`at_steps` gives, NaN also where it is left out, and the tasks of each group
+    :raises ValueError: there are no such steps, no run reaches one, or no task is left
+    """
+    # Of all tasks: a group may well have some that not all agents have.
+    members = group_tasks(groups, list(scores["task"].unique()))
+    if common:
+        scores = _common_tasks(scores)
+        kept = set(scores["task"])
+        members = {name: [task for task in tasks if task in kept] for name, tasks in members.items()}
+        members = {name: tasks for name, tasks in members.items() if tasks}
+        if not members:
+            raise ValueError("common: the groups have no task that all agents have")
+    matrix, steps = at_steps(scores, steps)
+    for step in steps:
+        if matrix[step].isna().all():
+            raise ValueError(f"steps must be within those of the runs, {_extent(scores)}, not {step:,}")
+    _warn_of_runs(matrix)
+    if common:
+        for step in steps:
+            matrix[step] = _common_at(matrix[step], step)
+    return matrix, steps, members
+
+
+def _common_at(values: pd.Series, step: int) -> pd.Series:
+    """The values of the tasks that all agents have which reach the step, NaN for the others."""
+    there = values.dropna().index.to_frame(index=False).drop_duplicates()
+    n_agents = there.groupby("task")["agent"].nunique()
+    common = n_agents[n_agents == there["agent"].nunique()].index
+    if not len(common):
+        raise ValueError(f"common: there is no task that all agents have at {step:,}")
+    if len(common) < len(n_agents):
+        warn(f"{len(common)} of {len(n_agents)} tasks are common to all agents at step {step:,}")
+    return values.where(values.index.get_level_values("task").isin(common))
 
 
 # ---------------------------------------------------------------- statistics
@@ -404,7 +452,7 @@ def aggregate(
     :param groups: names of :data:`GROUPS`, or tasks by name of the group; None for :data:`DEFAULT_GROUPS`. Groups
         without a task in the table are left out
     :param scores: see :func:`scored`
-    :param common: only the tasks that all agents have
+    :param common: only the tasks that all agents have, at each step of those agents that reach it
     :param reps: bootstrap samples
     :param confidence: of the intervals
     :param seed: of the bootstrap
@@ -415,15 +463,8 @@ def aggregate(
     :raises ImportError: rliable is not installed
     """
     check_samples(reps, confidence)
-    found = named_apart(scored(table, scores))
-    if common:
-        found = _common_tasks(found)
-    matrix, steps = at_steps(found, steps)
-    for step in steps:
-        if matrix[step].isna().all():
-            raise ValueError(f"steps must be within those of the runs, {_extent(found)}, not {step:,}")
-    members = group_tasks(groups, list(found["task"].unique()))
-    _warn_of_gaps(matrix, members)
+    matrix, steps, members = compared(named_apart(scored(table, scores)), steps, groups, common)
+    _warn_of_tasks(matrix, members)
     rows = []
     for agent, of_agent in matrix.groupby("agent", sort=False):
         for group, tasks in members.items():
@@ -612,14 +653,8 @@ def _at_step(
 
     :param common: None where the tasks are compared pair by pair
     """
-    found = named_apart(scored(table, scores))
-    if common:
-        found = _common_tasks(found)
-    matrix, _ = at_steps(found, [step])
-    if matrix[step].isna().all():
-        raise ValueError(f"step must be within those of the runs, {_extent(found)}, not {step:,}")
-    members = group_tasks(groups, list(found["task"].unique()))
-    _warn_of_gaps(matrix, {} if common is None else members)
+    matrix, _, members = compared(named_apart(scored(table, scores)), [step], groups, bool(common))
+    _warn_of_tasks(matrix, {} if common is None else members)
     matrix = matrix.dropna()
     for group, tasks in members.items():
         in_group = matrix[matrix.index.get_level_values("task").isin(tasks)]

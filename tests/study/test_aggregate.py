@@ -343,3 +343,23 @@ def test_two_seeds_of_equal_agents_are_seldom_told_apart() -> None:
         apart = found["low"] > 0.5 or found["high"] < 0.5
         interval, both = interval + apart, both + (apart and found["p"] < 0.05)
     assert interval > 15 and both <= 11
+
+
+def test_common_tasks_are_of_groups_and_of_each_step() -> None:
+    """b has all tasks, but of WALKER the first step only."""
+    rows = []
+    for agent, task, steps in (("a", CHEETAH, (10, 20)), ("a", WALKER, (10, 20)), ("b", CHEETAH, (10, 20))):
+        rows += [row for step in steps for row in runs_of(agent, task, [100, 100], step)]
+    rows += runs_of("b", WALKER, [900, 900], 10)
+    with pytest.warns(UserWarning, match="1 of 2 tasks are common to all agents at step 20"):
+        found = study.aggregate(made_up(rows), [10, 20], ["all"], common=True, reps=5)
+    assert list(found["tasks"]) == [2, 1, 2, 1]
+    # A group with a task that b has not at all.
+    rows += runs_of("a", PUSH, [1, 1], metric="success_rate")
+    groups = {"mine": [CHEETAH, PUSH], "push": [PUSH]}
+    found = study.aggregate(made_up(rows), [10], groups, common=True, reps=5)
+    assert list(found["group"]) == ["mine", "mine"] and list(found["tasks"]) == [1, 1]
+    profiles = study.performance_profiles(made_up(rows), 10, [0.5], groups, common=True, reps=5)
+    assert set(profiles["group"]) == {"mine"}
+    with pytest.raises(ValueError, match="the groups have no task that all agents have"):
+        study.aggregate(made_up(rows), [10], {"push": [PUSH]}, common=True)
