@@ -115,8 +115,13 @@ def _by_task(table: pd.DataFrame, scores: Scores | None) -> tuple[list[pd.DataFr
                 f"(--score {task}=LOW:HIGH)"
             )
             continue
-        if score.high == score.low:
-            raise ValueError(f"scores must have a high that is not low, not {task} {score}")
+        # With a negative return alone, -150 over a low of 0, the worst run would have the highest score.
+        if not (math.isfinite(score.high) and math.isfinite(score.low) and score.high > score.low):
+            raise ValueError(
+                f"scores must have a finite high above the low, not {score.low:g}:{score.high:g} of {task}: where "
+                f"returns are negative give both, Score(metric, high, low) "
+                f"(--score {task}=LOW:HIGH, as Pendulum-v1=-1500:-150)"
+            )
         found = rows[rows["metric"] == score.metric]
         without = rows.merge(found[RUN].drop_duplicates(), how="left", indicator=True)
         without = without[without["_merge"] == "left_only"]
@@ -228,12 +233,16 @@ def at_steps(scores: pd.DataFrame, steps: Sequence[int] | None) -> tuple[pd.Data
     return matrix, [int(step) for step in steps]
 
 
-def _warn_of_gaps(matrix: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> None:
-    """Say where an average is not over the same tasks, or the same runs, for all agents and steps."""
+def _warn_of_runs(matrix: pd.DataFrame) -> None:
+    """Say where an average is not over all runs."""
     for step in matrix:
         left_out = int(matrix[step].isna().sum())
         if left_out:
             warn(f"{left_out} of {len(matrix)} runs have no evaluations around step {step:,} and are left out there")
+
+
+def _warn_of_tasks(matrix: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> None:
+    """Say where an average is not over the same tasks for all agents."""
     by_agent = {agent: set(rows.index.get_level_values("task")) for agent, rows in matrix.groupby("agent", sort=False)}
     for name, members in groups.items():
         counts = {agent: len(tasks & set(members)) for agent, tasks in by_agent.items() if tasks & set(members)}
@@ -251,6 +260,49 @@ def _common_tasks(scores: pd.DataFrame) -> pd.DataFrame:
     if not common:
         raise ValueError("common: there is no task that all agents have")
     return scores[scores["task"].isin(common)]
+
+
+def compared(
+    scores: pd.DataFrame, steps: Sequence[int] | None, groups: Groups | None, common: bool
+) -> tuple[pd.DataFrame, list[int], dict[str, list[str]]]:
+    """
+    :param scores: of :func:`scored`, agents named apart
+    :param steps: see :func:`at_steps`
+    :param groups: see :func:`group_tasks`
+    :param common: at each step only the tasks that all agents have that reach it; a warning says what is left out
+    :return: what :func:`at_steps` gives, NaN also where it is left out, and the tasks of each group
+    :raises ValueError: there are no such steps, no run reaches one, or no task is left
+    """
+    # Of all tasks: a group may well have some that not all agents have.
+    members = group_tasks(groups, list(scores["task"].unique()))
+    if common:
+        scores = _common_tasks(scores)
+        kept = set(scores["task"])
+        members = {name: [task for task in tasks if task in kept] for name, tasks in members.items()}
+        members = {name: tasks for name, tasks in members.items() if tasks}
+        if not members:
+            raise ValueError("common: the groups have no task that all agents have")
+    matrix, steps = at_steps(scores, steps)
+    for step in steps:
+        if matrix[step].isna().all():
+            raise ValueError(f"steps must be within those of the runs, {_extent(scores)}, not {step:,}")
+    _warn_of_runs(matrix)
+    if common:
+        for step in steps:
+            matrix[step] = _common_at(matrix[step], step)
+    return matrix, steps, members
+
+
+def _common_at(values: pd.Series, step: int) -> pd.Series:
+    """The values of the tasks that all agents have which reach the step, NaN for the others."""
+    there = values.dropna().index.to_frame(index=False).drop_duplicates()
+    n_agents = there.groupby("task")["agent"].nunique()
+    common = n_agents[n_agents == there["agent"].nunique()].index
+    if not len(common):
+        raise ValueError(f"common: there is no task that all agents have at {step:,}")
+    if len(common) < len(n_agents):
+        warn(f"{len(common)} of {len(n_agents)} tasks are common to all agents at step {step:,}")
+    return values.where(values.index.get_level_values("task").isin(common))
 
 
 # ---------------------------------------------------------------- statistics
@@ -326,11 +378,12 @@ def bootstrap(
     :param reps: bootstrap samples
     :param confidence: share of them in the interval
     :param seed: of the samples
-    :return: statistic, lower and upper end, (n,) each; the ends NaN where no task has a second run
+    :return: statistic, lower and upper end, (n,) each; the ends NaN where a task has one run only
     :raises ImportError: rliable is not installed
     """
     point = statistic(*blocks)
-    if all(len(block) < 2 for block in blocks):
+    # A single run is redrawn as itself: its task would add nothing to the interval, however noisy its runs are.
+    if any(len(block) < 2 for block in blocks):
         return point, np.full_like(point, np.nan), np.full_like(point, np.nan)
     library = _rliable()
     score = blocks[0] if len(blocks) == 1 else list(blocks)
@@ -399,26 +452,19 @@ def aggregate(
     :param groups: names of :data:`GROUPS`, or tasks by name of the group; None for :data:`DEFAULT_GROUPS`. Groups
         without a task in the table are left out
     :param scores: see :func:`scored`
-    :param common: only the tasks that all agents have
+    :param common: only the tasks that all agents have, at each step of those agents that reach it
     :param reps: bootstrap samples
     :param confidence: of the intervals
     :param seed: of the bootstrap
     :return: a row an agent, group and step: ``agent``, ``group``, ``step``; ``iqm`` with its interval ``low`` and
         ``high``; ``mean``, ``median`` and ``optimality_gap`` with theirs (``mean_low``, ...); ``tasks`` and ``runs``,
-        how many it is over. Intervals are NaN where no task has a second run
+        how many it is over. Intervals are NaN where a task has one run only
     :raises ValueError: a task has no score, an argument is out of range, or no run reaches a step
     :raises ImportError: rliable is not installed
     """
     check_samples(reps, confidence)
-    found = named_apart(scored(table, scores))
-    if common:
-        found = _common_tasks(found)
-    matrix, steps = at_steps(found, steps)
-    for step in steps:
-        if matrix[step].isna().all():
-            raise ValueError(f"steps must be within those of the runs, {_extent(found)}, not {step:,}")
-    members = group_tasks(groups, list(found["task"].unique()))
-    _warn_of_gaps(matrix, members)
+    matrix, steps, members = compared(named_apart(scored(table, scores)), steps, groups, common)
+    _warn_of_tasks(matrix, members)
     rows = []
     for agent, of_agent in matrix.groupby("agent", sort=False):
         for group, tasks in members.items():
@@ -501,10 +547,16 @@ def probability_of_improvement(
     How likely a run of one agent scores more than a run of another on the same task, averaged over the tasks that both
     have; a tie counts a half (rliable's ``probability_of_improvement``).
 
+    The bootstrap's interval is too narrow where tasks have few runs: of n runs it has (n - 1) / n of the variance. So
+    there is a p besides, of a permutation test, which holds at any number of runs.
+
     :param table: see :func:`aggregate`, also for the other arguments
     :param step: simulator step
     :param pairs: agents x and y; every pair once, in the table's order, if None
-    :return: columns ``x``, ``y``, ``group``, ``step``, ``probability``, ``low``, ``high``, ``tasks``
+    :param reps: bootstrap samples, and permutations where not all are taken
+    :return: columns ``x``, ``y``, ``group``, ``step``, ``probability``, ``low``, ``high``, ``p`` (two-sided, of runs
+        exchanged between the two agents within each task) and ``tasks``. Intervals are NaN where a task has one run
+        only of either agent
     :raises ValueError: an agent of a pair is not in the table, or the two have no task in common
     """
     check_samples(reps, confidence)
@@ -537,7 +589,7 @@ def probability_of_improvement(
             rows.append(
                 {
                     "x": x, "y": y, "group": group, "step": step, "probability": probability[0], "low": low[0],
-                    "high": high[0], "tasks": len(tasks),
+                    "high": high[0], "p": _permutation_p(arrays, reps, seed), "tasks": len(tasks),
                 }
             )  # fmt: skip
     if not rows:
@@ -558,6 +610,41 @@ def _improvement(*arrays: np.ndarray) -> np.ndarray:
     return np.array([np.concatenate(shares).mean()])
 
 
+def _permutation_p(arrays: Sequence[np.ndarray], reps: int, seed: int) -> float:
+    """
+    :param arrays: see :func:`_improvement`
+    :param reps: permutations, where there are more than these and :data:`REPS`; otherwise all are taken
+    :param seed: of the permutations
+    :return: how likely the probability of improvement is as far from a half, either way, if the two agents are alike:
+        any run of a task may then be of either
+    """
+    half = len(arrays) // 2
+    pairs = [(np.concatenate([x, y]), len(x)) for x, y in zip(arrays[:half], arrays[half:], strict=True)]
+    # Mann and Whitney: a sum of ranks is the number of pairs won, ties a half, plus a constant.
+    ranks = [(pd.DataFrame(values).rank().to_numpy(), n) for values, n in pairs]
+    n_tasks = sum(values.shape[1] for values, _ in ranks)
+    weights = [1 / (n * (len(values) - n) * n_tasks) for values, n in ranks]
+    middle = [n * (len(values) + 1) / 2 for values, n in ranks]
+    observed = sum(
+        w * (values[:n].sum(axis=0) - m).sum() for (values, n), w, m in zip(ranks, weights, middle, strict=True)
+    )
+    labelings = math.prod(math.comb(len(values), n) ** values.shape[1] for values, n in ranks)
+    is_exact = labelings <= max(reps, REPS)
+    sums = np.zeros(1 if is_exact else reps)
+    rng = np.random.default_rng(seed)
+    for (values, n), weight, mean in zip(ranks, weights, middle, strict=True):
+        for of_task in values.T:
+            if is_exact:
+                chosen = np.array(list(itertools.combinations(of_task, n))).sum(axis=1)
+                sums = (sums[:, None] + weight * (chosen - mean)).ravel()
+            else:
+                drawn = rng.permuted(np.tile(of_task, (reps, 1)), axis=1)[:, :n].sum(axis=1)
+                sums += weight * (drawn - mean)
+    extreme = int((np.abs(sums) >= abs(observed) - 1e-9).sum())
+    # The labels as they are count as one of those that are drawn: p is never 0.
+    return extreme / len(sums) if is_exact else (extreme + 1) / (reps + 1)
+
+
 def _at_step(
     table: pd.DataFrame, step: int, groups: Groups | None, scores: Scores | None, common: bool | None
 ) -> Iterator[tuple[str, str, pd.DataFrame]]:
@@ -566,14 +653,8 @@ def _at_step(
 
     :param common: None where the tasks are compared pair by pair
     """
-    found = named_apart(scored(table, scores))
-    if common:
-        found = _common_tasks(found)
-    matrix, _ = at_steps(found, [step])
-    if matrix[step].isna().all():
-        raise ValueError(f"step must be within those of the runs, {_extent(found)}, not {step:,}")
-    members = group_tasks(groups, list(found["task"].unique()))
-    _warn_of_gaps(matrix, {} if common is None else members)
+    matrix, _, members = compared(named_apart(scored(table, scores)), [step], groups, bool(common))
+    _warn_of_tasks(matrix, {} if common is None else members)
     matrix = matrix.dropna()
     for group, tasks in members.items():
         in_group = matrix[matrix.index.get_level_values("task").isin(tasks)]

@@ -8,6 +8,7 @@ import itertools
 import json
 import math
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -23,6 +24,7 @@ from sb3_sample.study.aggregate import (
     blocks_of,
     bootstrap,
     check_samples,
+    compared,
     differing_arguments,
     group_tasks,
     iqm,
@@ -206,6 +208,12 @@ def _parted(runs: pd.DataFrame, columns: list[str]) -> list[tuple[dict[str, str]
 
 def _warn_of_missing(runs: pd.DataFrame, factors: list[str], group: str) -> None:
     there = runs.groupby("task")[factors].apply(lambda rows: len(rows.drop_duplicates()))
+    counts = runs.groupby(["task", *factors]).size()
+    if counts.nunique() > 1:
+        warn(
+            f"combinations of choices and tasks have {counts.min()} to {counts.max()} runs in {group!r}: those with "
+            "more weigh more in what is averaged over them"
+        )
     combinations = math.prod(runs[factor].nunique() for factor in factors)
     missing = int((combinations - there).sum())
     if missing:
@@ -360,7 +368,8 @@ def heatmap(
     :param step: simulator step; None for the last that all runs reach
     :param group: of tasks: a name, or the tasks
     :param scores: see :func:`~sb3_sample.study.aggregate.scored`
-    :return: values of ``y`` as index and of ``x`` as columns, both sorted; NaN where there is no run
+    :return: values of ``y`` as index and of ``x`` as columns, both sorted; NaN where there is no run. The step is
+        its ``attrs["step"]``. Warnings say of which cells runs are left out, and whether all are of the same tasks
     :raises ValueError: no run was given an argument, has recorded the metric, or reaches the step
     """
     rows = scored(table, scores) if value == "score" else table[table["metric"] == value]
@@ -368,7 +377,7 @@ def heatmap(
         raise ValueError(f"value must be score or of {', '.join(sorted(table['metric'].unique()))}, not {value!r}")
     rows = rows.rename(columns={"value": "score"})
     groups = [group] if isinstance(group, str) else {"tasks": group}
-    (tasks,) = group_tasks(groups, list(rows["task"].unique())).values() or [[]]
+    (tasks,) = group_tasks(groups, list(table["task"].unique())).values() or [[]]
     rows = rows[rows["task"].isin(tasks)]
     if not len(rows):
         raise ValueError(f"group must be one of the table's tasks, and there are none of {group!r}")
@@ -376,16 +385,29 @@ def heatmap(
     rows = rows.assign(x=argument(rows, x), y=argument(rows, y))
     step = int(rows.groupby(RUN, dropna=False)["step"].max().min()) if step is None else step
     cells: dict[tuple[str, str], float] = {}
+    tasks_of: dict[str, frozenset[str]] = {}
     for (x_value, y_value), cell in rows.groupby(["x", "y"], sort=False):
         matrix, _ = at_steps(cell, [step])
-        blocks = blocks_of(matrix.dropna())
+        kept = matrix.dropna()
+        name = f"{x}={x_value}, {y}={y_value}"
+        if len(kept) < len(matrix):
+            warn(
+                f"{len(matrix) - len(kept)} of {len(matrix)} runs of {name} have no evaluations around step {step:,} "
+                "and are left out"
+            )
+        tasks_of[name] = frozenset(kept.index.get_level_values("task"))
+        blocks = blocks_of(kept)
         if blocks:
             means = np.concatenate([block.mean(axis=0) for block in blocks])
             cells[x_value, y_value] = float(iqm(*blocks)[0] if value == "score" else means.mean())
     if not cells:
         raise ValueError(f"step must be within those of the runs, up to {rows['step'].max():,}, not {step:,}")
+    if len({each for each in tasks_of.values() if each}) > 1:
+        found_tasks = "; ".join(f"{name} {len(each)}" for name, each in tasks_of.items())
+        warn(f"cells are not of the same tasks ({found_tasks} of {len(set().union(*tasks_of.values()))})")
     found = pd.Series(cells).unstack(level=0)  # of two levels, not a table
     found.index.name, found.columns.name = y, x
+    found.attrs["step"] = step
     return found.loc[sorted(found.index, key=_natural), sorted(found.columns, key=_natural)]
 
 
@@ -416,9 +438,11 @@ def cost(
         raise ValueError("table must have the metric 'hours' of at least one run, and has it of none")
     found = aggregate(table, steps, groups, scores=scores, common=common, reps=reps, confidence=confidence, seed=seed)
     steps = list(dict.fromkeys(found["step"]))
+    with warnings.catch_warnings():  # aggregate has warned
+        warnings.simplefilter("ignore", UserWarning)
+        averaged, _, members = compared(scored(table, scores), steps, groups, common)
     timed = table[table["metric"] == "hours"].rename(columns={"value": "score"})
     matrix, _ = at_steps(timed, steps)
-    members = group_tasks(groups, list(scored(table, scores)["task"].unique()))
     by_agent = dict(list(matrix.groupby("agent")))
     hours = []
     for row in found.itertuples():
@@ -426,7 +450,9 @@ def cost(
             hours.append(math.nan)
             continue
         of_agent = by_agent[row.agent].droplevel("agent")[row.step].dropna()
-        of_tasks = of_agent[of_agent.index.isin(members[row.group])]
+        # The tasks of the score at that step, so that both are of the same.
+        there = averaged.loc[row.agent][row.step].dropna().index
+        of_tasks = of_agent[of_agent.index.isin(members[row.group]) & of_agent.index.isin(there)]
         hours.append(of_tasks.groupby(level=0).mean().mean())
     found["hours"] = hours
     found["steps_per_second"] = found["step"] / found["hours"] / 3_600

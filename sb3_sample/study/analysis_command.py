@@ -407,10 +407,14 @@ def _add_heatmap(parser: argparse.ArgumentParser) -> None:
 def _run_heatmap(options: argparse.Namespace) -> None:
     with refusing("study heatmap"):
         table = _read(options, *([] if options.value == "score" else [options.value]))
-        group = comparison(options.sources).groups.get(options.group, options.group)
+        chosen = chosen_groups(comparison(options.sources).groups, [options.group], table)
+        if isinstance(chosen, dict) and not chosen:
+            raise ValueError(f"group must have a task of the runs, and {options.group!r} has none")
+        group = chosen[options.group] if isinstance(chosen, dict) else options.group
         shared = _shared(options, "value", "step")
         found = analysis.heatmap(table, options.x, options.y, group=group, **shared)
         shown = found.reset_index().rename(columns={options.y: f"{options.y} \\ {options.x}"})
+        print(f"At {found.attrs['step']:,} simulator steps:\n")
         _put(shown, options.output, lambda: _draw_heatmap(found, options.value))
 
 
@@ -467,6 +471,7 @@ def _draw_heatmap(values: pd.DataFrame, name: str) -> "Figure":
     figure = new_figure(2 + 0.9 * values.shape[1], 1.5 + 0.6 * values.shape[0])
     axes = figure.add_subplot()
     figure.colorbar(_draw_grid(axes, values, cmap="viridis"), label="IQM of the scores" if name == "score" else name)
+    axes.set_title(f"{values.attrs['step']:,} simulator steps")
     axes.set_xlabel(values.columns.name)
     axes.set_ylabel(values.index.name)
     return figure

@@ -1,6 +1,7 @@
 """Scores over tasks and seeds: BRO's table 9, rliable called directly, and tables worked by hand."""
 
 import warnings
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -221,8 +222,10 @@ def test_tasks_without_a_score_need_the_users() -> None:
     found = study.aggregate(table, [10], scores={"Pendulum-v1": study.Score("return", -150, -1_200)}, reps=5)
     assert found["mean"].iloc[0] == pytest.approx(0.5)
     np.testing.assert_allclose(scored(table, {"Pendulum-v1": 300})["score"], [-4, -0.5])
-    with pytest.raises(ValueError, match="high that is not low"):
-        study.aggregate(table, [10], scores={"Pendulum-v1": 0.0})
+    # A low of 0 is above a negative high: the worse run would score more.
+    for bad in (0.0, -150, float("nan"), float("inf"), study.Score("return", 1, -float("inf"))):
+        with pytest.raises(ValueError, match=r"finite high above the low, .*--score Pendulum-v1=LOW:HIGH"):
+            study.aggregate(table, [10], scores={"Pendulum-v1": bad})
 
 
 def test_returns_do_not_stand_for_success() -> None:
@@ -273,3 +276,90 @@ def test_improvement_by_hand() -> None:
     assert other["probability"] == pytest.approx(1 - 2.5 / 6)
     with pytest.raises(ValueError, match="pairs must be of x, y, not 'z'"):
         study.probability_of_improvement(made_up(rows), 10, pairs=[("x", "z")])
+
+
+def test_a_single_run_of_any_task_leaves_no_interval() -> None:
+    """Nine tasks with one run each would else be as if they had no noise, and the interval nearly a point."""
+    tasks = [f"dmc/{i}" for i in range(9)]
+    rows = [row for agent, score in (("x", 501), ("y", 500)) for task in tasks for row in runs_of(agent, task, [score])]
+    rows += [*runs_of("x", CHEETAH, [500, 510]), *runs_of("y", CHEETAH, [505, 495])]
+    assert study.aggregate(made_up(rows), [10], ["all"], reps=20)[["low", "high", "mean_low"]].isna().all(axis=None)
+    assert study.performance_profiles(made_up(rows), 10, [0.5], ["all"], reps=20)["low"].isna().all()
+    found = study.probability_of_improvement(made_up(rows), 10, ["all"], reps=20).iloc[0]
+    assert found["probability"] > 0.9 and np.isnan(found["low"]) and np.isnan(found["high"])
+    # A single run of one side suffices.
+    rows = [*runs_of("x", CHEETAH, [5, 6]), *runs_of("y", CHEETAH, [1])]
+    assert np.isnan(study.probability_of_improvement(made_up(rows), 10, ["all"], reps=20).iloc[0]["low"])
+
+
+def p_of(x: np.ndarray, y: np.ndarray, **arguments: Any) -> float:
+    """x and y (runs, tasks)."""
+    rows = [
+        row
+        for agent, values in (("x", x), ("y", y))
+        for task, scores in enumerate(values.T)
+        for row in runs_of(agent, f"dmc/{task}", list(scores))
+    ]
+    found = study.probability_of_improvement(made_up(rows), 10, ["all"], **{"reps": 20, **arguments})
+    return float(found["p"].iloc[0])
+
+
+def test_p_of_improvement_is_that_of_mann_and_whitney_on_one_task() -> None:
+    mannwhitneyu = pytest.importorskip("scipy.stats").mannwhitneyu
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(0.8, 1, 5), rng.normal(0, 1, 4)
+    assert p_of(x[:, None], y[:, None]) == pytest.approx(mannwhitneyu(x, y, method="exact").pvalue)
+
+
+def test_p_of_improvement_by_hand() -> None:
+    # Two runs each of two tasks: 36 labelings, of which one and its opposite are as extreme.
+    best, worst = np.array([[3.0, 3], [4, 4]]), np.array([[1.0, 1], [2, 2]])
+    assert p_of(best, worst) == p_of(worst, best) == pytest.approx(2 / 36)
+    assert p_of(best, best) == 1
+    # 252 to the power of three: drawn, and the labels as they are are one of them.
+    many = np.arange(5.0)[:, None].repeat(3, axis=1)
+    assert p_of(many + 10, many, reps=500) == 1 / 501
+    middling = many + np.array([0.5, 1.5, -1.0])
+    assert p_of(middling, many, reps=4_000) == pytest.approx(p_of(middling, many, reps=4_000, seed=1), abs=0.03)
+    # Tasks with different numbers of runs: 3 * 6 labelings.
+    rows = [*runs_of("x", CHEETAH, [5]), *runs_of("y", CHEETAH, [1, 2])]
+    rows += [*runs_of("x", WALKER, [5, 6]), *runs_of("y", WALKER, [1, 2])]
+    found = study.probability_of_improvement(made_up(rows), 10, ["all"], reps=5)
+    assert found["p"].iloc[0] == pytest.approx(2 / 18)
+
+
+def test_two_seeds_of_equal_agents_are_seldom_told_apart() -> None:
+    """The interval alone tells them apart in more than a tenth of the cases, with p in a twentieth at most."""
+    rng = np.random.default_rng(0)
+    interval = both = 0
+    for _ in range(150):
+        rows = [
+            row
+            for agent in "xy"
+            for task in range(4)
+            for row in runs_of(agent, f"dmc/{task}", list(rng.normal(500, 100, 2)))
+        ]
+        found = study.probability_of_improvement(made_up(rows), 10, ["all"], reps=100).iloc[0]
+        apart = found["low"] > 0.5 or found["high"] < 0.5
+        interval, both = interval + apart, both + (apart and found["p"] < 0.05)
+    assert interval > 15 and both <= 11
+
+
+def test_common_tasks_are_of_groups_and_of_each_step() -> None:
+    """b has all tasks, but of WALKER the first step only."""
+    rows = []
+    for agent, task, steps in (("a", CHEETAH, (10, 20)), ("a", WALKER, (10, 20)), ("b", CHEETAH, (10, 20))):
+        rows += [row for step in steps for row in runs_of(agent, task, [100, 100], step)]
+    rows += runs_of("b", WALKER, [900, 900], 10)
+    with pytest.warns(UserWarning, match="1 of 2 tasks are common to all agents at step 20"):
+        found = study.aggregate(made_up(rows), [10, 20], ["all"], common=True, reps=5)
+    assert list(found["tasks"]) == [2, 1, 2, 1]
+    # A group with a task that b has not at all.
+    rows += runs_of("a", PUSH, [1, 1], metric="success_rate")
+    groups = {"mine": [CHEETAH, PUSH], "push": [PUSH]}
+    found = study.aggregate(made_up(rows), [10], groups, common=True, reps=5)
+    assert list(found["group"]) == ["mine", "mine"] and list(found["tasks"]) == [1, 1]
+    profiles = study.performance_profiles(made_up(rows), 10, [0.5], groups, common=True, reps=5)
+    assert set(profiles["group"]) == {"mine"}
+    with pytest.raises(ValueError, match="the groups have no task that all agents have"):
+        study.aggregate(made_up(rows), [10], {"push": [PUSH]}, common=True)

@@ -272,3 +272,39 @@ def test_score_against_hours() -> None:
     assert np.isnan(found.loc[("b", 200), "hours"])
     with pytest.raises(ValueError, match="'hours' of at least one run"):
         study.cost(grid())
+
+
+def test_a_heatmap_says_its_step_and_what_it_leaves_out() -> None:
+    table = sized()
+    short = (table["seed"] == 1) & (table["step"] == 200) & table["arguments"].str.contains("4.92M")
+    with pytest.warns(UserWarning, match="are left out") as told:
+        found = study.heatmap(table[~short], "model_size", "replay_ratio", step=200)
+    assert found.attrs["step"] == 200
+    assert [str(each.message) for each in told] == [
+        f"1 of 2 runs of model_size=4.92M, replay_ratio={rr} have no evaluations around step 200 and are left out"
+        for rr in (10, 2)
+    ]
+    other = table[table["arguments"].str.contains("0.55M")].assign(task=WALKER)
+    with pytest.warns(
+        UserWarning, match=r"cells are not of the same tasks \(.*model_size=4.92M, replay_ratio=2 1.* of 2\)"
+    ):
+        assert study.heatmap(pd.concat([table, other]), "model_size", "replay_ratio").attrs["step"] == 200
+
+
+def test_common_costs_are_of_the_tasks_of_the_score() -> None:
+    """Of the second task, which b lacks, a step takes ten times as long."""
+    rows = []
+    for agent, task, hours in (("a", CHEETAH, 1.0), ("a", WALKER, 10.0), ("b", CHEETAH, 2.0)):
+        for seed in (0, 1):
+            rows += [(agent, {}, task, seed, 100, "return", 5.0), (agent, {}, task, seed, 100, "hours", hours)]
+    found = study.cost(made_up(rows), [100], {"mine": [CHEETAH, WALKER]}, common=True, reps=5).set_index("agent")
+    assert found["hours"].to_dict() == {"a": 1.0, "b": 2.0} and (found["tasks"] == 1).all()
+    assert found["steps_per_second"]["a"] == pytest.approx(100 / 3_600)
+
+
+def test_marginals_of_unequal_numbers_of_runs_are_said() -> None:
+    table = grid()
+    more = grid(seeds=(2, 3))
+    more = more[more["arguments"] == more["arguments"].iloc[0]]
+    with pytest.warns(UserWarning, match="combinations of choices and tasks have 2 to 4 runs in 'all'"):
+        study.marginalize(pd.concat([table, more]), groups=["all"], reps=2)

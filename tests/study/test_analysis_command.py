@@ -95,6 +95,10 @@ def test_groups_and_factors_of_the_plan(run: Run, tmp_path: Path) -> None:
     out = run("aggregate", "s/runs", "--steps", "3k", "--reps", "5")
     assert "| mine | 3,000 |" in out and "| all | 3,000 |" not in out
     assert "0.015" in run("heatmap", "s", "-x", "b", "-y", "b", "--group", "mine")
+    # A group with a task of which there is no run.
+    out = run("heatmap", "s", "-x", "b", "-y", "b", "--group", "dogs")
+    assert "At 3,000 simulator steps:" in out and "0.015" in out
+    assert "| mine | 3,000 |" in run("aggregate", "s", "--steps", "3k", "--common", "--reps", "5")
     assert study.comparison(["s", "label=s/runs"]) == comparison
     with pytest.raises(SystemExit):
         run("aggregate", "s", "--steps", "3k", "--groups", "metaword")

@@ -189,6 +189,27 @@ def test_agents_that_cannot_be_told_apart(tmp_path: Path) -> None:
     assert "a and b cannot be told apart." in text_of(written(tmp_path / "r.html", made_up(rows)))
 
 
+def test_a_verdict_needs_enough_runs(tmp_path: Path) -> None:
+    """The interval is [1, 1] in both cases; of 36 ways to part two by two runs on two tasks two are as extreme."""
+    rows = runs("a", CHEETAH, [500, 600]) + runs("a", WALKER, [500, 600])
+    rows += runs("b", CHEETAH, [100, 200]) + runs("b", WALKER, [100, 200])
+    text = text_of(written(tmp_path / "r.html", made_up(rows)))
+    assert "a is ahead of b, without certainty." in text and "better than" not in text
+    assert "p = 0.056." in text and "p of the permutation test must be below 0.05" in text
+    page = written(tmp_path / "r.html", made_up(rows), confidence=0.9)
+    assert "a is better than b." in text_of(page)
+    assert tables_of(page)["Probability of improvement"][1][3] == "0.056"
+
+
+def test_single_runs_are_no_evidence(tmp_path: Path) -> None:
+    tasks = [f"dmc/task-{i}-v0" for i in range(9)]
+    rows = [row for agent, end in (("a", 501), ("b", 500)) for task in tasks for row in runs(agent, task, [end])]
+    rows += runs("a", CHEETAH, [500, 510]) + runs("b", CHEETAH, [495, 505])
+    text = text_of(written(tmp_path / "r.html", made_up(rows)))
+    assert "a is ahead of b, without certainty." in text and "better than" not in text
+    assert "There is no interval where a task has a single run: a, b." in text and "no task has a second" not in text
+
+
 def test_tasks_without_a_score_have_curves_and_are_named(tmp_path: Path) -> None:
     table = pd.concat([two_agents(), made_up(runs("good", OWN, [-5, -6]) + runs("bad", OWN, [-7, -8]))])
     page = written(tmp_path / "r.html", table)
@@ -301,6 +322,51 @@ def test_a_study_says_what_is_done_and_what_has_failed(folder: StudyFolder, tmp_
     assert re.search(r"Machines: .*: 2 runs with 2 threads each", text)
     # The step that a run of each agent has reached.
     assert "at 1,000 steps over 1 task" in text
+
+
+def test_an_agent_with_failed_runs_is_not_better(tmp_path: Path) -> None:
+    place = StudyFolder(tmp_path / "s")
+    made = [planned(agent, seed) for agent in ("A", "B") for seed in range(5)]
+    place.enter(Plan("s", tuple(made)))
+    for run in made:
+        values = (100.0 * (run.agent == "A") + run.seed,) * 3
+        with place.claim(run):  # type: ignore[union-attr]
+            pass
+        if (run.agent, run.seed) == ("A", 4):  # got half as far
+            write_run(place.place(run), seed=run.seed, steps=(1_000,), values=values[:1])
+            place.write_outcome(run, Outcome(False, attempts=2, traceback="NaN"))
+        else:
+            write_run(place.place(run), seed=run.seed, values=values)
+            place.write_outcome(run, Outcome(True, steps=3_000))
+    text = text_of(written(tmp_path / "r.html", place.path, steps=[3_000]))
+    assert "A is ahead of B, without certainty." in text and "better than" not in text
+    assert "1 failed run of A is not counted: the comparison favours it." in text
+    # At a step that it has reached it counts.
+    text = text_of(written(tmp_path / "r.html", place.path, steps=[1_000]))
+    assert "A is better than B." in text and "not counted" not in text
+    # The failed run of the worse agent changes nothing.
+    place.write_outcome(made[4], Outcome(True, steps=3_000))
+    write_evaluations(place.place(made[4]), (1_000, 2_000, 3_000), (100.0,) * 3)
+    place.write_outcome(made[9], Outcome(False, attempts=2))
+    (place.place(made[9]) / "evaluations.npz").unlink()
+    text = text_of(written(tmp_path / "r.html", place.path, steps=[3_000]))
+    assert "A is better than B." in text and "1 failed run of B is not counted" in text
+
+
+def test_planned_runs_that_are_not_here_may_have_failed(tmp_path: Path) -> None:
+    (tmp_path / "p.yml").write_text(
+        f"agents: {{good: {{algo: bro}}, bad: {{algo: bro_fast}}}}\n"
+        f"tasks: [{CHEETAH}, {WALKER}]\nseeds: 4\nsteps: 25_000\n"
+    )
+    rows = [
+        *runs("bad", CHEETAH, [1, 2, 3, 4]),
+        *runs("bad", WALKER, [1, 2, 3, 4]),
+        *runs("good", WALKER, [7, 8, 9, 9]),
+    ]
+    rows += runs("good", CHEETAH, [7, 8, 9])
+    text = text_of(written(tmp_path / "r.html", made_up(rows), plan=tmp_path / "p.yml"))
+    assert "good is ahead of bad, without certainty." in text
+    assert "1 planned run of good is not here: if failed, the comparison favours it." in text
 
 
 def test_an_empty_study_and_one_without_evaluations(tmp_path: Path) -> None:

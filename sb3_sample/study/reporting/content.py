@@ -30,6 +30,7 @@ from sb3_sample.study.reporting.pieces import (
     Text,
     counted,
     cut,
+    p_text,
 )
 from sb3_sample.study.reporting.reading import Gathered
 from sb3_sample.study.reporting.summary import holes, missing, summary
@@ -177,8 +178,8 @@ def _averages(facts: Facts, agents: dict[str, Agent], how: str) -> Section:
     else:
         parts.append(_normalised(facts))
         rows = facts.at(facts.step)
-        if rows["low"].isna().all():
-            parts.append("There are no intervals: no task has a second run.")
+        if rows["low"].isna().any():
+            parts.append("Agents with a single run on a task have no interval.")
         panels = []
         for key, name in _STATISTICS.items():
             prefix = "" if key == "iqm" else f"{key}_"
@@ -337,13 +338,13 @@ def _improvement(facts: Facts, agents: dict[str, Agent]) -> Section:
     which = "" if facts.all_pairs else ", the best agent with each other one"
     caption = (
         f"How likely a run of the first scores more than one of the second on the same task, ties a half, at "
-        f"{facts.step:,} steps, {facts.group}{which}"
+        f"{facts.step:,} steps, {facts.group}{which}; p is that of a permutation test"
     )
     section.parts.append(Figure("improvement", caption, [Dots("probability of improvement", dots, middle=0.5)], []))
     cells: list[list[Cell]] = [
-        [row["x"], row["y"], value, row["tasks"]] for row, value in zip(rows, values, strict=True)
+        [row["x"], row["y"], value, p_text(row["p"]), row["tasks"]] for row, value in zip(rows, values, strict=True)
     ]
-    section.parts.append(Table("Probability of improvement", ["agent", "over", "probability", "tasks"], cells))
+    section.parts.append(Table("Probability of improvement", ["agent", "over", "probability", "p", "tasks"], cells))
     return section
 
 

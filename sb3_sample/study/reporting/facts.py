@@ -47,6 +47,7 @@ class Facts:
     :param all_pairs: whether all pairs are compared, not only those with the best
     :param left_out: agents without averages, with the reason
     :param notes: warnings
+    :param confidence: of the intervals
     """
 
     lacking: dict[str, str]
@@ -62,6 +63,7 @@ class Facts:
     all_pairs: bool = True
     left_out: dict[str, str] = dataclasses.field(default_factory=dict)
     notes: list[str] = dataclasses.field(default_factory=list)
+    confidence: float = 0.95
 
     @property
     def step(self) -> int:
@@ -108,7 +110,7 @@ def compute(
     :raises ValueError: an argument is out of range, or no run reaches a step
     """
     measured = gathered.table[gathered.table["metric"].isin(_MEASURED)]
-    facts = Facts(unscored(measured, scores))
+    facts = Facts(unscored(measured, scores), confidence=confidence)
     rows = measured[~measured["task"].isin(list(facts.lacking))]
     if not len(rows):
         facts.reason = "No task of these runs has a score." if facts.lacking else "No run has been evaluated yet."

@@ -205,6 +205,14 @@ def interval_text(found: Interval) -> str:
     return f"{number(found.value)} ({number(found.low)}{DASH}{number(found.high)})"
 
 
+def p_text(p: float) -> str:
+    """
+    :param p: of a test
+    :return: the same for people, to two digits
+    """
+    return f"{p:.2g}" if p >= 1e-3 else "below 0.001"
+
+
 def counted(n: int, noun: str) -> str:
     """
     :param n: a number

@@ -43,6 +43,7 @@ class Gathered:
     :param planned: runs of the plan that was given
     :param made_with: of each run that says so, by what it was made: versions, device, processor, commit
     :param notes: what was left out, and why
+    :param labels: names that the agents of each of ``states`` were given, None for those of the plan
     """
 
     names: list[str]
@@ -57,6 +58,7 @@ class Gathered:
     planned: list[Run]
     made_with: list[dict[str, str]]
     notes: list[str]
+    labels: list[str | None] = dataclasses.field(default_factory=list)
 
     @property
     def agents(self) -> list[str]:
@@ -146,6 +148,7 @@ def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
             raise
     if is_study:
         found.states.append(status(path))
+        found.labels.append(label)
         if (path / PLAN).is_file():
             found.plans[str(source)] = read_regular(path / PLAN, _MAX_PLAN).decode(errors="replace")
         evaluated = [folder for folder in folders if (folder / EVALUATIONS).exists()]

@@ -2,12 +2,14 @@
 
 import json
 import math
+from collections import Counter
 from collections.abc import Sequence
 
+from sb3_sample.study.plan import Run
 from sb3_sample.study.reporting.facts import Facts
-from sb3_sample.study.reporting.pieces import STEPS, Interval, counted, cut, interval_text, range_text
+from sb3_sample.study.reporting.pieces import STEPS, Interval, counted, cut, interval_text, p_text, range_text
 from sb3_sample.study.reporting.reading import Gathered
-from sb3_sample.study.states import DONE
+from sb3_sample.study.states import DONE, FAILED
 from sb3_sample.study.table import RUN
 
 #: Agents that are named.
@@ -22,7 +24,7 @@ def summary(gathered: Gathered, facts: Facts) -> list[tuple[str, list[str]]]:
     """
     return [
         ("Compared", _compared(gathered)),
-        ("Result", _result(facts)),
+        ("Result", _result(gathered, facts)),
         ("Missing", _missing(gathered, facts)),
     ]
 
@@ -48,7 +50,7 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(cut(name) for name in shown) + (f" and {more} more" if more else "")
 
 
-def _result(facts: Facts) -> list[str]:
+def _result(gathered: Gathered, facts: Facts) -> list[str]:
     if facts.averages is None:
         return [f"No averages. {facts.reason}"]
     rows = facts.at(facts.step)
@@ -57,26 +59,87 @@ def _result(facts: Facts) -> list[str]:
     more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
     where = f"at {facts.step:,} steps over {counted(len(facts.tasks), 'task')}"
     words = f"Interquartile mean of the scores {where}: {named}{more}."
+    lost = _lost(gathered, facts)
     if facts.improvement is None:
         verdict = ["There is one agent." if len(found) == 1 else f"{found[0][0]} has the highest average."]
     else:
         best = facts.improvement.iloc[0]
-        verdict = _verdict(cut(best["x"]), cut(best["y"]), Interval(best["probability"], best["low"], best["high"]))
-    if all(math.isnan(value.low) for _, value in found):
+        chance = Interval(best["probability"], best["low"], best["high"])
+        favoured = best["x"] if chance.value > 0.5 else best["y"]
+        verdict = _verdict(
+            cut(best["x"]), cut(best["y"]), chance, best["p"], 1 - facts.confidence, is_whole=favoured not in lost
+        )
+    verdict += [sentence for agent in rows["agent"] for sentence in lost.get(agent, [])]
+    if (rows["runs"] == rows["tasks"]).all():
         verdict.append("There are no intervals, since no task has a second run: nothing is certain here.")
+    elif single := [agent for agent, value in found if math.isnan(value.low)]:
+        verdict.append(f"There is no interval where a task has a single run: {_listed(single)}.")
     return [*verdict, words]
 
 
-def _verdict(x: str, y: str, chance: Interval) -> list[str]:
-    """Probability of improvement, in words, of the two agents with the highest averages."""
-    why = f"A run of {x} beats one of {y} on the same task with probability {interval_text(chance)}."
+def _lost(gathered: Gathered, facts: Facts) -> dict[str, list[str]]:
+    """
+    Sentences by agent on its runs that have failed, or may have, and are in no average: without its worst runs an agent
+    looks better than it is.
+    """
+    ends = gathered.table.groupby(["agent", "task", "seed"])["step"].max()
+    heads = [
+        (row.agent, json.loads(row.arguments))
+        for row in gathered.table[["agent", "arguments"]].drop_duplicates().itertuples()
+        if row.agent not in gathered.published
+    ]
+
+    def counts(runs: Sequence[tuple[str, Run]]) -> Counter[str]:
+        found: Counter[str] = Counter()
+        for name, run in runs:
+            for agent in {
+                agent
+                for agent, given in heads
+                # With its arguments where these tell agents of one name apart.
+                if (agent == name or agent.startswith(f"{name} ("))
+                and all(given.get(key) == value for key, value in run.grid.items())
+            }:
+                found[agent] += ends.get((agent, run.task, run.seed), -1) < facts.step
+        return +found
+
+    failed = [
+        (label or each.run.agent, each.run)
+        for state, label in zip(gathered.states, gathered.labels, strict=True)
+        for each in state.of(FAILED)
+    ]
+    found: dict[str, list[str]] = {}
+    for agent, n in counts(failed).items():
+        found.setdefault(agent, []).append(
+            f"{counted(n, 'failed run')} of {cut(agent)} {'is' if n == 1 else 'are'} not counted: the comparison "
+            "favours it."
+        )
+    for agent, n in counts([(run.agent, run) for run in missing_runs(gathered)]).items():
+        found.setdefault(agent, []).append(
+            f"{counted(n, 'planned run')} of {cut(agent)} {'is' if n == 1 else 'are'} not here: if failed, the "
+            "comparison favours it."
+        )
+    return found
+
+
+def _verdict(x: str, y: str, chance: Interval, p: float, level: float, is_whole: bool) -> list[str]:
+    """
+    Probability of improvement, in words, of the two agents with the highest averages. A verdict needs the permutation
+    test beside the interval, which is too narrow where there are few runs, and all runs of the agent that it favours.
+    """
+    why = f"A run of {x} beats one of {y} on the same task with probability {interval_text(chance)}, p = {p_text(p)}."
+    if chance.low <= 0.5 <= chance.high:
+        return [f"{x} and {y} cannot be told apart.", why]
+    unsure = f"{x} is ahead of {y}, without certainty."
     if math.isnan(chance.low):
-        return [f"{x} is ahead of {y}, without certainty.", why]
+        return [unsure, why, "This probability has no interval, since a task has a single run of one of them."]
+    if p >= level:
+        few = f"Too few runs for a verdict: p of the permutation test must be below {level:.3g}."
+        return [unsure, why, few]
+    if not is_whole:
+        return [unsure, why]
     if chance.low > 0.5:
         return [f"{x} is better than {y}.", why]
-    if chance.high < 0.5:
-        return [f"{x} has the highest average, but is worse than {y} on most tasks.", why]
-    return [f"{x} and {y} cannot be told apart.", why]
+    return [f"{x} has the highest average, but is worse than {y} on most tasks.", why]
 
 
 def _missing(gathered: Gathered, facts: Facts) -> list[str]:
@@ -119,15 +182,26 @@ def missing(gathered: Gathered) -> dict[tuple[str, str], list[int]]:
     :param gathered: runs
     :return: seeds of the given plan's runs that are not among them, by agent (with the grid's arguments) and task
     """
+    found: dict[tuple[str, str], list[int]] = {}
+    for run in missing_runs(gathered):
+        found.setdefault((run.variant, run.task), []).append(run.seed)
+    return found
+
+
+def missing_runs(gathered: Gathered) -> list[Run]:
+    """
+    :param gathered: runs
+    :return: those of the given plan that are not among them
+    """
     runs = gathered.runs
     arguments = [json.loads(text) for text in runs["arguments"]]
     known = list(zip(runs["agent"], arguments, runs["task"], runs["seed"], strict=True))
-    found: dict[tuple[str, str], list[int]] = {}
-    for run in gathered.planned:
+    return [
+        run
+        for run in gathered.planned
         if not any(
             (agent, task, seed) == (run.agent, run.task, run.seed)
             and all(given.get(key) == value for key, value in run.grid.items())
             for agent, given, task, seed in known
-        ):
-            found.setdefault((run.variant, run.task), []).append(run.seed)
-    return found
+        )
+    ]
