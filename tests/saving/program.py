@@ -354,15 +354,13 @@ def outcome(agent: Any, folder: str, callback: Any = None) -> dict[str, str]:
 
 def start(target: Callable[..., None], *args: Any) -> Any:
     """
-    A process of its own, quickly: one that has imported everything already is forked.
+    A process of its own, quickly: one that has imported everything already is forked (``tests/conftest.py``).
 
     :param target: what it runs
     :param args: its arguments
     :return: the process
     """
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tests.saving.program"])
-    process = context.Process(target=target, args=args)
+    process = multiprocessing.get_context("forkserver").Process(target=target, args=args)
     process.start()
     return process
 
