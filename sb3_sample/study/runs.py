@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from sb3_sample.run_logs import EVALUATIONS, OFFLINE, read_evaluations
 from sb3_sample.saving import temporary
-from sb3_sample.saving.locks import Lock, take
+from sb3_sample.saving.locks import Lock, is_taken, take
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.study.plan import Comparison, Plan, Run
 
@@ -209,14 +209,9 @@ class StudyFolder:
         """
         :param run: a run
         :return: whether a process has it at present
+        :raises OSError: its lock cannot be read, or the folder has no locks
         """
-        if not self._beside(run, ".lock").exists():
-            return False
-        lock = self.claim(run)
-        if lock is None:
-            return True
-        lock.release()
-        return False
+        return is_taken(self._beside(run, ".lock"))
 
     def outcome(self, run: Run) -> Outcome:
         """
