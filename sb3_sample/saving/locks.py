@@ -54,6 +54,27 @@ class Lock:
         self.release()
 
 
+def is_taken(path: Path) -> bool:
+    """
+    Whether a process has the lock of a file, which is only read: it may be in a folder that cannot be written to.
+
+    :param path: of the file
+    :return: whether it is there and locked
+    :raises OSError: the file cannot be read, or its file system has no locks
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_CLOEXEC", 0))
+    except FileNotFoundError:
+        return False
+    try:
+        held = temporary.lock(descriptor, shared=True)
+    finally:
+        os.close(descriptor)
+    if held is None:
+        raise OSError(errno.ENOLCK, "the system or the file system has no locks", str(path))
+    return not held
+
+
 def take(path: Path) -> Lock | None:
     """
     Lock a file, without waiting.

@@ -53,17 +53,18 @@ def becoming(path: Path) -> Iterator[IO[bytes]]:
             return
 
 
-def lock(descriptor: int) -> bool | None:
+def lock(descriptor: int, shared: bool = False) -> bool | None:
     """
     Lock a file, without waiting for whoever has it locked.
 
     :param descriptor: of the open file
+    :param shared: whether others may have a shared lock at the same time
     :return: whether this process has the lock now; None where the system or the file system has none
     """
     if fcntl is None:
         return None
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:

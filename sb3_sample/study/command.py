@@ -39,7 +39,7 @@ def main(argv: Sequence[str]) -> None:
     options = parser.parse_args(argv)
     try:
         COMMANDS[options.command][2](options)
-    except (PlanError, StudyError) as error:
+    except (PlanError, StudyError, PermissionError) as error:
         refuse(f"study {options.command}", error)
 
 

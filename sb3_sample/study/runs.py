@@ -17,12 +17,14 @@ from typing import Any, NamedTuple
 
 from sb3_sample.run_logs import EVALUATIONS, OFFLINE, read_evaluations
 from sb3_sample.saving import temporary
-from sb3_sample.saving.locks import Lock, take
+from sb3_sample.saving.locks import Lock, is_taken, take
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.study.plan import Comparison, Plan, Run
 
 #: Content of a study's folder: its runs, the outcome of each, the list of them and the plan as it was read.
 RUNS, STATE, LIST, PLAN = "runs", "state", "study.json", "plan.yml"
+#: In the list: runs that were in it and are not in the plan any more, by their names.
+FORMER = "former"
 _LOG = "progress.jsonl"
 #: Bytes of the list, of what is said of one run, and of the end of a log that is looked at.
 MAX_LIST, MAX_OUTCOME, TAIL = 2**28, 2**20, 2**14
@@ -107,14 +109,18 @@ class StudyFolder:
             time.sleep(0.01)
         with lock:
             runs, comparison = {run.name: run for run in plan.runs}, plan.comparison
+            known: list[Run] = []
+            former: list[Run] = []
             if (self.path / LIST).exists():
-                known = self.runs()
-                _check_same(self.path, known, plan.runs)
+                known, former = self.runs(), self._former()
+                _check_same(self.path, [*former, *known], plan.runs)
                 if keep:
                     runs = {run.name: run for run in known} | runs
                     comparison = comparison if any(comparison) else self.comparison()
             listed = [run.as_json() for run in runs.values()]
-            content = {"name": plan.name, **comparison._asdict(), "runs": listed}
+            # Runs that were taken out of the plan: their folders are there, and they may be put back.
+            left = {run.name: run.as_json() for run in (*former, *known) if run.name not in runs}
+            content = {"name": plan.name, **comparison._asdict(), "runs": listed, FORMER: left}
             _write(self.path / LIST, json.dumps(content, indent=1))
             if plan.text:
                 _write(self.path / PLAN, plan.text)
@@ -138,6 +144,15 @@ class StudyFolder:
             return [Run.of_json(run) for run in content["runs"]]
         except (ValueError, KeyError, TypeError) as error:
             raise StudyError(f"{self.path / LIST} is not what sb3-sample study run has written: {error}") from error
+
+    def _former(self) -> list[Run]:
+        """Runs of earlier plans that are not in the last one and whose folders are there still."""
+        content = self._list()
+        try:
+            found = [Run.of_json(run) for run in content.get(FORMER, {}).values()]
+        except (ValueError, AttributeError, TypeError) as error:
+            raise StudyError(f"{self.path / LIST} is not what sb3-sample study run has written: {error}") from error
+        return [run for run in found if self.place(run).is_dir()]
 
     def comparison(self) -> Comparison:
         """
@@ -194,14 +209,9 @@ class StudyFolder:
         """
         :param run: a run
         :return: whether a process has it at present
+        :raises OSError: its lock cannot be read, or the folder has no locks
         """
-        if not self._beside(run, ".lock").exists():
-            return False
-        lock = self.claim(run)
-        if lock is None:
-            return True
-        lock.release()
-        return False
+        return is_taken(self._beside(run, ".lock"))
 
     def outcome(self, run: Run) -> Outcome:
         """

@@ -44,6 +44,8 @@ _SECONDS = "time/time_elapsed"
 _TIMED = re.compile(rb'\{"step": (\d{1,15}), [^\n]*?"time/time_elapsed": (\d{1,15}(?:\.\d+)?)[,}]')
 #: In the folder of a study: its list of runs, and the folder of them, ``runs/<agent and grid>/<task>/<seed>``.
 _LIST, _RUNS = "study.json", "runs"
+#: In that list: runs that were taken out of the plan, by their names.
+_FORMER = "former"
 #: Bytes of a run's log.
 _MAX_LOG = 256 * 2**20
 #: Bytes of a study's list of runs.
@@ -105,7 +107,8 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
     :param metrics: patterns of the metrics to keep: "return", "success_rate", "episode_length", "hours",
         "online_return" and "online_success_rate" (the training episodes, which explore, also of runs with evaluations)
         and whatever ``progress.jsonl`` has, e.g. "train/*"
-    :return: columns :data:`COLUMNS`, in the order of the sources. Where a run's files do not say its seed, it is its
+    :return: columns :data:`COLUMNS`, in the order of the sources. Runs that were taken out of their study's plan are
+        left out, with a warning. Where a run's files do not say its seed, it is its
         number among the runs of that agent and task, from 0 on
     :raises ValueError: there is no run in a source, a file is damaged, a run does not say its task, or two runs have
         the same agent, arguments, task and seed
@@ -118,7 +121,8 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
     seen: dict[tuple[Any, ...], Path] = {}
     numbered: dict[tuple[str, str], int] = {}
     training: list[Path] = []
-    named = functools.cache(_agents_of_study)
+    named, former = functools.cache(_agents_of_study), functools.cache(_former_of_study)
+    left_out: list[Path] = []
     for source in given:
         label, path = labelled(source)
         if path.suffix in (".csv", ".parquet") and path.is_file():
@@ -126,6 +130,10 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
             tables.append(table if label is None else table.assign(agent=label))
             continue
         for folder in find_runs(path):
+            study = _study_of(folder)
+            if study is not None and "/".join(folder.absolute().parts[-3:]) in former(study):
+                left_out.append(folder)
+                continue
             run = read_settings(folder)
             if run.task is None:
                 raise ValueError(
@@ -149,6 +157,11 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
                 training.append(folder)
             for metric, (steps, values) in _measured(folder, run, metrics).items():
                 rows.add(agent, arguments, run.task, seed, metric, steps, values)
+    if left_out:
+        warn(
+            f"{len(left_out)} runs ({left_out[0]}, ...) are not in their study's plan any more and are left out; "
+            "elsewhere their folders are read as any others"
+        )
     if training:
         warn(
             f"{len(training)} runs have no {EVALUATIONS} ({training[0]}, ...): their rows are training episodes, which "
@@ -171,10 +184,24 @@ def _agent_of_study(folder: Path, named: Callable[[Path], dict[str, str]]) -> st
     :param named: gives the agents by the beginning of their folders' names
     :return: the agent's name in the plan; None outside of a study
     """
+    study = _study_of(folder)
+    return None if study is None else named(study).get(folder.absolute().parents[1].name.partition(",")[0])
+
+
+def _study_of(folder: Path) -> Path | None:
+    """The study that a run's folder is in, if it is in one."""
     above = folder.absolute().parents
-    if len(above) < 4 or above[2].name != _RUNS or not (above[3] / _LIST).is_file():
-        return None
-    return named(above[3]).get(above[1].name.partition(",")[0])
+    return above[3] if len(above) > 3 and above[2].name == _RUNS and (above[3] / _LIST).is_file() else None
+
+
+def _former_of_study(folder: Path) -> set[str]:
+    """Names of the runs that were taken out of a study's plan: they may have been made with other settings."""
+    path = folder / _LIST
+    found = parse_json(read_regular(path, _MAX_LIST), str(path))
+    former = found.get(_FORMER, {}) if isinstance(found, dict) else {}
+    if not isinstance(former, dict):
+        raise BadFile(f"{path} is no list of a study's runs")
+    return set(former)
 
 
 def _agents_of_study(folder: Path) -> dict[str, str]:

@@ -83,3 +83,21 @@ def test_no_locks_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(temporary, "lock", lambda descriptor: None)
     with pytest.raises(OSError, match="has no locks"):
         locks.take(tmp_path / "lock")
+
+
+def test_whether_a_lock_is_taken_is_found_by_reading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a folder on a file system that cannot be written to, which a test as root does not get by permissions."""
+    path = tmp_path / "lock"
+    lock = take(path)
+    assert lock is not None
+    plain = os.open
+
+    def reading(name: Path, flags: int, *args: int) -> int:
+        if flags & (os.O_RDWR | os.O_WRONLY | os.O_CREAT):
+            raise PermissionError(13, "Permission denied", str(name))
+        return plain(name, flags, *args)
+
+    monkeypatch.setattr(os, "open", reading)
+    assert locks.is_taken(path) and not locks.is_taken(tmp_path / "none")
+    lock.release()
+    assert not locks.is_taken(path)

@@ -1,5 +1,7 @@
 """Plans: what they say, and what is refused before anything runs."""
 
+import dataclasses
+import shutil
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
@@ -8,10 +10,11 @@ import pytest
 
 pytest.importorskip("rl_zoo3")
 
-from sb3_sample import cli
+from sb3_sample import cli, study
 from sb3_sample.envs import suites
 from sb3_sample.study import Plan, PlanError, Run, read_plan
-from sb3_sample.study.runs import StudyFolder
+from sb3_sample.study.runs import StudyError, StudyFolder
+from tests.study.made_up import write_run
 
 ROOT = Path(__file__).parents[2]
 GOOD = """\
@@ -347,3 +350,25 @@ def test_data_of_a_plan_that_are_refused(plan_of, before: str, now: str, message
     assert before in DATA
     with pytest.raises(PlanError, match=message):
         plan_of(DATA.replace(before, now))
+
+
+def test_a_run_that_was_taken_out_of_the_plan_is_not_forgotten(tmp_path: Path) -> None:
+    folder = StudyFolder(tmp_path)
+    first, other = (Run("A", "bro", {"gamma": 0.9}, {}, "dmc/cheetah-run-v0", seed, 3_000) for seed in (0, 1))
+    folder.enter(Plan("s", (first, other)))
+    for run in (first, other):
+        write_run(folder.place(run), seed=run.seed, arguments=run.arguments)
+    folder.enter(Plan("s", (other,)))
+    folder.enter(Plan("s", (other,)))  # for good
+    with pytest.warns(UserWarning, match="1 runs .* are not in their study's plan any more and are left out"):
+        assert list(study.read(tmp_path)["seed"].unique()) == [1]
+    changed = dataclasses.replace(first, arguments={"gamma": 0.5})
+    with pytest.raises(StudyError, match="gamma.: 0.9.*the plan now says .*0.5"):
+        folder.enter(Plan("s", (changed, other)))
+    folder.enter(Plan("s", (first, other)))
+    assert list(study.read(tmp_path)["seed"].unique()) == [0, 1]
+    # One whose folder is gone may come back with other settings.
+    folder.enter(Plan("s", (other,)))
+    shutil.rmtree(folder.place(first))
+    folder.enter(Plan("s", (changed, other)))
+    assert folder.runs() == [changed, other]

@@ -370,7 +370,10 @@ def _costs(gathered: Gathered) -> Section:
             f"{host}: {counted(n, 'run')} with {counted(t, 'thread')} each" for (host, t), n in sorted(found.items())
         ]
         section.parts.append(f"Machines: {'; '.join(words)}.")
-    section.parts.append("Times compare only where all ran on one machine, with as many threads and neighbours.")
+    section.parts.append(
+        "Times compare only where all ran on one machine, with as many threads and neighbours. Runs that were made "
+        "together (--batch-seeds) have the time of all of them each."
+    )
     return section
 
 
