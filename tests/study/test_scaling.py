@@ -636,3 +636,19 @@ def test_an_interval_of_samples_without_values_is_none() -> None:
     reps = np.array([[1.0, np.nan], [2.0, np.nan], [3.0, np.nan], [np.inf, 4.0]])
     low, high = interval(np.array([2.0, 4.0]), reps, None)
     assert 1 <= low[0] <= high[0] <= 3 and np.isnan(low[1]) and np.isnan(high[1])
+
+
+def test_samples_of_one_budget_have_no_law() -> None:
+    """Levels that a sample passes at the same evaluations; the other samples have theirs."""
+    budgets = np.array([[1e12, 1e12, 1e12], [1e12, 2e12, 4e12]])
+    law = scaling.fit_budget(budgets, np.array([[4.0, 4.0, 4.0], [8.0, 4.0, 2.0]]))
+    assert np.isnan(law.exponent[0]) and law.exponent[1] == pytest.approx(-1)
+    with pytest.raises(ValueError, match="budgets must differ"):
+        scaling.fit_budget(budgets[:1], np.full((1, 3), 4.0))
+
+
+def test_a_size_law_far_from_a_replay_ratio_of_1() -> None:
+    ratios, sizes = (each.ravel() for each in np.meshgrid([5.0, 10.0, 15.0], [1e6, 4e6, 1.6e7]))
+    law = scaling.SizeLaw(1e6, 20.0, 2.0, 2e5, 0.5)
+    found = scaling.fit_model_size(ratios, sizes, law.steps(ratios, sizes))
+    np.testing.assert_allclose(found, law, rtol=1e-3)

@@ -57,7 +57,8 @@ def _result(gathered: Gathered, facts: Facts) -> list[str]:
     found = [(cut(row.agent), Interval(row.iqm, row.low, row.high)) for row in rows.itertuples()]
     named = ", ".join(f"{agent} {interval_text(value)}" for agent, value in found[:NAMED])
     more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
-    where = f"at {facts.step:,} steps over {counted(len(facts.tasks), 'task')}"
+    where = f"at {facts.step:,} steps over {counted(len(facts.groups[facts.group]), 'task')}"
+    where += f" of {facts.group}" if len(facts.groups[facts.group]) < len(facts.tasks) else ""
     words = f"Interquartile mean of the scores {where}: {named}{more}."
     lost = _lost(gathered, facts)
     if facts.improvement is None:
@@ -139,7 +140,7 @@ def _verdict(x: str, y: str, chance: Interval, p: float, level: float, is_whole:
         return [unsure, why]
     if chance.low > 0.5:
         return [f"{x} is better than {y}.", why]
-    return [f"{x} has the highest average, but is worse than {y} on most tasks.", why]
+    return [f"{x} is ahead of {y} by the averages, but its runs lose to those of {y} more often than not.", why]
 
 
 def _missing(gathered: Gathered, facts: Facts) -> list[str]:

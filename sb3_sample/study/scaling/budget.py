@@ -219,8 +219,8 @@ def fit_budget(budget: Sequence[float] | np.ndarray, replay_ratio: Sequence[floa
 
     :param budget: (..., L) FLOPs
     :param replay_ratio: (..., L)
-    :return: the law, of shape (...); NaN of samples with a level without a law
-    :raises ValueError: there are not two different budgets, or a number is not positive
+    :return: the law, of shape (...); NaN of samples with a level without a law, or whose budgets are all the same
+    :raises ValueError: no sample has two different budgets, or a number is not positive
     """
     budgets, ratios = np.asarray(budget, float), np.asarray(replay_ratio, float)
     if budgets.shape != ratios.shape or budgets.shape[-1:] < (2,):
@@ -230,10 +230,10 @@ def fit_budget(budget: Sequence[float] | np.ndarray, replay_ratio: Sequence[floa
     x, y = np.log(budgets), np.log(ratios)
     centred = x - x.mean(axis=-1, keepdims=True)
     spread = (centred**2).sum(axis=-1)
-    known = np.isfinite(spread)
-    if not known.any() or not (spread[known] > 1e-12).all():
+    known = np.isfinite(spread) & (spread > 1e-12)
+    if not known.any():
         raise ValueError("budgets must differ: an exponent cannot be had from one")
-    exponent = (centred * y).sum(axis=-1) / spread
+    exponent = (centred * y).sum(axis=-1) / np.where(known, spread, np.nan)
     return BudgetLaw((y.mean(axis=-1) - exponent * x.mean(axis=-1))[()], exponent[()])
 
 

@@ -52,15 +52,21 @@ def summary(laws: Laws) -> dict[str, Any]:
         row["fitted"] = _clean(level.law().steps(np.array(laws.replay_ratios)).tolist())
         row["censored"] = level.censored.tolist()
         found["data"].append(row)
+    notes = list(laws.notes)
     if laws.has_compute:
         found["budgets"] = _clean(laws.budgets().to_dict("records"))
         if len(laws.levels) >= HELD_OUT + 2:
-            of = laws.budget_laws()
-            found["budget"] = {
-                name: _json(laws.interval([np.atleast_1d(getattr(law, name)) for law in of]))
-                for name in BudgetLaw._fields
-            }
-    found["notes"] = laws.notes
+            try:
+                of = laws.budget_laws()
+            except ValueError as error:
+                # Of levels that are reached at the same evaluations; the other laws stand.
+                notes.append(f"there is no law of the budget: {error}")
+            else:
+                found["budget"] = {
+                    name: _json(laws.interval([np.atleast_1d(getattr(law, name)) for law in of]))
+                    for name in BudgetLaw._fields
+                }
+    found["notes"] = notes
     return found
 
 

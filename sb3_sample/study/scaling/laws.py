@@ -433,8 +433,9 @@ def fit_model_size(
             f"{len(values)}, of {len(np.unique(ratios))} and {len(np.unique(sizes))}"
         )
     x, z, y = np.log(ratios), np.log(sizes), np.log(values)
-    middle = z.mean()
-    z = z - middle
+    # Terms are then of the sizes of the steps, which bound them.
+    middle_x, middle = x.mean(), z.mean()
+    x, z = x - middle_x, z - middle
 
     def residual(theta: np.ndarray) -> np.ndarray:
         c, first, second, log_alpha, log_beta = theta
@@ -452,7 +453,7 @@ def fit_model_size(
     c, first, second, log_alpha, log_beta = map(float, found.x)
     alpha, beta = math.exp(log_alpha), math.exp(log_beta)
     b = math.exp(middle + (second - c) / beta)
-    return SizeLaw(math.exp(c), math.exp((first - c) / alpha), alpha, b, beta)
+    return SizeLaw(math.exp(c), math.exp(middle_x + (first - c) / alpha), alpha, b, beta)
 
 
 def _positive(values: Any, name: str) -> np.ndarray:

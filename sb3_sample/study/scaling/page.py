@@ -99,8 +99,9 @@ def limits(laws: Laws) -> list[str]:
     :param laws: of :func:`~sb3_sample.study.scaling.fit`
     :return: what they do not say, a sentence each
     """
-    found = list(laws.notes)
-    for row in summary(laws)["data"]:
+    numbers = summary(laws)
+    found = list(numbers["notes"])
+    for row in numbers["data"]:
         found += [f"level {row['level']:.0f}: {doubt}" for doubt in row["doubts"]]
         if row["left_out"]:
             found.append(f"level {row['level']:.0f}: without {', '.join(row['left_out'])}, which do not reach it")
