@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch.optim import Optimizer
 
-from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, TRUE_OR_FALSE, Kind, check_value, integer, is_number
+from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, DICT, TRUE_OR_FALSE, Kind, check_value, integer, is_number
 from sb3_sample.learner import losses
 from sb3_sample.learner.batch import Batch, for_each
 from sb3_sample.learner.parts import Learning, Part
@@ -424,7 +424,7 @@ class OptimisticShift(OptimisticExploration):
         actor = learner.actor
         action_dim = actor.action_dim
         own = {"width": 256, "n_blocks": 1} if network == "bronet" else {}
-        network_kwargs = {**own, **(network_kwargs or {})}
+        network_kwargs = {**own, **(check_value("network_kwargs", network_kwargs, DICT) or {})}
         made = NETWORKS[network]
         network_kwargs = widened(made, network_kwargs, width_factor)
         if isinstance(actor.trunk, Projected):

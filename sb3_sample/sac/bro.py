@@ -7,7 +7,7 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_sample.arguments import check_unused
 from sb3_sample.constructor import argument
-from sb3_sample.kinds import AT_LEAST_0
+from sb3_sample.kinds import AT_LEAST_0, DICT, check_value
 from sb3_sample.learner.exploration import Exploration
 from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.sac import checks
@@ -109,11 +109,8 @@ class BRO(SAC):
             **super()._full_policy_kwargs(),
         }
         if kwargs["actor_network"] == "bronet":
-            kwargs["actor_network_kwargs"] = {
-                "width": 256,
-                "n_blocks": 1,
-                **(kwargs.get("actor_network_kwargs") or {}),
-            }
+            given = check_value("actor_network_kwargs", kwargs.get("actor_network_kwargs"), DICT)
+            kwargs["actor_network_kwargs"] = {"width": 256, "n_blocks": 1, **(given or {})}
         if self.model_size is not None:
             kwargs["critic_network_kwargs"] = dict(
                 zip(("n_blocks", "width"), _model_size(self.model_size), strict=True)

@@ -246,3 +246,15 @@ def test_unknown_shift_network() -> None:
 def test_unknown_exploration_argument() -> None:
     with pytest.raises((ValueError, TypeError), match="foo"):
         bro(exploration_kwargs={"foo": 1})
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"policy_kwargs": {"actor_network_kwargs": 3}}, "actor_network_kwargs must be a dict, or None, not 3"),
+        ({"exploration_kwargs": {"network_kwargs": 3}}, "network_kwargs must be a dict, or None, not 3"),
+    ],
+)
+def test_arguments_of_networks_are_dicts(given: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        bro(**given)
