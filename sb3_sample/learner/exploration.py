@@ -312,7 +312,7 @@ class OptimisticExploration(Exploration):
         raise NotImplementedError
 
     def _project(self) -> None:
-        """Called after every step of the optimistic actor's optimizer: weights of unit norm are brought back to it."""
+        """Bring weights of unit norm back to it, after every step of the optimistic actor's optimizer."""
         project_weights(self)
 
     def _kl(self, learner: Learning, optimistic: Any, pessimistic: Any) -> torch.Tensor:

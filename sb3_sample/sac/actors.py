@@ -17,9 +17,9 @@ from torch import nn
 from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, FINITE, TRUE_OR_FALSE, check_value
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.losses import gaussian_kl, tanh_gaussian_log_prob
-from sb3_sample.networks import Network, RunningNorm, project_weights
-from sb3_sample.sac.features import TensorFeatures, share
-from sb3_sample.sac.trunks import check_saved_alone, keep_at_rest, make_trunk, with_plain_sizes
+from sb3_sample.networks import Network, project_weights
+from sb3_sample.sac.features import NetworkFeatures, share
+from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
 
 # The log standard deviation is squashed into this interval by a tanh.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
@@ -33,7 +33,7 @@ LOG_STD_ARGUMENTS = ("log_std_min", "log_std_max", "clip_log_std")
 GAUSSIAN_ARGUMENTS = (*LOG_STD_ARGUMENTS, "initial_std")
 
 
-class Actor(TensorFeatures, BasePolicy):
+class Actor(NetworkFeatures, BasePolicy):
     """
     Tanh-Gaussian actor: ``a = tanh(mean + std * noise)``, the log standard deviation squashed by a tanh into
     [-10, 2] (BRO, section B.1; bounds and squashing as in the published code), or clipped.
@@ -63,8 +63,6 @@ class Actor(TensorFeatures, BasePolicy):
     ARGUMENTS: ClassVar[tuple[str, ...]] = GAUSSIAN_ARGUMENTS
     #: View in evaluation mode, for the actions of TD targets, if the trunk ``stacks_rows``.
     at_rest: Any = None
-    #: The policy's running normalisation of observations, None for none.
-    observation_norm: RunningNorm | None = None
     _encoder: Any
 
     def __init__(
@@ -132,16 +130,6 @@ class Actor(TensorFeatures, BasePolicy):
         own = {"features_extractor": self.features_extractor, "shares_encoder": self.shares_encoder}
         own |= {name: getattr(self, name) for name in LOG_STD_ARGUMENTS}
         return {**super()._get_constructor_parameters(), **self._network_args, **own}
-
-    def save(self, path: str) -> None:
-        """
-        Save it alone, as in Stable-Baselines3.
-
-        :param path: of the file
-        :raises ValueError: observations are normalised by the policy
-        """
-        check_saved_alone(self)
-        super().save(path)
 
     def share(self, encoder: nn.Module) -> None:
         """

@@ -16,12 +16,12 @@ from torch import nn
 
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.learner.q_values import QValues
-from sb3_sample.networks import Network, RunningNorm, project_weights
-from sb3_sample.sac.features import TensorFeatures, share
-from sb3_sample.sac.trunks import check_saved_alone, keep_at_rest, make_trunk, with_plain_sizes
+from sb3_sample.networks import Network, project_weights
+from sb3_sample.sac.features import NetworkFeatures, share
+from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
 
 
-class CriticEnsemble(TensorFeatures, BaseModel):
+class CriticEnsemble(NetworkFeatures, BaseModel):
     """
     E critics with K outputs each, evaluated at once.
 
@@ -40,8 +40,6 @@ class CriticEnsemble(TensorFeatures, BaseModel):
     action_space: spaces.Box
     #: View in evaluation mode, for all but the critics' own step, if the trunk ``stacks_rows``.
     at_rest: Any = None
-    #: The policy's running normalisation of observations, None for none.
-    observation_norm: RunningNorm | None = None
     #: Whether the features extractor is that of other critics.
     shares_encoder: bool = False
     _encoder: Any
@@ -100,16 +98,6 @@ class CriticEnsemble(TensorFeatures, BaseModel):
         own = {**self._network_args, "features_extractor": self.features_extractor, "n_critics": self.n_critics}
         own["shares_encoder"] = self.shares_encoder
         return {**super()._get_constructor_parameters(), **own}
-
-    def save(self, path: str) -> None:
-        """
-        Save it alone, as in Stable-Baselines3.
-
-        :param path: of the file
-        :raises ValueError: observations are normalised by the policy
-        """
-        check_saved_alone(self)
-        super().save(path)
 
     def q_values(self, obs: PyTorchObs, actions: torch.Tensor) -> torch.Tensor:
         """
@@ -171,7 +159,7 @@ class CriticEnsemble(TensorFeatures, BaseModel):
         return [*self.trunk.copied_parameters(), *self.head.parameters()]
 
 
-class ValueNetwork(TensorFeatures, BaseModel):
+class ValueNetwork(NetworkFeatures, BaseModel):
     """
     Value of observations alone, by a network of the critics' kind.
 
@@ -182,9 +170,6 @@ class ValueNetwork(TensorFeatures, BaseModel):
     :param features_extractor: extractor of the observation's features
     :param normalize_images: whether images are divided by 255
     """
-
-    #: The policy's running normalisation of observations, None for none.
-    observation_norm: RunningNorm | None = None
 
     def __init__(
         self,

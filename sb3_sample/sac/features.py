@@ -7,6 +7,7 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import preprocess_obs
 from torch import nn
 
+from sb3_sample.networks import RunningNorm
 from sb3_sample.networks.modes import evaluated
 
 
@@ -26,6 +27,27 @@ class TensorFeatures:
         """
         found: torch.Tensor = features_extractor(_preprocessed(obs, self.observation_space, self.normalize_images))
         return found
+
+
+class NetworkFeatures(TensorFeatures):
+    """The same of actors and critics, which read observations through the policy's normalisation if it has one."""
+
+    #: The policy's running normalisation of observations, None for none.
+    observation_norm: RunningNorm | None = None
+
+    def save(self, path: str) -> None:
+        """
+        Save it alone, as in Stable-Baselines3.
+
+        :param path: of the file
+        :raises ValueError: observations are normalised by the policy's statistics, which the file would be without
+        """
+        if self.observation_norm is not None:
+            raise ValueError(
+                f"the file of a {type(self).__name__} would be without the statistics that its observations are "
+                "normalised by, which are the policy's: save the policy (model.policy.save) or the model"
+            )
+        super().save(path)  # type: ignore[misc]
 
 
 def share(network: Any, encoder: nn.Module) -> None:

@@ -71,15 +71,3 @@ def keep_at_rest(owner: Any) -> None:
     if choice is not None:
         # Past nn.Module's own setattr, which would register it.
         vars(owner)["at_rest"] = evaluated(owner)
-
-
-def check_saved_alone(owner: Any) -> None:
-    """
-    :param owner: an actor or critics
-    :raises ValueError: it reads observations through the policy's statistics, which its own file would be without
-    """
-    if owner.observation_norm is not None:
-        raise ValueError(
-            f"the file of a {type(owner).__name__} would be without the statistics that its observations are "
-            "normalised by, which are the policy's: save the policy (model.policy.save) or the model"
-        )

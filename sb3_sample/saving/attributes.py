@@ -17,7 +17,6 @@ import pathlib
 import random
 import re
 import struct
-import sys
 import types
 import uuid
 import weakref
@@ -28,7 +27,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from sb3_sample.saving.classes import may_be_set, member_of, of_member
+from sb3_sample.saving.classes import in_program, may_be_set, member_of, of_member, path_of
 from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.functions import FUNCTIONS, OtherKind, held, holding, name_of
 from sb3_sample.saving.hashes import distinct_hashes, part_name
@@ -204,16 +203,10 @@ def _may_have(owner: Any, name: str) -> bool:
     return known or may_be_set(type(owner), name) or kept
 
 
-def _enumeration(name: Any) -> type[enum.Enum] | None:
-    """The enumeration of a name that this program has, if there is one; nothing is imported for it."""
-    parts = name.split(".") if isinstance(name, str) else []
-    for i in range(len(parts) - 1, 0, -1):
-        found: Any = sys.modules.get(".".join(parts[:i]))
-        for part in parts[i:]:
-            found = vars(found).get(part) if isinstance(found, (types.ModuleType, type)) else None
-        if isinstance(found, type) and issubclass(found, enum.Enum):
-            return found
-    return None
+def _enumeration(path: Any) -> type[enum.Enum] | None:
+    """Find the enumeration of a path in this program; None if there is none."""
+    found = in_program(path) if isinstance(path, str) else None
+    return found if isinstance(found, type) and issubclass(found, enum.Enum) else None
 
 
 class Describer:
@@ -352,7 +345,7 @@ class Describer:
         :raises Opaque: it cannot be described; the message names the class of what cannot
         """
         if isinstance(value, enum.Enum):
-            return {"enum": member_of(value), "of": class_name(value)}
+            return {"enum": member_of(value), "of": path_of(type(value))}
         if isinstance(value, _CONSTANTS):
             return {"value": value}
         if id(value) in self._seen:

@@ -102,7 +102,7 @@ class CallbackStates:
     def __init__(self, callback: BaseCallback):
         self._callbacks = dict(walk(without_progress_bar(callback)))
         self._before = {path: self._attributes(each)[0] for path, each in self._callbacks.items()}
-        # Those of which it was told that something is lost.
+        # Paths of the callbacks of which it was warned that something is lost.
         self._told: set[str] = set()
         # What an earlier part of the run has changed belongs to the state as well.
         self._changed = {path: _CHANGED.setdefault(each, set()) for path, each in self._callbacks.items()}

@@ -116,7 +116,7 @@ class Checkpointer:
         self._resumed: dict[str, Any] | None = None
         self._manifest: dict[str, Any] = {"segments": {}}
         self._saved_at: int | None = None
-        #: What it was said of that no checkpoint holds it.
+        #: Names of what was left out of a checkpoint, of which it was warned.
         self._left_out: set[str] = set()
         self._whole_at: int | None = None
         self._interrupts: Interrupts | None = None
@@ -495,7 +495,7 @@ class Checkpointer:
     def _leave_out(self, state: dict[str, Any]) -> bool:
         """
         Take out of a state the episodes in progress and the callbacks that no file holds, and say so once: better
-        without them than no checkpoint. Whether anything was taken out.
+        without them than no checkpoint. Return whether anything was taken out.
         """
         reasons = {path: reason for path, each in state["callbacks"].items() if (reason := _refusal(each, path))}
         for path in reasons:
@@ -549,7 +549,7 @@ def _write(file: IO[bytes], kind: str, value: Any) -> None:
 
 
 def _refusal(value: Any, name: str) -> str:
-    """Why a value has no place in a checkpoint, or takes more than half of it; empty if it has one."""
+    """Say why a value has no place in a checkpoint, or takes more than half of it; empty if it has one."""
     tensors: dict[str, torch.Tensor] = {}
     try:
         text = json.dumps(encode(value, name, tensors)).encode()
@@ -579,7 +579,7 @@ def _check_parts(state: Any, path: Path) -> None:
 
 def _own_modules(model: BaseAlgorithm) -> tuple[str, ...]:
     """
-    Whose classes a checkpoint's parameters may name: of the packages that the parts of the model are of. Not whatever
+    Packages whose classes a checkpoint's parameters may name: those that the parts of the model are of. Not whatever
     the program has imported: objects of some classes do harm by being there, or by going away.
     """
     parts = [model, *vars(model).values(), *model.policy.modules()]

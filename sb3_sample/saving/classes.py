@@ -117,8 +117,16 @@ def is_importable(value: Any) -> bool:
     :param value: a class or a function
     :return: whether its path leads to it, in this program: not to what is made inside of a function
     """
-    found: Any = sys.modules.get(value.__module__ or "")
-    return _at(found, value.__qualname__.split(".")) is value
+    return in_program(path_of(value)) is value
+
+
+def in_program(path: str) -> Any:
+    """
+    :param path: what ``path_of`` gave
+    :return: what it leads to in this program, without any import; None if it leads to nothing
+    """
+    module, _, name = path.partition(":")
+    return _at(sys.modules.get(module), name.split("."))
 
 
 def _at(module: Any, names: Sequence[str]) -> Any:

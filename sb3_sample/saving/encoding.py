@@ -69,6 +69,15 @@ class _Plain:
     """A class of whose objects the attributes are all there is."""
 
 
+def bytes_of(tensor: torch.Tensor) -> bytes:
+    """
+    :param tensor: of any kind of number, also of those that NumPy has not
+    :return: its numbers
+    """
+    flat = tensor.detach().cpu().contiguous().reshape(-1)
+    return flat.view(torch.uint8).numpy().tobytes()
+
+
 def encode(value: Any, name: str, tensors: dict[str, torch.Tensor], schedule: bool = False) -> Any:
     """
     A value as a tree of JSON. Tensors on other devices are copied to the CPU, where :func:`decode` leaves them. A value

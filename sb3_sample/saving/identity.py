@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_sample.saving import training_state, vec_envs
 from sb3_sample.saving.checks import library_class
 from sb3_sample.saving.classes import path_of
-from sb3_sample.saving.encoding import GENERATORS, NAMED, Encoder, NotPortable
+from sb3_sample.saving.encoding import GENERATORS, NAMED, Encoder, NotPortable, bytes_of
 from sb3_sample.saving.model_tree import schedule_names
 from sb3_sample.saving.schedules import ScheduleTable
 
@@ -54,7 +54,7 @@ def identity_of(model: BaseAlgorithm, env: VecEnv) -> dict[str, list[str]]:
         digest = sha256(json.dumps(tree, sort_keys=True).encode())
         for key in sorted(tensors):
             digest.update(key.encode())
-            digest.update(tensors[key].cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
+            digest.update(bytes_of(tensors[key]))
         identity[name] = [digest.hexdigest(), _shown(value, name in schedules)]
     return identity
 

@@ -54,6 +54,10 @@ class Lock:
         self.release()
 
 
+def _without_locks(path: Path) -> OSError:
+    return OSError(errno.ENOLCK, "the system or the file system has no locks", str(path))
+
+
 def is_taken(path: Path) -> bool:
     """
     Whether a process has the lock of a file, which is only read: it may be in a folder that cannot be written to.
@@ -71,7 +75,7 @@ def is_taken(path: Path) -> bool:
     finally:
         os.close(descriptor)
     if held is None:
-        raise OSError(errno.ENOLCK, "the system or the file system has no locks", str(path))
+        raise _without_locks(path)
     return not held
 
 
@@ -89,7 +93,7 @@ def take(path: Path) -> Lock | None:
             on_return.callback(os.close, descriptor)
             held = temporary.lock(descriptor)
             if held is None:
-                raise OSError(errno.ENOLCK, "the system or the file system has no locks", str(path))
+                raise _without_locks(path)
             if held is False:
                 return None
             # Whoever removed the file since it was opened would lock another one by its name.

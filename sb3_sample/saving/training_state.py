@@ -29,8 +29,8 @@ from sb3_sample.saving.kept import Kept, declared
 from sb3_sample.version import __version__
 from sb3_sample.warn import warn
 
-#: What Monitor tells of the last episodes. Its texts name tasks and levels ("metaworld/reach-v3"), and never say where
-#: a program writes.
+#: Buffers of what Monitor tells of the last episodes. Their texts name tasks and levels ("metaworld/reach-v3"), and
+#: never say where a program writes.
 _OF_EPISODES = ("ep_info_buffer", "ep_success_buffer")
 #: Arguments that may differ between the parts of a run: where it computes, and what it prints.
 HARMLESS = ("verbose", "device", "tensorboard_log", "compile", "_init_setup_model")

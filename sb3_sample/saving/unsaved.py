@@ -14,7 +14,7 @@ from torch.optim import Optimizer
 
 from sb3_sample.own_classes import names_in
 from sb3_sample.saving.classes import PACKAGES, within
-from sb3_sample.saving.encoding import Encoder, NotPortable
+from sb3_sample.saving.encoding import Encoder, NotPortable, bytes_of
 
 #: Attributes of every torch module.
 _OF_EVERY_MODULE = frozenset(vars(nn.Module()))
@@ -104,7 +104,6 @@ def _digest(value: Any) -> str | None:
         return None
     digest = hashlib.sha256(json.dumps(tree).encode())
     for tensor in tensors.values():
-        flat = tensor.detach().cpu().contiguous().reshape(-1)
         digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
-        digest.update(flat.view(torch.uint8).numpy().tobytes())
+        digest.update(bytes_of(tensor))
     return digest.hexdigest()

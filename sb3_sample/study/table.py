@@ -11,7 +11,7 @@ import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -22,6 +22,7 @@ from sb3_sample.plots import DATA, all_published_curves, find_runs, named_algori
 from sb3_sample.run_logs import EVALUATIONS, OFFLINE, read_evaluations, read_monitors
 from sb3_sample.run_settings import RECORD, RunSettings, plain_id, read_settings
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
+from sb3_sample.study.runs import FORMER, LIST, MAX_LIST, RUNS
 from sb3_sample.warn import warn
 
 COLUMNS = ["agent", "arguments", "task", "seed", "step", "metric", "value"]
@@ -42,14 +43,8 @@ _LOG = "progress.jsonl"
 _SECONDS = "time/time_elapsed"
 #: A line of the log, as far as the time.
 _TIMED = re.compile(rb'\{"step": (\d{1,15}), [^\n]*?"time/time_elapsed": (\d{1,15}(?:\.\d+)?)[,}]')
-#: In the folder of a study: its list of runs, and the folder of them, ``runs/<agent and grid>/<task>/<seed>``.
-_LIST, _RUNS = "study.json", "runs"
-#: In that list: runs that were taken out of the plan, by their names.
-_FORMER = "former"
 #: Bytes of a run's log.
 _MAX_LOG = 256 * 2**20
-#: Bytes of a study's list of runs.
-_MAX_LIST = 2**28
 
 
 class _Rows:
@@ -121,7 +116,7 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
     seen: dict[tuple[Any, ...], Path] = {}
     numbered: dict[tuple[str, str], int] = {}
     training: list[Path] = []
-    named, former = functools.cache(_agents_of_study), functools.cache(_former_of_study)
+    listed = functools.cache(_list_of_study)
     left_out: list[Path] = []
     for source in given:
         label, path = labelled(source)
@@ -131,7 +126,7 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
             continue
         for folder in find_runs(path):
             study = _study_of(folder)
-            if study is not None and "/".join(folder.absolute().parts[-3:]) in former(study):
+            if study is not None and "/".join(folder.absolute().parts[-3:]) in listed(study).former:
                 left_out.append(folder)
                 continue
             run = read_settings(folder)
@@ -140,7 +135,7 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
                     f"{folder} does not say which task it is of: it has no {RECORD}, no args.yml of the zoo, and no "
                     "environment's id in its Monitor files"
                 )
-            agent = label or _agent_of_study(folder, named) or run.agent or folder.resolve().parent.name
+            agent = label or _agent_of_study(folder, study, listed) or run.agent or folder.resolve().parent.name
             seed = run.seed
             if seed is None:
                 seed = numbered.get((agent, run.task), 0)
@@ -178,41 +173,45 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
     return table.reset_index(drop=True)
 
 
-def _agent_of_study(folder: Path, named: Callable[[Path], dict[str, str]]) -> str | None:
+class _List(NamedTuple):
     """
-    :param folder: a run's
-    :param named: gives the agents by the beginning of their folders' names
+    What is read of a study's list of runs.
+
+    :param agents: agents by the beginning of their folders' names
+    :param former: names of runs that were taken out of the plan: they may have been made with other settings
+    """
+
+    agents: dict[str, str]
+    former: set[str]
+
+
+def _agent_of_study(folder: Path, study: Path | None, listed: Callable[[Path], _List]) -> str | None:
+    """
+    :param folder: of a run
+    :param study: that it is in, if it is in one
+    :param listed: reads the list of a study
     :return: the agent's name in the plan; None outside of a study
     """
-    study = _study_of(folder)
-    return None if study is None else named(study).get(folder.absolute().parents[1].name.partition(",")[0])
+    return None if study is None else listed(study).agents.get(folder.absolute().parents[1].name.partition(",")[0])
 
 
 def _study_of(folder: Path) -> Path | None:
-    """The study that a run's folder is in, if it is in one."""
+    """Find the study that a run's folder, ``runs/<agent and grid>/<task>/<seed>``, is in, if it is in one."""
     above = folder.absolute().parents
-    return above[3] if len(above) > 3 and above[2].name == _RUNS and (above[3] / _LIST).is_file() else None
+    return above[3] if len(above) > 3 and above[2].name == RUNS and (above[3] / LIST).is_file() else None
 
 
-def _former_of_study(folder: Path) -> set[str]:
-    """Names of the runs that were taken out of a study's plan: they may have been made with other settings."""
-    path = folder / _LIST
-    found = parse_json(read_regular(path, _MAX_LIST), str(path))
-    former = found.get(_FORMER, {}) if isinstance(found, dict) else {}
-    if not isinstance(former, dict):
-        raise BadFile(f"{path} is no list of a study's runs")
-    return set(former)
-
-
-def _agents_of_study(folder: Path) -> dict[str, str]:
-    path = folder / _LIST
-    found = parse_json(read_regular(path, _MAX_LIST), str(path))
-    runs = found.get("runs") if isinstance(found, dict) else None
-    if not isinstance(runs, list) or not all(
-        isinstance(run, dict) and isinstance(run.get("agent"), str) for run in runs
+def _list_of_study(folder: Path) -> _List:
+    path = folder / LIST
+    found = parse_json(read_regular(path, MAX_LIST), str(path))
+    runs, former = (found.get("runs"), found.get(FORMER, {})) if isinstance(found, dict) else (None, None)
+    if (
+        not isinstance(runs, list)
+        or not all(isinstance(run, dict) and isinstance(run.get("agent"), str) for run in runs)
+        or not isinstance(former, dict)
     ):
         raise BadFile(f"{path} is no list of a study's runs")
-    return {re.sub(r"[^\w.,=+()-]+", "-", run["agent"]): run["agent"] for run in runs}
+    return _List({re.sub(r"[^\w.,=+()-]+", "-", run["agent"]): run["agent"] for run in runs}, set(former))
 
 
 def labelled(source: str | Path) -> tuple[str | None, Path]:

@@ -3,7 +3,8 @@
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from sb3_sample.study.plan import Run
 from sb3_sample.study.reporting.facts import Facts
@@ -97,8 +98,7 @@ def _lost(gathered: Gathered, facts: Facts) -> dict[str, list[str]]:
                 agent
                 for agent, given in heads
                 # With its arguments where these tell agents of one name apart.
-                if (agent == name or agent.startswith(f"{name} ("))
-                and all(given.get(key) == value for key, value in run.grid.items())
+                if (agent == name or agent.startswith(f"{name} (")) and _is_of_grid(run, given)
             }:
                 found[agent] += ends.get((agent, run.task, run.seed), -1) < facts.step
         return +found
@@ -189,6 +189,11 @@ def missing(gathered: Gathered) -> dict[tuple[str, str], list[int]]:
     return found
 
 
+def _is_of_grid(run: Run, given: Mapping[str, Any]) -> bool:
+    """Whether arguments are those of a planned run's place in the grid."""
+    return all(given.get(key) == value for key, value in run.grid.items())
+
+
 def missing_runs(gathered: Gathered) -> list[Run]:
     """
     :param gathered: runs
@@ -201,8 +206,7 @@ def missing_runs(gathered: Gathered) -> list[Run]:
         run
         for run in gathered.planned
         if not any(
-            (agent, task, seed) == (run.agent, run.task, run.seed)
-            and all(given.get(key) == value for key, value in run.grid.items())
+            (agent, task, seed) == (run.agent, run.task, run.seed) and _is_of_grid(run, given)
             for agent, given, task, seed in known
         )
     ]

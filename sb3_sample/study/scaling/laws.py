@@ -139,7 +139,7 @@ class DataLaw(NamedTuple):
         return {name for _, names in self._doubts(replay_ratio) for name in names}
 
     def _doubts(self, replay_ratio: Sequence[float] | np.ndarray) -> list[tuple[str, tuple[str, ...]]]:
-        """What was not determined, in words and by name."""
+        """Doubts in words, each with the names of the parameters concerned."""
         found: list[tuple[str, tuple[str, ...]]] = []
         ratios = _positive(replay_ratio, "replay_ratio")
         if not ALPHA[0] * 1.01 < self.alpha < ALPHA[1] * 0.99:
