@@ -71,7 +71,7 @@ demo: $(VENV)/.demo
 lint: $(VENV)/.all
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy sb3_sample
+	$(BIN)/mypy --num-workers 2 sb3_sample
 	$(BIN)/lint-imports
 
 test: lint

@@ -217,9 +217,9 @@ def test_start_pairs_lie_in_the_first_half_of_a_time_limit() -> None:
     assert {round(callback.measure()["critic_value"]) for _ in range(40)} == {0, 1, 2}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("probability", "gamma", "rollout_length", "n"),
-    [(0.2, 0.9, 40, 1_500), pytest.param(0.02, 0.99, 1_000, 900, marks=pytest.mark.slow)],
+    ("probability", "gamma", "rollout_length", "n"), [(0.2, 0.9, 40, 1_500), (0.02, 0.99, 1_000, 900)]
 )
 def test_episodes_that_end_at_random(probability: float, gamma: float, rollout_length: int, n: int) -> None:
     """

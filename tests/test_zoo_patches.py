@@ -92,6 +92,7 @@ def test_one_file_replaces_what_is_the_zoos() -> None:
     assert set().union(*found.values()) <= OWN
 
 
+@pytest.mark.slow
 def test_register_replaces_what_it_says_and_nothing_else() -> None:
     result = subprocess.run([sys.executable, "-c", PROGRAM], cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr

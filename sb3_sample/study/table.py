@@ -93,8 +93,9 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
     The table of runs: of this package (``--run-dir``), of the zoo, and of folders with Monitor files only.
 
     A run's values are those of its evaluations, the mean over the episodes of each. A run without evaluations has its
-    training episodes instead, a row an episode, at the step at which it ended; a warning says so. ``hours`` is the time
-    that the run had taken, and ``diagnostics/...`` what it has logged of itself.
+    training episodes instead, a row an episode, at the step at which it ended; a warning says so. One of a study whose
+    other runs have evaluations is before its first, and has none of these values. ``hours`` is the time that the run
+    had taken, and ``diagnostics/...`` what it has logged of itself.
 
     :param sources: folders of runs, or folders with runs at any depth, or tables as :func:`write` writes them.
         ``"LABEL=FOLDER"`` names the agent; else it has the name of the study's plan or, outside of a study, of its
@@ -118,13 +119,16 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
     training: list[Path] = []
     listed = functools.cache(_list_of_study)
     left_out: list[Path] = []
+    early: list[Path] = []
     for source in given:
         label, path = labelled(source)
         if path.suffix in (".csv", ".parquet") and path.is_file():
             table = load(path)
             tables.append(table if label is None else table.assign(agent=label))
             continue
-        for folder in find_runs(path):
+        folders = find_runs(path)
+        evaluated = {_study_of(folder) for folder in folders if (folder / EVALUATIONS).exists()}
+        for folder in folders:
             study = _study_of(folder)
             if study is not None and "/".join(folder.absolute().parts[-3:]) in listed(study).former:
                 left_out.append(folder)
@@ -148,15 +152,21 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
                     f"{agent}, {run.task}, seed {seed}. LABEL=FOLDER names one otherwise"
                 )
             seen[key] = folder
+            before_first = False
             if not (folder / EVALUATIONS).exists():
-                training.append(folder)
+                before_first = study is not None and study in evaluated
+                (early if before_first else training).append(folder)
             for metric, (steps, values) in _measured(folder, run, metrics).items():
+                if before_first and metric in _MONITORED:
+                    continue
                 rows.add(agent, arguments, run.task, seed, metric, steps, values)
     if left_out:
         warn(
             f"{len(left_out)} runs ({left_out[0]}, ...) are not in their study's plan any more and are left out; "
             "elsewhere their folders are read as any others"
         )
+    if early:
+        warn(f"{len(early)} runs ({early[0]}, ...) are before their first evaluation and have no return yet")
     if training:
         warn(
             f"{len(training)} runs have no {EVALUATIONS} ({training[0]}, ...): their rows are training episodes, which "

@@ -115,6 +115,7 @@ def test_seeds_beyond_32_bits() -> None:
     np.testing.assert_array_equal(first, second)
 
 
+@pytest.mark.slow
 def test_triton_is_loaded_before_an_opengl(tmp_path: Path) -> None:
     """Their two LLVMs in the other order are a segmentation fault (``select_gl_backend``)."""
     (tmp_path / "triton.py").write_text("import sys\nprint('dm_control' in sys.modules)\n")
@@ -127,6 +128,7 @@ def test_triton_is_loaded_before_an_opengl(tmp_path: Path) -> None:
     assert result.stdout.split() == ["False", "DMCEnv"], result.stderr
 
 
+@pytest.mark.slow
 def test_an_opengl_and_then_an_optimizer() -> None:
     program = (
         "import sb3_sample\n"

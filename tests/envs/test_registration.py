@@ -92,7 +92,8 @@ def test_an_id_given_to_an_algorithm() -> None:
     assert model.ep_success_buffer is not None and len(model.ep_success_buffer) == 1
 
 
-@pytest.mark.parametrize("start_method", ["spawn", pytest.param("forkserver", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("start_method", ["spawn", "forkserver"])
 def test_workers_that_never_imported_the_package(start_method: str) -> None:
     # In a program given by -c a worker cannot import the main module again, as it would a script's.
     code = f"""
@@ -108,6 +109,7 @@ for env_id in ("dmc/acrobot-swingup-v0", "metaworld/reach-v3"):
     assert run(code).splitlines() == ["(2, 6)", "(2, 39)"]
 
 
+@pytest.mark.slow
 def test_workers_play_the_same_episodes() -> None:
     settings: dict = {"vec_env_cls": SubprocVecEnv, "vec_env_kwargs": {"start_method": "spawn"}}
     workers = make_vec_env("dmc/acrobot-swingup-v0", n_envs=1, seed=3, env_kwargs={"action_repeat": 4}, **settings)

@@ -154,7 +154,8 @@ def test_with_an_optimistic_actor_and_diagnostics() -> None:
     assert TINY_BRO["n_quantiles"] == 5
 
 
-@pytest.mark.parametrize("head", ["categorical", pytest.param("hl_gauss", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("head", ["categorical", "hl_gauss"])
 def test_it_learns_the_returns_of_a_chain(head: str) -> None:
     """The toy's value under discount 0.5: the reward is the number of the step, seven in an episode."""
     model = sac(

@@ -14,7 +14,7 @@ from sb3_sample.learner.execution import CapturedActing, Execution, inputs_like
 from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.pessimism import LearnedPessimism
-from tests.sac.common import COMPILES, MAKERS, PIXEL_MAKERS, random_batch, sac, state
+from tests.sac.common import COMPILES, MAKERS, PIXEL_MAKERS, random_batch, sac, sampled, state
 from tests.sac.test_execution import FEW_STEPS, ROUNDING, TOLERANCE, WITHOUT_GRADIENT, Recorder
 
 
@@ -133,10 +133,7 @@ def assert_alike(maker: str, ours: Sequence[Any], theirs: Sequence[Any]) -> None
 
 @pytest.mark.parametrize(
     "maker",
-    [
-        *(name for name in MAKERS if name not in REFUSED),
-        *(pytest.param(name, marks=pytest.mark.slow) for name in PIXEL_MAKERS),
-    ],
+    [*sampled(name for name in MAKERS if name not in REFUSED), *sampled(PIXEL_MAKERS, ())],
 )
 def test_each_is_what_it_is_alone(maker: str) -> None:
     alone, others = models_of(maker, 3), models_of(maker, 3)
@@ -154,7 +151,7 @@ def test_each_is_what_it_is_alone(maker: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["eager", "captured"])
-@pytest.mark.parametrize("maker", [name for name in MAKERS if name not in (*REFUSED, "OAC")])
+@pytest.mark.parametrize("maker", sampled(name for name in MAKERS if name not in (*REFUSED, "OAC")))
 def test_actions_are_those_of_each(maker: str, how: str) -> None:
     models = models_of(maker, 3)
     learners = [model.learner for model in models]

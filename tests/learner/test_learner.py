@@ -279,6 +279,7 @@ def test_compiled() -> None:
     assert max((a - b).abs().max().item() for a, b in pairs) < 1e-4 and compiled.seconds_compiling > 0
 
 
+@pytest.mark.slow
 def test_the_example_runs(tmp_path: Path) -> None:
     """With fewer steps; at most fifteen lines, without the docstring and blank ones."""
     text = (Path(__file__).parents[2] / "examples" / "offline_bro.py").read_text()

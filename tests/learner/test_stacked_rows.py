@@ -134,7 +134,7 @@ def test_rows_that_know_nothing_of_each_other() -> None:
 
 # ReDo recycles in a network that lists its hidden units.
 @pytest.mark.parametrize(("cls", "redo_period"), [(CrossQ, None), (WithTargets, None), (Stacked, 7)])
-@pytest.mark.parametrize("pessimism", ["gpl", 1.0])
+@pytest.mark.parametrize("pessimism", ["gpl", pytest.param(1.0, marks=pytest.mark.slow)])
 def test_trains_saves_and_resumes(cls: Any, redo_period: int | None, pessimism: Any, tmp_path: Path) -> None:
     def make() -> Any:
         return crossq(cls, pessimism=pessimism, resets=40, redo_period=redo_period, sam_radius=0.05)

@@ -1,7 +1,7 @@
 """Tiny environments and models that the tests of the off-policy family share."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 import gymnasium as gym
@@ -264,6 +264,11 @@ PIXEL_MAKERS: dict[str, Callable[..., Any]] = {
 }
 #: One of each kind of part, for the slower tests.
 REPRESENTATIVE = ["SAC", "BRO", "BROTD3", "DAC", "VPLSAC", "OPLSAC", "TOPSAC", "RegularizedSAC", "DebiasedRQ"]
+
+
+def sampled(names: Iterable[str], sample: Collection[str] = REPRESENTATIVE) -> list[Any]:
+    """Parameters of a test that all pass in the long tests, and a sample of them in the short ones."""
+    return [name if name in sample else pytest.param(name, marks=pytest.mark.slow) for name in names]
 
 
 def state(model: SAC) -> dict[str, torch.Tensor]:

@@ -164,7 +164,7 @@ def test_named_transitions(as_dict: bool) -> None:
 
 
 @pytest.mark.parametrize("as_dict", [False, True])
-@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("n_envs", [1, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("normalize", [False, True])
 def test_trains_as_with_stable_baselines3s_buffer(as_dict: bool, n_envs: int, normalize: bool) -> None:
     """Bit by bit, over the ring's seam and a second ``learn``, which breaks an episode off."""

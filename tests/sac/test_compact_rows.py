@@ -52,7 +52,7 @@ def test_state(space: str, rows: int, n_envs: int, share: float) -> None:
 
 
 @CASES
-@pytest.mark.parametrize("longest", [1, 4, 30])
+@pytest.mark.parametrize("longest", [pytest.param(1, marks=pytest.mark.slow), 4, 30])
 def test_appended_pieces(space: str, rows: int, n_envs: int, share: float, longest: int) -> None:
     """Only what is new is taken each time; the pieces that reach back far enough are the buffer."""
     buffer, other = split_pair(SPACES[space], rows, n_envs, share)

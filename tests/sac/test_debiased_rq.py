@@ -320,6 +320,7 @@ def test_arguments_at_loading(tmp_path: Path) -> None:
         {"policy_kwargs": {**TINY_DR_Q["policy_kwargs"], "n_critics": 3}},
     ],
 )
+@pytest.mark.slow
 def test_parts_of_the_family(kwargs: dict[str, Any]) -> None:
     model = dr_q(**kwargs).learn(50)
     assert model._n_updates > 30 and all(torch.isfinite(p).all() for p in model.policy.parameters())

@@ -33,7 +33,7 @@ from sb3_sample.srspr.networks import SPRNetwork
 from sb3_sample.srspr.policies import SPRPolicy
 from sb3_sample.training import compiling
 from tests.agents import OFF_POLICY, env_of
-from tests.sac.common import COMPILES, PIXEL_MAKERS, Toy, bro, differing, sac, state, vec
+from tests.sac.common import COMPILES, PIXEL_MAKERS, Toy, bro, differing, sac, sampled, state, vec
 from tests.srspr.common import TINY
 
 #: Largest difference of a parameter after 50 updates, each of which moves it by up to 3e-4. The same arithmetic in
@@ -149,11 +149,10 @@ def updates(model: Any, n: int, seed: int = 0, each: Callable[[int], None] = lam
         model.train(1, 8)
 
 
-# BRO's compiled step is a fast test of test_golden.py; test_drq.py has those from pixels, with a tolerance for their
-# convolutions.
-@pytest.mark.slow
+# test_golden.py has the published files' steps compiled, test_drq.py those from pixels, with a tolerance for their
+# convolutions. DAC's, with two actors, is the one that the short tests compile.
 @COMPILES
-@pytest.mark.parametrize("maker", [name for name in OFF_POLICY if name not in PIXEL_MAKERS])
+@pytest.mark.parametrize("maker", sampled((name for name in OFF_POLICY if name not in PIXEL_MAKERS), ("DAC",)))
 def test_compiled_is_eager(maker: str) -> None:
     model, compiled = pair(maker, compile=True)
     n = FEW_STEPS.get(maker, 50)
@@ -167,7 +166,7 @@ def test_compiled_is_eager(maker: str) -> None:
         assert compiled._metrics[name].item() == pytest.approx(value.item(), rel=1e-2, abs=1e-3), name
 
 
-@pytest.mark.parametrize("maker", OFF_POLICY)
+@pytest.mark.parametrize("maker", sampled(OFF_POLICY))
 def test_captured_is_eager(maker: str) -> None:
     model, other = pair(maker)
     recorder = captured(other)
@@ -321,6 +320,7 @@ def test_moments_are_found_in_any_order_of_the_file() -> None:
     assert largest_difference(model, compiled) < TOLERANCE
 
 
+@pytest.mark.slow
 def test_diagnostics_do_not_have_steps_captured_anew() -> None:
     model = sac(compile=False, learning_starts=10)
     recorder = captured(model)
@@ -585,6 +585,7 @@ class OwnSPRPolicy(SPRPolicy):
 
 
 @COMPILES
+@pytest.mark.slow
 def test_says_how_long_it_takes(capsys: pytest.CaptureFixture[str]) -> None:
     model = sac(compile=True, verbose=1)
     model.learn(30)
@@ -593,10 +594,9 @@ def test_says_how_long_it_takes(capsys: pytest.CaptureFixture[str]) -> None:
     assert out.count("Compiled in") == 1
 
 
+@pytest.mark.slow
 @COMPILES
-@pytest.mark.parametrize(
-    "replay_ratio", [pytest.param(0.5, marks=pytest.mark.slow), 1, pytest.param(3, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("replay_ratio", [0.5, 1, 3])
 def test_diagnostics_find_gradients_of_a_compiled_model(replay_ratio: float) -> None:
     model = sac(compile=True, learning_starts=10, replay_ratio=replay_ratio)
     callback = DiagnosticsCallback(Toy(), every=20)

@@ -946,10 +946,6 @@ def test_files_are_there() -> None:
     assert all(path.stem.startswith("dr_q_") for path in others)  # test_golden_dr_q.py has them
 
 
-#: Compiled here in the short tests too; the other files in the long ones.
-COMPILED_IN_SHORT = {"bro_quantile_public"}
-
-
 @pytest.mark.parametrize(
     ("path", "execution"),
     [
@@ -957,14 +953,12 @@ COMPILED_IN_SHORT = {"bro_quantile_public"}
             path,
             execution,
             id=f"{path.stem}-{execution}",
-            marks=[]
-            if execution != "compiled"
-            else [COMPILES]
-            if path.stem in COMPILED_IN_SHORT
-            else [COMPILES, pytest.mark.slow],
+            marks=[COMPILES, pytest.mark.slow] if execution == "compiled" else [],
         )
         for path in FILES
         for execution in EXECUTIONS
+        # Compiled, a file of the initial values as they are is the public one's step.
+        if (execution, path.stem.partition("_rawinit")[1]) != ("compiled", "_rawinit")
     ],
 )
 def test_golden(path: Path, execution: str) -> None:

@@ -14,7 +14,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_sample import DiagnosticsCallback
 from sb3_sample.replay.buffers import DeviceReplayBuffer
-from tests.sac.common import MAKERS, Toy, sac, vec
+from tests.sac.common import MAKERS, Toy, sac, sampled, vec
 
 WIDE = spaces.Box(np.array([-10, 0]), np.array([10, 3]), dtype=np.int64)
 BYTES = spaces.Box(np.array([-128, 0]), np.array([127, 100]), dtype=np.int8)
@@ -43,7 +43,7 @@ def check(model: Any, space: spaces.Box) -> None:
     assert all(np.isfinite(value.item()) for value in model._metrics.values()) and model._metrics
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", sampled(MAKERS))
 def test_every_agent_trains(maker: str, tmp_path: Path) -> None:
     model = MAKERS[maker](vec(2, action_space=WIDE), learning_starts=20).learn(60)
     check(model, WIDE)

@@ -729,7 +729,7 @@ def random_numbers() -> Callable[[], None]:
 
 
 @pytest.mark.parametrize("name", RULES)
-@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("n_envs", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_loaded_in_the_middle_of_an_episode_it_goes_on_as_if_uninterrupted(
     name: str, n_envs: int, tmp_path: Path
 ) -> None:

@@ -11,7 +11,7 @@ from sb3_sample import BRO, BROTD3, DAC, SRSAC, BROFast
 from sb3_sample.learner.plasticity import Resets
 from sb3_sample.networks.batch_norm import running_moments
 from sb3_sample.sac.bro import BRO_FAST_RESETS, BRO_RESETS
-from tests.sac.common import MAKERS, bro, random_batch, sac, vec
+from tests.sac.common import MAKERS, bro, random_batch, sac, sampled, vec
 
 
 class Recorder:
@@ -291,7 +291,7 @@ class UpdateRecorder:
         (1, {"replay_ratio": 4}, 240),
         (1, {"replay_ratio": 0.5}, 30),
         # 80 gradient steps at once are more than are drawn at once.
-        (4, {"replay_ratio": 20}, 1_280),
+        pytest.param(4, {"replay_ratio": 20}, 1_280, marks=pytest.mark.slow),
         (1, {"train_freq": (1, "episode"), "gradient_steps": -1}, 63),
     ],
 )
@@ -314,7 +314,7 @@ def test_a_training_does_not_end_with_networks_that_have_learned_nothing() -> No
     assert recorder.after == [20, 40]
 
 
-@pytest.mark.parametrize("maker", list(MAKERS))
+@pytest.mark.parametrize("maker", sampled(MAKERS))
 def test_every_algorithm_takes_resets_by_gradient_steps(maker: str) -> None:
     """They replace the resets that a class has of its own; tiny ones of the makers are taken back."""
     model = MAKERS[maker](reset_gradient_steps=15, resets=(), replay_ratio=1)

@@ -18,7 +18,7 @@ from sb3_sample.sac import SAC, BROFast
 from sb3_sample.sac.policies import SACPolicy
 from sb3_sample.saving import container
 from tests.agents import OFF_POLICY, env_of, seen_by
-from tests.sac.common import MAKERS, REPRESENTATIVE, bro, differing, sac, state, vec
+from tests.sac.common import MAKERS, REPRESENTATIVE, bro, differing, sac, sampled, state, vec
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(16, 3)).astype(np.float32)
 
@@ -40,7 +40,7 @@ def continue_training(maker: str, model: Any, n: int = 25) -> Any:
 
 
 @pytest.mark.parametrize("maker", OFF_POLICY)
-@pytest.mark.parametrize("trained", [True, False])
+@pytest.mark.parametrize("trained", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_save_load_gives_the_same_model(maker: str, trained: bool, tmp_path: Path) -> None:
     model = OFF_POLICY[maker](**resetting(maker, 18))
     if trained:
@@ -59,7 +59,7 @@ def test_save_load_gives_the_same_model(maker: str, trained: bool, tmp_path: Pat
         np.testing.assert_array_equal(loaded.predict(seen_by(model), deterministic=deterministic)[0], ours)
 
 
-@pytest.mark.parametrize("maker", OFF_POLICY)
+@pytest.mark.parametrize("maker", sampled(OFF_POLICY))
 def test_loaded_model_trains_on_identically(maker: str, tmp_path: Path) -> None:
     interval = {} if maker == "SRSPR" else {"target_update_interval": 2}
     model = OFF_POLICY[maker](**resetting(maker, 18, 50), replay_ratio=1.5, **interval).learn(30)
@@ -309,7 +309,7 @@ def test_replay_buffer(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-@pytest.mark.parametrize("maker", REPRESENTATIVE)
+@pytest.mark.parametrize("maker", sampled(REPRESENTATIVE, ("SAC", "BRO", "VPLSAC", "RegularizedSAC")))
 def test_seeds(maker: str, n_envs: int) -> None:
     first, same, different = (MAKERS[maker](vec(n_envs), seed=s, resets=(20,)).learn(36) for s in (4, 4, 5))
     assert not differing(state(first), state(same))

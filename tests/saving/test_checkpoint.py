@@ -1112,7 +1112,7 @@ class Prices(gym.Wrapper):
         return self.env.step(action)
 
 
-@pytest.mark.parametrize("kind", ["on disk", "many"])
+@pytest.mark.parametrize("kind", ["on disk", pytest.param("many", marks=pytest.mark.slow)])
 def test_a_checkpoint_without_the_episodes_is_better_than_none(kind: str, tmp_path: Path) -> None:
     def learn(steps: int) -> Any:
         env = DummyVecEnv([lambda: Monitor(Prices(gym.make("Pendulum-v1"), tmp_path, kind))])
@@ -1138,6 +1138,7 @@ class Log(BaseCallback):
         return True
 
 
+@pytest.mark.slow
 def test_a_checkpoint_without_a_callbacks_state_is_better_than_none(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="does not hold the state of callback: callback takes"):
         sac().learn(40, callback=Log(), checkpoint=tmp_path / "run", **STEPS)

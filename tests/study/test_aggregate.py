@@ -328,6 +328,7 @@ def test_p_of_improvement_by_hand() -> None:
     assert found["p"].iloc[0] == pytest.approx(2 / 18)
 
 
+@pytest.mark.slow
 def test_two_seeds_of_equal_agents_are_seldom_told_apart() -> None:
     """The interval alone tells them apart in more than a tenth of the cases, with p in a twentieth at most."""
     rng = np.random.default_rng(0)

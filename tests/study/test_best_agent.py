@@ -20,6 +20,7 @@ from sb3_sample.learner.exploration import OptimisticShift
 from sb3_sample.study import Plan, PlanError, Run, read_plan
 from sb3_sample.study.plan import constructor_value
 from sb3_sample.zoo import ALGORITHMS
+from tests.sac.common import sampled
 
 ROOT = Path(__file__).parents[2]
 EVIDENCE = ROOT / "studies" / "evidence"
@@ -99,14 +100,7 @@ def test_arithmetic_is_bros_as_the_head_says(name: str, screening: dict[str, Run
     assert each * ratio == pytest.approx(1.92, rel=0.06)
 
 
-#: As the others but for their sizes, or trained elsewhere too.
-SLOW = ("BRO", "SimbaV2 optimistic RR10", "XQC optimistic RR10")
-
-
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in names("best_agent")],
-)
+@pytest.mark.parametrize("name", sampled(names("best_agent"), ("SimbaV2 optimistic faded", "DR.Q narrow")))
 def test_candidates_train(name: str, screening: dict[str, Run]) -> None:
     run = screening[name]
     arguments = {key: constructor_value(key, value) for key, value in run.arguments.items()}

@@ -108,6 +108,7 @@ class Shrinking(schedule.Processes):
         return 1 if made.exists() and "end" in made.read_text() else 3
 
 
+@pytest.mark.slow
 def test_fewer_runs_at_once_when_there_is_less_room(tmp_path: Path) -> None:
     plan, folder = nothing.plan(8, sleep=0.3), StudyFolder(tmp_path)
     folder.enter(plan)

@@ -71,6 +71,7 @@ def test_agents_are_measured_on_the_data_that_they_have(tmp_path: Path, monkeypa
     assert module.seconds_of_learning(dataclasses.replace(timed, data={}), times) == 1.0
 
 
+@pytest.mark.slow
 def test_what_cannot_be_measured_is_an_error(tmp_path: Path) -> None:
     run = Run("A", "sac_sample", {}, {}, "CartPole-v1", 0, 30_000)
     with pytest.raises(RuntimeError, match="A on CartPole-v1, seed 0 cannot be measured: .*Discrete") as caught:

@@ -433,6 +433,9 @@ def test_from_a_table_to_settings(tmp_path: Path) -> None:
         assert any("replay ratio is that of all tasks" in limit for limit in found.limits) == (task is not None)
     with pytest.raises(ValueError, match="task must be one of the laws', .*, not 'typo'"):
         again.predict(budget=5e15, task="typo")
+    levels = [dataclasses.replace(again.levels[0], left_out=["dmc/dog-run-v0"]), *again.levels[1:]]
+    limits = dataclasses.replace(again, levels=levels).predict(budget=5e15).limits
+    assert any(re.fullmatch(r"level \d+: without dmc/dog-run-v0, which do not reach it", limit) for limit in limits)
     for asked, words in (
         ({}, "exactly one"), ({"data": 1e5, "compute": 1e15}, "exactly one"), ({"budget": -1.0}, "budget must be"),
         ({"replay_ratio": 100.0}, "warrant 0.25 to 32"), ({"data": 10.0}, "steps must be above"),

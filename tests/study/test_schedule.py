@@ -70,6 +70,7 @@ def test_a_run_that_fails_is_tried_again_and_named_and_the_others_go_on(tmp_path
     assert run(plan, tmp_path, retries=0).counts["done"] == 4
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_is_replaced(tmp_path: Path) -> None:
     plan = Plan("mixed", (*nothing.plan(1, die=2).runs, *nothing.plan(3).runs[1:]))
     found = run(plan, tmp_path, retries=1)
@@ -95,6 +96,7 @@ def test_two_schedulers_on_one_folder_share_the_runs(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_claimed_run_is_waited_for_and_taken_when_its_process_is_gone(tmp_path: Path, monkeypatch) -> None:
     from sb3_sample.study import schedule
 

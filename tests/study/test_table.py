@@ -142,6 +142,23 @@ def test_seeds_that_no_file_says_are_numbers_of_the_runs(tmp_path: Path) -> None
     assert list(table["value"][::3]) == [1.0, 2.0, 10.0] and list(table["seed"][::3]) == [0, 1, 2]
 
 
+def test_a_run_of_a_study_before_its_first_evaluation_has_no_return(tmp_path: Path) -> None:
+    first, second = (tmp_path / "study" / "runs" / "BRO" / "dmc-cheetah-run-v0" / seed for seed in "01")
+    write_run(first)
+    write_run(second, seed=1, log=[{"step": 500, "diagnostics/x": 1}])
+    (second / "evaluations.npz").unlink()
+    (tmp_path / "study" / "study.json").write_text(json.dumps({"name": "x", "runs": [{"agent": "BRO"}]}))
+    with pytest.warns(UserWarning, match="1 runs .* are before their first evaluation and have no return yet"):
+        table = study.read(tmp_path / "study", ["return", "episode_length", "online_return", "diagnostics/*"])
+    assert set(table.loc[table["seed"] == 0, "metric"]) == {"return", "online_return"}
+    assert set(table.loc[table["seed"] == 1, "metric"]) == {"online_return", "diagnostics/x"}
+    # Of a study without any evaluation the training episodes are what there is.
+    (first / "evaluations.npz").unlink()
+    with pytest.warns(UserWarning, match="2 runs have no evaluations.npz .*training episodes"):
+        table = study.read(tmp_path / "study", ["return"])
+    assert set(table["seed"]) == {0, 1}
+
+
 def test_agents_of_a_study_have_the_names_of_its_plan(tmp_path: Path) -> None:
     folder = tmp_path / "study" / "runs" / "BRO-Fast,replay_ratio=2" / "dmc-cheetah-run-v0"
     write_run(folder / "0", algo="bro_fast", seed=0)

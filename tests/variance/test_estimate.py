@@ -69,6 +69,7 @@ def test_intervals_cover_the_exact_values(kwargs: dict[str, Any], of_exact: dict
     assert result.n_parameters == 8
 
 
+@pytest.mark.slow
 def test_intervals_are_narrow_enough_to_say_something() -> None:
     result, truth = estimate(0, 200), exact()
     for name in ("policy variance", "gain of steps", "margin"):

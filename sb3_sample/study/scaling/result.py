@@ -365,6 +365,10 @@ class Laws:
         limits = self._limits(ratio, task)
         if task is not None:
             limits.append("the replay ratio is that of all tasks together: a budget's law is not of one task")
+        for level in self.levels:
+            limits += [f"level {level.level:g}: {doubt}" for doubt in level.law().doubts(self.replay_ratios)]
+            if level.left_out:
+                limits.append(f"level {level.level:g}: without {', '.join(level.left_out)}, which do not reach it")
         inside = table["budget"].min() <= budget <= table["budget"].max()
         if not inside:
             limits.append(
