@@ -171,11 +171,13 @@ class Watch:
 
     @contextlib.contextmanager
     def watching(self) -> Iterator[None]:
+        # What is imported for the first time is not compiled to a file.
+        writes, sys.dont_write_bytecode = sys.dont_write_bytecode, True
         self.seen, self.modules, self.on = [], set(), True
         try:
             yield
         finally:
-            self.on = False
+            self.on, sys.dont_write_bytecode = False, writes
 
 
 @cache
