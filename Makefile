@@ -103,7 +103,9 @@ demo-imports: setup.cfg $(LOCK)
 	.venv-demo/bin/python examples/demo.py --help > /dev/null
 	rm -rf .venv-demo
 
+# With Ray too, which [all] leaves out.
 test-all: lint demo-imports
+	$(PIP) -e ".[cluster]"
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -n 2 --durations=60
 
 WORKERS ?= 1
