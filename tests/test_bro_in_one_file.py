@@ -288,6 +288,7 @@ def test_resets_and_replay_ratio(n_steps: int, monkeypatch: pytest.MonkeyPatch) 
     assert sum(a.critic_optimizer.n_steps for a in made) == model._n_updates
 
 
+@pytest.mark.slow
 def test_equal_seeds_are_equal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(one_file, "evaluate", functools.partial(one_file.evaluate, n_episodes=2))
     runs = [run(250, seed, learning_starts=150, resets=(200,)) for seed in (0, 0, 1)]

@@ -107,6 +107,7 @@ def test_train_shows_the_options_of_the_zoo(zoo_run, capsys: pytest.CaptureFixtu
     assert "bro_fast" in output
 
 
+@pytest.mark.slow
 def test_train_continue_enjoy_and_plot_an_id_with_a_slash(zoo_run, capsys: pytest.CaptureFixture[str]) -> None:
     folder = Path("logs/bro") / f"{NAME}_1"
     zoo_run(

@@ -108,6 +108,7 @@ def test_wrong_arguments(kwargs: dict[str, Any], words: str) -> None:
         gym.make("dmc/cartpole-swingup-v0", **kwargs)
 
 
+@pytest.mark.slow
 def test_wrong_pictures(opengl: None) -> None:
     with pytest.raises(ValueError, match="camera=17"):
         make(camera=17)

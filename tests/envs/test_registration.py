@@ -55,6 +55,7 @@ def test_importing_the_package_imports_no_library() -> None:
     assert run(print_imported).strip() == "[]"
 
 
+@pytest.mark.slow
 def test_the_module_prefix_needs_no_import() -> None:
     code = "import gymnasium as gym; print(gym.make('sb3_sample:dmc/acrobot-swingup-v0').spec.id)"
     assert run(code).strip() == "dmc/acrobot-swingup-v0"

@@ -129,7 +129,9 @@ def test_in_batches(cls: Any) -> None:
     assert samples_as_its_class(model.replay_buffer)
 
 
-@pytest.mark.parametrize("cls", [TaskReplay, HeldOutTaskReplay, DeviceTaskReplay])
+@pytest.mark.parametrize(
+    "cls", [TaskReplay, *(pytest.param(cls, marks=pytest.mark.slow) for cls in (HeldOutTaskReplay, DeviceTaskReplay))]
+)
 def test_in_files_and_checkpoints(cls: Any, tmp_path: Path) -> None:
     kwargs: Any = {"validation_proportion": 0.3} if cls is HeldOutTaskReplay else {}
     model = make(cls, **kwargs).learn(160, checkpoint=tmp_path / "a", checkpoint_freq=50)

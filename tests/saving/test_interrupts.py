@@ -106,7 +106,7 @@ def speak(folder: Path, number: int) -> None:
     os._exit(0)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_a_line_says_where_the_run_was_saved(number: int, tmp_path: Path) -> None:
     run(tmp_path, number, target=speak)
     *_, last = (tmp_path / "said").read_text().splitlines()

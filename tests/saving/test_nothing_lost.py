@@ -699,6 +699,7 @@ def test_a_subclass_that_has_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 NEEDED = {"policy_class": "policy=", "observation_space": "env=", "action_space": "env="}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("maker", EACH)
 def test_any_attribute_can_be_left_out(maker: str, tmp_path: Path) -> None:
     """With the default in its place, or, where there is none, what to pass instead."""

@@ -69,7 +69,7 @@ def learn(folder: Path, steps: int) -> Any:
 @pytest.mark.parametrize(
     ("calls", "code"),
     [
-        pytest.param(calls, code, marks=[] if code == errno.EIO or calls == CALLS else pytest.mark.slow)
+        pytest.param(calls, code, marks=[] if calls == CALLS else pytest.mark.slow)
         for calls in (*((call,) for call in CALLS), CALLS)
         for code in CODES
     ],

@@ -90,6 +90,7 @@ def test_what_goes_into_the_final_is_as_it_was_screened(screening: dict[str, Run
         assert (run.algo, run.arguments) == (screening[name].algo, screening[name].arguments)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", names("best_agent"))
 def test_arithmetic_is_bros_as_the_head_says(name: str, screening: dict[str, Run], gflop) -> None:
     each, ratio = gflop(screening[name].algo, screening[name].arguments)

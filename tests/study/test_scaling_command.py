@@ -102,6 +102,7 @@ def measured(table: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_the_figures(measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("matplotlib")
     cli.main(["scaling", "plot", f"BRO={measured}", *LEVELS, "-o", str(tmp_path / "figures")])
@@ -265,6 +266,7 @@ def test_the_reports_figure_has_laws_and_points(table: Path) -> None:
     assert report_figures.png(figure).startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_a_plan_is_one_that_study_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("rl_zoo3")
     path = tmp_path / "sweep.yml"
