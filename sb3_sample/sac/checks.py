@@ -140,11 +140,31 @@ def check_offline(agent: Any) -> None:
     :param agent: the algorithm
     :raises ValueError: if it asks for steps of an environment
     """
+    _check_statistics(agent.get_vec_normalize_env())
     scaler = agent.learner.reward_scaler
     if scaler is not None and scaler.needs_steps:
         raise ValueError(
             f"reward_scale={agent.reward_scale!r} divides by a measure of returns in an environment, and learn_offline "
             "takes no steps there: pass reward_scale=None, or 'linear' for rewards of a size that suits the critics"
+        )
+
+
+def _check_statistics(normalize: Any) -> None:
+    """Whether a ``VecNormalize``, if any, has statistics to normalise a data set by."""
+    if normalize is None:
+        return
+    counts = []
+    if normalize.norm_obs:
+        of_parts = normalize.obs_rms.values() if isinstance(normalize.obs_rms, dict) else [normalize.obs_rms]
+        # A reset has given one observation of each environment.
+        counts += [of_part.count - normalize.num_envs for of_part in of_parts]
+    if normalize.norm_reward:
+        counts.append(normalize.ret_rms.count)
+    if any(count < 1 for count in counts):
+        raise ValueError(
+            "env: VecNormalize has no statistics yet, and learn_offline takes no steps that would give it some: load "
+            "saved ones (load_vec_normalize), or pass normalize_observations=True and a reward_scale of 'linear' in "
+            "its place"
         )
 
 

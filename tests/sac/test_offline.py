@@ -556,6 +556,24 @@ def test_normalisation_is_that_of_the_environment() -> None:
     assert not torch.equal(batch.observations, raw.observations)
 
 
+@pytest.mark.parametrize("kwargs", [{"norm_reward": False}, {"norm_obs": False}])
+def test_a_normalisation_without_statistics_is_refused(kwargs: dict[str, Any]) -> None:
+    """It would clip the numbers as they are."""
+    venv = VecNormalize(vec(), gamma=0.9, **kwargs)
+    venv.reset()
+    model = offline(SAC, venv)
+    with pytest.raises(ValueError, match="VecNormalize has no statistics yet, .* load saved ones"):
+        model.learn_offline(data(), 1)
+    venv.training = False
+    for _ in range(2):
+        with pytest.raises(ValueError, match="VecNormalize has no statistics yet"):
+            model.learn_offline(data(), 1)
+        venv.step(np.zeros((1, 2)))
+    venv.training = True
+    venv.step(np.zeros((1, 2)))
+    assert model.learn_offline(data(), 1)._n_updates == 1
+
+
 def test_transitions_held_out_are_never_trained_on() -> None:
     transitions = data()
     model = offline(VPLSAC, vec(), validation_proportion=0.25)
