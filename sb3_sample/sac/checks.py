@@ -138,8 +138,13 @@ def check_offline(agent: Any) -> None:
     Check that an algorithm can learn from a data set alone.
 
     :param agent: the algorithm
-    :raises ValueError: if it asks for steps of an environment
+    :raises ValueError: if it asks for steps of an environment, or for returns of several steps
     """
+    if agent.n_steps > 1:
+        raise ValueError(
+            f"n_steps={agent.n_steps} asks for returns of several steps, and a data set has transitions of one: pass "
+            "n_steps=1"
+        )
     _check_statistics(agent.get_vec_normalize_env())
     scaler = agent.learner.reward_scaler
     if scaler is not None and scaler.needs_steps:

@@ -452,6 +452,11 @@ def test_a_range_of_returns_needs_data() -> None:
         offline(IQL, vec(), **kwargs).learn_offline(same, 1)
 
 
+def test_returns_of_several_steps_are_refused() -> None:
+    with pytest.raises(ValueError, match="n_steps=3 asks for returns of several steps, .*: pass n_steps=1"):
+        sac(n_steps=3).learn_offline(data(), 1)
+
+
 def test_an_agent_that_learns_from_windows_is_refused() -> None:
     with pytest.raises(ValueError, match="learn_offline: DebiasedRQ learns from windows of several steps"):
         MAKERS["DebiasedRQ"]().learn_offline(data(), 1)
