@@ -12,8 +12,16 @@ from gymnasium import spaces
 from sb3_sample.learner.batch import Batch, for_each
 from sb3_sample.replay.columns import samples_at
 from sb3_sample.replay.dataset_files import opened_hdf5, read_minari, write_minari
-from sb3_sample.replay.memory_map import check_folder, zeros
-from sb3_sample.replay.steps import CHUNK, Steps, check_action_space, check_actions, put, stored_dtype
+from sb3_sample.replay.memory_map import check_folder, n_bytes, zeros
+from sb3_sample.replay.steps import (
+    CHUNK,
+    Steps,
+    action_dtype,
+    check_action_space,
+    check_actions,
+    observation_dtypes,
+    put,
+)
 from sb3_sample.warn import warn
 
 Arrays = np.ndarray | dict[str, np.ndarray]
@@ -24,7 +32,7 @@ class Dataset:
     Fixed set of transitions, from which batches are drawn uniformly with replacement. It is made by one of the
     functions ``from_...``.
 
-    :param steps: the steps, floats of observations and rewards as float32, integers as they are
+    :param steps: the steps, in the types of their spaces, floats of observations and rewards as float32
     :param observation_space: of the observations
     :param action_space: of the actions as an environment takes them
     :param seed: of the generator that :meth:`sample` draws from
@@ -74,6 +82,8 @@ class Dataset:
         Without ``next_observations`` a step's next observation is the following step's. A truncated step, and the
         last one, have none then and are left out with a warning, unless the episode terminated there.
 
+        Observations and actions are held in the types of their spaces, floats of observations as float32.
+
         :param observations: (N, O), or a dict of such arrays; NumPy's, ``numpy.memmap`` included, or h5py's data sets
         :param actions: (N, A), in the environment's units, within the bounds of ``action_space``
         :param rewards: (N,)
@@ -87,7 +97,8 @@ class Dataset:
         :param memory_map: folder whose disk holds the observations and actions, if they are larger than the memory; the
             files are unnamed and vanish with the data set. None: memory
         :return: the data set
-        :raises ValueError: if the arrays are not of one length, not of the spaces, or not finite
+        :raises ValueError: if the arrays are not of one length, not of the spaces, or not finite, or a space of
+            integers has not their numbers
         """
         observations, actions = _arrays("observations", observations, 2), _arrays("actions", actions, 1)
         if len(actions.shape) < 2:
@@ -116,18 +127,25 @@ class Dataset:
         _check_shapes("observations", observation_space, observations)
         for name, value in given.items():
             _check_shapes(name, observation_space, value)
-        folder = _folder(memory_map, [*_parts(observations), *_parts(given.get("next_observations", {})), actions])
+        of_observations, of_actions = observation_dtypes(observation_space), action_dtype(action_space)
+        held = [(values, of_observations) for values in (observations, *given.values())]
+        folder = _folder(memory_map, [*held, (actions, of_actions)])
         terminated, truncated = flags["terminations"] == 1, flags["truncations"] == 1
         steps = Steps(
-            _copied("observations", observations, folder),
+            _copied("observations", observations, of_observations, folder),
             np.arange(n),
             None,
-            _copied("next_observations", given["next_observations"], folder) if given else None,
-            _copied("actions", actions, folder, keep_floats=True),
+            _copied("next_observations", given["next_observations"], of_observations, folder) if given else None,
+            _copied("actions", actions, of_actions, folder),
             rewards,
             terminated,
             truncated,
-            {name: _copied(f"columns[{name!r}]", values, None) for name, values in more.items()},
+            {
+                name: _copied(
+                    f"columns[{name!r}]", values, np.float32 if values.dtype.kind == "f" else values.dtype, None
+                )
+                for name, values in more.items()
+            },
         )
         check_actions(steps.actions, action_space)
         n_left_out = 0
@@ -410,19 +428,25 @@ def _arrays(name: str, values: Any, least_axes: int) -> Any:
     return array
 
 
-def _copied(name: str, values: Any, folder: str | None, keep_floats: bool = False) -> Any:
+def _copied(name: str, values: Any, dtype: Any, folder: str | None) -> Any:
     if isinstance(values, dict):
-        return {key: _copied(f"{name}[{key!r}]", value, folder, keep_floats) for key, value in values.items()}
-    out = zeros(folder, values.shape, stored_dtype(values.dtype, keep_floats))
+        return {key: _copied(f"{name}[{key!r}]", value, dtype[key], folder) for key, value in values.items()}
+    out = zeros(folder, values.shape, dtype)
     put(name, values, out)
     return out
 
 
-def _folder(memory_map: Any, arrays: list[Any]) -> str | None:
+def _folder(memory_map: Any, held: list[tuple[Any, Any]]) -> str | None:
+    """The folder, if there is room for arrays that are held in a type each, both by the keys of a dict."""
     if memory_map is None:
         return None
-    needed = sum(int(np.prod(each.shape)) * stored_dtype(each.dtype).itemsize for each in arrays)
-    return check_folder(memory_map, needed)
+
+    def needed(values: Any, dtype: Any) -> int:
+        if isinstance(values, dict):
+            return sum(needed(value, dtype[key]) for key, value in values.items())
+        return n_bytes(values.shape, dtype)
+
+    return check_folder(memory_map, sum(needed(*each) for each in held))
 
 
 def _breaks(steps: Steps) -> np.ndarray:

@@ -97,10 +97,10 @@ def read_minari(id_or_path: Any, memory_map: Any) -> tuple[Steps, spaces.Space, 
     if n < 1 or not isinstance(action_space, spaces.Box):
         raise ValueError(f"{folder} must have steps with actions of a Box, not {n} of {action_space}")
     sets.check_action_space(action_space.shape, action_space)
-    layout = _layout(observation_space, folder)
+    layout, of_actions = _layout(observation_space, folder), sets.action_dtype(action_space)
     if memory_map is not None:
         needed = sum(n_bytes((n + n_episodes, *shape), dtype) for shape, dtype in layout.values())
-        memory_map = check_folder(memory_map, needed + n_bytes((n, *action_space.shape), action_space.dtype))
+        memory_map = check_folder(memory_map, needed + n_bytes((n, *action_space.shape), of_actions))
     stored = {key: zeros(memory_map, (n + n_episodes, *shape), dtype) for key, (shape, dtype) in layout.items()}
     is_dict = isinstance(observation_space, spaces.Dict)
     steps = sets.Steps(
@@ -108,7 +108,7 @@ def read_minari(id_or_path: Any, memory_map: Any) -> tuple[Steps, spaces.Space, 
         np.zeros(n, np.int64),
         np.zeros(n, np.int64),
         None,
-        zeros(memory_map, (n, *action_space.shape), action_space.dtype),
+        zeros(memory_map, (n, *action_space.shape), of_actions),
         np.zeros(n, np.float32),
         np.zeros(n, bool),
         np.zeros(n, bool),
@@ -156,7 +156,7 @@ def _layout(space: spaces.Space, folder: Path) -> dict[str, tuple[tuple[int, ...
     for part in parts.values():
         if not isinstance(part, (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)):
             raise ValueError(f"{folder} must have arrays as observations, alone or in one dict, not {space}")
-    return {key: (part.shape or (1,), sets.stored_dtype(np.dtype(part.dtype))) for key, part in parts.items()}
+    return {key: (part.shape or (1,), sets.observation_dtypes(part)) for key, part in parts.items()}
 
 
 def _found(id_or_path: Any, minari: Any) -> Path:

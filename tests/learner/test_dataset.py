@@ -105,6 +105,12 @@ def test_dict_and_image_observations() -> None:
         ({"observations": np.array([["x"]] * 8)}, "observations must be numbers"),
         ({"observations": np.zeros(8)}, r"observations must be numbers of shape \(N, ...\)"),
         ({"observation_space": spaces.Box(-1, 1, (2,))}, "are none of observation_space"),
+        (
+            {"observation_space": spaces.Box(0, 255, (1,), np.uint8), "observations": OBSERVATIONS / 100},
+            "observations must be whole numbers within uint8, as their space has them, not 0.1",
+        ),
+        ({"observation_space": spaces.Box(0, 9, (1,), np.uint8), "observations": ACTIONS}, "not -1.0"),
+        ({"observation_space": spaces.Discrete(9), "observations": np.full((8, 1), np.nan)}, "whole numbers"),
         ({"next_observations": np.zeros((7, 1))}, "next_observations must have as many steps"),
         ({"next_observations": np.zeros((8, 2))}, "are none of observation_space"),
         ({"truncations": np.ones(8), "terminations": np.zeros(8)}, "next_observations must be given"),
