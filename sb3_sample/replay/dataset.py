@@ -262,8 +262,8 @@ class Dataset:
 
     def to_minari(self, id_or_path: str | os.PathLike[str], **metadata: Any) -> None:
         """
-        Write a data set of Minari's, uncompressed. An end of an episode that is no termination is a truncation there.
-        Needs the extra ``[offline]``.
+        Write a data set of Minari's, uncompressed. An end of an episode that is no termination is a truncation there;
+        further columns are left out with a warning. Needs the extra ``[offline]``.
 
         :param id_or_path: a new folder, or an id (``cartpole/swingup-v0``) among Minari's local data sets
         :param metadata: what Minari keeps besides: ``author``, ``algorithm_name``, ``description``, ...
@@ -276,6 +276,11 @@ class Dataset:
 
     def __repr__(self) -> str:
         return f"Dataset({len(self):,} transitions, sha256 {self.fingerprint[:16]})"
+
+    @property
+    def column_names(self) -> list[str]:
+        """Names of the further columns, sorted."""
+        return sorted(self._steps.columns)
 
     @property
     def n_episodes(self) -> int:

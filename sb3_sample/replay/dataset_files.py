@@ -14,6 +14,7 @@ from sb3_sample.extras import install
 from sb3_sample.replay import steps as sets
 from sb3_sample.replay.memory_map import check_folder, n_bytes, zeros
 from sb3_sample.replay.steps import Steps
+from sb3_sample.warn import warn
 
 #: An id of Minari's: namespaces, a name, a version.
 _ID = re.compile(r"[\w-]+(/[\w-]+)*-v\d+")
@@ -181,6 +182,8 @@ def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> None:
     :raises ValueError: if there is one already
     """
     minari = _minari()
+    if data.column_names:
+        warn(f"Minari's format has no place for columns={data.column_names}: they are not among what is written")
     storage_class = minari.dataset.minari_storage.MinariStorage
     buffer_class = minari.data_collector.episode_buffer.EpisodeBuffer
     if _is_id(id_or_path):

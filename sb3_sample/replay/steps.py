@@ -66,9 +66,8 @@ def put(name: str, values: Any, out: np.ndarray) -> None:
         if name != "actions" and piece.dtype.kind == "f" and not np.isfinite(piece).all():
             raise ValueError(f"{name} must be finite, within {out.dtype}")
         if piece.dtype != given.dtype and piece.dtype.kind in "iu" and (piece != given).any():
-            raise ValueError(
-                f"{name} must be whole numbers within {out.dtype}, as their space has them, not {given[piece != given][0]}"
-            )
+            wrong = given[piece != given][0]
+            raise ValueError(f"{name} must be whole numbers within {out.dtype}, as their space has them, not {wrong}")
         out[first : first + CHUNK] = piece
 
 

@@ -155,8 +155,9 @@ class Apart:
         self._has_warned_of_lapsed = True
         warn(
             f"{self._n_lapsed} of {n_due} gradient steps have lapsed: they, or evaluations and other callbacks, take "
-            f"longer than the environment's steps, so that fewer are taken than replay_ratio={self._model.replay_ratio} a transition. Pass a smaller "
-            "replay_ratio or control_frequency, or choose smaller networks"
+            "longer than the environment's steps, so that fewer are taken than "
+            f"replay_ratio={self._model.replay_ratio} a transition. Pass a smaller replay_ratio or control_frequency, "
+            "or choose smaller networks"
         )
 
     def record(self) -> None:

@@ -22,7 +22,7 @@ from sb3_sample.learner.exploration import EXPLORATIONS
 from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
 from sb3_sample.learner.reward_scale import LinearScale
 from sb3_sample.replay.buffers import DeviceReplayBuffer, DeviceValidationReplayBuffer, ValidationSplit
-from sb3_sample.replay.columns import has_own_columns
+from sb3_sample.replay.columns import columns_of, has_own_columns
 from sb3_sample.replay.compact import CompactReplay
 from sb3_sample.replay.weighted import FadedReplay, PrioritizedReplay, WindowReplay
 from sb3_sample.sac.multi_task import is_multi_task
@@ -217,6 +217,14 @@ def _check_prior_data(agent: Any) -> None:
     if cls is not None and issubclass(cls, PrioritizedReplay):
         raise ValueError(
             f"prior_data have no priorities, by which replay_buffer_class={cls.__name__} draws: leave one of them out"
+        )
+    columns = sorted(name for name, column in columns_of(cls).items() if column.in_batch)
+    ours, theirs = sorted(set(columns) - set(columns_of(None))), agent.prior_data.column_names
+    if ours != theirs:
+        of_buffer = "the replay buffer" if cls is None else f"replay_buffer_class={cls.__name__}"
+        raise ValueError(
+            f"prior_data must have the further columns of {of_buffer}, {ours or 'none'}, not {theirs or 'none'}: all "
+            "transitions of a batch have the same"
         )
     if agent.n_steps > 1:
         raise ValueError(

@@ -89,6 +89,13 @@ def test_arrays_of_other_types_than_their_spaces_survive_minari(tmp_path: Path) 
         assert [rows["observations"][key].dtype for key in "bc"] == [np.int8, np.int64]
 
 
+def test_columns_that_minari_has_no_place_for_are_warned_of(tmp_path: Path) -> None:
+    pytest.importorskip("minari", reason="needs the extra [offline]")
+    with pytest.warns(UserWarning, match=r"Minari's format has no place for columns=\['task'\]"):
+        made(columns={"task": np.arange(60)}).to_minari(tmp_path / "set")
+    assert_same(made(), Dataset.from_minari(tmp_path / "set"))
+
+
 def test_minari_by_id_and_in_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("minari", reason="needs the extra [offline]")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
