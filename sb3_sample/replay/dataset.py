@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Iterator, Mapping
 from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -260,16 +261,17 @@ class Dataset:
             memory_map=memory_map,
         )
 
-    def to_minari(self, id_or_path: str | os.PathLike[str], **metadata: Any) -> None:
+    def to_minari(self, id_or_path: str | os.PathLike[str], **metadata: Any) -> Path:
         """
         Write a data set of Minari's, uncompressed. An end of an episode that is no termination is a truncation there;
         further columns are left out with a warning. Needs the extra ``[offline]``.
 
         :param id_or_path: a new folder, or an id (``cartpole/swingup-v0``) among Minari's local data sets
         :param metadata: what Minari keeps besides: ``author``, ``algorithm_name``, ``description``, ...
-        :raises ValueError: if there is one already, or the id is none
+        :return: the folder that it is in
+        :raises ValueError: if there is one already, or an id is the path of a folder here too: ``./`` makes it one
         """
-        write_minari(self, id_or_path, metadata)
+        return write_minari(self, id_or_path, metadata)
 
     def __len__(self) -> int:
         return len(self._steps.actions)

@@ -172,14 +172,15 @@ def _found(id_or_path: Any, minari: Any) -> Path:
     raise ValueError(f"id_or_path={os.fspath(id_or_path)!r} must be a data set of Minari's: there is none in {places}")
 
 
-def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> None:
+def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> Path:
     """
     Write a data set of Minari's.
 
     :param data: the data set
     :param id_or_path: new folder, or an id
     :param metadata: what Minari keeps besides
-    :raises ValueError: if there is one already
+    :return: the folder
+    :raises ValueError: if there is one already, or an id is the path of a folder here too
     """
     minari = _minari()
     if data.column_names:
@@ -188,6 +189,14 @@ def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> None:
     buffer_class = minari.data_collector.episode_buffer.EpisodeBuffer
     if _is_id(id_or_path):
         name, folder = str(id_or_path), Path(minari.storage.get_dataset_path(id_or_path)) / "data"
+        as_path = Path(id_or_path)
+        if as_path.exists() or ("/" in name and as_path.parent.exists()):
+            # What is read by this name is the folder here, if there is one.
+            raise ValueError(
+                f"id_or_path={name!r} is an id of Minari's, of {folder.parent}, and a path here too, since "
+                f"{as_path if as_path.exists() else as_path.parent} is there: pass './{name}' for a folder, or another "
+                "id"
+            )
     else:
         # Minari looks for its files below a relative folder once more below that folder.
         folder = Path(id_or_path).expanduser().absolute() / "data"
@@ -220,3 +229,4 @@ def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> None:
             )
 
     storage.update_episodes(buffers())
+    return folder.parent

@@ -102,6 +102,14 @@ def test_minari_by_id_and_in_files(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     made().to_minari("toys/random-v0")
     assert_same(made(), Dataset.from_minari("toys/random-v0"))
     assert_same(made(), Dataset.from_minari("toys/random-v0", memory_map=tmp_path / "maps"))
+    # By a name that is the path of a folder too, it is not clear where it is to be.
+    monkeypatch.chdir(tmp_path / "maps")
+    for name, folder in (("here/set-v5", "here"), ("set-v5", "set-v5")):
+        Path(folder).mkdir()
+        with pytest.raises(ValueError, match=rf"id_or_path='{name}' is an id of .* since {folder} is there: .*'./{name}'"):
+            made().to_minari(name)
+        assert made().to_minari(f"./{name}") == Path(name).absolute()
+    assert made().to_minari("other/set-v5") == tmp_path / "other" / "set-v5"
     with pytest.raises(ValueError, match="id_or_path='toys/other-v0' must be a data set of Minari's: there is none"):
         Dataset.from_minari("toys/other-v0")
 
