@@ -446,6 +446,11 @@ def test_a_range_of_returns_needs_data() -> None:
     with pytest.raises(ValueError, match="return_range=1000.0 of reward_scale_kwargs is that of a data set: call"):
         offline(IQL, vec(), **kwargs).learn(12)
     assert offline(SAC, vec(), prior_data=data(), **kwargs).learn(12)._n_updates > 0
+    # It is that of the first data set learned from, not of prior data for later.
+    model = offline(IQL, vec(), prior_data=data(seed=7), **kwargs)
+    assert model.learner.reward_scaler.waits_for_data
+    factor = model.learn_offline(data(), 1).learn(12).learner.reward_scaler.factor.item()
+    assert factor == pytest.approx(1_000 / data().return_range)
     ends = np.ones(4)
     same = Dataset.from_arrays(np.eye(4, 3), np.zeros((4, 2)), ends, ends, ends * 0)
     with pytest.raises(ValueError, match="whose episodes all have the same return: pass factor"):
