@@ -151,7 +151,14 @@ class Dataset:
         check_actions(steps.actions, action_space)
         n_left_out = 0
         if given:
-            steps = steps._replace(truncations=truncated | (_breaks(steps) & ~terminated))
+            breaks = _breaks(steps) & ~terminated & ~truncated
+            steps = steps._replace(truncations=truncated | breaks)
+            if breaks.sum() > max(n // 2, 1):
+                warn(
+                    f"next_observations of {breaks.sum()} of {n} steps are not the following observations: each of "
+                    "them is the end of an episode here. The steps are not in the order in which they were taken, or "
+                    "the two are not of the same numbers"
+                )
         else:
             # Those of a step that terminated are not bootstrapped from, whatever they are: its own observation.
             cut_off = truncated | (steps.at == n - 1)
@@ -291,10 +298,37 @@ class Dataset:
 
     @property
     def return_range(self) -> float:
-        """Largest less smallest undiscounted return of the episodes, those that are cut off included."""
-        rewards = _numpy(self._steps.rewards).astype(np.float64)
-        returns = [rewards[rows].sum() for rows in self.episodes()]
+        """
+        Largest less smallest undiscounted return of the episodes, those that are cut off included. Where a next
+        observation is the following observation but for rounding, the episode goes on.
+
+        :raises ValueError: if most steps are episodes of their own that did not terminate, as of shuffled data
+        """
+        rewards, last = _numpy(self._steps.rewards).astype(np.float64), -1
+        returns, n_alone = [], 0
+        for end in self._last_steps():
+            returns.append(rewards[last + 1 : end + 1].sum())
+            n_alone += int(end == last + 1 and not self._steps.terminations[end])
+            last = end
+        if n_alone > max(len(self) // 2, 1):
+            raise ValueError(
+                f"{n_alone} of {len(self)} steps are episodes of their own, so that the returns have no meaningful "
+                "range: the data set must have its steps in the order in which they were taken"
+            )
         return float(max(returns) - min(returns))
+
+    def _last_steps(self) -> np.ndarray:
+        """Last steps of the episodes, one where a next observation is the following one but for rounding left out."""
+        steps, terminated = self._steps, _numpy(self._steps.terminations)
+        ends = np.flatnonzero(terminated | _numpy(steps.truncations))
+        goes_on = np.zeros(len(self), bool)
+        cut_off = ends[~terminated[ends] & (ends < len(self) - 1)]
+        for first in range(0, len(cut_off), CHUNK):
+            rows = cut_off[first : first + CHUNK]
+            following, then = _take(steps.observations, steps.at[rows + 1]), self._next_observations(rows)
+            # Where they are the same, it is the data set that says so.
+            goes_on[rows] = _rows_agree(then, following, np.isclose) & ~_rows_agree(then, following, np.equal)
+        return ends[~goes_on[ends]]
 
     @property
     def fingerprint(self) -> str:
@@ -461,11 +495,17 @@ def _breaks(steps: Steps) -> np.ndarray:
     n = len(steps.actions)
     breaks = np.ones(n, bool)
     for first in range(0, n - 1, CHUNK):
-        rows, last = slice(first, min(first + CHUNK, n - 1)), min(first + CHUNK, n - 1)
-        pairs = zip(_parts(steps.next_observations), _parts(steps.observations), strict=True)
-        same = [(ours[rows] == now[first + 1 : last + 1]).reshape(last - first, -1).all(1) for ours, now in pairs]
-        breaks[rows] = ~np.logical_and.reduce(same)
+        last = min(first + CHUNK, n - 1)
+        rows, following = slice(first, last), slice(first + 1, last + 1)
+        then, now = _take(steps.next_observations, rows), _take(steps.observations, following)
+        breaks[rows] = ~_rows_agree(then, now, np.equal)
     return breaks
+
+
+def _rows_agree(then: Any, now: Any, agree: Callable[..., np.ndarray]) -> np.ndarray:
+    """Whether observations agree in all their numbers, (N,)."""
+    pairs = [(_numpy(a), _numpy(b)) for a, b in zip(_parts(then), _parts(now), strict=True)]
+    return np.logical_and.reduce([agree(a, b).reshape(len(a), -1).all(1) for a, b in pairs])  # type: ignore[no-any-return]
 
 
 def _column(name: str, values: Any) -> np.ndarray:

@@ -216,8 +216,8 @@ class SAC(  # type: ignore[misc]  # actor
         self._prior_of = now
 
     def _tell_of(self, data: Dataset) -> None:
-        """Tell the rule that scales rewards, if any, of a data set."""
-        if self.learner.reward_scaler is not None:
+        """Tell the rule that scales rewards of a data set, if it waits for one."""
+        if self.learner.reward_scaler is not None and self.learner.reward_scaler.waits_for_data:
             self.learner.reward_scaler.on_dataset(data.return_range)
 
     def _check_arguments(self) -> None:

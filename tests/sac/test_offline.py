@@ -446,6 +446,14 @@ def test_a_range_of_returns_needs_data() -> None:
     with pytest.raises(ValueError, match="return_range=1000.0 of reward_scale_kwargs is that of a data set: call"):
         offline(IQL, vec(), **kwargs).learn(12)
     assert offline(SAC, vec(), prior_data=data(), **kwargs).learn(12)._n_updates > 0
+    order, given = np.random.default_rng(0).permutation(200), data().rows(slice(None))
+    names = ("observations", "actions", "rewards", "terminations", "truncations", "next_observations")
+    *now, following = (given[name][order] for name in names)
+    with pytest.warns(UserWarning, match="not in the order"):
+        shuffled = Dataset.from_arrays(*now, next_observations=following)
+    with pytest.raises(ValueError, match="in the order in which they were taken"):
+        offline(IQL, vec(), **kwargs).learn_offline(shuffled, 1)
+    assert offline(IQL, vec(), reward_scale="linear").learn_offline(shuffled, 1)._n_updates == 1
     # It is that of the first data set learned from, not of prior data for later.
     model = offline(IQL, vec(), prior_data=data(seed=7), **kwargs)
     assert model.learner.reward_scaler.waits_for_data
