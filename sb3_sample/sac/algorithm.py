@@ -64,6 +64,7 @@ from sb3_sample.sac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SACP
 from sb3_sample.sac.sb3_names import SB3Names
 from sb3_sample.sac.update_schedule import UpdateSchedule
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
+from sb3_sample.saving.checks import check_environment
 from sb3_sample.saving.encoding import Lenient
 from sb3_sample.saving.kept import Kept
 from sb3_sample.saving.model import SafeFiles
@@ -327,6 +328,7 @@ class SAC(  # type: ignore[misc]  # actor
             self.observation_space, self.action_space = venv.observation_space, venv.action_space
             self.n_envs, self.env, self._vec_normalize_env = venv.num_envs, venv, unwrap_vec_normalize(venv)
             self._setup_model()
+        check_environment(venv, self.observation_space, self.action_space)
         checks.check_device_buffer(self, unwrap_vec_normalize(venv))
         super().set_env(venv, force_reset)
         if is_first and self.seed is not None:

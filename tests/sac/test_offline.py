@@ -302,6 +302,24 @@ def test_spaces_come_from_the_data_the_arguments_or_the_environment(where: str) 
     model.learn(1)
 
 
+def test_an_environment_whose_numbers_are_of_another_type(tmp_path: Path) -> None:
+    """As those of Gymnasium's MuJoCo, of float64, where data have float32 and no bounds."""
+    env = vec(obs_space=spaces.Box(-9, 9, (3,), np.float64))
+    model = offline(IQL).learn_offline(data(), 2)
+    words = r"save the model, and load\(path, env=env, observation_space=env.observation_space, action_space="
+    with pytest.raises(ValueError, match=words):
+        model.set_env(env)
+    model.save(tmp_path / "m")
+    with pytest.raises(ValueError, match=words):
+        IQL.load(tmp_path / "m", env=env)
+    given = {"observation_space": env.observation_space, "action_space": env.action_space}
+    again = IQL.load(tmp_path / "m", env=env, **given)
+    assert not differing(state(model), state(again)) and again.learn(12)._n_updates > 2
+    for other in (vec(obs_space=spaces.Box(-9, 9, (4,))), vec(action_space=spaces.Box(-2, 2, (2,)))):
+        with pytest.raises(ValueError, match=r"spaces do not match: .*\)$"):
+            model.set_env(other)
+
+
 def test_a_model_without_spaces_takes_those_of_its_first_environment() -> None:
     model = offline(SAC)
     with pytest.raises(ValueError, match="env: the model was made or loaded without one: pass env= to it, or call set"):
