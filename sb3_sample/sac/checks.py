@@ -124,6 +124,13 @@ def check_dataset(name: str, dataset: Any, observation_space: Any, action_space:
     ours, theirs = _shapes(observation_space), _shapes(dataset.observation_space)
     if ours != theirs:
         raise ValueError(f"{name} must have observations of the model's shape, {ours}, not {theirs}")
+    for key, part in _parts(observation_space).items():
+        other, which = _parts(dataset.observation_space)[key], f"observations[{key!r}]" if key else "observations"
+        if not _means_alike(part, other):
+            raise ValueError(
+                f"{name} must have {which} that mean the same numbers as the model's {part}, not {other}: pass "
+                "observation_space= where the data set is made, with pictures of its range"
+            )
     own, other = action_space, dataset.action_space
     same = own.shape == other.shape and np.allclose([own.low, own.high], [other.low, other.high])
     if not same:
@@ -197,6 +204,17 @@ def _shapes(space: Any) -> Any:
     if isinstance(space, spaces.Dict):
         return {key: part.shape for key, part in sorted(space.spaces.items())}
     return space.shape
+
+
+def _parts(space: Any) -> dict[str, Any]:
+    return dict(space.spaces) if isinstance(space, spaces.Dict) else {"": space}
+
+
+def _means_alike(ours: Any, theirs: Any) -> bool:
+    """Whether numbers of the same shape have one meaning: as many classes, or pictures of one range."""
+    if not (isinstance(ours, spaces.Box) and isinstance(theirs, spaces.Box)):
+        return bool(ours == theirs)
+    return len(ours.shape) != 3 or ours.dtype.kind == theirs.dtype.kind
 
 
 def _check_prior_data(agent: Any) -> None:

@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_sample import BC, BRO, IQL, SAC, TD3BC, VPLSAC, Dataset, PrioritizedReplayBuffer, SimBa
 from sb3_sample.learner import losses
+from sb3_sample.sac.checks import check_dataset
 from tests.sac.common import MAKERS, TINY_RESIDUAL, TINY_SAC, differing, sac, state, vec
 
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
@@ -369,6 +370,26 @@ def test_data_of_other_spaces_are_refused() -> None:
         offline(SAC, vec(action_space=spaces.Box(-2, 2, (2,)))).learn_offline(data(), 1)
     with pytest.raises(ValueError, match=r"dataset must have observations of the model's shape, \(5,\), not \(3,\)"):
         offline(SAC, vec(obs_space=spaces.Box(-1, 1, (5,)))).learn_offline(data(), 1)
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs"),
+    [
+        (spaces.Discrete(5), spaces.Discrete(10)),
+        (spaces.MultiDiscrete([3, 4]), spaces.MultiDiscrete([4, 4])),
+        (spaces.Box(0, 1, (3, 4, 4)), spaces.Box(0, 255, (3, 4, 4), np.uint8)),
+    ],
+)
+@pytest.mark.parametrize("as_dict", [False, True])
+def test_data_of_other_classes_or_pictures_are_refused(ours: Any, theirs: Any, as_dict: bool) -> None:
+    observations: Any = np.zeros((4, *(theirs.shape or (1,))), theirs.dtype)
+    if as_dict:
+        ours, theirs, observations = spaces.Dict(a=ours), spaces.Dict(a=theirs), {"a": observations}
+    ends = np.ones(4)
+    transitions = Dataset.from_arrays(observations, np.zeros((4, 2)), ends, ends, ends * 0, observation_space=theirs)
+    check_dataset("dataset", transitions, theirs, ACTIONS)
+    with pytest.raises(ValueError, match="dataset must have observations.* that mean the same numbers as the model's"):
+        check_dataset("dataset", transitions, ours, ACTIONS)
 
 
 def test_dict_observations_and_hindsight_goals() -> None:
