@@ -106,7 +106,9 @@ def test_minari_by_id_and_in_files(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.chdir(tmp_path / "maps")
     for name, folder in (("here/set-v5", "here"), ("set-v5", "set-v5")):
         Path(folder).mkdir()
-        with pytest.raises(ValueError, match=rf"id_or_path='{name}' is an id of .* since {folder} is there: .*'./{name}'"):
+        with pytest.raises(
+            ValueError, match=rf"id_or_path='{name}' is an id of .* since {folder} is there: .*'./{name}'"
+        ):
             made().to_minari(name)
         assert made().to_minari(f"./{name}") == Path(name).absolute()
     assert made().to_minari("other/set-v5") == tmp_path / "other" / "set-v5"
