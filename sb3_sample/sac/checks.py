@@ -214,7 +214,7 @@ def _means_alike(ours: Any, theirs: Any) -> bool:
     """Whether numbers of the same shape have one meaning: as many classes, or pictures of one range."""
     if not (isinstance(ours, spaces.Box) and isinstance(theirs, spaces.Box)):
         return bool(ours == theirs)
-    return len(ours.shape) != 3 or ours.dtype.kind == theirs.dtype.kind
+    return len(ours.shape) != 3 or np.dtype(ours.dtype).kind == np.dtype(theirs.dtype).kind
 
 
 def _check_prior_data(agent: Any) -> None:
