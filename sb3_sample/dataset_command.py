@@ -73,8 +73,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _run(args: argparse.Namespace) -> None:
     data = _recorded(args) if args.command == "record" else _read(args)
     if args.command != "info":
-        data.to_minari(args.output)
-        print(f"{len(data)} transitions of {data.n_episodes} episodes written to {args.output}")
+        folder = data.to_minari(args.output)
+        print(f"{len(data)} transitions of {data.n_episodes} episodes written to {folder}")
     elif args.json:
         print(json.dumps(facts_of(data)))
     else:

@@ -164,6 +164,12 @@ def test_several_environments_are_refused(run: Run, capsys: pytest.CaptureFixtur
     assert "--dataset: n_envs must be 1, not 2" in capsys.readouterr().err
 
 
+def test_statistics_of_the_environment_are_refused(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main([*COMMAND, "--algo", "iql", "--dataset", "a.hdf5", "-n", "30", *SMALL, "normalize:True"])
+    assert "--dataset: normalize measures observations and rewards in the environment" in capsys.readouterr().err
+
+
 def test_a_record_without_data_says_nothing_of_them(run: Run) -> None:
     run("--algo", "sac_sample", "-n", "20", "--run-dir", "run")
     assert not {"dataset", "prior_data", "offline_steps"} & Record.read(Path("run")).settings.keys()

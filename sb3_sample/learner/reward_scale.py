@@ -27,9 +27,14 @@ class RewardScale(BatchTransform):
     #: Added to the rewards after the division.
     shift: float = 0.0
 
+    @property
+    def waits_for_data(self) -> bool:
+        """Whether the scale is still to follow from a data set."""
+        return False
+
     def on_dataset(self, return_range: float) -> None:
         """
-        Called when learning from a data set begins.
+        Called when learning from a data set begins, if the rule waits for one.
 
         :param return_range: largest less smallest return of its episodes
         """
@@ -321,14 +326,13 @@ class LinearScale(RewardScale):
         return self.return_range is not None and not self.factor.item()
 
     def on_dataset(self, return_range: float) -> None:
-        if self.waits_for_data:
-            if return_range <= 0:
-                raise ValueError(
-                    f"return_range={self.return_range} cannot be that of a data set whose episodes all have the same "
-                    "return: pass factor in its place"
-                )
-            assert self.return_range is not None
-            self.factor.fill_(self.return_range / return_range)
+        if return_range <= 0:
+            raise ValueError(
+                f"return_range={self.return_range} cannot be that of a data set whose episodes all have the same "
+                "return: pass factor in its place"
+            )
+        assert self.return_range is not None
+        self.factor.fill_(self.return_range / return_range)
 
     def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
         return 1 / self.factor

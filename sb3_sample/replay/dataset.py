@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Iterator, Mapping
 from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,16 @@ from gymnasium import spaces
 from sb3_sample.learner.batch import Batch, for_each
 from sb3_sample.replay.columns import samples_at
 from sb3_sample.replay.dataset_files import opened_hdf5, read_minari, write_minari
-from sb3_sample.replay.memory_map import check_folder, zeros
-from sb3_sample.replay.steps import CHUNK, Steps, check_action_space, check_actions, put, stored_dtype
+from sb3_sample.replay.memory_map import check_folder, n_bytes, zeros
+from sb3_sample.replay.steps import (
+    CHUNK,
+    Steps,
+    action_dtype,
+    check_action_space,
+    check_actions,
+    observation_dtypes,
+    put,
+)
 from sb3_sample.warn import warn
 
 Arrays = np.ndarray | dict[str, np.ndarray]
@@ -24,7 +33,7 @@ class Dataset:
     Fixed set of transitions, from which batches are drawn uniformly with replacement. It is made by one of the
     functions ``from_...``.
 
-    :param steps: the steps, floats of observations and rewards as float32, integers as they are
+    :param steps: the steps, in the types of their spaces, floats of observations and rewards as float32
     :param observation_space: of the observations
     :param action_space: of the actions as an environment takes them
     :param seed: of the generator that :meth:`sample` draws from
@@ -74,6 +83,8 @@ class Dataset:
         Without ``next_observations`` a step's next observation is the following step's. A truncated step, and the
         last one, have none then and are left out with a warning, unless the episode terminated there.
 
+        Observations and actions are held in the types of their spaces, floats of observations as float32.
+
         :param observations: (N, O), or a dict of such arrays; NumPy's, ``numpy.memmap`` included, or h5py's data sets
         :param actions: (N, A), in the environment's units, within the bounds of ``action_space``
         :param rewards: (N,)
@@ -87,7 +98,8 @@ class Dataset:
         :param memory_map: folder whose disk holds the observations and actions, if they are larger than the memory; the
             files are unnamed and vanish with the data set. None: memory
         :return: the data set
-        :raises ValueError: if the arrays are not of one length, not of the spaces, or not finite
+        :raises ValueError: if the arrays are not of one length, not of the spaces, or not finite, or a space of
+            integers has not their numbers
         """
         observations, actions = _arrays("observations", observations, 2), _arrays("actions", actions, 1)
         if len(actions.shape) < 2:
@@ -116,23 +128,37 @@ class Dataset:
         _check_shapes("observations", observation_space, observations)
         for name, value in given.items():
             _check_shapes(name, observation_space, value)
-        folder = _folder(memory_map, [*_parts(observations), *_parts(given.get("next_observations", {})), actions])
+        of_observations, of_actions = observation_dtypes(observation_space), action_dtype(action_space)
+        held = [(values, of_observations) for values in (observations, *given.values())]
+        folder = _folder(memory_map, [*held, (actions, of_actions)])
         terminated, truncated = flags["terminations"] == 1, flags["truncations"] == 1
         steps = Steps(
-            _copied("observations", observations, folder),
+            _copied("observations", observations, of_observations, folder),
             np.arange(n),
             None,
-            _copied("next_observations", given["next_observations"], folder) if given else None,
-            _copied("actions", actions, folder, keep_floats=True),
+            _copied("next_observations", given["next_observations"], of_observations, folder) if given else None,
+            _copied("actions", actions, of_actions, folder),
             rewards,
             terminated,
             truncated,
-            {name: _copied(f"columns[{name!r}]", values, None) for name, values in more.items()},
+            {
+                name: _copied(
+                    f"columns[{name!r}]", values, np.float32 if values.dtype.kind == "f" else values.dtype, None
+                )
+                for name, values in more.items()
+            },
         )
         check_actions(steps.actions, action_space)
         n_left_out = 0
         if given:
-            steps = steps._replace(truncations=truncated | (_breaks(steps) & ~terminated))
+            breaks = _breaks(steps) & ~terminated & ~truncated
+            steps = steps._replace(truncations=truncated | breaks)
+            if breaks.sum() > max(n // 2, 1):
+                warn(
+                    f"next_observations of {breaks.sum()} of {n} steps are not the following observations: each of "
+                    "them is the end of an episode here. The steps are not in the order in which they were taken, or "
+                    "the two are not of the same numbers"
+                )
         else:
             # Those of a step that terminated are not bootstrapped from, whatever they are: its own observation.
             cut_off = truncated | (steps.at == n - 1)
@@ -242,16 +268,17 @@ class Dataset:
             memory_map=memory_map,
         )
 
-    def to_minari(self, id_or_path: str | os.PathLike[str], **metadata: Any) -> None:
+    def to_minari(self, id_or_path: str | os.PathLike[str], **metadata: Any) -> Path:
         """
-        Write a data set of Minari's, uncompressed. An end of an episode that is no termination is a truncation there.
-        Needs the extra ``[offline]``.
+        Write a data set of Minari's, uncompressed. An end of an episode that is no termination is a truncation there;
+        further columns are left out with a warning. Needs the extra ``[offline]``.
 
         :param id_or_path: a new folder, or an id (``cartpole/swingup-v0``) among Minari's local data sets
         :param metadata: what Minari keeps besides: ``author``, ``algorithm_name``, ``description``, ...
-        :raises ValueError: if there is one already, or the id is none
+        :return: the folder that it is in
+        :raises ValueError: if there is one already, or an id is the path of a folder here too: ``./`` makes it one
         """
-        write_minari(self, id_or_path, metadata)
+        return write_minari(self, id_or_path, metadata)
 
     def __len__(self) -> int:
         return len(self._steps.actions)
@@ -260,16 +287,48 @@ class Dataset:
         return f"Dataset({len(self):,} transitions, sha256 {self.fingerprint[:16]})"
 
     @property
+    def column_names(self) -> list[str]:
+        """Names of the further columns, sorted."""
+        return sorted(self._steps.columns)
+
+    @property
     def n_episodes(self) -> int:
         """Number of episodes, those that are cut off included."""
         return int((self._steps.terminations | self._steps.truncations).sum())
 
     @property
     def return_range(self) -> float:
-        """Largest less smallest undiscounted return of the episodes, those that are cut off included."""
-        rewards = _numpy(self._steps.rewards).astype(np.float64)
-        returns = [rewards[rows].sum() for rows in self.episodes()]
+        """
+        Largest less smallest undiscounted return of the episodes, those that are cut off included. Where a next
+        observation is the following observation but for rounding, the episode goes on.
+
+        :raises ValueError: if most steps are episodes of their own that did not terminate, as of shuffled data
+        """
+        rewards, last = _numpy(self._steps.rewards).astype(np.float64), -1
+        returns, n_alone = [], 0
+        for end in self._last_steps():
+            returns.append(rewards[last + 1 : end + 1].sum())
+            n_alone += int(end == last + 1 and not self._steps.terminations[end])
+            last = end
+        if n_alone > max(len(self) // 2, 1):
+            raise ValueError(
+                f"{n_alone} of {len(self)} steps are episodes of their own, so that the returns have no meaningful "
+                "range: the data set must have its steps in the order in which they were taken"
+            )
         return float(max(returns) - min(returns))
+
+    def _last_steps(self) -> np.ndarray:
+        """Last steps of the episodes, one where a next observation is the following one but for rounding left out."""
+        steps, terminated = self._steps, _numpy(self._steps.terminations)
+        ends = np.flatnonzero(terminated | _numpy(steps.truncations))
+        goes_on = np.zeros(len(self), bool)
+        cut_off = ends[~terminated[ends] & (ends < len(self) - 1)]
+        for first in range(0, len(cut_off), CHUNK):
+            rows = cut_off[first : first + CHUNK]
+            following, then = _take(steps.observations, steps.at[rows + 1]), self._next_observations(rows)
+            # Where they are the same, it is the data set that says so.
+            goes_on[rows] = _rows_agree(then, following, np.isclose) & ~_rows_agree(then, following, np.equal)
+        return ends[~goes_on[ends]]
 
     @property
     def fingerprint(self) -> str:
@@ -410,19 +469,25 @@ def _arrays(name: str, values: Any, least_axes: int) -> Any:
     return array
 
 
-def _copied(name: str, values: Any, folder: str | None, keep_floats: bool = False) -> Any:
+def _copied(name: str, values: Any, dtype: Any, folder: str | None) -> Any:
     if isinstance(values, dict):
-        return {key: _copied(f"{name}[{key!r}]", value, folder, keep_floats) for key, value in values.items()}
-    out = zeros(folder, values.shape, stored_dtype(values.dtype, keep_floats))
+        return {key: _copied(f"{name}[{key!r}]", value, dtype[key], folder) for key, value in values.items()}
+    out = zeros(folder, values.shape, dtype)
     put(name, values, out)
     return out
 
 
-def _folder(memory_map: Any, arrays: list[Any]) -> str | None:
+def _folder(memory_map: Any, held: list[tuple[Any, Any]]) -> str | None:
+    """The folder, if there is room for arrays that are held in a type each, both by the keys of a dict."""
     if memory_map is None:
         return None
-    needed = sum(int(np.prod(each.shape)) * stored_dtype(each.dtype).itemsize for each in arrays)
-    return check_folder(memory_map, needed)
+
+    def needed(values: Any, dtype: Any) -> int:
+        if isinstance(values, dict):
+            return sum(needed(value, dtype[key]) for key, value in values.items())
+        return n_bytes(values.shape, dtype)
+
+    return check_folder(memory_map, sum(needed(*each) for each in held))
 
 
 def _breaks(steps: Steps) -> np.ndarray:
@@ -430,11 +495,17 @@ def _breaks(steps: Steps) -> np.ndarray:
     n = len(steps.actions)
     breaks = np.ones(n, bool)
     for first in range(0, n - 1, CHUNK):
-        rows, last = slice(first, min(first + CHUNK, n - 1)), min(first + CHUNK, n - 1)
-        pairs = zip(_parts(steps.next_observations), _parts(steps.observations), strict=True)
-        same = [(ours[rows] == now[first + 1 : last + 1]).reshape(last - first, -1).all(1) for ours, now in pairs]
-        breaks[rows] = ~np.logical_and.reduce(same)
+        last = min(first + CHUNK, n - 1)
+        rows, following = slice(first, last), slice(first + 1, last + 1)
+        then, now = _take(steps.next_observations, rows), _take(steps.observations, following)
+        breaks[rows] = ~_rows_agree(then, now, np.equal)
     return breaks
+
+
+def _rows_agree(then: Any, now: Any, agree: Callable[..., np.ndarray]) -> np.ndarray:
+    """Whether observations agree in all their numbers, (N,)."""
+    pairs = [(_numpy(a), _numpy(b)) for a, b in zip(_parts(then), _parts(now), strict=True)]
+    return np.logical_and.reduce([agree(a, b).reshape(len(a), -1).all(1) for a, b in pairs])  # type: ignore[no-any-return]
 
 
 def _column(name: str, values: Any) -> np.ndarray:

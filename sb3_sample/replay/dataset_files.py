@@ -14,6 +14,7 @@ from sb3_sample.extras import install
 from sb3_sample.replay import steps as sets
 from sb3_sample.replay.memory_map import check_folder, n_bytes, zeros
 from sb3_sample.replay.steps import Steps
+from sb3_sample.warn import warn
 
 #: An id of Minari's: namespaces, a name, a version.
 _ID = re.compile(r"[\w-]+(/[\w-]+)*-v\d+")
@@ -97,10 +98,10 @@ def read_minari(id_or_path: Any, memory_map: Any) -> tuple[Steps, spaces.Space, 
     if n < 1 or not isinstance(action_space, spaces.Box):
         raise ValueError(f"{folder} must have steps with actions of a Box, not {n} of {action_space}")
     sets.check_action_space(action_space.shape, action_space)
-    layout = _layout(observation_space, folder)
+    layout, of_actions = _layout(observation_space, folder), sets.action_dtype(action_space)
     if memory_map is not None:
         needed = sum(n_bytes((n + n_episodes, *shape), dtype) for shape, dtype in layout.values())
-        memory_map = check_folder(memory_map, needed + n_bytes((n, *action_space.shape), action_space.dtype))
+        memory_map = check_folder(memory_map, needed + n_bytes((n, *action_space.shape), of_actions))
     stored = {key: zeros(memory_map, (n + n_episodes, *shape), dtype) for key, (shape, dtype) in layout.items()}
     is_dict = isinstance(observation_space, spaces.Dict)
     steps = sets.Steps(
@@ -108,7 +109,7 @@ def read_minari(id_or_path: Any, memory_map: Any) -> tuple[Steps, spaces.Space, 
         np.zeros(n, np.int64),
         np.zeros(n, np.int64),
         None,
-        zeros(memory_map, (n, *action_space.shape), action_space.dtype),
+        zeros(memory_map, (n, *action_space.shape), of_actions),
         np.zeros(n, np.float32),
         np.zeros(n, bool),
         np.zeros(n, bool),
@@ -156,7 +157,7 @@ def _layout(space: spaces.Space, folder: Path) -> dict[str, tuple[tuple[int, ...
     for part in parts.values():
         if not isinstance(part, (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)):
             raise ValueError(f"{folder} must have arrays as observations, alone or in one dict, not {space}")
-    return {key: (part.shape or (1,), sets.stored_dtype(np.dtype(part.dtype))) for key, part in parts.items()}
+    return {key: (part.shape or (1,), sets.observation_dtypes(part)) for key, part in parts.items()}
 
 
 def _found(id_or_path: Any, minari: Any) -> Path:
@@ -171,20 +172,31 @@ def _found(id_or_path: Any, minari: Any) -> Path:
     raise ValueError(f"id_or_path={os.fspath(id_or_path)!r} must be a data set of Minari's: there is none in {places}")
 
 
-def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> None:
+def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> Path:
     """
     Write a data set of Minari's.
 
     :param data: the data set
     :param id_or_path: new folder, or an id
     :param metadata: what Minari keeps besides
-    :raises ValueError: if there is one already
+    :return: the folder
+    :raises ValueError: if there is one already, or an id is the path of a folder here too
     """
     minari = _minari()
+    if data.column_names:
+        warn(f"Minari's format has no place for columns={data.column_names}: they are not among what is written")
     storage_class = minari.dataset.minari_storage.MinariStorage
     buffer_class = minari.data_collector.episode_buffer.EpisodeBuffer
     if _is_id(id_or_path):
         name, folder = str(id_or_path), Path(minari.storage.get_dataset_path(id_or_path)) / "data"
+        as_path = Path(id_or_path)
+        if as_path.exists() or ("/" in name and as_path.parent.exists()):
+            # What is read by this name is the folder here, if there is one.
+            raise ValueError(
+                f"id_or_path={name!r} is an id of Minari's, of {folder.parent}, and a path here too, since "
+                f"{as_path if as_path.exists() else as_path.parent} is there: pass './{name}' for a folder, or another "
+                "id"
+            )
     else:
         # Minari looks for its files below a relative folder once more below that folder.
         folder = Path(id_or_path).expanduser().absolute() / "data"
@@ -217,3 +229,4 @@ def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> None:
             )
 
     storage.update_episodes(buffers())
+    return folder.parent

@@ -92,12 +92,14 @@ class DatasetSource:
         if venv is not None:
 
             def normalized(observations: Any) -> Any:
-                return for_each(torch.from_numpy, venv.normalize_obs(for_each(lambda part: part.numpy(), observations)))
+                return for_each(
+                    torch.from_numpy, venv.normalize_obs(for_each(lambda part: part.cpu().numpy(), observations))
+                )
 
             batch = batch._replace(
                 observations=normalized(batch.observations),
                 next_observations=normalized(batch.next_observations),
-                rewards=torch.from_numpy(venv.normalize_reward(batch.rewards.numpy()).astype(np.float32)),
+                rewards=torch.from_numpy(venv.normalize_reward(batch.rewards.cpu().numpy()).astype(np.float32)),
             )
         device = self._model.device
         moved: dict[str, Any] = {

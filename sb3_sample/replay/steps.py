@@ -29,13 +29,24 @@ class Steps(NamedTuple):
     columns: dict[str, Any]
 
 
-def stored_dtype(dtype: Any, keep_floats: bool = False) -> Any:
+def observation_dtypes(space: Any) -> Any:
     """
-    :param dtype: of values
-    :param keep_floats: whether floats stay what they are
-    :return: the type that they are stored in
+    :param space: of observations
+    :return: the type that they are stored in, floats as float32; of a Dict by key
     """
-    return np.dtype(np.float32) if dtype.kind == "f" and not keep_floats else dtype
+    if isinstance(space, spaces.Dict):
+        return {key: observation_dtypes(part) for key, part in space.spaces.items()}
+    dtype = np.dtype(space.dtype)
+    return np.dtype(np.float32) if dtype.kind == "f" else dtype
+
+
+def action_dtype(space: spaces.Box) -> Any:
+    """
+    :param space: of actions
+    :return: the type that they are stored in, which has fractions in any case
+    """
+    dtype = np.dtype(space.dtype)
+    return dtype if dtype.kind == "f" else np.dtype(np.float32)
 
 
 def put(name: str, values: Any, out: np.ndarray) -> None:
@@ -45,13 +56,18 @@ def put(name: str, values: Any, out: np.ndarray) -> None:
     :param name: what they are, for the error
     :param values: an array, or what is read like one
     :param out: of the same shape, which they are written to
-    :raises ValueError: if they are not finite in its type; of actions :func:`check_actions` says so
+    :raises ValueError: if they are not finite in its type; of actions :func:`check_actions` says so. If its type is one
+        of integers and has not their numbers
     """
     for first in range(0, len(out), CHUNK):
-        with np.errstate(over="ignore"):
-            piece = np.asarray(values[first : first + CHUNK]).astype(out.dtype)
+        given = np.asarray(values[first : first + CHUNK])
+        with np.errstate(over="ignore", invalid="ignore"):
+            piece = given.astype(out.dtype)
         if name != "actions" and piece.dtype.kind == "f" and not np.isfinite(piece).all():
             raise ValueError(f"{name} must be finite, within {out.dtype}")
+        if piece.dtype != given.dtype and piece.dtype.kind in "iu" and (piece != given).any():
+            wrong = given[piece != given][0]
+            raise ValueError(f"{name} must be whole numbers within {out.dtype}, as their space has them, not {wrong}")
         out[first : first + CHUNK] = piece
 
 

@@ -64,6 +64,7 @@ from sb3_sample.sac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SACP
 from sb3_sample.sac.sb3_names import SB3Names
 from sb3_sample.sac.update_schedule import UpdateSchedule
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
+from sb3_sample.saving.checks import check_environment
 from sb3_sample.saving.encoding import Lenient
 from sb3_sample.saving.kept import Kept
 from sb3_sample.saving.model import SafeFiles
@@ -200,8 +201,6 @@ class SAC(  # type: ignore[misc]  # actor
             self._take_prior_data(self.prior_data)
         self._source: ReplaySource | DatasetSource = ReplaySource(self)
         self.learner = self._make_learner(networks=self.policy, counts=self)
-        if self.prior_data is not None:
-            self._tell_of(self.prior_data)
         checks.check_rule(self)
         checks.check_sampling(self, self.replay_buffer)
         self._plain_attributes = plain_attributes(self)
@@ -218,8 +217,8 @@ class SAC(  # type: ignore[misc]  # actor
         self._prior_of = now
 
     def _tell_of(self, data: Dataset) -> None:
-        """Tell the rule that scales rewards, if any, of a data set."""
-        if self.learner.reward_scaler is not None:
+        """Tell the rule that scales rewards of a data set, if it waits for one."""
+        if self.learner.reward_scaler is not None and self.learner.reward_scaler.waits_for_data:
             self.learner.reward_scaler.on_dataset(data.return_range)
 
     def _check_arguments(self) -> None:
@@ -329,6 +328,7 @@ class SAC(  # type: ignore[misc]  # actor
             self.observation_space, self.action_space = venv.observation_space, venv.action_space
             self.n_envs, self.env, self._vec_normalize_env = venv.num_envs, venv, unwrap_vec_normalize(venv)
             self._setup_model()
+        check_environment(venv, self.observation_space, self.action_space)
         checks.check_device_buffer(self, unwrap_vec_normalize(venv))
         super().set_env(venv, force_reset)
         if is_first and self.seed is not None:

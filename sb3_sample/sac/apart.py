@@ -1,5 +1,6 @@
 """Acting apart from learning: ``learn(asynchronous=True)``."""
 
+import collections
 import contextlib
 import math
 import threading
@@ -63,10 +64,8 @@ class Apart:
             math.ceil(n_left / model.n_envs),
             None if frequency is None else 1 / frequency,
         )
-        # More than this is not due: what could not be taken within so long.
-        per_second = frequency or 0
-        n_tasks = model._tasks_together
-        self._most_due = max(math.ceil(model.replay_ratio * max(per_second * LAPSE, 1) * model.n_envs / n_tasks), 1)
+        #: When the latest steps began, and the gradient steps that are due for each.
+        self._recent: collections.deque[tuple[float, int]] = collections.deque()
 
     # ---------------------------------------------------------------- parameters
 
@@ -126,9 +125,14 @@ class Apart:
         """
         self._n_stored += len(step.dones)
         self.n_due += n_due
-        if self.n_due > self._most_due:
-            self._n_lapsed += self.n_due - self._most_due
-            self.n_due = self._most_due
+        self._recent.append((step.begun, n_due))
+        while self._recent[0][0] <= step.begun - LAPSE:
+            self._recent.popleft()
+        # More than this is due for steps of before.
+        most_due = max(sum(n for _, n in self._recent), 1)
+        if self.n_due > most_due:
+            self._n_lapsed += self.n_due - most_due
+            self.n_due = most_due
         self._n_periods += 1 + step.missed
         self._n_missed += step.missed
         self._latest = max(self._latest, step.late)
@@ -150,9 +154,10 @@ class Apart:
             return
         self._has_warned_of_lapsed = True
         warn(
-            f"{self._n_lapsed} of {n_due} gradient steps have lapsed: they take longer than the environment's steps, "
-            f"so that fewer are taken than replay_ratio={self._model.replay_ratio} a transition. Pass a smaller "
-            "replay_ratio or control_frequency, or choose smaller networks"
+            f"{self._n_lapsed} of {n_due} gradient steps have lapsed: they, or evaluations and other callbacks, take "
+            "longer than the environment's steps, so that fewer are taken than "
+            f"replay_ratio={self._model.replay_ratio} a transition. Pass a smaller replay_ratio or control_frequency, "
+            "or choose smaller networks"
         )
 
     def record(self) -> None:

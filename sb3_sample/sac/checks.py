@@ -22,7 +22,7 @@ from sb3_sample.learner.exploration import EXPLORATIONS
 from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
 from sb3_sample.learner.reward_scale import LinearScale
 from sb3_sample.replay.buffers import DeviceReplayBuffer, DeviceValidationReplayBuffer, ValidationSplit
-from sb3_sample.replay.columns import has_own_columns
+from sb3_sample.replay.columns import columns_of, has_own_columns
 from sb3_sample.replay.compact import CompactReplay
 from sb3_sample.replay.weighted import FadedReplay, PrioritizedReplay, WindowReplay
 from sb3_sample.sac.multi_task import is_multi_task
@@ -124,6 +124,13 @@ def check_dataset(name: str, dataset: Any, observation_space: Any, action_space:
     ours, theirs = _shapes(observation_space), _shapes(dataset.observation_space)
     if ours != theirs:
         raise ValueError(f"{name} must have observations of the model's shape, {ours}, not {theirs}")
+    for key, part in _parts(observation_space).items():
+        other, which = _parts(dataset.observation_space)[key], f"observations[{key!r}]" if key else "observations"
+        if not _means_alike(part, other):
+            raise ValueError(
+                f"{name} must have {which} that mean the same numbers as the model's {part}, not {other}: pass "
+                "observation_space= where the data set is made, with pictures of its range"
+            )
     own, other = action_space, dataset.action_space
     same = own.shape == other.shape and np.allclose([own.low, own.high], [other.low, other.high])
     if not same:
@@ -138,13 +145,38 @@ def check_offline(agent: Any) -> None:
     Check that an algorithm can learn from a data set alone.
 
     :param agent: the algorithm
-    :raises ValueError: if it asks for steps of an environment
+    :raises ValueError: if it asks for steps of an environment, or for returns of several steps
     """
+    if agent.n_steps > 1:
+        raise ValueError(
+            f"n_steps={agent.n_steps} asks for returns of several steps, and a data set has transitions of one: pass "
+            "n_steps=1"
+        )
+    _check_statistics(agent.get_vec_normalize_env())
     scaler = agent.learner.reward_scaler
     if scaler is not None and scaler.needs_steps:
         raise ValueError(
             f"reward_scale={agent.reward_scale!r} divides by a measure of returns in an environment, and learn_offline "
             "takes no steps there: pass reward_scale=None, or 'linear' for rewards of a size that suits the critics"
+        )
+
+
+def _check_statistics(normalize: Any) -> None:
+    """Whether a ``VecNormalize``, if any, has statistics to normalise a data set by."""
+    if normalize is None:
+        return
+    counts = []
+    if normalize.norm_obs:
+        of_parts = normalize.obs_rms.values() if isinstance(normalize.obs_rms, dict) else [normalize.obs_rms]
+        # A reset has given one observation of each environment.
+        counts += [of_part.count - normalize.num_envs for of_part in of_parts]
+    if normalize.norm_reward:
+        counts.append(normalize.ret_rms.count)
+    if any(count < 1 for count in counts):
+        raise ValueError(
+            "env: VecNormalize has no statistics yet, and learn_offline takes no steps that would give it some: load "
+            "saved ones (load_vec_normalize), or pass normalize_observations=True and a reward_scale of 'linear' in "
+            "its place"
         )
 
 
@@ -174,6 +206,17 @@ def _shapes(space: Any) -> Any:
     return space.shape
 
 
+def _parts(space: Any) -> dict[str, Any]:
+    return dict(space.spaces) if isinstance(space, spaces.Dict) else {"": space}
+
+
+def _means_alike(ours: Any, theirs: Any) -> bool:
+    """Whether numbers of the same shape have one meaning: as many classes, or pictures of one range."""
+    if not (isinstance(ours, spaces.Box) and isinstance(theirs, spaces.Box)):
+        return bool(ours == theirs)
+    return len(ours.shape) != 3 or np.dtype(ours.dtype).kind == np.dtype(theirs.dtype).kind
+
+
 def _check_prior_data(agent: Any) -> None:
     """Whether batches can have their share of the prior data."""
     if agent._prior_of is not None:
@@ -192,6 +235,14 @@ def _check_prior_data(agent: Any) -> None:
     if cls is not None and issubclass(cls, PrioritizedReplay):
         raise ValueError(
             f"prior_data have no priorities, by which replay_buffer_class={cls.__name__} draws: leave one of them out"
+        )
+    columns = sorted(name for name, column in columns_of(cls).items() if column.in_batch)
+    ours, theirs = sorted(set(columns) - set(columns_of(None))), agent.prior_data.column_names
+    if ours != theirs:
+        of_buffer = "the replay buffer" if cls is None else f"replay_buffer_class={cls.__name__}"
+        raise ValueError(
+            f"prior_data must have the further columns of {of_buffer}, {ours or 'none'}, not {theirs or 'none'}: all "
+            "transitions of a batch have the same"
         )
     if agent.n_steps > 1:
         raise ValueError(

@@ -19,6 +19,8 @@ class UpdateSchedule(DecidesCompiling, UpdatesOwed):
         the coming environment steps pay for compiling.
         """
         checks.check_one_reward_scale(self)
+        if self._learns_from is None and self.prior_data is not None:
+            self._tell_of(self.prior_data)
         checks.check_scale_is_known(self)
         n_steps = self._total_timesteps - self.num_timesteps
         if self.learning_rate_schedule is not None and self.planned_updates is None:

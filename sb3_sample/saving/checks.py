@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import TrainFreq
+from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample.errors import ParametersDoNotFit as ParametersDoNotFit
@@ -297,3 +298,39 @@ def check_metadata(metadata: Any, name: str) -> None:
         for key, kept in metadata.items()
     ):
         raise BadFile(f"{name}: {metadata!r:.200} are no versions of layers")
+
+
+def check_environment(env: Any, observation_space: Any, action_space: Any) -> None:
+    """
+    Check that an environment is one for a model.
+
+    :param env: the environment
+    :param observation_space: the model's
+    :param action_space: the model's
+    :raises ValueError: if its spaces are others; where they hold the same numbers, with the way to go on
+    """
+    try:
+        check_for_correct_spaces(env, observation_space, action_space)
+    except ValueError as error:
+        theirs, ours = env.action_space, action_space
+        same = _hold_alike(env.observation_space, observation_space) and _hold_alike(theirs, ours)
+        if same and isinstance(ours, spaces.Box):
+            same = np.allclose([theirs.low, theirs.high], [ours.low, ours.high])
+        if not same:
+            raise
+        raise ValueError(
+            f"{error}. Both hold the same numbers: save the model, and load(path, env=env, "
+            "observation_space=env.observation_space, action_space=env.action_space) goes on with the environment's"
+        ) from None
+
+
+def _hold_alike(theirs: Any, ours: Any) -> bool:
+    """Whether spaces are of one shape and one kind of numbers."""
+    if isinstance(theirs, spaces.Dict) and isinstance(ours, spaces.Dict):
+        return theirs.spaces.keys() == ours.spaces.keys() and all(
+            _hold_alike(part, ours.spaces[key]) for key, part in theirs.spaces.items()
+        )
+    if type(theirs) is not type(ours) or theirs.shape != ours.shape:
+        return False
+    floats = isinstance(ours, spaces.Box) and np.dtype(theirs.dtype).kind == np.dtype(ours.dtype).kind == "f"
+    return floats or bool(theirs == ours)

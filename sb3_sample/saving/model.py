@@ -11,7 +11,7 @@ from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
+from stable_baselines3.common.utils import get_system_info
 
 from sb3_sample.arguments import NoPolicy, check_load, check_policy_class, naming_changes
 from sb3_sample.saving import container, notice, paths
@@ -19,6 +19,7 @@ from sb3_sample.saving.budget import Budget
 from sb3_sample.saving.checks import (
     ParametersDoNotFit,
     check_counts,
+    check_environment,
     check_kinds,
     check_names,
     check_sizes,
@@ -223,7 +224,7 @@ class SafeFiles(BaseAlgorithm):
             verbose = kwargs.get("verbose", attributes.get("verbose", 0))
             env = cls._wrap_env(maybe_make_env(env, verbose), verbose)
             spaces = [attributes.get(name, getattr(env, name)) for name in ("observation_space", "action_space")]
-            check_for_correct_spaces(env, *spaces)
+            check_environment(env, *spaces)
             noise = attributes.get("action_noise")
             if isinstance(noise, VectorizedActionNoise) and noise.n_envs != env.num_envs:
                 # ``learn`` makes one of each environment again.

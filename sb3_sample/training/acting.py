@@ -61,6 +61,7 @@ class Step(NamedTuple):
     :param age: gradient steps since the parameters that chose the actions were handed over; None for random actions
     :param late: seconds after the beginning of its period
     :param missed: periods before it in which no step began
+    :param begun: when it began, in seconds since some moment, rests left out
     """
 
     observations: Any
@@ -73,6 +74,7 @@ class Step(NamedTuple):
     age: int | None
     late: float
     missed: int
+    begun: float
 
 
 class Chosen(NamedTuple):
@@ -109,6 +111,7 @@ class ActingThread:
         self._taken: queue.SimpleQueue[Step | BaseException] = queue.SimpleQueue()
         self._condition = threading.Condition()
         self._stops = self._rests = self._at_rest = False
+        self._rested = 0.0  # seconds
         self._thread = threading.Thread(target=self._run, name="acting", daemon=True)
         self._interval = sys.getswitchinterval()
 
@@ -163,15 +166,18 @@ class ActingThread:
             self._thread.join()
             sys.setswitchinterval(self._interval)
 
-    def _may_begin(self) -> bool:
-        """Whether another step is to be taken, after a rest if one is asked for."""
+    def _has_rested(self) -> bool:
+        """Rest if it is asked for, and say whether it was."""
         with self._condition:
+            asked, begin = self._rests and not self._stops, self._clock.now()
             while self._rests and not self._stops:
                 self._at_rest = True
                 self._condition.notify_all()
                 self._condition.wait()
             self._at_rest = False
-            return not self._stops
+            if asked:
+                self._rested += self._clock.now() - begin
+            return asked
 
     def _run(self) -> None:
         try:
@@ -183,24 +189,29 @@ class ActingThread:
         begin: float | None = None
         number = 0  # of the period
         for n_before in range(self._n_steps):
-            if not self._may_begin():
-                return
-            observations = self._observations
-            chosen = self._choose(observations, n_before)
-            late, missed = 0.0, 0
-            if self._period is not None:
+            self._has_rested()
+            observations, late, missed, is_due = self._observations, 0.0, 0, False
+            while not is_due:
+                if self._stops:
+                    return
+                chosen = self._choose(observations, n_before)
+                if self._period is None:
+                    break
                 now = self._clock.now()
                 begin = now if begin is None else begin
                 behind = (now - begin) / self._period - number
                 if behind > GRACE:
-                    missed = math.ceil(behind - GRACE)
-                    number += missed
+                    missed += math.ceil(behind - GRACE)
+                    number += math.ceil(behind - GRACE)
                 due = begin + number * self._period
                 self._clock.wait_until(due)
                 late = self._clock.now() - due
-                number += 1
-                if not self._may_begin():
-                    return
+                # After a rest the action is old and the period over: choose anew, for a period that can be met.
+                is_due = not self._has_rested()
+            if self._stops:
+                return
+            number += 1
+            begun = self._clock.now() - self._rested
             new_obs, rewards, dones, infos = self._env.step(chosen.actions)
             self._observations = new_obs
             self._taken.put(
@@ -215,5 +226,6 @@ class ActingThread:
                     chosen.age,
                     late,
                     missed,
+                    begun,
                 )
             )

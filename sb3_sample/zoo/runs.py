@@ -535,6 +535,11 @@ class Manager(ExperimentManager):
             found[0]["prior_data"] = self._sets["prior_data"]
         if self._dataset is not None and self.n_envs > 1:
             raise RunError(f"--dataset: n_envs must be 1, not {self.n_envs}: the environment is for evaluations")
+        if self._dataset is not None and self.normalize and not self.continue_training:
+            raise RunError(
+                "--dataset: normalize measures observations and rewards in the environment, where no step is taken: "
+                "-params normalize:False, with normalize_observations:True for the data's own statistics"
+            )
         steps = self._data.offline_steps
         if steps is not None and steps >= self.n_timesteps:
             raise RunError(

@@ -46,6 +46,30 @@ def test_given_next_observations_keep_every_step() -> None:
     assert {r: s for r, (s, _) in rows(data).items()} == {r: r * 10 + 1 for r in range(8)} and len(data) == 8
 
 
+def test_steps_out_of_their_order_are_warned_of_and_have_no_range_of_returns() -> None:
+    rng = np.random.default_rng(0)
+    observations = rng.normal(size=(31, 3)) * 50
+    ends = np.zeros(30)
+    ends[[9, 19]] = 1
+    following = observations[1:] + 10 * ends[:, None]
+
+    def made(order: Any, following: np.ndarray, ends: np.ndarray = ends) -> Dataset:
+        given = (observations[:-1], np.zeros((30, 2)), np.arange(30.0), ends * 0, ends)
+        return Dataset.from_arrays(*(each[order] for each in given), next_observations=following[order])
+
+    exact = made(slice(None), following)
+    assert exact.n_episodes == 3 and exact.return_range == 200
+    with pytest.warns(UserWarning, match="next_observations of 2. of 30 steps are not the following observations"):
+        rounded = made(slice(None), following * (1 + 1e-6))
+    assert rounded.n_episodes > 20 and rounded.return_range == 200
+    with pytest.warns(UserWarning, match="not in the order in which they were taken"):
+        shuffled = made(rng.permutation(30), following, ends * 0)
+    with pytest.raises(ValueError, match=r"\d+ of 30 steps are episodes of their own, .* in the order"):
+        _ = shuffled.return_range
+    alone = Dataset.from_arrays(**arrays(terminations=np.ones(8)))
+    assert alone.n_episodes == 8 and alone.return_range == 7
+
+
 def test_a_last_step_that_terminates_stays() -> None:
     ended = TERMINATIONS.copy()
     ended[7] = 1
@@ -105,6 +129,12 @@ def test_dict_and_image_observations() -> None:
         ({"observations": np.array([["x"]] * 8)}, "observations must be numbers"),
         ({"observations": np.zeros(8)}, r"observations must be numbers of shape \(N, ...\)"),
         ({"observation_space": spaces.Box(-1, 1, (2,))}, "are none of observation_space"),
+        (
+            {"observation_space": spaces.Box(0, 255, (1,), np.uint8), "observations": OBSERVATIONS / 100},
+            "observations must be whole numbers within uint8, as their space has them, not 0.1",
+        ),
+        ({"observation_space": spaces.Box(0, 9, (1,), np.uint8), "observations": ACTIONS}, "not -1.0"),
+        ({"observation_space": spaces.Discrete(9), "observations": np.full((8, 1), np.nan)}, "whole numbers"),
         ({"next_observations": np.zeros((7, 1))}, "next_observations must have as many steps"),
         ({"next_observations": np.zeros((8, 2))}, "are none of observation_space"),
         ({"truncations": np.ones(8), "terminations": np.zeros(8)}, "next_observations must be given"),

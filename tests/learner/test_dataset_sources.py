@@ -72,12 +72,46 @@ def test_round_trip_through_minari(as_dict: bool, tmp_path: Path) -> None:
         data.to_minari(tmp_path / "set")
 
 
+def test_arrays_of_other_types_than_their_spaces_survive_minari(tmp_path: Path) -> None:
+    pytest.importorskip("minari", reason="needs the extra [offline]")
+    rng = np.random.default_rng(0)
+    observations = {"a": np.arange(8)[:, None], "b": np.eye(8, 3, dtype=bool), "c": np.arange(8.0)[:, None]}
+    parts = {"a": spaces.Box(-9, 9, (1,), np.float64), "b": spaces.MultiBinary(3), "c": spaces.Discrete(9)}
+    ends = np.ones(8)
+    for dtype, name in ((np.float32, "single"), (np.float64, "double")):
+        given = (observations, rng.uniform(-1, 1, (8, 2)), ends, ends, ends * 0)
+        box = spaces.Box(-1, 1, (2,), dtype)
+        data = Dataset.from_arrays(*given, observation_space=spaces.Dict(parts), action_space=box)
+        data.to_minari(tmp_path / name)
+        assert_same(data, Dataset.from_minari(tmp_path / name))
+        rows = data.rows(slice(None))
+        assert rows["actions"].dtype == dtype and rows["observations"]["a"].dtype == np.float32
+        assert [rows["observations"][key].dtype for key in "bc"] == [np.int8, np.int64]
+
+
+def test_columns_that_minari_has_no_place_for_are_warned_of(tmp_path: Path) -> None:
+    pytest.importorskip("minari", reason="needs the extra [offline]")
+    with pytest.warns(UserWarning, match=r"Minari's format has no place for columns=\['task'\]"):
+        made(columns={"task": np.arange(60)}).to_minari(tmp_path / "set")
+    assert_same(made(), Dataset.from_minari(tmp_path / "set"))
+
+
 def test_minari_by_id_and_in_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("minari", reason="needs the extra [offline]")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     made().to_minari("toys/random-v0")
     assert_same(made(), Dataset.from_minari("toys/random-v0"))
     assert_same(made(), Dataset.from_minari("toys/random-v0", memory_map=tmp_path / "maps"))
+    # By a name that is the path of a folder too, it is not clear where it is to be.
+    monkeypatch.chdir(tmp_path / "maps")
+    for name, folder in (("here/set-v5", "here"), ("set-v5", "set-v5")):
+        Path(folder).mkdir()
+        with pytest.raises(
+            ValueError, match=rf"id_or_path='{name}' is an id of .* since {folder} is there: .*'./{name}'"
+        ):
+            made().to_minari(name)
+        assert made().to_minari(f"./{name}") == Path(name).absolute()
+    assert made().to_minari("other/set-v5") == tmp_path / "other" / "set-v5"
     with pytest.raises(ValueError, match="id_or_path='toys/other-v0' must be a data set of Minari's: there is none"):
         Dataset.from_minari("toys/other-v0")
 

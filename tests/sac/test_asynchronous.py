@@ -21,7 +21,7 @@ from sb3_sample.learner.execution import CAPTURING
 from sb3_sample.sac.apart import MAX_AGE, Apart
 from sb3_sample.saving.checkpoint import Checkpointer
 from sb3_sample.training import acting
-from sb3_sample.training.acting import ActingThread, Chosen
+from sb3_sample.training.acting import ActingThread, Chosen, Step
 from tests.sac.common import MAKERS, Toy, sac, vec
 from tests.sac.pixels import drq
 
@@ -170,6 +170,38 @@ def test_at_rest_no_step_begins(clock: Made) -> None:
     assert not thread._thread.is_alive()
 
 
+def test_after_a_rest_an_action_is_chosen_anew_for_a_period_that_can_be_met(monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[int] = []
+
+    def wait() -> None:
+        waits.append(1)
+        if len(waits) == 3:  # for the period at 0.1
+            until(lambda: thread._rests)
+
+    clock = Made(wait)
+    monkeypatch.setattr(acting, "CLOCK", clock)
+    env: Any = Durations(clock, [0.03] * 4)
+    chosen: list[float] = []
+
+    def choose(observations: Any, n_before: int) -> Chosen:
+        chosen.append(clock.time)
+        return Chosen(np.full((1, 1), clock.time), np.zeros((1, 1)), 3)
+
+    thread = ActingThread(env, choose, np.zeros((1, 1)), 4, 0.05)
+    thread.start()
+    until(lambda: len(waits) == 3)
+    thread.rest()
+    clock.time += 0.23
+    thread.go_on()
+    thread._thread.join(30)
+    steps = thread.taken(wait=False)
+    thread.stop()
+    np.testing.assert_allclose(env.starts, [0, 0.05, 0.35, 0.4])
+    np.testing.assert_allclose([step.actions.item() for step in steps], [0, 0.03, 0.33, 0.38])
+    assert [step.missed for step in steps] == [0, 0, 5, 0] and len(chosen) == 5
+    np.testing.assert_allclose([step.begun for step in steps], [0, 0.05, 0.12, 0.17])
+
+
 # ---------------------------------------------------------------- learn
 
 
@@ -264,6 +296,27 @@ def test_an_environment_that_is_too_fast_does_not_wait_and_the_log_says_so(clock
     assert last["asynchronous/lapsed_updates"] > 0 and last["asynchronous/replay_ratio"] < 5
     assert last["asynchronous/largest_parameter_age"] <= MAX_AGE
     assert last["asynchronous/missed_periods"] == 0 and last["asynchronous/largest_lateness_ms"] == 0
+
+
+@pytest.mark.parametrize("frequency", [None, 50])
+def test_gradient_steps_lapse_after_a_second(frequency: float | None) -> None:
+    """Whether the environment keeps its own time, here 50 Hz, or is kept to it."""
+    apart = Apart(sac(replay_ratio=2).learn(24), frequency)
+
+    def note(begun: float) -> None:
+        given: list[Any] = [None, None, None, None, None, np.zeros(1, bool), [{}], 0, 0.0, 0]
+        apart.note(Step(*given, begun=begun), 2)
+
+    for n in range(50):
+        note(0.02 * n)
+    assert apart.n_due == 100 and apart._n_lapsed == 0
+    note(1.01)
+    assert apart.n_due == 100 and apart._n_lapsed == 2
+    apart.n_due = 0
+    note(1.03)
+    assert apart.n_due == 2
+    note(60.0)
+    assert apart.n_due == 2 and apart._n_lapsed == 4
 
 
 def test_missed_periods_are_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_sample import BC, BRO, IQL, SAC, TD3BC, VPLSAC, Dataset, PrioritizedReplayBuffer, SimBa
 from sb3_sample.learner import losses
+from sb3_sample.sac.checks import check_dataset
 from tests.sac.common import MAKERS, TINY_RESIDUAL, TINY_SAC, differing, sac, state, vec
 
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
@@ -302,6 +303,24 @@ def test_spaces_come_from_the_data_the_arguments_or_the_environment(where: str) 
     model.learn(1)
 
 
+def test_an_environment_whose_numbers_are_of_another_type(tmp_path: Path) -> None:
+    """As those of Gymnasium's MuJoCo, of float64, where data have float32 and no bounds."""
+    env = vec(obs_space=spaces.Box(-9, 9, (3,), np.float64))
+    model = offline(IQL).learn_offline(data(), 2)
+    words = r"save the model, and load\(path, env=env, observation_space=env.observation_space, action_space="
+    with pytest.raises(ValueError, match=words):
+        model.set_env(env)
+    model.save(tmp_path / "m")
+    with pytest.raises(ValueError, match=words):
+        IQL.load(tmp_path / "m", env=env)
+    given = {"observation_space": env.observation_space, "action_space": env.action_space}
+    again = IQL.load(tmp_path / "m", env=env, **given)
+    assert not differing(state(model), state(again)) and again.learn(12)._n_updates > 2
+    for other in (vec(obs_space=spaces.Box(-9, 9, (4,))), vec(action_space=spaces.Box(-2, 2, (2,)))):
+        with pytest.raises(ValueError, match=r"spaces do not match: .*\)$"):
+            model.set_env(other)
+
+
 def test_a_model_without_spaces_takes_those_of_its_first_environment() -> None:
     model = offline(SAC)
     with pytest.raises(ValueError, match="env: the model was made or loaded without one: pass env= to it, or call set"):
@@ -351,6 +370,26 @@ def test_data_of_other_spaces_are_refused() -> None:
         offline(SAC, vec(action_space=spaces.Box(-2, 2, (2,)))).learn_offline(data(), 1)
     with pytest.raises(ValueError, match=r"dataset must have observations of the model's shape, \(5,\), not \(3,\)"):
         offline(SAC, vec(obs_space=spaces.Box(-1, 1, (5,)))).learn_offline(data(), 1)
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs"),
+    [
+        (spaces.Discrete(5), spaces.Discrete(10)),
+        (spaces.MultiDiscrete([3, 4]), spaces.MultiDiscrete([4, 4])),
+        (spaces.Box(0, 1, (3, 4, 4)), spaces.Box(0, 255, (3, 4, 4), np.uint8)),
+    ],
+)
+@pytest.mark.parametrize("as_dict", [False, True])
+def test_data_of_other_classes_or_pictures_are_refused(ours: Any, theirs: Any, as_dict: bool) -> None:
+    observations: Any = np.zeros((4, *(theirs.shape or (1,))), theirs.dtype)
+    if as_dict:
+        ours, theirs, observations = spaces.Dict(a=ours), spaces.Dict(a=theirs), {"a": observations}
+    ends = np.ones(4)
+    transitions = Dataset.from_arrays(observations, np.zeros((4, 2)), ends, ends, ends * 0, observation_space=theirs)
+    check_dataset("dataset", transitions, theirs, ACTIONS)
+    with pytest.raises(ValueError, match="dataset must have observations.* that mean the same numbers as the model's"):
+        check_dataset("dataset", transitions, ours, ACTIONS)
 
 
 def test_dict_observations_and_hindsight_goals() -> None:
@@ -446,10 +485,28 @@ def test_a_range_of_returns_needs_data() -> None:
     with pytest.raises(ValueError, match="return_range=1000.0 of reward_scale_kwargs is that of a data set: call"):
         offline(IQL, vec(), **kwargs).learn(12)
     assert offline(SAC, vec(), prior_data=data(), **kwargs).learn(12)._n_updates > 0
+    order, given = np.random.default_rng(0).permutation(200), data().rows(slice(None))
+    names = ("observations", "actions", "rewards", "terminations", "truncations", "next_observations")
+    *now, following = (given[name][order] for name in names)
+    with pytest.warns(UserWarning, match="not in the order"):
+        shuffled = Dataset.from_arrays(*now, next_observations=following)
+    with pytest.raises(ValueError, match="in the order in which they were taken"):
+        offline(IQL, vec(), **kwargs).learn_offline(shuffled, 1)
+    assert offline(IQL, vec(), reward_scale="linear").learn_offline(shuffled, 1)._n_updates == 1
+    # It is that of the first data set learned from, not of prior data for later.
+    model = offline(IQL, vec(), prior_data=data(seed=7), **kwargs)
+    assert model.learner.reward_scaler.waits_for_data
+    factor = model.learn_offline(data(), 1).learn(12).learner.reward_scaler.factor.item()
+    assert factor == pytest.approx(1_000 / data().return_range)
     ends = np.ones(4)
     same = Dataset.from_arrays(np.eye(4, 3), np.zeros((4, 2)), ends, ends, ends * 0)
     with pytest.raises(ValueError, match="whose episodes all have the same return: pass factor"):
         offline(IQL, vec(), **kwargs).learn_offline(same, 1)
+
+
+def test_returns_of_several_steps_are_refused() -> None:
+    with pytest.raises(ValueError, match="n_steps=3 asks for returns of several steps, .*: pass n_steps=1"):
+        sac(n_steps=3).learn_offline(data(), 1)
 
 
 def test_an_agent_that_learns_from_windows_is_refused() -> None:
@@ -554,6 +611,24 @@ def test_normalisation_is_that_of_the_environment() -> None:
     np.testing.assert_array_equal(batch.next_observations, venv.normalize_obs(raw.next_observations.numpy()))
     np.testing.assert_allclose(batch.rewards, venv.normalize_reward(raw.rewards.numpy()), rtol=1e-6)
     assert not torch.equal(batch.observations, raw.observations)
+
+
+@pytest.mark.parametrize("kwargs", [{"norm_reward": False}, {"norm_obs": False}])
+def test_a_normalisation_without_statistics_is_refused(kwargs: dict[str, Any]) -> None:
+    """It would clip the numbers as they are."""
+    venv = VecNormalize(vec(), gamma=0.9, **kwargs)
+    venv.reset()
+    model = offline(SAC, venv)
+    with pytest.raises(ValueError, match="VecNormalize has no statistics yet, .* load saved ones"):
+        model.learn_offline(data(), 1)
+    venv.training = False
+    for _ in range(2):
+        with pytest.raises(ValueError, match="VecNormalize has no statistics yet"):
+            model.learn_offline(data(), 1)
+        venv.step(np.zeros((1, 2)))
+    venv.training = True
+    venv.step(np.zeros((1, 2)))
+    assert model.learn_offline(data(), 1)._n_updates == 1
 
 
 def test_transitions_held_out_are_never_trained_on() -> None:

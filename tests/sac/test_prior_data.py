@@ -16,6 +16,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_sample import IQL, SAC, VPLSAC, Dataset, DebiasedRQ, PrioritizedReplayBuffer
 from sb3_sample.learner.learner import Learner
+from sb3_sample.replay.columns import Column
+from sb3_sample.replay.compact import CompactReplayBuffer
 from tests.sac.common import MAKERS, Toy, differing, sac, state, vec
 
 MARK = 1_000.0
@@ -53,6 +55,20 @@ def test_every_agent_has_the_share_of_prior_data_in_every_batch(maker: str, batc
     for batch in batches:
         assert (batch.rewards >= MARK).flatten().tolist() == [True] * 2 + [False] * 6
         assert batch.discounts == model.gamma
+
+
+class TaskReplay(CompactReplayBuffer):
+    more_columns = (Column("task", lambda step: np.zeros(len(step.infos)), dtype=np.int64),)
+
+
+def test_prior_data_have_the_columns_of_the_replay_buffer(batches: list[Any]) -> None:
+    data = prior(columns={"task": np.ones(60, np.int64)})
+    with pytest.raises(ValueError, match=r"prior_data must have .* of the replay buffer, none, not \['task'\]"):
+        sac(prior_data=data)
+    with pytest.raises(ValueError, match=r"of replay_buffer_class=TaskReplay, \['task'\], not none"):
+        sac(prior_data=prior(), replay_buffer_class=TaskReplay)
+    sac(prior_data=data, replay_buffer_class=TaskReplay).learn(12)
+    assert batches[0].columns["task"].flatten().tolist() == [1] * 4 + [0] * 4
 
 
 @pytest.mark.parametrize(("share", "size", "expected"), [(0.5, 8, 4), (0.5, 6, 3), (0.1, 30, 3), (0.9, 10, 9)])
