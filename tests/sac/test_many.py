@@ -18,6 +18,7 @@ from gymnasium import spaces
 from stable_baselines3 import SAC as SB3SAC
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_sample import BRO, MBMAPPO, SAC, VPLSAC, DebiasedRQ, train_many
@@ -250,6 +251,21 @@ def test_numbers_that_differ_by_learner() -> None:
     assert [(model.learning_rate, model.gamma) for model in models] == [(1e-3, 0.9), (1e-4, 0.99)]
     own = SAC("MlpPolicy", Toy(), seed=5, learning_rate=1e-4, gamma=0.99, **TINY_SAC).learn(20)
     assert same(learned(models[1]), learned(own))
+
+
+def test_noise_of_actions_is_each_learners_own() -> None:
+    def noise() -> OrnsteinUhlenbeckActionNoise:
+        return OrnsteinUhlenbeckActionNoise(np.zeros(2), np.full(2, 0.5))
+
+    shared = noise()
+    models = train_many(
+        SAC, "MlpPolicy", Toy, seeds=(1, 2), total_timesteps=20, action_noise=shared, **TINY_SAC,
+    )  # fmt: skip
+    assert same(shared.noise_prev, noise().noise_prev)
+    for model, seed in zip(models, (1, 2), strict=True):
+        own = SAC("MlpPolicy", Toy(), seed=seed, action_noise=noise(), **TINY_SAC).learn(20)
+        assert same(learned(model), learned(own))
+        assert same(model.action_noise.noise_prev, own.action_noise.noise_prev)
 
 
 def test_a_learner_that_its_callback_stops(joint: Any) -> None:
