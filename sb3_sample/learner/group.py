@@ -179,7 +179,9 @@ class LearnerGroup:
         if self._acting is None:
             of_group = CapturedActing(self, "mapped_actions", cuda_graph) if captures(self, self._first) else None
             self._acting = of_group or (lambda group, stacked: group.mapped_actions(*stacked))
-        return self._of_each_learner(self._acting(self, _stacked(inputs, self.device)))
+        # Whose thread this is may be another's than those that act.
+        with torch.inference_mode():
+            return self._of_each_learner(self._acting(self, _stacked(inputs, self.device)))
 
     def _of_each_learner(self, metrics: Metrics) -> list[Metrics]:
         rows = {name: values.unbind() for name, values in metrics.items()}
@@ -214,7 +216,9 @@ class LearnerGroup:
         # Each looks at its own.
         changed = [settings.have_changed() for settings in self._settings]
         if any(changed):
-            self._take_settings()
+            # Actions are computed in inference mode, whose tensors no gradient step can read.
+            with torch.inference_mode(False):
+                self._take_settings()
             self._execution = self._drawing = self._acting = None
 
     def _made(self, method: str) -> Execution:

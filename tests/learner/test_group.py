@@ -248,6 +248,21 @@ def test_numbers_may_differ(maker: str, arguments: dict[str, Sequence[Any]]) -> 
     assert differences(alone[0], alone[1])[0] > 1e-4
 
 
+def test_a_setting_may_change_between_a_step_and_actions() -> None:
+    """What acts is in inference mode, and what learns is not."""
+    models = [models_of("BRO", 1, pessimism=pessimism)[0] for pessimism in (0.2, 0.7)]
+    learners = [model.learner for model in models]
+    group = together(learners, lambda i: take(models[i], 1))
+    for learner in learners:
+        learner.explorer.kl_target = 0.2
+    observations = random_batch(models[0]).observations
+    inputs = [(observations, learner.explorer.draw_noise(learner, observations)) for learner in learners]
+    with torch.inference_mode():
+        group.act(inputs)
+    assert not any(each["actions"].requires_grad for each in group.act(inputs))
+    together(learners, lambda i: take(models[i], 1), group)
+
+
 @pytest.mark.parametrize("how", ["eager", "captured", pytest.param("compiled", marks=[COMPILES, pytest.mark.slow])])
 def test_groups_go_on_after_resets(how: str) -> None:
     """Weights are drawn anew in place, and moments are cleared, which moves them."""

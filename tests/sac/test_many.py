@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 from sb3_sample import BRO, MBMAPPO, SAC, VPLSAC, DebiasedRQ, train_many
 from sb3_sample.learner.execution import Execution
+from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.sac import many
 from sb3_sample.saving import training_state
 from sb3_sample.saving.run_folder import RunFolder, common_starts
@@ -280,6 +281,19 @@ def test_a_learner_that_its_callback_stops(joint: Any) -> None:
     assert [model.num_timesteps for model in models] == [30, 15, 30]
     if joint is not None:
         assert [len(each.learners) for each in joint.made if each.n_steps] == [3, 2]
+
+
+def test_the_last_learner_may_leave_while_the_others_wait_to_act(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            return self.n_calls < 16
+
+    monkeypatch.setattr(many, "joint_of", LearnerGroup)
+    models = train_many(
+        SAC, "MlpPolicy", Toy, seeds=SEEDS, total_timesteps=24, callback=lambda i: Stop() if i == 2 else None,
+        **{**TINY_SAC, "replay_ratio": 0.25},
+    )  # fmt: skip
+    assert [model.num_timesteps for model in models] == [24, 24, 16]
 
 
 def test_a_model_that_is_trained_within_a_callback() -> None:
