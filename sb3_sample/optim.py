@@ -56,6 +56,8 @@ class AdamW(Optimizer):
         self._steps: list[torch.Tensor] = []
         # Number of parameters whose moments exist; another one if moments were cleared.
         self._n_prepared = -1
+        #: Whether the learners whose parameters are stacked have taken different numbers of steps.
+        self.counts_differ = False
         #: Number of times that :meth:`prepare` has made tensors.
         self.version = 0
 
@@ -164,12 +166,12 @@ class AdamW(Optimizer):
                 (p, _laid_out_like(p, g), self.state[p]["exp_avg"], self.state[p]["exp_avg_sq"], steps[..., j])
                 for j, p, g in used
             ]
-            differ = self._rates.dim() > 1 or isinstance(group["weight_decay"], torch.Tensor)
+            differ = self._rates.dim() > 1 or self.counts_differ or isinstance(group["weight_decay"], torch.Tensor)
             if is_tracing() or differ:
                 _plain_adamw(group, rows, self._rates[i])
                 continue
             if steps.dim() > 1:
-                # Learners side by side have taken as many.
+                # The learners side by side have taken as many.
                 rows = [(*tensors, step[0]) for *tensors, step in rows]
             rate = self._rates[i] if self.capturable else group["lr"]
             if group["weight_decay"] == 0:

@@ -109,6 +109,10 @@ class LearnerGroup:
         self._differing: list[tuple[dict[str, Any], str, torch.Tensor]] = []
         self._settings = [Settings(learner, private=False) for learner in self.learners]
         self._versions: list[int] = []
+        #: Whether the learners' optimizers have taken different numbers of steps, as after a reset of one.
+        self.counts_differ = False
+        # Each learner's gradient steps at the last one that was taken here.
+        self._n_updates: list[int] = []
         self._execution: Execution | None = None
         self._drawing: Execution | None = None
         self._acting: Acting | None = None
@@ -204,10 +208,17 @@ class LearnerGroup:
         for optimizer in optimizers:
             optimizer.prepare()
         versions = [optimizer.version for optimizer in optimizers]
+        n_updates = [learner.n_updates for learner in self.learners]
+        is_next = n_updates in (self._n_updates, [n + 1 for n in self._n_updates])
+        self._n_updates = n_updates
         if versions != self._versions:
             # Moments were cleared, or loaded.
             self._take_moments()
             self._versions = versions
+            is_next = False
+        if not is_next:
+            # One has stepped alone. Only then, as it waits for a GPU.
+            self._compare_counts()
         self._take_rates()
         self._take_changes()
 
@@ -340,6 +351,13 @@ class LearnerGroup:
                         optimizer.state[p]["step"] = counts[s, j]
             stacked._n_prepared = len(stacked.state)
             stacked.version += 1
+
+    def _compare_counts(self) -> None:
+        """Look whether the learners have taken as many steps of each parameter, of which Adam's step is quicker."""
+        counts = [steps for stacked in self._optimizers.values() for steps in stacked._steps]
+        self.counts_differ = any(not torch.equal(steps, steps[:1].expand_as(steps)) for steps in counts)
+        for stacked in self._optimizers.values():
+            stacked.counts_differ = self.counts_differ
 
     def _take_rates(self) -> None:
         """Pass the learning rates on: one for all where they are the same, else one for each."""

@@ -294,6 +294,38 @@ def test_groups_go_on_after_resets(how: str) -> None:
     assert differences(*others)[0] > 1e-2
 
 
+@pytest.mark.parametrize("how", ["eager", "captured"])
+def test_one_may_be_reset_or_step_alone(how: str) -> None:
+    """Its optimizers have then taken another number of steps than the others'."""
+    alone, others = models_of("SAC", 2), models_of("SAC", 2)
+
+    def train(model: Any) -> None:
+        take(model, 20)
+        if model.seed == 0:
+            torch.manual_seed(0)
+            model.learner.reinitialize()
+        take(model, 6)
+        if model.seed == 1:
+            take_alone(model)
+        take(model, 6)
+
+    def take_alone(model: Any) -> None:
+        seat, model.learner._execution = model.learner._execution, None
+        take(model, 1)
+        model.learner._execution = seat
+
+    for model in alone:
+        train(model)
+    group = LearnerGroup([model.learner for model in others])
+    if how == "captured":
+        group._execution = Execution(group, False, False, recorder := Recorder(group), "mapped_step")
+    together(group.learners, lambda i: train(others[i]), group)
+    assert group.counts_differ
+    for a, b in zip(alone, others, strict=True):
+        assert differences(a, b)[0] < TOLERANCE
+    assert how == "eager" or recorder.n_recordings == 2
+
+
 @pytest.mark.parametrize(
     ("kwargs", "reason"),
     [
