@@ -373,7 +373,18 @@ def _are_alike(a: Any, b: Any) -> bool:
         return isinstance(b, dict) and a.keys() == b.keys() and all(_are_alike(a[key], b[key]) for key in a)
     if isinstance(a, tuple):
         return isinstance(b, tuple) and len(a) == len(b) and all(map(_are_alike, a, b))
-    return type(a) is type(b) and (isinstance(a, float) or a == b)
+    return are_real((a, b)) or (type(a) is type(b) and a == b)
+
+
+def are_real(values: Sequence[Any]) -> bool:
+    """
+    Tell real numbers from counts and words: learners may differ in them.
+
+    :param values: values of learners
+    :return: whether they are numbers, of which one at least is a float
+    """
+    floats = [isinstance(value, float) for value in values]
+    return any(floats) and all(is_float or type(value) is int for is_float, value in zip(floats, values, strict=True))
 
 
 # ---------------------------------------------------------------- generators

@@ -20,6 +20,7 @@ from sb3_sample.lockstep import (
     Group,
     LeftWithTheOthers,
     Seat,
+    _are_alike,
     present,
 )
 
@@ -209,3 +210,11 @@ def test_an_interrupt_of_the_waiting_thread_ends_all() -> None:
     seed(7)
     assert after == draw()
     assert sorted(ended) == ["0", "1", "2"]
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "alike"),
+    [(0.9, 1, True), (0.9, 0.99, True), (1, 1, True), (1, 2, False), (True, 1.0, False), (None, 0.5, False)],
+)
+def test_inputs_may_differ_in_real_numbers(a: Any, b: Any, alike: bool) -> None:
+    assert _are_alike((a, "same"), (b, "same")) is alike

@@ -26,11 +26,14 @@ from sb3_sample.learner.execution import (
     why_not_compiled,
 )
 from sb3_sample.learner.learner import Learner
+from sb3_sample.lockstep import are_real
 from sb3_sample.optim import AdamW
 from sb3_sample.warn import warn
 
 #: Numbers of a learner that its gradient step does not read, or reads from its inputs.
-_NOT_READ = {"learning_starts", "verbose", "compile", "learning_rate", "gamma"}
+_NOT_READ = {"learning_starts", "verbose", "compile", "learning_rate"}
+#: What a learner has or has not (None), and does around its gradient step by itself.
+_AROUND = {"redo", "reward_scaler", "schedule"}
 
 
 class _Networks(nn.Module):
@@ -107,7 +110,7 @@ class LearnerGroup:
         self._discounts: float | torch.Tensor = 0.0
         #: Numbers that differ between learners: object of the first learner, attribute, (S,).
         self._differing: list[tuple[dict[str, Any], str, torch.Tensor]] = []
-        self._settings = [Settings(learner, private=False) for learner in self.learners]
+        self._settings = [_settings_of(learner) for learner in self.learners]
         self._versions: list[int] = []
         #: Whether the learners' optimizers have taken different numbers of steps, as after a reset of one.
         self.counts_differ = False
@@ -391,11 +394,9 @@ class LearnerGroup:
             if any(other != name for _, other, _ in rows):
                 raise ValueError(f"learners must have the same settings, and not each has {name}")
             group = groups.get(id(values))
-            if name in _NOT_READ:
-                continue
             differ = any(value != first for value in of_each)
             may_differ = group is None or name == "weight_decay"
-            if differ and not (may_differ and all(isinstance(value, float) for value in of_each)):
+            if differ and not (may_differ and are_real(of_each)):
                 raise ValueError(f"learners must agree in {name}, not {of_each!r}")
             held = torch.tensor(of_each, dtype=torch.float32, device=self.device) if differ else first
             if group is not None:
@@ -404,6 +405,17 @@ class LearnerGroup:
                 self._differing.append((values, name, held))
                 if values is vars(self._first) and name == "tau":
                     self._descent.tau = held
+
+
+def _settings_of(learner: Learner) -> Settings:
+    """The settings in which a learner's gradient step may differ from another's."""
+    settings = Settings(learner, private=False)
+    settings.held = [
+        (values, name, value)
+        for values, name, value in settings.held
+        if name not in _NOT_READ and not (name in _AROUND and values is vars(learner))
+    ]
+    return settings
 
 
 def _by_name(rows: Sequence[dict[str, torch.Tensor]]) -> dict[str, Sequence[torch.Tensor]]:
@@ -424,7 +436,7 @@ def _stacked(inputs: Sequence[tuple[Any, ...]], device: torch.device) -> tuple[A
             return type(first)(*fields) if hasattr(first, "_fields") else tuple(fields)
         if all(value == first for value in values):
             return first
-        if not all(isinstance(value, float) for value in values):
+        if not are_real(values):
             raise ValueError(f"the learners' gradient steps must be of one kind, not {list(values)!r}")
         return torch.tensor(values, dtype=torch.float32, device=device)
 

@@ -917,7 +917,9 @@ class Learner(Executable):
         """
         if self.actor_pessimism is None:
             return self.pessimism_rule.value(q)
-        return pessimistic_value(q, float(self.actor_pessimism))
+        # A tensor within the step of several learners.
+        weight: Any = self.actor_pessimism
+        return pessimistic_value(q, weight if isinstance(weight, torch.Tensor) else float(weight))
 
     def _follow(self, target: Any, online: Any) -> None:
         """Take one step of Polyak averaging; with ``tau=1`` the target is the online network."""

@@ -227,7 +227,12 @@ def test_compiled_and_captured_groups(how: str) -> None:
         ("SAC", {"tau": [0.1, 0.5], "gamma": [0.9, 0.99]}),
         ("SAC", {"target_entropy": [-1.0, 1.0], "pessimism": [0.2, 0.7]}),
         ("BRO", {"learning_rate": [1e-3, 1e-4], "tau": [0.1, 0.5], "gamma": [0.9, 0.99]}),
+        ("SAC", {"actor_pessimism": [0.25, 0.75]}),
+        ("SAC", {"tau": [1, 0.5], "gamma": [0.9, 1]}),
+        ("SAC", {"tau": [1, 1], "gamma": [0.9, 0.99]}),
+        ("OPLSAC", {"gamma": [0.5, 0.99]}),
         ("BRO", {"weight_decay": [1e-1, 1e-4]}),
+        ("BRO", {"weight_decay": [0, 1e-1]}),
     ],
 )
 def test_numbers_may_differ(maker: str, arguments: dict[str, Sequence[Any]]) -> None:
@@ -246,6 +251,11 @@ def test_numbers_may_differ(maker: str, arguments: dict[str, Sequence[Any]]) -> 
     together(learners, lambda i: take(others[i], 20))
     assert_alike(maker, alone, others)
     assert differences(alone[0], alone[1])[0] > 1e-4
+
+
+def test_what_is_done_around_the_step_may_be_there_or_not() -> None:
+    others = sac(compile=False, seed=1, redo_period=5, reward_scale="xqc")
+    LearnerGroup([sac(compile=False, seed=0).learner, others.learner])
 
 
 def test_a_setting_may_change_between_a_step_and_actions() -> None:
