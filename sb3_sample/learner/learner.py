@@ -562,6 +562,8 @@ class Learner(Executable):
             if self._heard:
                 self.before_updates()
             self.plasticity.before_gradient_steps(self, 1)
+            # A compiled or captured step is told of rates, settings and moments that were set since the last one.
+            self.prepared_execution()
             self.set_training_mode(True)
             try:
                 yield

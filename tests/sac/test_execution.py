@@ -33,7 +33,7 @@ from sb3_sample.srspr.networks import SPRNetwork
 from sb3_sample.srspr.policies import SPRPolicy
 from sb3_sample.training import compiling
 from tests.agents import OFF_POLICY, env_of
-from tests.sac.common import COMPILES, PIXEL_MAKERS, Toy, bro, differing, sac, sampled, state, vec
+from tests.sac.common import COMPILES, PIXEL_MAKERS, Toy, bro, differing, random_batch, sac, sampled, state, vec
 from tests.srspr.common import TINY
 
 #: Largest difference of a parameter after 50 updates, each of which moves it by up to 3e-4. The same arithmetic in
@@ -274,6 +274,31 @@ def test_a_captured_step_gives_its_own_metrics_and_no_old_gradients() -> None:
     assert not model.gradients_are_stale and model.critic.head.weight.grad is not None
     updates(model, 1)
     assert model.gradients_are_stale
+
+
+def test_captured_updates_of_a_learner_take_what_was_set() -> None:
+    """Without an algorithm, which prepares each turn: rates, settings, and moments that a reset has cleared."""
+    models = pair("SAC")
+    captured(models[1])
+    for model in models:
+        learner = model.learner
+        torch.manual_seed(0)
+
+        def take(n: int, model: Any = model) -> None:
+            for i in range(n):
+                model.learner.update(random_batch(model, seed=i))
+
+        take(6)
+        before = [p.clone() for p in learner.actor.parameters()]
+        learner.set_learning_rate(0.0)
+        take(1)
+        assert all(map(torch.equal, before, learner.actor.parameters()))
+        learner.set_learning_rate(1e-3)
+        learner.tau = 0.5
+        take(2)
+        learner.reinitialize()
+        take(5)
+    assert largest_difference(*models) < TOLERANCE
 
 
 class AbsoluteHead(ValueHead):
