@@ -205,6 +205,8 @@ class Group:
         self.starts: Any = None
         self._joint: Joint | None = None
         self._over = threading.Event()
+        # The GPU that is the current one where the trainings are started; None before CUDA is used.
+        self._gpu: int | None = None
 
     # ---------------------------------------------------------------- the whole
 
@@ -217,6 +219,7 @@ class Group:
         """
         before = Generators()
         before.take()
+        self._gpu = torch.cuda.current_device() if torch.cuda.is_initialized() else None
         threads = [threading.Thread(target=self._make, args=(seat,), daemon=True) for seat in self.seats]
         for thread in threads:
             thread.start()
@@ -237,6 +240,9 @@ class Group:
         seat.turn.acquire()
         _HERE.seat = seat
         try:
+            if self._gpu is not None:
+                # A thread begins with the first one.
+                torch.cuda.set_device(self._gpu)
             seat.generators.put_back()
             if self.stop is None and not self.failed:
                 seat.body()

@@ -203,6 +203,30 @@ def test_groups_go_on_after_resets() -> None:
     assert largest_difference(*there) > 1e-2
 
 
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="there is one GPU")
+def test_steps_and_actions_are_captured_on_the_second_gpu() -> None:
+    models = [model_on(device, "SAC", "captured") for device in ("cuda:0", "cuda:1")]
+    for model in models:
+        take(model, 12)
+        observations = torch.ones(1, 3, device=model.device)
+        with torch.inference_mode():
+            found = [model.learner.explore(observations).clone() for _ in range(8)]
+        assert not torch.equal(found[-1], found[-2])
+    assert largest_difference(*models) < TOLERANCE
+
+
+def test_a_setting_that_is_compiled_changes_under_capture() -> None:
+    models = []
+    for how in ("eager", "compiled"):
+        models.append(model := model_on("cuda", "SAC", how))
+        take(model, 8)
+        model.learner.tau = 0.5
+        model.learner.prepared_execution()
+        take(model, 8)
+    assert models[1].learner._execution._captured._recorded
+    assert largest_difference(*models) < TOLERANCE
+
+
 def test_resets_and_schedules_under_capture() -> None:
     models = []
     for compile in (False, True):

@@ -218,3 +218,15 @@ def test_an_interrupt_of_the_waiting_thread_ends_all() -> None:
 )
 def test_inputs_may_differ_in_real_numbers(a: Any, b: Any, alike: bool) -> None:
     assert _are_alike((a, "same"), (b, "same")) is alike
+
+
+def test_threads_have_the_gpu_of_who_starts_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It belongs to the thread, and a new one has the first."""
+    chosen: list[tuple[Any, int]] = []
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "set_device", lambda device: chosen.append((present().name, device)))
+    monkeypatch.setattr(torch.cuda, "get_rng_state_all", list)
+    monkeypatch.setattr(torch.cuda, "set_rng_state_all", lambda states: None)
+    group(lambda seat: None, lambda seat: None).run()
+    assert chosen == [("0", 1), ("1", 1)]
