@@ -161,7 +161,9 @@ class AdamW(Optimizer):
             if len(used) == len(params):
                 steps.add_(1)
             else:
-                steps[..., [j for j, _, _ in used]] += 1
+                # One by one, as indices would come from the host, for which a GPU waits, and a capture cannot.
+                for j, _, _ in used:
+                    steps[..., j].add_(1)
             rows: list[tuple[torch.Tensor, ...]] = [
                 (p, _laid_out_like(p, g), self.state[p]["exp_avg"], self.state[p]["exp_avg_sq"], steps[..., j])
                 for j, p, g in used

@@ -85,6 +85,17 @@ def test_is_the_cpu(maker: str, how: str) -> None:
     assert largest_difference(here, there) < (10 * TOLERANCE if maker in ROUNDING else TOLERANCE)
 
 
+def test_parameters_without_gradient_are_captured() -> None:
+    """Those of a deviation that a deterministic actor does not have."""
+    here, there = (
+        model_on(*of, pessimistic_actor="deterministic") for of in (("cpu", "DAC"), ("cuda", "DAC", "captured"))
+    )
+    for model in (here, there):
+        take(model, 12)
+    assert there.learner._execution._captured._recorded
+    assert largest_difference(here, there) < TOLERANCE
+
+
 @pytest.mark.parametrize("how", HOWS)
 @pytest.mark.parametrize("name", ["bro_quantile_public", "dac_edge", "bro_scalar_public"])
 def test_golden(name: str, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
