@@ -15,8 +15,8 @@ import torch
 
 from sb3_sample import BRO, SAC, DeviceReplayBuffer, train_many
 from sb3_sample.faults import TrainingDiverged
-from sb3_sample.learner.batch import Batch
-from sb3_sample.learner.execution import CapturedActing, old_torch, why_not_compiled
+from sb3_sample.learner.batch import Batch, Noise
+from sb3_sample.learner.execution import CapturedActing, inputs_like, old_torch, why_not_compiled
 from sb3_sample.learner.group import LearnerGroup
 from tests.learner.test_group import REFUSED, take, together
 from tests.sac import test_golden as golden
@@ -300,6 +300,21 @@ def test_the_update_does_not_wait_for_the_gpu(maker: str) -> None:
 
     take(model, 12, check)
     assert model.learner._execution._captured._recorded
+
+
+def test_the_update_of_a_group_does_not_wait_for_the_gpu() -> None:
+    models = [model_on("cuda", "SAC", "captured", seed=i, gamma=gamma) for i, gamma in enumerate((0.9, 0.99))]
+    group, inputs = LearnerGroup([model.learner for model in models]), []
+    for model in models:
+        model.learner.set_training_mode(True)
+        batch = random_batch(model, seed=model.seed)._replace(discounts=model.gamma)
+        noise = Noise(*(torch.randn((8, model.actor.action_dim)) for _ in range(3)))
+        inputs.append(inputs_like((batch, noise, None, True, True), lambda x: x.to("cuda")))
+    for i in range(12):
+        torch.cuda.set_sync_debug_mode("error" if i > 5 else "default")
+        group.step(inputs)
+        torch.cuda.set_sync_debug_mode("default")
+    assert group._execution is not None and group._execution._captured._recorded
 
 
 @pytest.mark.parametrize("maker", ["SAC", "BRO", "DAC", "OAC", "BROTD3", "FlashSAC"])

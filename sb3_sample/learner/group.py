@@ -3,6 +3,7 @@ Many learners in one gradient step: their networks, moments and statistics are s
 gradient step of one is mapped over it by ``torch.vmap``.
 """
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import zip_longest
@@ -110,6 +111,8 @@ class LearnerGroup:
         self._discounts: float | torch.Tensor = 0.0
         #: Numbers that differ between learners: object of the first learner, attribute, (S,).
         self._differing: list[tuple[dict[str, Any], str, torch.Tensor]] = []
+        # Numbers that differ between the inputs are mostly the same as before, and a GPU waits for those of the host.
+        self._row = functools.lru_cache(maxsize=8)(self._made_row)
         self._settings = [_settings_of(learner) for learner in self.learners]
         self._versions: list[int] = []
         #: Whether the learners' optimizers have taken different numbers of steps, as after a reset of one.
@@ -173,7 +176,7 @@ class LearnerGroup:
             self._drawing = self._drawing or self._made("mapped_drawn_step")
             execution = self._drawing
         execution.prepare(self)
-        return self._of_each_learner(execution(self, *_stacked(inputs, self.device)))
+        return self._of_each_learner(execution(self, *_stacked(inputs, self._row)))
 
     def act(self, inputs: Sequence[tuple[Any, ...]]) -> list[Metrics]:
         """
@@ -188,7 +191,7 @@ class LearnerGroup:
             self._acting = of_group or (lambda group, stacked: group.mapped_actions(*stacked))
         # Whose thread this is may be another's than those that act.
         with torch.inference_mode():
-            return self._of_each_learner(self._acting(self, _stacked(inputs, self.device)))
+            return self._of_each_learner(self._acting(self, _stacked(inputs, self._row)))
 
     def _of_each_learner(self, metrics: Metrics) -> list[Metrics]:
         rows = {name: values.unbind() for name, values in metrics.items()}
@@ -204,6 +207,11 @@ class LearnerGroup:
                     state.update({name: value.clone() for name, value in state.items()})
                 # Made anew from them.
                 optimizer.__setstate__(optimizer.__dict__)
+
+    def _made_row(self, values: tuple[float, ...]) -> torch.Tensor:
+        # Actions are computed in inference mode.
+        with torch.inference_mode(False):
+            return torch.tensor(values, dtype=torch.float32, device=self.device)
 
     def _prepare(self) -> None:
         """Bring the stacks up to date with what has happened to the learners since the last step."""
@@ -269,7 +277,7 @@ class LearnerGroup:
             if extra is not None:
                 extra = extra._replace(batch=extra.batch._replace(discounts=None))
             inputs.append((batch._replace(discounts=None), noise, extra))
-        batch, noise, extra = _stacked(inputs, self.device)
+        batch, noise, extra = _stacked(inputs, self._row)
         batch = batch._replace(discounts=self._discounts)
         if extra is not None:
             extra = extra._replace(batch=extra.batch._replace(discounts=self._discounts))
@@ -422,8 +430,8 @@ def _by_name(rows: Sequence[dict[str, torch.Tensor]]) -> dict[str, Sequence[torc
     return {name: [row[name] for row in rows] for name in rows[0]}
 
 
-def _stacked(inputs: Sequence[tuple[Any, ...]], device: torch.device) -> tuple[Any, ...]:
-    """Inputs of S learners as one, tensors with an axis S in front; a number that differs becomes a tensor (S,)."""
+def _stacked(inputs: Sequence[tuple[Any, ...]], row: Callable[[tuple[float, ...]], torch.Tensor]) -> tuple[Any, ...]:
+    """Inputs of S learners as one, tensors with an axis S in front; numbers that differ become a tensor (S,), a row."""
 
     def stack(values: Sequence[Any]) -> Any:
         first = values[0]
@@ -438,7 +446,7 @@ def _stacked(inputs: Sequence[tuple[Any, ...]], device: torch.device) -> tuple[A
             return first
         if not are_real(values):
             raise ValueError(f"the learners' gradient steps must be of one kind, not {list(values)!r}")
-        return torch.tensor(values, dtype=torch.float32, device=device)
+        return row(tuple(values))
 
     result: tuple[Any, ...] = stack([tuple(each) for each in inputs])
     return result

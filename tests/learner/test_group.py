@@ -253,6 +253,17 @@ def test_numbers_may_differ(maker: str, arguments: dict[str, Sequence[Any]]) -> 
     assert differences(alone[0], alone[1])[0] > 1e-4
 
 
+def test_numbers_that_differ_are_put_on_the_device_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    models = [models_of("SAC", 1, gamma=gamma)[0] for gamma in (0.9, 0.99)]
+    learners = [model.learner for model in models]
+    group = together(learners, lambda i: take(models[i], 1))
+    made: list[Any] = []
+    make = torch.tensor
+    monkeypatch.setattr(torch, "tensor", lambda *args, **kwargs: made.append(args) or make(*args, **kwargs))
+    together(learners, lambda i: take(models[i], 2), group)
+    assert made == []
+
+
 def test_what_is_done_around_the_step_may_be_there_or_not() -> None:
     others = sac(compile=False, seed=1, redo_period=5, reward_scale="xqc")
     LearnerGroup([sac(compile=False, seed=0).learner, others.learner])
