@@ -142,7 +142,7 @@ class AdamW(Optimizer):
         # Called by load_state_dict, copy and pickle: what follows from the state is made anew by prepare.
         super().__setstate__(state)
         self.capturable, self._rates, self._rates_held, self._steps = False, None, [], []
-        self._n_prepared, self.version = -1, getattr(self, "version", 0)
+        self._n_prepared, self.version, self.counts_differ = -1, getattr(self, "version", 0), False
 
     @torch.no_grad()
     def apply(self, gradients: Sequence[torch.Tensor | None]) -> None:
