@@ -205,6 +205,8 @@ class Group:
         self.starts: Any = None
         self._joint: Joint | None = None
         self._over = threading.Event()
+        # The GPU that is the current one where the trainings are started; None before CUDA is used.
+        self._gpu: int | None = None
 
     # ---------------------------------------------------------------- the whole
 
@@ -217,6 +219,7 @@ class Group:
         """
         before = Generators()
         before.take()
+        self._gpu = torch.cuda.current_device() if torch.cuda.is_initialized() else None
         threads = [threading.Thread(target=self._make, args=(seat,), daemon=True) for seat in self.seats]
         for thread in threads:
             thread.start()
@@ -237,6 +240,9 @@ class Group:
         seat.turn.acquire()
         _HERE.seat = seat
         try:
+            if self._gpu is not None:
+                # A thread begins with the first one.
+                torch.cuda.set_device(self._gpu)
             seat.generators.put_back()
             if self.stop is None and not self.failed:
                 seat.body()
@@ -373,7 +379,18 @@ def _are_alike(a: Any, b: Any) -> bool:
         return isinstance(b, dict) and a.keys() == b.keys() and all(_are_alike(a[key], b[key]) for key in a)
     if isinstance(a, tuple):
         return isinstance(b, tuple) and len(a) == len(b) and all(map(_are_alike, a, b))
-    return type(a) is type(b) and (isinstance(a, float) or a == b)
+    return are_real((a, b)) or (type(a) is type(b) and a == b)
+
+
+def are_real(values: Sequence[Any]) -> bool:
+    """
+    Tell real numbers from counts and words: learners may differ in them.
+
+    :param values: values of learners
+    :return: whether they are numbers, of which one at least is a float
+    """
+    floats = [isinstance(value, float) for value in values]
+    return any(floats) and all(is_float or type(value) is int for is_float, value in zip(floats, values, strict=True))
 
 
 # ---------------------------------------------------------------- generators

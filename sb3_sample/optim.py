@@ -56,6 +56,8 @@ class AdamW(Optimizer):
         self._steps: list[torch.Tensor] = []
         # Number of parameters whose moments exist; another one if moments were cleared.
         self._n_prepared = -1
+        #: Whether the learners whose parameters are stacked have taken different numbers of steps.
+        self.counts_differ = False
         #: Number of times that :meth:`prepare` has made tensors.
         self.version = 0
 
@@ -140,7 +142,7 @@ class AdamW(Optimizer):
         # Called by load_state_dict, copy and pickle: what follows from the state is made anew by prepare.
         super().__setstate__(state)
         self.capturable, self._rates, self._rates_held, self._steps = False, None, [], []
-        self._n_prepared, self.version = -1, getattr(self, "version", 0)
+        self._n_prepared, self.version, self.counts_differ = -1, getattr(self, "version", 0), False
 
     @torch.no_grad()
     def apply(self, gradients: Sequence[torch.Tensor | None]) -> None:
@@ -159,17 +161,19 @@ class AdamW(Optimizer):
             if len(used) == len(params):
                 steps.add_(1)
             else:
-                steps[..., [j for j, _, _ in used]] += 1
+                # One by one, as indices would come from the host, for which a GPU waits, and a capture cannot.
+                for j, _, _ in used:
+                    steps[..., j].add_(1)
             rows: list[tuple[torch.Tensor, ...]] = [
                 (p, _laid_out_like(p, g), self.state[p]["exp_avg"], self.state[p]["exp_avg_sq"], steps[..., j])
                 for j, p, g in used
             ]
-            differ = self._rates.dim() > 1 or isinstance(group["weight_decay"], torch.Tensor)
+            differ = self._rates.dim() > 1 or self.counts_differ or isinstance(group["weight_decay"], torch.Tensor)
             if is_tracing() or differ:
                 _plain_adamw(group, rows, self._rates[i])
                 continue
             if steps.dim() > 1:
-                # Learners side by side have taken as many.
+                # The learners side by side have taken as many.
                 rows = [(*tensors, step[0]) for *tensors, step in rows]
             rate = self._rates[i] if self.capturable else group["lr"]
             if group["weight_decay"] == 0:

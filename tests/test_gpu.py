@@ -15,8 +15,8 @@ import torch
 
 from sb3_sample import BRO, SAC, DeviceReplayBuffer, train_many
 from sb3_sample.faults import TrainingDiverged
-from sb3_sample.learner.batch import Batch
-from sb3_sample.learner.execution import CapturedActing, old_torch, why_not_compiled
+from sb3_sample.learner.batch import Batch, Noise
+from sb3_sample.learner.execution import CapturedActing, inputs_like, old_torch, why_not_compiled
 from sb3_sample.learner.group import LearnerGroup
 from tests.learner.test_group import REFUSED, take, together
 from tests.sac import test_golden as golden
@@ -83,6 +83,17 @@ def test_is_the_cpu(maker: str, how: str) -> None:
     if how != "eager" and n > 6:
         assert execution._captured._recorded
     assert largest_difference(here, there) < (10 * TOLERANCE if maker in ROUNDING else TOLERANCE)
+
+
+def test_parameters_without_gradient_are_captured() -> None:
+    """Those of a deviation that a deterministic actor does not have."""
+    here, there = (
+        model_on(*of, pessimistic_actor="deterministic") for of in (("cpu", "DAC"), ("cuda", "DAC", "captured"))
+    )
+    for model in (here, there):
+        take(model, 12)
+    assert there.learner._execution._captured._recorded
+    assert largest_difference(here, there) < TOLERANCE
 
 
 @pytest.mark.parametrize("how", HOWS)
@@ -203,6 +214,30 @@ def test_groups_go_on_after_resets() -> None:
     assert largest_difference(*there) > 1e-2
 
 
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="there is one GPU")
+def test_steps_and_actions_are_captured_on_the_second_gpu() -> None:
+    models = [model_on(device, "SAC", "captured") for device in ("cuda:0", "cuda:1")]
+    for model in models:
+        take(model, 12)
+        observations = torch.ones(1, 3, device=model.device)
+        with torch.inference_mode():
+            found = [model.learner.explore(observations).clone() for _ in range(8)]
+        assert not torch.equal(found[-1], found[-2])
+    assert largest_difference(*models) < TOLERANCE
+
+
+def test_a_setting_that_is_compiled_changes_under_capture() -> None:
+    models = []
+    for how in ("eager", "compiled"):
+        models.append(model := model_on("cuda", "SAC", how))
+        take(model, 8)
+        model.learner.tau = 0.5
+        model.learner.prepared_execution()
+        take(model, 8)
+    assert models[1].learner._execution._captured._recorded
+    assert largest_difference(*models) < TOLERANCE
+
+
 def test_resets_and_schedules_under_capture() -> None:
     models = []
     for compile in (False, True):
@@ -265,6 +300,21 @@ def test_the_update_does_not_wait_for_the_gpu(maker: str) -> None:
 
     take(model, 12, check)
     assert model.learner._execution._captured._recorded
+
+
+def test_the_update_of_a_group_does_not_wait_for_the_gpu() -> None:
+    models = [model_on("cuda", "SAC", "captured", seed=i, gamma=gamma) for i, gamma in enumerate((0.9, 0.99))]
+    group, inputs = LearnerGroup([model.learner for model in models]), []
+    for model in models:
+        model.learner.set_training_mode(True)
+        batch = random_batch(model, seed=model.seed)._replace(discounts=model.gamma)
+        noise = Noise(*(torch.randn((8, model.actor.action_dim)) for _ in range(3)))
+        inputs.append(inputs_like((batch, noise, None, True, True), lambda x: x.to("cuda")))
+    for i in range(12):
+        torch.cuda.set_sync_debug_mode("error" if i > 5 else "default")
+        group.step(inputs)
+        torch.cuda.set_sync_debug_mode("default")
+    assert group._execution is not None and group._execution._captured._recorded
 
 
 @pytest.mark.parametrize("maker", ["SAC", "BRO", "DAC", "OAC", "BROTD3", "FlashSAC"])

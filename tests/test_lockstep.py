@@ -20,6 +20,7 @@ from sb3_sample.lockstep import (
     Group,
     LeftWithTheOthers,
     Seat,
+    _are_alike,
     present,
 )
 
@@ -209,3 +210,23 @@ def test_an_interrupt_of_the_waiting_thread_ends_all() -> None:
     seed(7)
     assert after == draw()
     assert sorted(ended) == ["0", "1", "2"]
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "alike"),
+    [(0.9, 1, True), (0.9, 0.99, True), (1, 1, True), (1, 2, False), (True, 1.0, False), (None, 0.5, False)],
+)
+def test_inputs_may_differ_in_real_numbers(a: Any, b: Any, alike: bool) -> None:
+    assert _are_alike((a, "same"), (b, "same")) is alike
+
+
+def test_threads_have_the_gpu_of_who_starts_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It belongs to the thread, and a new one has the first."""
+    chosen: list[tuple[Any, int]] = []
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "set_device", lambda device: chosen.append((present().name, device)))
+    monkeypatch.setattr(torch.cuda, "get_rng_state_all", list)
+    monkeypatch.setattr(torch.cuda, "set_rng_state_all", lambda states: None)
+    group(lambda seat: None, lambda seat: None).run()
+    assert chosen == [("0", 1), ("1", 1)]

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_sample import optim
 from sb3_sample.networks import MLP
@@ -193,6 +194,27 @@ def test_summed_loss_through_autograd_grad() -> None:
     p[0].grad = grad
     optimizer.step()
     torch.testing.assert_close(p[0].detach(), initial[0].detach() - 1e-2, rtol=1e-5, atol=1e-6)
+
+
+class _Indexing(TorchDispatchMode):
+    """Counts what takes places from an index tensor, which on a GPU would have to be copied there."""
+
+    n = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.n += "index" in str(func)
+        return func(*args, **(kwargs or {}))
+
+
+def test_steps_of_some_parameters_are_counted_without_indices() -> None:
+    params = parameters([(2,), (3,), (4,)])
+    optimizer = AdamW(params)
+    params[0].grad, params[2].grad = torch.ones(2), torch.ones(4)
+    optimizer.prepare()
+    with _Indexing() as indexing:
+        optimizer.step()
+    assert [int(optimizer.state[p]["step"]) for p in params] == [1, 0, 1]
+    assert indexing.n == 0
 
 
 def test_parameters_without_gradient_stay() -> None:

@@ -114,7 +114,7 @@ class StackedDescent:
         ours, theirs = self._parameters[id(target)], self._parameters[id(online)]
         theirs = theirs[len(theirs) - len(ours) :]
         with torch.no_grad():
-            if isinstance(self.tau, float):
+            if not isinstance(self.tau, torch.Tensor):
                 torch._foreach_lerp_(ours, theirs, weight=self.tau)
                 return
             for p, q in zip(ours, theirs, strict=True):

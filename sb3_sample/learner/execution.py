@@ -5,11 +5,13 @@ All three run the same function, ``Learner.gradient_step``, which is independent
 noise as tensors, does not branch on the value of a tensor, and counts nothing outside of tensors.
 """
 
+import functools
 import operator
 import re
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
 import torch
@@ -439,13 +441,24 @@ def cuda_graph(run: Callable[[], Metrics]) -> tuple[Callable[[], None], Metrics]
     """
     Capture as a CUDA graph.
 
-    :param run: what to capture
+    :param run: what to capture, of the current device
     :return: function that repeats it, and its result
     """
     graph = torch.cuda.CUDAGraph()
-    with CAPTURING, torch.cuda.graph(graph):
+    with CAPTURING, torch.cuda.graph(graph, stream=_capture_stream(torch.cuda.current_device())):
         metrics = run()
     return graph.replay, metrics
+
+
+@functools.cache
+def _capture_stream(device: int) -> torch.cuda.Stream:
+    """The stream of a GPU's captures. torch's own is of the GPU on which the first of a process was made."""
+    return torch.cuda.Stream(device)
+
+
+def _current(device: torch.device) -> AbstractContextManager[Any]:
+    """Have a GPU be the current one, of which streams and captures are: a capture of another one is empty."""
+    return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
 
 
 class Captured:
@@ -483,6 +496,9 @@ class Captured:
         self._tensors.renew()
         now = [program, *(t.data_ptr() for t in self._tensors.all)]
         if self._settings.have_changed() or now != self._held:
+            if self._held is not None and self._held[0] != program:
+                # The next steps are traced and compiled, which is not done within a capture.
+                self._runs.clear()
             self._recorded.clear()
             self._held = now
 
@@ -498,10 +514,14 @@ class Captured:
         kind = _kind(inputs)
         runs = self._runs[kind] = self._runs.get(kind, 0) + 1
         if runs <= self.WARM_UP:
-            return _aside(lambda: step(learner, *inputs)) if learner.device.type == "cuda" else step(learner, *inputs)
+            if learner.device.type != "cuda":
+                return step(learner, *inputs)
+            with _current(learner.device):
+                return _aside(lambda: step(learner, *inputs))
         if kind not in self._recorded:
             own = inputs_like(inputs, torch.clone)
-            self._recorded[kind] = (own, *self._recorder(lambda: step(learner, *own)))
+            with _current(learner.device):
+                self._recorded[kind] = (own, *self._recorder(lambda: step(learner, *own)))
         own, repeat, metrics = self._recorded[kind]
         if given := tensors_of(inputs):
             torch._foreach_copy_(tensors_of(own), given)

@@ -3,6 +3,7 @@ Many learners in one gradient step: their networks, moments and statistics are s
 gradient step of one is mapped over it by ``torch.vmap``.
 """
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import zip_longest
@@ -26,11 +27,14 @@ from sb3_sample.learner.execution import (
     why_not_compiled,
 )
 from sb3_sample.learner.learner import Learner
+from sb3_sample.lockstep import are_real
 from sb3_sample.optim import AdamW
 from sb3_sample.warn import warn
 
 #: Numbers of a learner that its gradient step does not read, or reads from its inputs.
-_NOT_READ = {"learning_starts", "verbose", "compile", "learning_rate", "gamma"}
+_NOT_READ = {"learning_starts", "verbose", "compile", "learning_rate"}
+#: What a learner has or has not (None), and does around its gradient step by itself.
+_AROUND = {"redo", "reward_scaler", "schedule"}
 
 
 class _Networks(nn.Module):
@@ -107,8 +111,14 @@ class LearnerGroup:
         self._discounts: float | torch.Tensor = 0.0
         #: Numbers that differ between learners: object of the first learner, attribute, (S,).
         self._differing: list[tuple[dict[str, Any], str, torch.Tensor]] = []
-        self._settings = [Settings(learner, private=False) for learner in self.learners]
+        # Numbers that differ between the inputs are mostly the same as before, and a GPU waits for those of the host.
+        self._row = functools.lru_cache(maxsize=8)(self._made_row)
+        self._settings = [_settings_of(learner) for learner in self.learners]
         self._versions: list[int] = []
+        #: Whether the learners' optimizers have taken different numbers of steps, as after a reset of one.
+        self.counts_differ = False
+        # Each learner's gradient steps at the last one that was taken here.
+        self._n_updates: list[int] = []
         self._execution: Execution | None = None
         self._drawing: Execution | None = None
         self._acting: Acting | None = None
@@ -166,7 +176,7 @@ class LearnerGroup:
             self._drawing = self._drawing or self._made("mapped_drawn_step")
             execution = self._drawing
         execution.prepare(self)
-        return self._of_each_learner(execution(self, *_stacked(inputs, self.device)))
+        return self._of_each_learner(execution(self, *_stacked(inputs, self._row)))
 
     def act(self, inputs: Sequence[tuple[Any, ...]]) -> list[Metrics]:
         """
@@ -179,7 +189,9 @@ class LearnerGroup:
         if self._acting is None:
             of_group = CapturedActing(self, "mapped_actions", cuda_graph) if captures(self, self._first) else None
             self._acting = of_group or (lambda group, stacked: group.mapped_actions(*stacked))
-        return self._of_each_learner(self._acting(self, _stacked(inputs, self.device)))
+        # Whose thread this is may be another's than those that act.
+        with torch.inference_mode():
+            return self._of_each_learner(self._acting(self, _stacked(inputs, self._row)))
 
     def _of_each_learner(self, metrics: Metrics) -> list[Metrics]:
         rows = {name: values.unbind() for name, values in metrics.items()}
@@ -196,16 +208,28 @@ class LearnerGroup:
                 # Made anew from them.
                 optimizer.__setstate__(optimizer.__dict__)
 
+    def _made_row(self, values: tuple[float, ...]) -> torch.Tensor:
+        # Actions are computed in inference mode.
+        with torch.inference_mode(False):
+            return torch.tensor(values, dtype=torch.float32, device=self.device)
+
     def _prepare(self) -> None:
         """Bring the stacks up to date with what has happened to the learners since the last step."""
         optimizers = [optimizer for of_each in self._of_each.values() for optimizer in of_each]
         for optimizer in optimizers:
             optimizer.prepare()
         versions = [optimizer.version for optimizer in optimizers]
+        n_updates = [learner.n_updates for learner in self.learners]
+        is_next = n_updates in (self._n_updates, [n + 1 for n in self._n_updates])
+        self._n_updates = n_updates
         if versions != self._versions:
             # Moments were cleared, or loaded.
             self._take_moments()
             self._versions = versions
+            is_next = False
+        if not is_next:
+            # One has stepped alone. Only then, as it waits for a GPU.
+            self._compare_counts()
         self._take_rates()
         self._take_changes()
 
@@ -214,7 +238,9 @@ class LearnerGroup:
         # Each looks at its own.
         changed = [settings.have_changed() for settings in self._settings]
         if any(changed):
-            self._take_settings()
+            # Actions are computed in inference mode, whose tensors no gradient step can read.
+            with torch.inference_mode(False):
+                self._take_settings()
             self._execution = self._drawing = self._acting = None
 
     def _made(self, method: str) -> Execution:
@@ -251,7 +277,7 @@ class LearnerGroup:
             if extra is not None:
                 extra = extra._replace(batch=extra.batch._replace(discounts=None))
             inputs.append((batch._replace(discounts=None), noise, extra))
-        batch, noise, extra = _stacked(inputs, self.device)
+        batch, noise, extra = _stacked(inputs, self._row)
         batch = batch._replace(discounts=self._discounts)
         if extra is not None:
             extra = extra._replace(batch=extra.batch._replace(discounts=self._discounts))
@@ -337,6 +363,13 @@ class LearnerGroup:
             stacked._n_prepared = len(stacked.state)
             stacked.version += 1
 
+    def _compare_counts(self) -> None:
+        """Look whether the learners have taken as many steps of each parameter, of which Adam's step is quicker."""
+        counts = [steps for stacked in self._optimizers.values() for steps in stacked._steps]
+        self.counts_differ = any(not torch.equal(steps, steps[:1].expand_as(steps)) for steps in counts)
+        for stacked in self._optimizers.values():
+            stacked.counts_differ = self.counts_differ
+
     def _take_rates(self) -> None:
         """Pass the learning rates on: one for all where they are the same, else one for each."""
         for path, stacked in self._optimizers.items():
@@ -369,11 +402,9 @@ class LearnerGroup:
             if any(other != name for _, other, _ in rows):
                 raise ValueError(f"learners must have the same settings, and not each has {name}")
             group = groups.get(id(values))
-            if name in _NOT_READ:
-                continue
             differ = any(value != first for value in of_each)
             may_differ = group is None or name == "weight_decay"
-            if differ and not (may_differ and all(isinstance(value, float) for value in of_each)):
+            if differ and not (may_differ and are_real(of_each)):
                 raise ValueError(f"learners must agree in {name}, not {of_each!r}")
             held = torch.tensor(of_each, dtype=torch.float32, device=self.device) if differ else first
             if group is not None:
@@ -384,12 +415,23 @@ class LearnerGroup:
                     self._descent.tau = held
 
 
+def _settings_of(learner: Learner) -> Settings:
+    """The settings in which a learner's gradient step may differ from another's."""
+    settings = Settings(learner, private=False)
+    settings.held = [
+        (values, name, value)
+        for values, name, value in settings.held
+        if name not in _NOT_READ and not (name in _AROUND and values is vars(learner))
+    ]
+    return settings
+
+
 def _by_name(rows: Sequence[dict[str, torch.Tensor]]) -> dict[str, Sequence[torch.Tensor]]:
     return {name: [row[name] for row in rows] for name in rows[0]}
 
 
-def _stacked(inputs: Sequence[tuple[Any, ...]], device: torch.device) -> tuple[Any, ...]:
-    """Inputs of S learners as one, tensors with an axis S in front; a number that differs becomes a tensor (S,)."""
+def _stacked(inputs: Sequence[tuple[Any, ...]], row: Callable[[tuple[float, ...]], torch.Tensor]) -> tuple[Any, ...]:
+    """Inputs of S learners as one, tensors with an axis S in front; numbers that differ become a tensor (S,), a row."""
 
     def stack(values: Sequence[Any]) -> Any:
         first = values[0]
@@ -402,9 +444,9 @@ def _stacked(inputs: Sequence[tuple[Any, ...]], device: torch.device) -> tuple[A
             return type(first)(*fields) if hasattr(first, "_fields") else tuple(fields)
         if all(value == first for value in values):
             return first
-        if not all(isinstance(value, float) for value in values):
+        if not are_real(values):
             raise ValueError(f"the learners' gradient steps must be of one kind, not {list(values)!r}")
-        return torch.tensor(values, dtype=torch.float32, device=device)
+        return row(tuple(values))
 
     result: tuple[Any, ...] = stack([tuple(each) for each in inputs])
     return result

@@ -562,6 +562,8 @@ class Learner(Executable):
             if self._heard:
                 self.before_updates()
             self.plasticity.before_gradient_steps(self, 1)
+            # A compiled or captured step is told of rates, settings and moments that were set since the last one.
+            self.prepared_execution()
             self.set_training_mode(True)
             try:
                 yield
@@ -917,7 +919,9 @@ class Learner(Executable):
         """
         if self.actor_pessimism is None:
             return self.pessimism_rule.value(q)
-        return pessimistic_value(q, float(self.actor_pessimism))
+        # A tensor within the step of several learners.
+        weight: Any = self.actor_pessimism
+        return pessimistic_value(q, weight if isinstance(weight, torch.Tensor) else float(weight))
 
     def _follow(self, target: Any, online: Any) -> None:
         """Take one step of Polyak averaging; with ``tau=1`` the target is the online network."""

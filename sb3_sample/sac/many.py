@@ -1,5 +1,6 @@
 """``train_many``: the same training with many seeds, in one process."""
 
+import copy
 import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -9,6 +10,7 @@ import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, EvalCallback
 from stable_baselines3.common.env_util import is_wrapped, make_vec_env
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
@@ -74,7 +76,7 @@ def train_many(
     :param n_envs: environments of each learner
     :param vec_env_cls: class of the learners' vectorised environments, such as ``SupervisedSubprocVecEnv``, whose
         workers all step at the same time; in this process if None
-    :param arguments: of ``cls``, the same for all learners
+    :param arguments: of ``cls``, the same for all learners; an ``action_noise`` is copied for each
     :return: the trained models, in the order of the seeds
     :raises ValueError: if an argument is out of range, contradicts another, or is of what cannot be trained so
     :raises TypeError: if ``cls`` has no such argument
@@ -103,8 +105,11 @@ def train_many(
     def train(index: int) -> None:
         seed, folder = names[index], folders[index]
         made = _environment(env, n_envs, vec_env_cls)
-        own = {name: values[index] for name, values in differing.items()}
-        model = models[index] = cls(policy, made, seed=seed, **arguments, **own)
+        own = {**arguments, **{name: values[index] for name, values in differing.items()}}
+        if isinstance(noise := own.get("action_noise"), ActionNoise):
+            # It may hold the state of a process, which moves with a learner's steps.
+            own["action_noise"] = copy.deepcopy(noise)
+        model = models[index] = cls(policy, made, seed=seed, **own)
         callbacks = None if callback is None else callback(index)
         if eval_env is not None:
             evaluation = _evaluation(eval_env, seed, eval_freq, n_eval_episodes, model.n_envs, folder)

@@ -131,10 +131,11 @@ def attempt_all(
     from sb3_sample.sac.many import train_together
 
     outcomes: dict[str, Outcome | None] = {}
-    with training() as make:
+    # Taken once, since each training begins while another's streams are in force.
+    with training() as make, _streams_in_force() as before:
 
         def body(run: Run) -> None:
-            outcomes[run.name] = attempt(folder, run, options, threads, make)
+            outcomes[run.name] = attempt(folder, run, options, threads, make, before)
 
         seats = [Seat(run.title, functools.partial(body, run), folder.place(run)) for run in runs]
         try:
@@ -146,7 +147,14 @@ def attempt_all(
     return [outcomes[run.name] for run in runs]
 
 
-def attempt(folder: StudyFolder, run: Run, options: list[str], threads: int, make: Train = train) -> Outcome | None:
+def attempt(
+    folder: StudyFolder,
+    run: Run,
+    options: list[str],
+    threads: int,
+    make: Train = train,
+    before: Sequence[int] | None = None,
+) -> Outcome | None:
     """
     Make a run in this process, or go on with it, and write down what became of it.
 
@@ -155,6 +163,7 @@ def attempt(folder: StudyFolder, run: Run, options: list[str], threads: int, mak
     :param options: options of ``sb3-sample train``
     :param threads: of this process, for the record
     :param make: makes a run
+    :param before: descriptors to which standard output and error go when it has ended; None: to where they go now
     :return: what became of it; None if another process has it
     :raises SystemExit: after SIGTERM, when the run has written its checkpoint; a ``KeyboardInterrupt`` after SIGINT
     :raises OSError: if the folder cannot be written to, or has no locks
@@ -164,13 +173,13 @@ def attempt(folder: StudyFolder, run: Run, options: list[str], threads: int, mak
         return None
     with lock:
         lock.write(this_process())
-        before = folder.outcome(run)
-        if before.done:  # by another process, since this one has looked
-            return before
+        earlier = folder.outcome(run)
+        if earlier.done:  # by another process, since this one has looked
+            return earlier
         place, start = folder.place(run), time.monotonic()
         first = checkpointed(place)
-        outcome = Outcome(False, before.attempts, threads=threads)
-        with _printing_to(folder.output(run)):
+        outcome = Outcome(False, earlier.attempts, threads=threads)
+        with _printing_to(folder.output(run), before):
             try:
                 make(run, place, options)
             except BaseException as error:
@@ -178,7 +187,7 @@ def attempt(folder: StudyFolder, run: Run, options: list[str], threads: int, mak
                     raise
                 text = traceback.format_exc()
                 print(text, file=sys.stderr)
-                outcome = outcome._replace(attempts=before.attempts + 1, traceback=text)
+                outcome = outcome._replace(attempts=earlier.attempts + 1, traceback=text)
         gc.collect()  # networks and environments are in circles
         progress = folder.progress(run)
         outcome = outcome._replace(
@@ -192,29 +201,40 @@ def attempt(folder: StudyFolder, run: Run, options: list[str], threads: int, mak
 
 
 @contextlib.contextmanager
-def _printing_to(path: Path) -> Iterator[None]:
+def _streams_in_force() -> Iterator[list[int]]:
+    """Descriptors to which standard output and error go at present."""
+    descriptors = [os.dup(stream.fileno()) for stream in (sys.stdout, sys.stderr)]
+    try:
+        yield descriptors
+    finally:
+        for descriptor in descriptors:
+            os.close(descriptor)
+
+
+def _switch(descriptors: Sequence[int]) -> None:
+    """Have standard output and error go to descriptors."""
+    for stream, descriptor in zip((sys.stdout, sys.stderr), descriptors, strict=True):
+        stream.flush()
+        os.dup2(descriptor, stream.fileno())
+
+
+@contextlib.contextmanager
+def _printing_to(path: Path, before: Sequence[int] | None = None) -> Iterator[None]:
     """
     Have a file take what this process and those that it starts print, after what it has. Of trainings in lockstep each
-    has its own, whenever it is its turn.
+    has its own, whenever it is its turn; ``before`` is then what was in force when none of them had begun.
     """
-    streams = (sys.stdout, sys.stderr)
-    before = [os.dup(stream.fileno()) for stream in streams]
-    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    seat = present()
-
-    def switch(descriptors: Sequence[int]) -> None:
-        for stream, descriptor in zip(streams, descriptors, strict=True):
-            stream.flush()
-            os.dup2(descriptor, stream.fileno())
-
-    try:
-        switch([file, file])
-        if seat is not None:
-            seat.on_turn = lambda: switch([file, file])
-        yield
-    finally:
-        if seat is not None:
-            seat.on_turn = lambda: None
-        switch(before)
-        for descriptor in (*before, file):
-            os.close(descriptor)
+    with contextlib.ExitStack() as stack:
+        before = stack.enter_context(_streams_in_force()) if before is None else before
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        stack.callback(os.close, file)
+        seat = present()
+        try:
+            _switch([file, file])
+            if seat is not None:
+                seat.on_turn = lambda: _switch([file, file])
+            yield
+        finally:
+            if seat is not None:
+                seat.on_turn = lambda: None
+            _switch(before)

@@ -227,7 +227,12 @@ def test_compiled_and_captured_groups(how: str) -> None:
         ("SAC", {"tau": [0.1, 0.5], "gamma": [0.9, 0.99]}),
         ("SAC", {"target_entropy": [-1.0, 1.0], "pessimism": [0.2, 0.7]}),
         ("BRO", {"learning_rate": [1e-3, 1e-4], "tau": [0.1, 0.5], "gamma": [0.9, 0.99]}),
+        ("SAC", {"actor_pessimism": [0.25, 0.75]}),
+        ("SAC", {"tau": [1, 0.5], "gamma": [0.9, 1]}),
+        ("SAC", {"tau": [1, 1], "gamma": [0.9, 0.99]}),
+        ("OPLSAC", {"gamma": [0.5, 0.99]}),
         ("BRO", {"weight_decay": [1e-1, 1e-4]}),
+        ("BRO", {"weight_decay": [0, 1e-1]}),
     ],
 )
 def test_numbers_may_differ(maker: str, arguments: dict[str, Sequence[Any]]) -> None:
@@ -246,6 +251,37 @@ def test_numbers_may_differ(maker: str, arguments: dict[str, Sequence[Any]]) -> 
     together(learners, lambda i: take(others[i], 20))
     assert_alike(maker, alone, others)
     assert differences(alone[0], alone[1])[0] > 1e-4
+
+
+def test_numbers_that_differ_are_put_on_the_device_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    models = [models_of("SAC", 1, gamma=gamma)[0] for gamma in (0.9, 0.99)]
+    learners = [model.learner for model in models]
+    group = together(learners, lambda i: take(models[i], 1))
+    made: list[Any] = []
+    make = torch.tensor
+    monkeypatch.setattr(torch, "tensor", lambda *args, **kwargs: made.append(args) or make(*args, **kwargs))
+    together(learners, lambda i: take(models[i], 2), group)
+    assert made == []
+
+
+def test_what_is_done_around_the_step_may_be_there_or_not() -> None:
+    others = sac(compile=False, seed=1, redo_period=5, reward_scale="xqc")
+    LearnerGroup([sac(compile=False, seed=0).learner, others.learner])
+
+
+def test_a_setting_may_change_between_a_step_and_actions() -> None:
+    """What acts is in inference mode, and what learns is not."""
+    models = [models_of("BRO", 1, pessimism=pessimism)[0] for pessimism in (0.2, 0.7)]
+    learners = [model.learner for model in models]
+    group = together(learners, lambda i: take(models[i], 1))
+    for learner in learners:
+        learner.explorer.kl_target = 0.2
+    observations = random_batch(models[0]).observations
+    inputs = [(observations, learner.explorer.draw_noise(learner, observations)) for learner in learners]
+    with torch.inference_mode():
+        group.act(inputs)
+    assert not any(each["actions"].requires_grad for each in group.act(inputs))
+    together(learners, lambda i: take(models[i], 1), group)
 
 
 @pytest.mark.parametrize("how", ["eager", "captured", pytest.param("compiled", marks=[COMPILES, pytest.mark.slow])])
@@ -277,6 +313,38 @@ def test_groups_go_on_after_resets(how: str) -> None:
         assert differences(a, b)[0] < 10 * TOLERANCE
         assert all(int(state["step"]) == 12 for state in b.critic.optimizer.state.values())
     assert differences(*others)[0] > 1e-2
+
+
+@pytest.mark.parametrize("how", ["eager", "captured"])
+def test_one_may_be_reset_or_step_alone(how: str) -> None:
+    """Its optimizers have then taken another number of steps than the others'."""
+    alone, others = models_of("SAC", 2), models_of("SAC", 2)
+
+    def train(model: Any) -> None:
+        take(model, 20)
+        if model.seed == 0:
+            torch.manual_seed(0)
+            model.learner.reinitialize()
+        take(model, 6)
+        if model.seed == 1:
+            take_alone(model)
+        take(model, 6)
+
+    def take_alone(model: Any) -> None:
+        seat, model.learner._execution = model.learner._execution, None
+        take(model, 1)
+        model.learner._execution = seat
+
+    for model in alone:
+        train(model)
+    group = LearnerGroup([model.learner for model in others])
+    if how == "captured":
+        group._execution = Execution(group, False, False, recorder := Recorder(group), "mapped_step")
+    together(group.learners, lambda i: train(others[i]), group)
+    assert group.counts_differ
+    for a, b in zip(alone, others, strict=True):
+        assert differences(a, b)[0] < TOLERANCE
+    assert how == "eager" or recorder.n_recordings == 2
 
 
 @pytest.mark.parametrize(

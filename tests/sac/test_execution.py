@@ -1,13 +1,15 @@
 """The three ways to run the gradient step give the same numbers: eager, compiled, captured."""
 
+import contextlib
 import copy
 import io
 import json
 import re
 import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -33,7 +35,7 @@ from sb3_sample.srspr.networks import SPRNetwork
 from sb3_sample.srspr.policies import SPRPolicy
 from sb3_sample.training import compiling
 from tests.agents import OFF_POLICY, env_of
-from tests.sac.common import COMPILES, PIXEL_MAKERS, Toy, bro, differing, sac, sampled, state, vec
+from tests.sac.common import COMPILES, PIXEL_MAKERS, Toy, bro, differing, random_batch, sac, sampled, state, vec
 from tests.srspr.common import TINY
 
 #: Largest difference of a parameter after 50 updates, each of which moves it by up to 3e-4. The same arithmetic in
@@ -274,6 +276,98 @@ def test_a_captured_step_gives_its_own_metrics_and_no_old_gradients() -> None:
     assert not model.gradients_are_stale and model.critic.head.weight.grad is not None
     updates(model, 1)
     assert model.gradients_are_stale
+
+
+def test_captured_updates_of_a_learner_take_what_was_set() -> None:
+    """Without an algorithm, which prepares each turn: rates, settings, and moments that a reset has cleared."""
+    models = pair("SAC")
+    captured(models[1])
+    for model in models:
+        learner = model.learner
+        torch.manual_seed(0)
+
+        def take(n: int, model: Any = model) -> None:
+            for i in range(n):
+                model.learner.update(random_batch(model, seed=i))
+
+        take(6)
+        before = [p.clone() for p in learner.actor.parameters()]
+        learner.set_learning_rate(0.0)
+        take(1)
+        assert all(map(torch.equal, before, learner.actor.parameters()))
+        learner.set_learning_rate(1e-3)
+        learner.tau = 0.5
+        take(2)
+        learner.reinitialize()
+        take(5)
+    assert largest_difference(*models) < TOLERANCE
+
+
+class Programs:
+    """In the place of compiled steps: notes whether a program is made within a recording."""
+
+    seconds = 0.0
+
+    def __init__(self, recorder: "Noting"):
+        self.recorder, self.version, self.made = recorder, 0, -1
+        self.made_within: list[bool] = []
+
+    def prepare(self, learner: Any) -> None:
+        pass
+
+    def __call__(self, step: Any, learner: Any, inputs: Any) -> Any:
+        if self.made != self.version:
+            self.made = self.version
+            self.made_within.append(self.recorder.records)
+        return step(learner, *inputs)
+
+
+class Noting(Recorder):
+    """Knows whether it is recording."""
+
+    records = False
+
+    def __call__(self, run: Any) -> Any:
+        self.records = True
+        try:
+            return super().__call__(run)
+        finally:
+            self.records = False
+
+
+def test_nothing_is_compiled_within_a_capture() -> None:
+    """After a setting has changed, a compiled step is made anew in one that is run as it is."""
+    _, model = pair("SAC")
+    recorder = Noting(model.learner)
+    model.learner._execution = Execution(model.learner, False, False, recorder)
+    programs = model.learner._execution._compiled = Programs(recorder)
+    updates(model, 5)
+    model.tau, programs.version = 0.3, 1
+    updates(model, 5)
+    assert programs.made_within == [False, False]
+    assert (recorder.n_recordings, recorder.n_repetitions) == (2, 4)
+
+
+def test_captures_are_made_on_the_learners_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    current, seen = [torch.device("cuda:0")], []
+
+    @contextlib.contextmanager
+    def change(device: torch.device) -> Iterator[None]:
+        current.append(device)
+        yield
+        current.pop()
+
+    def record(run: Callable[[], Any]) -> Any:
+        seen.append(current[-1])
+        return lambda: None, {}
+
+    monkeypatch.setattr(torch.cuda, "device", change)
+    monkeypatch.setattr(execution, "_aside", lambda run: seen.append(current[-1]) or {})
+    learner = SimpleNamespace(device=torch.device("cuda:1"), step_modules=tuple, optimizers=dict)
+    captured = execution.Captured(learner, record)
+    for _ in range(5):
+        captured(lambda learner: {}, learner, ())
+    assert seen == [learner.device] * 4
 
 
 class AbsoluteHead(ValueHead):

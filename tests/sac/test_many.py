@@ -18,10 +18,12 @@ from gymnasium import spaces
 from stable_baselines3 import SAC as SB3SAC
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_sample import BRO, MBMAPPO, SAC, VPLSAC, DebiasedRQ, train_many
 from sb3_sample.learner.execution import Execution
+from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.sac import many
 from sb3_sample.saving import training_state
 from sb3_sample.saving.run_folder import RunFolder, common_starts
@@ -252,6 +254,21 @@ def test_numbers_that_differ_by_learner() -> None:
     assert same(learned(models[1]), learned(own))
 
 
+def test_noise_of_actions_is_each_learners_own() -> None:
+    def noise() -> OrnsteinUhlenbeckActionNoise:
+        return OrnsteinUhlenbeckActionNoise(np.zeros(2), np.full(2, 0.5))
+
+    shared = noise()
+    models = train_many(
+        SAC, "MlpPolicy", Toy, seeds=(1, 2), total_timesteps=20, action_noise=shared, **TINY_SAC,
+    )  # fmt: skip
+    assert same(shared.noise_prev, noise().noise_prev)
+    for model, seed in zip(models, (1, 2), strict=True):
+        own = SAC("MlpPolicy", Toy(), seed=seed, action_noise=noise(), **TINY_SAC).learn(20)
+        assert same(learned(model), learned(own))
+        assert same(model.action_noise.noise_prev, own.action_noise.noise_prev)
+
+
 def test_a_learner_that_its_callback_stops(joint: Any) -> None:
     class Stop(BaseCallback):
         def _on_step(self) -> bool:
@@ -264,6 +281,19 @@ def test_a_learner_that_its_callback_stops(joint: Any) -> None:
     assert [model.num_timesteps for model in models] == [30, 15, 30]
     if joint is not None:
         assert [len(each.learners) for each in joint.made if each.n_steps] == [3, 2]
+
+
+def test_the_last_learner_may_leave_while_the_others_wait_to_act(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            return self.n_calls < 16
+
+    monkeypatch.setattr(many, "joint_of", LearnerGroup)
+    models = train_many(
+        SAC, "MlpPolicy", Toy, seeds=SEEDS, total_timesteps=24, callback=lambda i: Stop() if i == 2 else None,
+        **{**TINY_SAC, "replay_ratio": 0.25},
+    )  # fmt: skip
+    assert [model.num_timesteps for model in models] == [24, 24, 16]
 
 
 def test_a_model_that_is_trained_within_a_callback() -> None:

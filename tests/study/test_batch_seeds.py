@@ -62,7 +62,10 @@ def test_each_run_has_its_own_outcome_output_and_lock(
     assert elsewhere is not None
     options = ["--num-threads", "1", "--device", "cpu"]
     with capfd.disabled():
+        streams = [os.fstat(stream.fileno()) for stream in (sys.stdout, sys.stderr)]
         found = attempt_all(folder, group, options, 1)
+        # What the process prints then is none of the runs'.
+        assert all(map(os.path.samestat, streams, (os.fstat(stream.fileno()) for stream in (sys.stdout, sys.stderr))))
     first, second, third, taken = found
     assert taken is None
     elsewhere.release()
