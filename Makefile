@@ -20,8 +20,7 @@ BIN := $(VENV)/bin
 version = $(shell $(1) -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 VERSION := $(call version,$(PYTHON))
 LOCK := constraints/$(VERSION).txt
-# Bytecode of all packages would take as long as unpacking them: what is imported is compiled then.
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c $(LOCK)
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(LOCK)
 # rliable asks for a release of arch that has no wheel for Python 3.14. Built from source without its compiled parts it
 # needs no compiler; wheels, where there are some, are the same as ever.
 export ARCH_NO_BINARY := 1
