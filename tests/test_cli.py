@@ -346,6 +346,7 @@ def test_a_missing_zoo_is_named(tmp_path: Path) -> None:
     assert "Traceback" not in result.stderr
 
 
+@pytest.mark.slow
 def test_a_broken_import_is_not_taken_for_a_missing_zoo(tmp_path: Path) -> None:
     (tmp_path / "optuna.py").write_text("raise ImportError('broken')")  # stands before the installed one
     code = "from sb3_sample.cli import main; main(['train'])"

@@ -352,6 +352,7 @@ def test_statistics_that_are_missing_are_asked_for(family: str, tmp_path: Path) 
     assert (tmp_path / "policy.onnx").exists()
 
 
+@pytest.mark.slow
 def test_statistics_that_a_plain_environment_lacks_are_warned_of(tmp_path: Path) -> None:
     sac(VecNormalize(vec())).learn(12).save(tmp_path / "m")
     loaded = SAC.load(tmp_path / "m", env=vec())

@@ -419,6 +419,7 @@ def test_the_stock_zoo_knows_the_algorithms_whichever_module_comes_first(module:
     assert "bro_fast" in result.stdout
 
 
+@pytest.mark.slow
 def test_the_stock_zoo_does_not_hide_a_failure() -> None:
     result = in_repository("-c", "import sys; sys.modules['sb3_sample.sac'] = None; import rl_zoo3.import_envs")
     assert result.returncode != 0

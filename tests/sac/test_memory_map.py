@@ -47,6 +47,7 @@ def n_mapped(folder: Path, process: int | str = "self") -> int:
     return sum(str(folder) in line for line in Path(f"/proc/{process}/maps").read_text().splitlines())
 
 
+@pytest.mark.slow
 def test_a_killed_run_leaves_nothing(tmp_path: Path) -> None:
     """And while it lives, another may use the folder."""
     code = (

@@ -346,6 +346,7 @@ def toy() -> Monitor:
     return Monitor(Toy())
 
 
+@pytest.mark.slow
 def test_a_worker_lives_on() -> None:
     """What an environment in another process cannot be given is an error here, and not the end of the worker."""
     env = SubprocVecEnv([toy])

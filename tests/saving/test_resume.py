@@ -24,10 +24,10 @@ NORMALIZED: dict[str, Any] = {"n": 2, "wrap": "normalize"}
 #: By name: the algorithm, its arguments and its environment.
 FAST: dict[str, dict[str, Any]] = {
     "BRO": {"algorithm": "BRO", "kwargs": {"resets": (40, 120)}, "evaluate": True, "diagnose": True},
-    "VPLSAC, workers": {"algorithm": "VPLSAC", "kwargs": {"reset_gradient_steps": 43}, "env": WORKERS4},
     "MBMA": {"algorithm": "MBMA"},
 }
 SLOW: dict[str, dict[str, Any]] = {
+    "VPLSAC, workers": {"algorithm": "VPLSAC", "kwargs": {"reset_gradient_steps": 43}, "env": WORKERS4},
     **{name: {"algorithm": name} for name in (
         "SAC", "BROFast", "BROTD3", "DAC", "SRSAC", "OAC", "TOPSAC", "GPLSAC", "OPLSAC", "RegularizedSAC", "SimBa",
         "SimbaV2", "BRC", "DebiasedRQ", "CrossQ", "CrossQ+WN", "XQC", "FlashSAC", "QMA", "MBPO", "rewound",

@@ -131,7 +131,8 @@ def _made_place(folder: StudyFolder, plan: Plan) -> Path:
     return folder.path / "state/Nothing/nothing-v0/0.lock"
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_processes_end_with_the_scheduler_and_the_same_command_goes_on(tmp_path: Path, number: int) -> None:
     program = (
         "import sys; from sb3_sample import study; from tests.study import nothing\n"
