@@ -33,7 +33,7 @@ from sb3_sample.warn import warn
 
 #: Numbers of a learner that its gradient step does not read, or reads from its inputs.
 _NOT_READ = {"learning_starts", "verbose", "compile", "learning_rate"}
-#: What a learner has or has not (None), and does around its gradient step by itself.
+#: Parts that a learner has or has not (None), and uses around its gradient step by itself.
 _AROUND = {"redo", "reward_scaler", "schedule"}
 
 
@@ -209,7 +209,8 @@ class LearnerGroup:
                 optimizer.__setstate__(optimizer.__dict__)
 
     def _made_row(self, values: tuple[float, ...]) -> torch.Tensor:
-        # Actions are computed in inference mode.
+        """A number of each learner as a tensor, (S,)."""
+        # Actions are computed in inference mode, whose tensors no gradient step can read.
         with torch.inference_mode(False):
             return torch.tensor(values, dtype=torch.float32, device=self.device)
 
@@ -238,9 +239,7 @@ class LearnerGroup:
         # Each looks at its own.
         changed = [settings.have_changed() for settings in self._settings]
         if any(changed):
-            # Actions are computed in inference mode, whose tensors no gradient step can read.
-            with torch.inference_mode(False):
-                self._take_settings()
+            self._take_settings()
             self._execution = self._drawing = self._acting = None
 
     def _made(self, method: str) -> Execution:
@@ -389,7 +388,7 @@ class LearnerGroup:
         # Of batches that a step draws itself, where no tensor can come from the host.
         gammas = [learner.gamma for learner in self.learners]
         same = all(gamma == gammas[0] for gamma in gammas)
-        self._discounts = gammas[0] if same else torch.tensor(gammas, dtype=torch.float32, device=self.device)
+        self._discounts = gammas[0] if same else self._made_row(tuple(gammas))
         # The stacked optimizers' groups, by those of the first learner.
         groups = {
             id(theirs): ours
@@ -406,7 +405,7 @@ class LearnerGroup:
             may_differ = group is None or name == "weight_decay"
             if differ and not (may_differ and are_real(of_each)):
                 raise ValueError(f"learners must agree in {name}, not {of_each!r}")
-            held = torch.tensor(of_each, dtype=torch.float32, device=self.device) if differ else first
+            held = self._made_row(tuple(of_each)) if differ else first
             if group is not None:
                 group[name] = held
             elif differ:

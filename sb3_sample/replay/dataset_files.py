@@ -191,7 +191,7 @@ def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> Path:
         name, folder = str(id_or_path), Path(minari.storage.get_dataset_path(id_or_path)) / "data"
         as_path = Path(id_or_path)
         if as_path.exists() or ("/" in name and as_path.parent.exists()):
-            # What is read by this name is the folder here, if there is one.
+            # Reading takes the folder here of this name, if there is one.
             raise ValueError(
                 f"id_or_path={name!r} is an id of Minari's, of {folder.parent}, and a path here too, since "
                 f"{as_path if as_path.exists() else as_path.parent} is there: pass './{name}' for a folder, or another "

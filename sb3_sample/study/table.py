@@ -126,10 +126,9 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
             table = load(path)
             tables.append(table if label is None else table.assign(agent=label))
             continue
-        folders = find_runs(path)
-        evaluated = {_study_of(folder) for folder in folders if (folder / EVALUATIONS).exists()}
-        for folder in folders:
-            study = _study_of(folder)
+        folders = [(folder, _study_of(folder), (folder / EVALUATIONS).exists()) for folder in find_runs(path)]
+        with_evaluations = {study for _, study, has_evaluations in folders if study is not None and has_evaluations}
+        for folder, study, has_evaluations in folders:
             if study is not None and "/".join(folder.absolute().parts[-3:]) in listed(study).former:
                 left_out.append(folder)
                 continue
@@ -152,9 +151,8 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
                     f"{agent}, {run.task}, seed {seed}. LABEL=FOLDER names one otherwise"
                 )
             seen[key] = folder
-            before_first = False
-            if not (folder / EVALUATIONS).exists():
-                before_first = study is not None and study in evaluated
+            before_first = not has_evaluations and study in with_evaluations
+            if not has_evaluations:
                 (early if before_first else training).append(folder)
             for metric, (steps, values) in _measured(folder, run, metrics).items():
                 if before_first and metric in _MONITORED:
