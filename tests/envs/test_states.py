@@ -168,6 +168,46 @@ def test_check_restorable(env_id: str) -> None:
     check_restorable(make(env_id), make(env_id))
 
 
+class Randomized(gym.Wrapper):
+    """Draws numbers of the model's physics anew for each episode, as domain randomisation does."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        observation, info = self.env.reset(**kwargs)
+        model, rng = self.unwrapped.model, self.unwrapped.np_random  # type: ignore[attr-defined]
+        model.opt.gravity[2] = rng.uniform(-20, -1)
+        model.opt.wind[:] = rng.uniform(-5, 5, 3)
+        model.opt.timestep = rng.uniform(0.005, 0.012)
+        model.opt.integrator = int(rng.integers(4))
+        model.stat.meaninertia = rng.uniform(1, 2)
+        model.geom_contype[:] = rng.integers(2, size=model.ngeom)
+        model.geom_rgba[:] = rng.uniform(size=(model.ngeom, 4))
+        return observation, info
+
+
+def randomized() -> Any:
+    return Randomized(make_env("HalfCheetah-v5"))
+
+
+def test_numbers_of_the_model_that_a_wrapper_draws() -> None:
+    env, other = randomized(), randomized()
+    env.reset(seed=1)
+    steps(env, random_actions(env, 5))
+    state, actions = save_state(env), random_actions(env, 15, seed=1)
+    model = env.unwrapped.model
+    drawn = model.opt.gravity.copy(), model.opt.integrator, model.geom_contype.copy(), model.geom_rgba.copy()
+    expected = steps(env, actions)
+    env.reset()
+    for again in (env, other):
+        restore_state(again, state)
+        model = again.unwrapped.model
+        for value, before in zip(
+            (model.opt.gravity, model.opt.integrator, model.geom_contype, model.geom_rgba), drawn, strict=True
+        ):
+            np.testing.assert_array_equal(value, before)
+        assert_equal(steps(again, actions), expected)
+    check_restorable(env, other)
+
+
 class Hidden(gym.Env):
     """Keeps its state where nobody finds it, as an environment does that runs in another process."""
 
@@ -184,9 +224,27 @@ class Hidden(gym.Env):
         return np.array([next(self.simulator)], dtype=float), 0.0, False, False, {}
 
 
+class OfTheReset(Hidden):
+    """What a reset draws is hidden, and nothing else."""
+
+    def __init__(self) -> None:
+        self.drawn = iter([0.0])  # the iterator's place is no data
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        gym.Env.reset(self, seed=seed)
+        self.drawn = iter([self.np_random.random()] * 10**3)
+        return np.zeros(1), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
+        return np.array([next(self.drawn)]), 0.0, False, False, {}
+
+
 def test_environments_that_cannot_be_restored() -> None:
     with pytest.raises(ValueError, match="env must be an environment whose state can be saved .* not <.*Hidden"):
         check_restorable(Hidden())
+    with pytest.raises(ValueError, match="the same actions gave something else"):
+        check_restorable(OfTheReset())
     with pytest.raises(TypeError, match=r"env must be a gymnasium.Env, not 'Hopper-v5'"):
         save_state("Hopper-v5")  # type: ignore[arg-type]
 
