@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.monitor import Monitor
 
 from sb3_sample.envs.atari import is_atari
 from sb3_sample.saving.attributes import is_view_of_foreign_memory
@@ -32,11 +33,15 @@ _GENERATORS = (np.random.Generator, np.random.RandomState)
 _NOT_STATE = (
     gym.Env, gym.Space, gym.envs.registration.EnvSpec, io.IOBase, type, types.ModuleType, types.FunctionType
 )  # fmt: skip
+#: Attributes of Monitor that report on all episodes so far, and its clock: nothing follows from them.
+_REPORTS = ("episode_returns", "episode_lengths", "episode_times", "t_start")
 #: Ends of the names of integer arrays of MuJoCo's model that are masks, switches and classes.
 _SWITCHES = (
     "contype", "conaffinity", "condim", "_priority", "_group", "limited", "_active0", "_active", "_castshadow",
     "_actearly", "_actgravcomp", "_gaintype", "_biastype",
 )  # fmt: skip
+#: Functions that hold on to objects.
+BOUND = (types.MethodType, functools.partial)
 
 
 class EnvState(NamedTuple):
@@ -294,28 +299,44 @@ def state_attributes(layer: Any) -> dict[str, Any]:
     Select what may change of a wrapper or an environment.
 
     :param layer: the wrapper or environment
-    :return: its attributes that are data through and through, by name, themselves and no copies
+    :return: its attributes that are data through and through, by name, themselves and no copies. Not Monitor's lists of
+        all episodes, which grow with the training
     """
-    return {name: value for name, value in vars(layer).items() if _is_state(value)}
+    left_out = _REPORTS if isinstance(layer, Monitor) else ()
+    return {name: value for name, value in vars(layer).items() if name not in left_out and _is_state(value, set())}
 
 
-def _is_state(value: Any) -> bool:
-    """Whether a value is data through and through: numbers, arrays, generators, containers and objects of them."""
+def _is_state(value: Any, seen: set[int]) -> bool:
+    """
+    Whether a value is data through and through: numbers, arrays, generators, containers and objects of them.
+
+    :param value: any
+    :param seen: ids of what is being looked at, or was, which refers to itself in a cycle
+    """
     if isinstance(value, np.ndarray):
         # A view of the simulator's own memory, as some tasks of Meta-World keep, follows it.
         return not is_view_of_foreign_memory(value)
     if isinstance(value, (*_CONSTANTS, *_GENERATORS)):
         return True
+    if id(value) in seen:
+        return True
+    seen.add(id(value))
     if isinstance(value, dict):
-        return all(_is_state(item) for item in value.values())
+        return all(_is_state(item, seen) for item in value.values())
     if isinstance(value, _CONTAINERS):
-        return all(_is_state(item) for item in value)
+        return all(_is_state(item, seen) for item in value)
+    if isinstance(value, types.MethodType):
+        # That of an environment or a wrapper is none: its copy would be of a copy of them, which nobody steps.
+        return _is_state(value.__self__, seen)
+    if isinstance(value, functools.partial):
+        called = isinstance(value.func, types.FunctionType) or _is_state(value.func, seen)
+        return called and all(_is_state(item, seen) for item in (*value.args, *value.keywords.values()))
     if isinstance(value, _NOT_STATE) or not hasattr(value, "__dict__"):
         return False
     # Objects of a wrapper, such as the running mean and variance of a normalisation. A simulator's are the layers' and
     # the data's; an environment inside of another attribute is none of the wrappers that this module knows.
     return not type(value).__module__.startswith(("mujoco", "dm_control", "gymnasium.envs")) and all(
-        _is_state(item) for item in vars(value).values()
+        _is_state(item, seen) for item in vars(value).values()
     )
 
 
@@ -324,7 +345,7 @@ def is_simulator(value: Any) -> bool:
     :param value: of an attribute of an environment
     :return: whether it may be what simulates it: neither a part of the state nor a description
     """
-    return not _is_state(value) and not isinstance(value, _NOT_STATE)
+    return not _is_state(value, set()) and not isinstance(value, (*_NOT_STATE, *BOUND))
 
 
 def _bit_generator(generator: Any, seed: int) -> Any:

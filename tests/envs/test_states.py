@@ -1,13 +1,16 @@
 """Going back to a state is exact: the same actions give the same observations, rewards and ends, bit by bit."""
 
+import functools
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor
 
 from sb3_sample.envs import make_env
+from sb3_sample.envs.rewinding import sibling_of
 from sb3_sample.envs.states import check_restorable, random_action, restore_state, save_state
 from tests.variance.common import Tabular
 
@@ -206,6 +209,73 @@ def test_numbers_of_the_model_that_a_wrapper_draws() -> None:
             np.testing.assert_array_equal(value, before)
         assert_equal(steps(again, actions), expected)
     check_restorable(env, other)
+
+
+class Node:
+    """Knows its parent, as its parent knows it, and can be asked for a method of its own."""
+
+    def __init__(self, parent: Any = None) -> None:
+        self.parent, self.children, self.n = parent, [], 0
+
+    def count(self) -> int:
+        self.n += 1
+        return self.n
+
+
+class Bound(gym.Env):
+    """Holds methods, of its own and of an object of its state, and objects that refer to each other."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,))
+    action_space = spaces.Box(-1, 1, (1,))
+
+    def __init__(self, kind: str = "method") -> None:
+        self.t, self.root = 0.0, Node()
+        self.root.children.append(Node(self.root))
+        self.reward = self.dense if kind == "method" else functools.partial(Bound.dense, self)
+        self.count = self.root.children[0].count
+
+    def dense(self) -> float:
+        return self.t
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.t = self.np_random.random()
+        return np.zeros(2), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.t += float(action[0])
+        return np.array([self.count(), self.root.children[0].n], float), self.reward(), False, False, {}
+
+
+@pytest.mark.parametrize("kind", ["method", "partial"])
+def test_methods_stay_those_of_the_environment(kind: str) -> None:
+    env, other = Bound(kind), Bound(kind)
+    check_restorable(env)
+    check_restorable(env, other)
+    for each in (env, other):
+        of = each.reward.__self__ if kind == "method" else each.reward.args[0]  # type: ignore[attr-defined]
+        assert of is each
+        node = each.root.children[0]
+        assert node.parent is each.root and each.count.__self__ is node
+
+
+def test_monitors_past_episodes_are_no_part_of_a_state() -> None:
+    env = Monitor(make_env("CartPole-v1"))
+    env.reset(seed=0)
+    steps(env, random_actions(env, 100))
+    n = len(env.episode_returns)
+    state = save_state(env)
+    held = [name for name, value in state.layers[0].items() if isinstance(value, list)]
+    assert n > 0 and held == ["rewards"]
+    steps(env, random_actions(env, 100))
+    later = list(env.episode_returns)
+    restore_state(env, state)
+    assert env.episode_returns == later and len(later) > n
+    sibling = sibling_of(env)
+    for _ in range(2):
+        restore_state(sibling, state)
+        steps(sibling, random_actions(env, 50))
+    assert not sibling.get_wrapper_attr("episode_returns")
 
 
 class Hidden(gym.Env):

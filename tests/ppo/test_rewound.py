@@ -430,6 +430,31 @@ def test_the_course_of_a_copied_wrapper_is_its_own() -> None:
     assert len(envs[0].drawn) == 8 and envs[0].drawn == envs[1].drawn
 
 
+class Shaped(gym.Wrapper):
+    """Keeps methods, of its own and of the environment."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        self.t = 0
+        self.bonus, self.inner = self.linear, functools.partial(env.step)
+
+    def linear(self) -> float:
+        return float(self.t)
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        observation, reward, *rest = self.inner(action)
+        return observation, float(reward) + self.bonus(), *rest
+
+
+def test_methods_of_a_copied_wrapper_are_its_own() -> None:
+    env = Shaped(Ends(3))
+    sibling: Any = sibling_of(env)
+    assert sibling.bonus.__self__ is sibling and sibling.inner.func.__self__ is sibling.env is not env.env
+    check_restorable(sibling, sibling_of(env))
+    assert env.t == 0
+
+
 def test_atari_states() -> None:
     """Sticky actions, which the console draws, and the stack of frames are restored bit by bit."""
     ale_py = pytest.importorskip("ale_py", reason="needs ale-py")
