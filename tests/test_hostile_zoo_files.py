@@ -23,6 +23,7 @@ pytest.importorskip("seaborn")
 
 from sb3_sample import cli
 from sb3_sample.envs.base import select_gl_backend
+from sb3_sample.zoo.settings import WRAPPERS, _check_wrapper
 from tests import hostile_zoo_files
 from tests.hostile_zoo_files import (
     COMMANDS,
@@ -229,6 +230,12 @@ def test_wrappers_that_only_compute_are_taken(key: str, wrappers: list[str], her
     text = wrappers[0] if wrappers == ["null"] else f"[{', '.join(f'{{{w}}}' if ':' in w else w for w in wrappers)}]"
     set_yaml(key, text, here / RUN / ENV / "config.yml")
     cli.main(COMMANDS["enjoy"])
+
+
+@pytest.mark.parametrize("noop_max", [None, 30])
+def test_no_ops_at_the_start_of_an_atari_game_may_be_left_out(noop_max: int | None) -> None:
+    wrapper = {"sb3_sample.envs.atari.AtariFrames": {"noop_max": noop_max}}
+    _check_wrapper(wrapper, WRAPPERS, "config.yml: env_wrapper", ())
 
 
 def test_wrappers_of_trusted_modules_may_have_any_argument(here: Path) -> None:

@@ -8,6 +8,7 @@ by some tasks before they are computed anew, so that they are written too.
 """
 
 import functools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,7 +16,14 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_sample.envs.atari import is_atari
-from sb3_sample.envs.states import layers_of, model_arrays, simulator_of
+from sb3_sample.envs.states import (
+    layers_of,
+    model_arrays,
+    more_model_arrays,
+    options_of,
+    set_model_numbers,
+    simulator_of,
+)
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name
 
 #: Name of what :mod:`sb3_sample.saving.vec_envs` puts into an environment of another process.
@@ -27,6 +35,8 @@ _CLOCKS = {"stable_baselines3.common.monitor.Monitor": ("t_start",)}
 #: Arrays whose size depends on the contacts, and on which bodies touch each other; they are computed anew at each step,
 #: before they are read.
 _IN_ARENA = ("efc_", "iefc_", "island_", "map_", "iL", "iM", "iacc", "ifrc")
+#: Of MuJoCo's contacts; it uses those of a model unchecked.
+_CONTACT_DIMENSIONS = (1, 3, 4, 6)
 
 
 def pack(env: gym.Env) -> tuple[dict[str, Any], list[str]]:
@@ -139,7 +149,8 @@ def _pack_simulator(model: Any, data: Any) -> dict[str, Any]:
     return {
         "integration": integration,
         "data": {name: getattr(data, name).copy() for name in _data_arrays()},
-        "model": {name: getattr(model, name).copy() for name in model_arrays()},
+        "model": {name: getattr(model, name).copy() for name in (*model_arrays(), *more_model_arrays())},
+        "options": options_of(model),
     }
 
 
@@ -147,8 +158,11 @@ def _unpack_simulator(model: Any, data: Any, state: dict[str, Any]) -> None:
     import mujoco
 
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
-    owners = {"model": (model, model_arrays()), "data": (data, _data_arrays())}
-    if state.keys() != {"integration", *owners}:
+    # Checkpoints of earlier versions are without options and masks; those of the environment stay.
+    recent = "options" in state
+    own_arrays = (*model_arrays(), *more_model_arrays()) if recent else model_arrays()
+    owners = {"model": (model, own_arrays), "data": (data, _data_arrays())}
+    if state.keys() - {"options"} != {"integration", *owners}:
         raise DoesNotFit("the state of the simulator is not what is saved of one")
     _check_like(np.empty(mujoco.mj_stateSize(model, kind)), state["integration"], "integration")
     for part, (owner, names) in owners.items():
@@ -157,13 +171,39 @@ def _unpack_simulator(model: Any, data: Any, state: dict[str, Any]) -> None:
             raise DoesNotFit(f"the arrays of the simulator's {part} are not those that are saved of one")
         for name in names:
             _check_like(getattr(owner, name), state[part][name], name)
-    for name in model_arrays():
-        getattr(model, name)[...] = state["model"][name]
+    if recent and not np.isin(state["model"]["geom_condim"], _CONTACT_DIMENSIONS).all():
+        raise DoesNotFit(f"geom_condim of the simulator holds other numbers than {_CONTACT_DIMENSIONS}")
+    options = state.get("options", {})
+    if recent:
+        _check_options(options_of(model), options)
+    set_model_numbers(model, {**state["model"], **options})
     mujoco.mj_setState(model, data, state["integration"], kind)
     # Contacts and constraints, which dm_control computes at the end of a step for the next one.
     mujoco.mj_step1(model, data)
     for name in _data_arrays():
         getattr(data, name)[...] = state["data"][name]
+
+
+def _check_options(own: dict[str, Any], options: Any) -> None:
+    """Numbers of the model's structures, in the place of its own."""
+    import mujoco
+
+    if not isinstance(options, dict) or options.keys() != own.keys():
+        raise DoesNotFit("the options of the simulator are not those that are saved of one")
+    ends = {
+        "opt.integrator": len(mujoco.mjtIntegrator.__members__), "opt.cone": len(mujoco.mjtCone.__members__),
+        "opt.jacobian": len(mujoco.mjtJacobian.__members__), "opt.solver": len(mujoco.mjtSolver.__members__),
+        "opt.disableflags": 2 ** int(mujoco.mjtDisableBit.mjNDISABLE),
+        "opt.enableflags": 2 ** int(mujoco.mjtEnableBit.mjNENABLE),
+    }  # fmt: skip
+    for name, value in own.items():
+        given = options[name]
+        if isinstance(value, np.ndarray):
+            _check_like(value, given, name)
+        elif type(given) is not type(value) or not math.isfinite(given):
+            raise DoesNotFit(f"{name} of the simulator is {given!r:.50}, which no {type(value).__name__} of it is")
+        elif isinstance(given, int) and not 0 <= given < ends.get(name, 2**31):
+            raise DoesNotFit(f"{name} of the simulator is {given}, which MuJoCo does not know")
 
 
 def _pack_console(env: Any) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Q-values of actions at visited states: siblings of the environment go back to the states, and the policy goes on."""
 
+import collections
 import copy
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
@@ -8,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_sample.envs.states import EnvState, is_simulator, layers_of, restore_state, state_attributes
+from sb3_sample.envs.states import BOUND, EnvState, is_simulator, layers_of, restore_state, state_attributes
 
 
 class Follower(Protocol):
@@ -165,7 +166,11 @@ def sibling_of(env: gym.Env) -> gym.Env:
 
 def _wrapped_like(wrapper: gym.Wrapper, env: gym.Env) -> gym.Env:
     if isinstance(wrapper, Monitor):
-        return Monitor(env, None, info_keywords=wrapper.info_keywords)
+        monitor: Any = Monitor(env, None, info_keywords=wrapper.info_keywords)
+        # Nobody asks for its episodes, and they would fill the memory.
+        for name in ("episode_returns", "episode_lengths", "episode_times"):
+            setattr(monitor, name, collections.deque(maxlen=0))
+        return monitor  # type: ignore[no-any-return]
     if isinstance(wrapper, gym.wrappers.RecordVideo):
         raise ValueError("a video is recorded, and would be of the copies too: leave RecordVideo out")
     make: Callable[..., gym.Env] = type(wrapper)
@@ -181,6 +186,11 @@ def _wrapped_like(wrapper: gym.Wrapper, env: gym.Env) -> gym.Env:
                 "too: derive it from gymnasium.utils.RecordConstructorArgs"
             )
     like = copy.copy(wrapper)
-    vars(like).update(copy.deepcopy(state_attributes(wrapper)))
     like.env = env
+    # What is bound to the wrapper or to what it wraps is bound to the others then.
+    layers = zip(layers_of(wrapper), layers_of(like), strict=True)
+    others: dict[int, Any] = {id(layer): other for layer, other in layers}
+    copied = state_attributes(wrapper)
+    copied.update({name: value for name, value in vars(wrapper).items() if isinstance(value, BOUND)})
+    vars(like).update(copy.deepcopy(copied, others))
     return like

@@ -2,7 +2,8 @@
 Saving the state of an environment and going back to it, so that other actions can be tried at a visited state.
 
 A saved state is all that decides what comes next: the simulator's (``mjData``, with what was derived from positions and
-velocities, and the numbers of the model, which some tasks draw anew for each episode; or that of Atari's console), the
+velocities, and the numbers of the model, which some tasks and wrappers draw anew for each episode, options such as
+gravity, contact masks and colours among them, but not kinds of parts and indices; or that of Atari's console), the
 task's, the counters of time limits and wrappers, and the random generators. It can be restored in the environment that
 it is of, any number of times, or in another one that was made in the same way.
 """
@@ -11,12 +12,14 @@ import collections
 import copy
 import functools
 import io
+import operator
 import types
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.monitor import Monitor
 
 from sb3_sample.envs.atari import is_atari
 from sb3_sample.saving.attributes import is_view_of_foreign_memory
@@ -30,6 +33,15 @@ _GENERATORS = (np.random.Generator, np.random.RandomState)
 _NOT_STATE = (
     gym.Env, gym.Space, gym.envs.registration.EnvSpec, io.IOBase, type, types.ModuleType, types.FunctionType
 )  # fmt: skip
+#: Attributes of Monitor that report on all episodes so far, and its clock: nothing follows from them.
+_REPORTS = ("episode_returns", "episode_lengths", "episode_times", "t_start")
+#: Ends of the names of integer arrays of MuJoCo's model that are masks, switches and classes.
+_SWITCHES = (
+    "contype", "conaffinity", "condim", "_priority", "_group", "limited", "_active0", "_active", "_castshadow",
+    "_actearly", "_actgravcomp", "_gaintype", "_biastype",
+)  # fmt: skip
+#: Functions that hold on to objects.
+BOUND = (types.MethodType, functools.partial)
 
 
 class EnvState(NamedTuple):
@@ -39,13 +51,13 @@ class EnvState(NamedTuple):
     :param layers: attributes of the environment's wrappers, outermost first, of the environment itself, and of its task
         and control loop if it is one of dm_control
     :param data: copy of MuJoCo's data; None if it has no simulator
-    :param model: arrays of MuJoCo's model, by name
+    :param model: arrays of MuJoCo's model and numbers of its options, by name: ``body_mass``, ``opt.gravity``
     :param console: of the Arcade Learning Environment, its generator included; None if it is not of it
     """
 
     layers: list[dict[str, Any]]
     data: Any
-    model: dict[str, np.ndarray]
+    model: dict[str, Any]
     console: Any = None
 
 
@@ -60,7 +72,7 @@ def save_state(env: gym.Env) -> EnvState:
     data, model = None, {}
     if simulator is not None:
         data = copy.copy(simulator[1])
-        model = {name: getattr(simulator[0], name).copy() for name in model_arrays()}
+        model = model_numbers(simulator[0])
     # Copied together, so that a generator that two of them share is shared in the copy.
     attributes = copy.deepcopy([state_attributes(layer) for layer in layers])
     base: Any = env.unwrapped
@@ -94,8 +106,7 @@ def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None
                 f"state must be of env's model: it has {len(state.data.qpos)} positions of {len(state.data.xpos)} "
                 f"bodies, env {model.nq} of {model.nbody}"
             )
-        for name, array in state.model.items():
-            getattr(model, name)[...] = array
+        set_model_numbers(model, state.model)
         mujoco.mj_copyData(data, model, state.data)
     if is_atari(env) != (state.console is not None):
         raise ValueError("state must be of an environment like env: only one of the two is Atari's")
@@ -114,7 +125,7 @@ def check_restorable(env: gym.Env, other: gym.Env | None = None, n_steps: int = 
     Try it: random actions from a state that is reached by others, and once more from the same state restored.
 
     :param env: environment; it is reset
-    :param other: environment to restore the state in; ``env`` itself if None
+    :param other: environment to restore the state in, after a reset with another seed; ``env`` itself if None
     :param n_steps: steps before the state and, at most, from it
     :param seed: of the reset and the actions
     :raises ValueError: the two differ in an observation, reward or end of the episode
@@ -129,6 +140,8 @@ def check_restorable(env: gym.Env, other: gym.Env | None = None, n_steps: int = 
     actions = [random_action(env.action_space, rng) for _ in range(n_steps)]
     first = list(_follow(env, actions))
     other = env if other is None else other
+    # What a reset draws must come back, too.
+    other.reset(seed=seed + 1)
     message = (
         f"env must be an environment whose state can be saved and restored, as those of dmc/, Gymnasium's MuJoCo and "
         f"classic control, and Atari's, not {env}: "
@@ -191,6 +204,44 @@ def simulator_of(env: gym.Env) -> tuple[Any, Any] | None:
     return None
 
 
+def model_numbers(model: Any) -> dict[str, Any]:
+    """
+    :param model: MuJoCo's
+    :return: copies of its arrays that are not empty, and of the numbers of :func:`model_options`
+    """
+    names = (*model_arrays(), *more_model_arrays())
+    numbers = {name: array.copy() for name in names if (array := getattr(model, name)).size}
+    return {**numbers, **options_of(model)}
+
+
+def options_of(model: Any) -> dict[str, Any]:
+    """
+    :param model: MuJoCo's
+    :return: copies of the numbers of :func:`model_options`, by name
+    """
+    options: dict[str, Any] = {}
+    for structure, names in model_options().items():
+        owner = operator.attrgetter(structure)(model)
+        for name in names:
+            value = getattr(owner, name)
+            options[f"{structure}.{name}"] = value.copy() if isinstance(value, np.ndarray) else value
+    return options
+
+
+def set_model_numbers(model: Any, numbers: dict[str, Any]) -> None:
+    """
+    :param model: MuJoCo's
+    :param numbers: of :func:`model_numbers`, or some of them; unchecked
+    """
+    owners = {"": model, **{structure: operator.attrgetter(structure)(model) for structure in model_options()}}
+    for name, value in numbers.items():
+        structure, _, last = name.rpartition(".")
+        if isinstance(value, np.ndarray):
+            getattr(owners[structure], last)[...] = value
+        else:
+            setattr(owners[structure], last, value)
+
+
 @functools.cache
 def model_arrays() -> tuple[str, ...]:
     """
@@ -198,12 +249,49 @@ def model_arrays() -> tuple[str, ...]:
         the ground. Not meshes, their search trees and textures, the megabytes of a model, which no task of these
         suites changes
     """
+    arrays = _arrays_of_a_model()
+    return tuple(name for name, array in arrays.items() if array.dtype == np.float64 or name == "hfield_data")
+
+
+@functools.cache
+def more_model_arrays() -> tuple[str, ...]:
+    """
+    :return: names of further arrays that a task or a wrapper may change: how things look, which of them touch each
+        other, and what is switched on. No indices in MuJoCo's memory, which it follows unchecked
+    """
+    arrays, known = _arrays_of_a_model(), model_arrays()
+    return tuple(
+        name
+        for name, array in arrays.items()
+        if name not in known and not name.startswith("flex") and (array.dtype == np.float32 or name.endswith(_SWITCHES))
+    )
+
+
+@functools.cache
+def model_options() -> dict[str, tuple[str, ...]]:
+    """
+    :return: names of the numbers and arrays of a model's structures, by structure: options of the physics, means that
+        the solver measures by, and the light at the camera
+    """
+    model = _smallest_model()
+    return {
+        structure: tuple(name for name in dir(operator.attrgetter(structure)(model)) if not name.startswith("_"))
+        for structure in ("opt", "stat", "vis.headlight")
+    }
+
+
+@functools.cache
+def _smallest_model() -> Any:
     import mujoco
 
-    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    return mujoco.MjModel.from_xml_string("<mujoco/>")
+
+
+def _arrays_of_a_model() -> dict[str, np.ndarray]:
+    """All but meshes, skins and textures."""
+    model = _smallest_model()
     names = [name for name in dir(model) if not name.startswith(("_", "mesh_", "tex_", "skin_", "bvh_", "oct_"))]
-    arrays = {name: value for name in names if isinstance(value := getattr(model, name), np.ndarray)}
-    return tuple(name for name, value in arrays.items() if value.dtype == np.float64 or name == "hfield_data")
+    return {name: value for name in names if isinstance(value := getattr(model, name), np.ndarray)}
 
 
 def state_attributes(layer: Any) -> dict[str, Any]:
@@ -211,28 +299,44 @@ def state_attributes(layer: Any) -> dict[str, Any]:
     Select what may change of a wrapper or an environment.
 
     :param layer: the wrapper or environment
-    :return: its attributes that are data through and through, by name, themselves and no copies
+    :return: its attributes that are data through and through, by name, themselves and no copies. Not Monitor's lists of
+        all episodes, which grow with the training
     """
-    return {name: value for name, value in vars(layer).items() if _is_state(value)}
+    left_out = _REPORTS if isinstance(layer, Monitor) else ()
+    return {name: value for name, value in vars(layer).items() if name not in left_out and _is_state(value, set())}
 
 
-def _is_state(value: Any) -> bool:
-    """Whether a value is data through and through: numbers, arrays, generators, containers and objects of them."""
+def _is_state(value: Any, seen: set[int]) -> bool:
+    """
+    Whether a value is data through and through: numbers, arrays, generators, containers and objects of them.
+
+    :param value: any
+    :param seen: ids of what is being looked at, or was, which refers to itself in a cycle
+    """
     if isinstance(value, np.ndarray):
         # A view of the simulator's own memory, as some tasks of Meta-World keep, follows it.
         return not is_view_of_foreign_memory(value)
     if isinstance(value, (*_CONSTANTS, *_GENERATORS)):
         return True
+    if id(value) in seen:
+        return True
+    seen.add(id(value))
     if isinstance(value, dict):
-        return all(_is_state(item) for item in value.values())
+        return all(_is_state(item, seen) for item in value.values())
     if isinstance(value, _CONTAINERS):
-        return all(_is_state(item) for item in value)
+        return all(_is_state(item, seen) for item in value)
+    if isinstance(value, types.MethodType):
+        # That of an environment or a wrapper is none: its copy would be of a copy of them, which nobody steps.
+        return _is_state(value.__self__, seen)
+    if isinstance(value, functools.partial):
+        called = isinstance(value.func, types.FunctionType) or _is_state(value.func, seen)
+        return called and all(_is_state(item, seen) for item in (*value.args, *value.keywords.values()))
     if isinstance(value, _NOT_STATE) or not hasattr(value, "__dict__"):
         return False
     # Objects of a wrapper, such as the running mean and variance of a normalisation. A simulator's are the layers' and
     # the data's; an environment inside of another attribute is none of the wrappers that this module knows.
     return not type(value).__module__.startswith(("mujoco", "dm_control", "gymnasium.envs")) and all(
-        _is_state(item) for item in vars(value).values()
+        _is_state(item, seen) for item in vars(value).values()
     )
 
 
@@ -241,7 +345,7 @@ def is_simulator(value: Any) -> bool:
     :param value: of an attribute of an environment
     :return: whether it may be what simulates it: neither a part of the state nor a description
     """
-    return not _is_state(value) and not isinstance(value, _NOT_STATE)
+    return not _is_state(value, set()) and not isinstance(value, (*_NOT_STATE, *BOUND))
 
 
 def _bit_generator(generator: Any, seed: int) -> Any:

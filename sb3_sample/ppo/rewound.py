@@ -150,6 +150,16 @@ class RewoundPPO(ExtraSamplesPPO):
             check_restorable(self._siblings[0], self._siblings[-1])
         except Exception as error:
             raise ValueError(f"{error}. Pass {self.plain} for plain PPO") from error
+        for index, env in enumerate(base.envs[1:], 1):
+            try:
+                # Few steps: what another constructor or function does differs from the first.
+                check_restorable(sibling_of(env), self._siblings[0], n_steps=5)
+            except Exception as error:
+                raise ValueError(
+                    f"the environments of env must be made in the same way, since copies of the first follow the "
+                    f"further actions of all: a state of environment {index} goes on otherwise in a copy of "
+                    f"environment 0 ({error}). Pass {self.plain} for plain PPO, or keep what differs in attributes"
+                ) from error
 
     def _venv(self, venv: Any) -> DummyVecEnv:
         """The environments in this process, below wrappers that are known."""
@@ -272,9 +282,11 @@ class _Saver(BaseCallback):
         self.callback.update_locals(locals_)
 
     def on_step(self) -> bool:
-        if len(self.agent._states) < self.n_steps:
+        # First the callback, which may change the environment that the next action is taken in.
+        goes_on = self.callback.on_step()
+        if goes_on and len(self.agent._states) < self.n_steps:
             self._save()
-        return self.callback.on_step()
+        return goes_on
 
     def _on_step(self) -> bool:
         return True

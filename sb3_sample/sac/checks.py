@@ -495,7 +495,8 @@ def _check_replay(agent: Any) -> None:
 def _check_memory_map(agent: Any) -> None:
     """A buffer in files: only those of this package know it."""
     cls, is_split = agent.replay_buffer_class, agent.validation_proportion > 0
-    stacks = stacked_frames(agent.env, agent.observation_space) is not None
+    stacks = "frame_stack" in (agent.replay_buffer_kwargs or {})
+    stacks = stacks or stacked_frames(agent.env, agent.observation_space) is not None
     on_device = cls is not None and issubclass(cls, DeviceReplayBuffer)
     made_by_us = (is_split and not on_device) or (
         agent.n_steps == 1 or stacks if cls is None else issubclass(cls, CompactReplay)

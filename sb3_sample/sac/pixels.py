@@ -51,7 +51,8 @@ def check_images(who: str, space: Any) -> None:
         raise ValueError(f"{must}, not one of shape {space.shape}: dmc/ environments take pixels=84")
     if space.dtype != np.uint8:
         raise ValueError(
-            f"{must}, not of {space.dtype}: have the environment give 0 to 255 in uint8, a quarter of the memory"
+            f"{must}, not of {space.dtype}: have the environment give 0 to 255 in uint8, a quarter of the memory, and "
+            "VecNormalize leave them so, norm_obs=False"
         )
     if not is_image_space(space):
         raise ValueError(f"{must} with the bounds 0 and 255, not {space.low.min()} and {space.high.max()}")

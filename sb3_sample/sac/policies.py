@@ -417,6 +417,11 @@ def _normalized_shape(space: spaces.Space) -> tuple[int, ...]:
     """Shape of observations whose running normalisation makes sense."""
     if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and not is_image_space(space):
         return space.shape
+    if is_image_space(space):
+        raise ValueError(
+            f"normalize_observations=True is not for images, which are divided by 255 (observations {space}): pass "
+            "normalize_observations=False"
+        )
     raise ValueError(
         f"normalize_observations=True needs observations of a Box of floats, not of {space}: use VecNormalize"
     )

@@ -30,7 +30,7 @@ from sb3_sample.saving.unsaved import plain_attributes
 from sb3_sample.srspr.arguments import SRSPRArguments
 from sb3_sample.srspr.learner import SPRLearner
 from sb3_sample.srspr.policies import SPRPolicy
-from sb3_sample.srspr.replay import SPRReplayBuffer
+from sb3_sample.srspr.replay import SETTINGS, SPRReplayBuffer
 from sb3_sample.training.compiling import DecidesCompiling
 from sb3_sample.training.metrics_log import MetricsLog
 from sb3_sample.training.resumable import Resumable
@@ -131,8 +131,11 @@ class SRSPR(  # type: ignore[misc]
         if self.replay_buffer_class is None:
             self.replay_buffer_class = SPRReplayBuffer
         own = {"frame_stack": self.frame_stack, "horizon": max(self.n_steps, self.n_predictions)}
-        if taken := own.keys() & self.replay_buffer_kwargs.keys():
-            raise ValueError(f"replay_buffer_kwargs has {sorted(taken)}, which follow from the algorithm's arguments")
+        if taken := (own.keys() | set(SETTINGS)) & self.replay_buffer_kwargs.keys():
+            raise ValueError(
+                f"replay_buffer_kwargs has {sorted(taken)}, which are the algorithm's, or follow from its arguments: "
+                "leave them out"
+            )
         self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, **own}
         self.optimize_memory_usage = False
         # Stable-Baselines3 would take it for an argument of a buffer of its own.

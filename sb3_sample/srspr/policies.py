@@ -60,7 +60,7 @@ class SPRPolicy(BasePolicy):
         optimizer_class: type[torch.optim.Optimizer] = AdamW,
         optimizer_kwargs: dict[str, Any] | None = None,
     ):
-        kwargs = {"eps": EPS} if optimizer_kwargs is None and optimizer_class is AdamW else optimizer_kwargs or {}
+        kwargs = {**({"eps": EPS} if optimizer_class is AdamW else {}), **(optimizer_kwargs or {})}
         super().__init__(observation_space, action_space, optimizer_class=optimizer_class, optimizer_kwargs=kwargs)
         check_value("policy_kwargs['channels']", channels, _CHANNELS)
         check_value("policy_kwargs['width']", width, integer(1))

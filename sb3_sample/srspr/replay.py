@@ -18,6 +18,10 @@ from sb3_sample.replay.weighted import WindowReplay
 _SMALL = 1e-10
 
 
+#: Of ``WindowReplay``: windows do not fade, and the priority of one is the root of its loss.
+SETTINGS = {"fade": 1.0, "fade_floor": 0.1, "priority_exponent": 0.5, "smallest_error": 0.0}
+
+
 class StateWindows(NamedTuple):
     """
     Windows of consecutive states.
@@ -52,7 +56,7 @@ class SPRReplay(WindowReplay):
     """
 
     def __init__(self, *args: Any, horizon: int = 10, **kwargs: Any):
-        super().__init__(*args, horizon=horizon, fade=1.0, priority_exponent=0.5, smallest_error=0.0, **kwargs)
+        super().__init__(*args, horizon=horizon, **SETTINGS, **kwargs)
 
     def draw(self, n: int) -> np.ndarray:
         """

@@ -211,8 +211,8 @@ WRAPPERS: dict[type, Arguments] = {
         "info_keywords": _are_words,
     },
     AtariFrames: {
-        "size": _is_count, "frame_stack": _is_count, "frame_skip": _is_count, "noop_max": _is_count,
-        "episodic_life": _is_flag, "clip_reward": _is_flag,
+        "size": _is_count, "frame_stack": _is_count, "frame_skip": _is_count,
+        "noop_max": lambda value: value is None or _is_count(value), "episodic_life": _is_flag, "clip_reward": _is_flag,
     },
     atari_wrappers.AtariWrapper: {
         **_EXTREMES, "screen_size": _is_shape, "clip_reward": _is_flag, "action_repeat_probability": _is_number,

@@ -92,6 +92,19 @@ def test_states(opengl: None) -> None:
     env.close()
 
 
+@pytest.mark.parametrize("task", ["finger-spin", "fish-upright"])
+def test_colours_that_a_task_sets_at_its_reset_are_part_of_a_state(task: str, opengl: None) -> None:
+    env, other = (gym.make(f"dmc/{task}-v0", pixels=64, action_repeat=4) for _ in range(2))
+    check_restorable(env, other, n_steps=2)
+    state, _ = pack(env)
+    fresh = gym.make(f"dmc/{task}-v0", pixels=64, action_repeat=4)
+    action = np.zeros(env.action_space.shape, np.float32)
+    unpack(fresh, state)
+    np.testing.assert_array_equal(fresh.unwrapped.step(action)[0], env.unwrapped.step(action)[0])
+    for each in (env, other, fresh):
+        each.close()
+
+
 @pytest.mark.parametrize(
     ("kwargs", "words"),
     [

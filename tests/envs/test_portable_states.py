@@ -12,11 +12,11 @@ from stable_baselines3.common.monitor import Monitor
 
 from sb3_sample.envs import make_env
 from sb3_sample.envs.portable_states import pack, unpack
-from sb3_sample.envs.states import layers_of, restore_state, save_state, simulator_of
+from sb3_sample.envs.states import layers_of, more_model_arrays, restore_state, save_state, simulator_of
 from sb3_sample.saving import container
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name, same
 from sb3_sample.saving.encoding import decode, encode
-from tests.envs.test_states import assert_equal, random_actions, steps
+from tests.envs.test_states import assert_equal, random_actions, randomized, steps
 
 FAST = [
     "dmc/cartpole-swingup-v0",  # physics alone
@@ -114,6 +114,28 @@ def test_a_view_of_the_simulators_memory_follows_it() -> None:
     assert_equal(steps(env, actions), expected)
 
 
+def test_numbers_of_the_model_that_a_wrapper_draws(tmp_path: Path) -> None:
+    env, other = Monitor(randomized()), Monitor(randomized())
+    env.reset(seed=1)
+    steps(env, random_actions(env, 5))
+    state, opaque = pack(env)
+    assert not opaque
+    state = through_a_file(state, tmp_path / "state")
+    actions = random_actions(env, 15, seed=1)
+    expected = steps(env, actions)
+    unpack(other, state)
+    assert_equal(steps(other, actions), expected)
+
+
+def test_states_of_earlier_versions_have_no_options_and_masks(simulated: tuple[gym.Env, dict[str, Any]]) -> None:
+    env, state = simulated
+    state = copy.deepcopy(state)
+    del state["simulator"]["options"]
+    for name in more_model_arrays():
+        del state["simulator"]["model"][name]
+    unpack(env, state)
+
+
 #: Arrays of the simulator that a state could bring: those that are indices in its memory, which MuJoCo follows without
 #: a check, and those that are saved, as something else.
 HOSTILE = [
@@ -124,6 +146,13 @@ HOSTILE = [
     *(("data", name, 10**6) for name in ("efc_J", "M_rownnz", "tree_asleep", "contact")),
     ("model", "body_mass", "int"), ("model", "body_mass", "long"), ("model", "body_mass", "list"),
     ("model", "body_mass", "left out"), ("model", "body_mass", np.nan), ("model", "geom_size", np.inf),
+    ("model", "geom_condim", 7), ("model", "geom_contype", "left out"), ("model", "geom_rgba", "long"),
+    ("options", "opt.gravity", "long"), ("options", "opt.gravity", np.inf), ("options", "opt.wind", "left out"),
+    *(("options", name, number) for name, number in (
+        ("opt.timestep", 1), ("opt.more", "int"), ("opt.timestep", float("nan")), ("opt.integrator", 4),
+        ("opt.integrator", -1), ("opt.solver", True), ("opt.iterations", 2**31), ("opt.disableflags", 2**30),
+        ("opt.cone", "1"),
+    )),
     ("data", "qacc_warmstart", np.nan), ("data", "xpos", "int"), ("data", "qM", "left out"), ("data", "qpos", "long"),
     (None, "integration", np.nan), (None, "integration", "long"), (None, "integration", "int"),
     (None, "integration", "list"), (None, "integration", "left out"), (None, "model", "list"), (None, "more", 1),
@@ -152,7 +181,7 @@ def test_the_simulators_memory_is_given_what_is_saved_of_it(
     else:
         own = getattr(model if part == "model" else data, name, None)
         array = np.array(own) if isinstance(own, np.ndarray) else np.zeros(3, np.int32)
-    changed: Any = {
+    changed: Any = value if part == "options" and not isinstance(array, np.ndarray) else {
         "int": lambda: array.astype(np.int64), "long": lambda: np.zeros((len(array) + 1, *array.shape[1:])),
         "list": lambda: [1.0], "left out": lambda: None,
     }.get(value, lambda: np.full_like(array, value))()  # fmt: skip

@@ -1,13 +1,16 @@
 """Going back to a state is exact: the same actions give the same observations, rewards and ends, bit by bit."""
 
+import functools
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor
 
 from sb3_sample.envs import make_env
+from sb3_sample.envs.rewinding import sibling_of
 from sb3_sample.envs.states import check_restorable, random_action, restore_state, save_state
 from tests.variance.common import Tabular
 
@@ -168,6 +171,113 @@ def test_check_restorable(env_id: str) -> None:
     check_restorable(make(env_id), make(env_id))
 
 
+class Randomized(gym.Wrapper):
+    """Draws numbers of the model's physics anew for each episode, as domain randomisation does."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        observation, info = self.env.reset(**kwargs)
+        model, rng = self.unwrapped.model, self.unwrapped.np_random  # type: ignore[attr-defined]
+        model.opt.gravity[2] = rng.uniform(-20, -1)
+        model.opt.wind[:] = rng.uniform(-5, 5, 3)
+        model.opt.timestep = rng.uniform(0.005, 0.012)
+        model.opt.integrator = int(rng.integers(4))
+        model.stat.meaninertia = rng.uniform(1, 2)
+        model.geom_contype[:] = rng.integers(2, size=model.ngeom)
+        model.geom_rgba[:] = rng.uniform(size=(model.ngeom, 4))
+        return observation, info
+
+
+def randomized() -> Any:
+    return Randomized(make_env("HalfCheetah-v5"))
+
+
+def test_numbers_of_the_model_that_a_wrapper_draws() -> None:
+    env, other = randomized(), randomized()
+    env.reset(seed=1)
+    steps(env, random_actions(env, 5))
+    state, actions = save_state(env), random_actions(env, 15, seed=1)
+    model = env.unwrapped.model
+    drawn = model.opt.gravity.copy(), model.opt.integrator, model.geom_contype.copy(), model.geom_rgba.copy()
+    expected = steps(env, actions)
+    env.reset()
+    for again in (env, other):
+        restore_state(again, state)
+        model = again.unwrapped.model
+        for value, before in zip(
+            (model.opt.gravity, model.opt.integrator, model.geom_contype, model.geom_rgba), drawn, strict=True
+        ):
+            np.testing.assert_array_equal(value, before)
+        assert_equal(steps(again, actions), expected)
+    check_restorable(env, other)
+
+
+class Node:
+    """Knows its parent, as its parent knows it, and can be asked for a method of its own."""
+
+    def __init__(self, parent: Any = None) -> None:
+        self.parent, self.children, self.n = parent, [], 0
+
+    def count(self) -> int:
+        self.n += 1
+        return self.n
+
+
+class Bound(gym.Env):
+    """Holds methods, of its own and of an object of its state, and objects that refer to each other."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,))
+    action_space = spaces.Box(-1, 1, (1,))
+
+    def __init__(self, kind: str = "method") -> None:
+        self.t, self.root = 0.0, Node()
+        self.root.children.append(Node(self.root))
+        self.reward = self.dense if kind == "method" else functools.partial(Bound.dense, self)
+        self.count = self.root.children[0].count
+
+    def dense(self) -> float:
+        return self.t
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.t = self.np_random.random()
+        return np.zeros(2), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.t += float(action[0])
+        return np.array([self.count(), self.root.children[0].n], float), self.reward(), False, False, {}
+
+
+@pytest.mark.parametrize("kind", ["method", "partial"])
+def test_methods_stay_those_of_the_environment(kind: str) -> None:
+    env, other = Bound(kind), Bound(kind)
+    check_restorable(env)
+    check_restorable(env, other)
+    for each in (env, other):
+        of = each.reward.__self__ if kind == "method" else each.reward.args[0]  # type: ignore[attr-defined]
+        assert of is each
+        node = each.root.children[0]
+        assert node.parent is each.root and each.count.__self__ is node
+
+
+def test_monitors_past_episodes_are_no_part_of_a_state() -> None:
+    env = Monitor(make_env("CartPole-v1"))
+    env.reset(seed=0)
+    steps(env, random_actions(env, 100))
+    n = len(env.episode_returns)
+    state = save_state(env)
+    held = [name for name, value in state.layers[0].items() if isinstance(value, list)]
+    assert n > 0 and held == ["rewards"]
+    steps(env, random_actions(env, 100))
+    later = list(env.episode_returns)
+    restore_state(env, state)
+    assert env.episode_returns == later and len(later) > n
+    sibling = sibling_of(env)
+    for _ in range(2):
+        restore_state(sibling, state)
+        steps(sibling, random_actions(env, 50))
+    assert not sibling.get_wrapper_attr("episode_returns")
+
+
 class Hidden(gym.Env):
     """Keeps its state where nobody finds it, as an environment does that runs in another process."""
 
@@ -184,9 +294,27 @@ class Hidden(gym.Env):
         return np.array([next(self.simulator)], dtype=float), 0.0, False, False, {}
 
 
+class OfTheReset(Hidden):
+    """What a reset draws is hidden, and nothing else."""
+
+    def __init__(self) -> None:
+        self.drawn = iter([0.0])  # the iterator's place is no data
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        gym.Env.reset(self, seed=seed)
+        self.drawn = iter([self.np_random.random()] * 10**3)
+        return np.zeros(1), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
+        return np.array([next(self.drawn)]), 0.0, False, False, {}
+
+
 def test_environments_that_cannot_be_restored() -> None:
     with pytest.raises(ValueError, match="env must be an environment whose state can be saved .* not <.*Hidden"):
         check_restorable(Hidden())
+    with pytest.raises(ValueError, match="the same actions gave something else"):
+        check_restorable(OfTheReset())
     with pytest.raises(TypeError, match=r"env must be a gymnasium.Env, not 'Hopper-v5'"):
         save_state("Hopper-v5")  # type: ignore[arg-type]
 

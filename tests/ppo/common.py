@@ -60,11 +60,11 @@ def quiet(model: Any) -> Any:
     return model
 
 
-def collected(model: Any) -> Any:
+def collected(model: Any, callback: Any = None) -> Any:
     """The model with one rollout and no update."""
     quiet(model)
     model.train = lambda: None
-    model.learn(model.n_steps * model.n_envs)
+    model.learn(model.n_steps * model.n_envs, callback)
     del model.train
     return model
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from gymnasium.wrappers import FrameStackObservation, RecordVideo, TimeLimit
+from gymnasium.wrappers import FrameStackObservation, RecordVideo, TimeLimit, TransformReward
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -430,6 +430,31 @@ def test_the_course_of_a_copied_wrapper_is_its_own() -> None:
     assert len(envs[0].drawn) == 8 and envs[0].drawn == envs[1].drawn
 
 
+class Shaped(gym.Wrapper):
+    """Keeps methods, of its own and of the environment."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        self.t = 0
+        self.bonus, self.inner = self.linear, functools.partial(env.step)
+
+    def linear(self) -> float:
+        return float(self.t)
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        observation, reward, *rest = self.inner(action)
+        return observation, float(reward) + self.bonus(), *rest
+
+
+def test_methods_of_a_copied_wrapper_are_its_own() -> None:
+    env = Shaped(Ends(3))
+    sibling: Any = sibling_of(env)
+    assert sibling.bonus.__self__ is sibling and sibling.inner.func.__self__ is sibling.env is not env.env
+    check_restorable(sibling, sibling_of(env))
+    assert env.t == 0
+
+
 def test_atari_states() -> None:
     """Sticky actions, which the console draws, and the stack of frames are restored bit by bit."""
     ale_py = pytest.importorskip("ale_py", reason="needs ale-py")
@@ -480,6 +505,41 @@ class HoldsOn(gym.Wrapper):
 class NoCopy(Ends):
     def __deepcopy__(self, memo: Any) -> Any:
         raise TypeError("cannot be copied")
+
+
+class Bonus(gym.Wrapper):
+    """Pays a bonus, which a callback raises."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        self.bonus = 0.0
+
+    def step(self, action: Any) -> Any:
+        observation, _, *rest = self.env.step(action)
+        return observation, self.bonus, *rest
+
+
+class Raises(BaseCallback):
+    def _on_step(self) -> bool:
+        self.training_env.set_attr("bonus", float(self.num_timesteps))
+        return True
+
+
+def test_states_are_saved_after_the_callback() -> None:
+    agent = rewound(DummyVecEnv([lambda: Bonus(Toy())]), gamma=0.0, horizon=1, n_actions=2)
+    samples = collected(agent, Raises()).simulate(agent.current_rollout().observations)
+    assert samples.q_values.flatten().tolist() == list(range(agent.n_steps))
+
+
+def test_environments_that_differ() -> None:
+    """A function of a wrapper is no part of a state."""
+
+    def make(scale: float) -> Any:
+        return lambda: TransformReward(gym.make("CartPole-v1"), lambda reward: scale * reward)
+
+    with pytest.raises(ValueError, match=r"made in the same way.* environment 1 .*n_actions=1 for plain PPO"):
+        rewound(DummyVecEnv([make(1.0), make(100.0)]))
+    rewound(DummyVecEnv([make(2.0), make(2.0)]))
 
 
 @pytest.mark.parametrize(

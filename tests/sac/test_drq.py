@@ -11,9 +11,19 @@ import torch
 import torch.nn.functional as F
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import NatureCNN
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
-from sb3_sample import BRO, SAC, CompactNStepReplayBuffer, CompactReplayBuffer, DebiasedRQ, DrQ, DrQv2
+from sb3_sample import (
+    BRO,
+    SAC,
+    CompactNStepReplayBuffer,
+    CompactReplayBuffer,
+    DebiasedRQ,
+    DrQ,
+    DrQv2,
+    SimBa,
+    SimbaV2,
+)
 from sb3_sample.learner.augmentation import RandomShift, shifted
 from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.sac.encoders import ConvEncoder
@@ -240,26 +250,39 @@ def test_the_gradient_of_a_clamped_action() -> None:
     )
 
 
-@pytest.mark.parametrize("choice", [{"target_encoder": "online"}, {"actor_features": "before"}])
-def test_choices_of_the_encoder(choice: dict[str, str]) -> None:
-    """Each by itself, on DrQ and on SAC with an extractor of one's own: it trains, and differs from the other."""
-    models = [
-        drq(policy_kwargs={**TINY, **choice}),
-        drq(),
-        sac(frames(), policy="CnnPolicy", batch_size=4, policy_kwargs={
-            "net_arch": [8], "features_extractor_class": ConvEncoder, "share_features_extractor": True,
-            "features_extractor_kwargs": TINY["features_extractor_kwargs"], **choice,
-        }),
-    ]  # fmt: skip
-    for model in models:
-        model.learner.update(
-            batch_of(4), Noise(transforms=(torch.ones(16, 2).long(),) if len(model.transforms) else None)
-        )
-    changed = differing(state(models[0]), state(models[1]))
-    own = [name for name in changed if "actor" in name or "extractor" in name or "critic" in name]
-    assert own
-    with pytest.raises(ValueError, match="share_features_extractor=True"):
-        sac(frames(), policy="CnnPolicy", policy_kwargs={**choice, "features_extractor_class": ConvEncoder})
+def _own_extractor(**choice: str) -> SAC:
+    return sac(frames(), policy="CnnPolicy", batch_size=4, policy_kwargs={
+        "net_arch": [8], "features_extractor_class": ConvEncoder, "share_features_extractor": True,
+        "features_extractor_kwargs": TINY["features_extractor_kwargs"], **choice,
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "make", [lambda **choice: drq(policy_kwargs={**TINY, **choice}, policy_delay=1), _own_extractor]
+)
+@pytest.mark.parametrize("choice", [{}, {"target_encoder": "online"}, {"actor_features": "before"}])
+def test_choices_of_the_encoder(choice: dict[str, str], make: Any) -> None:
+    """Each by itself, on DrQ and on SAC with an extractor of one's own: what differs after a step, what not."""
+    models, changed = [make(**choice), make()], []
+    for step in range(2):
+        for model in models:
+            torch.manual_seed(step)
+            model.learner.update(batch_of(4, seed=step), Noise())
+        changed.append(set(differing(*(state(model) for model in models))))
+    first, second = changed
+    if not choice:
+        assert not first | second
+    elif "target_encoder" in choice:
+        # A target's own encoder lags behind from the first step on, and is used in the second.
+        assert {name.rsplit(".layers", 1)[0] for name in first} == {"policy/critic_target.features_extractor"}
+        assert {name for name in second if name.startswith("critic.optimizer")}
+    else:
+        # The critics' step has changed the encoder by the time that the actor uses it.
+        assert {name for name in first if name.startswith("actor.optimizer")}
+        assert not [name for name in first if "critic" in name]
+    if choice:
+        with pytest.raises(ValueError, match="share_features_extractor=True"):
+            sac(frames(), policy="CnnPolicy", policy_kwargs={**choice, "features_extractor_class": ConvEncoder})
 
 
 def test_a_rate_of_the_encoders_own() -> None:
@@ -436,6 +459,8 @@ def test_the_replay_follows_the_environment(tmp_path: Path) -> None:
     single = frames(frame_stack=1, channels=3)
     assert drq(single, replay_buffer_kwargs={"frame_stack": 3}).replay_buffer.frame_stack == 3
     assert drqv2(replay_buffer_kwargs={"memory_map": str(tmp_path)}).replay_buffer.memory_map
+    both = {"frame_stack": 3, "memory_map": str(tmp_path)}
+    assert drqv2(single, replay_buffer_kwargs=both).replay_buffer.memory_map
     model.learn(20).save(tmp_path / "m")
     loaded = DrQ.load(tmp_path / "m")
     assert loaded.replay_buffer.frame_stack == 3
@@ -507,6 +532,15 @@ def test_observations_that_are_no_images(space: spaces.Space, words: str) -> Non
             make(space, action_space, policy="CnnPolicy")
     with pytest.raises(ValueError, match=words):
         BRO.learner(space, action_space, policy="CnnPolicy", augmentation="shift")
+
+
+@pytest.mark.parametrize("cls", [SimBa, SimbaV2])
+def test_agents_that_normalize_vectors_say_what_to_pass_for_images(cls: Any) -> None:
+    arguments: dict[str, Any] = {"augmentation": "shift", "device": "cpu", "buffer_size": 20}
+    with pytest.raises(ValueError, match="divided by 255.*pass normalize_observations=False"):
+        cls("CnnPolicy", frames(), **arguments)
+    with pytest.raises(ValueError, match="not of float32.*norm_obs=False"):
+        cls("CnnPolicy", VecNormalize(frames()), **arguments)
 
 
 def test_images_that_come_channels_last_in_an_environment() -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -195,6 +196,27 @@ class Wrapped(Kind):
 
     def number(self) -> float:
         return 0.0
+
+
+class Physics(Kind):
+    """A simulator whose gravity, time step and contacts are drawn anew for each episode."""
+
+    def set_up(self) -> None:
+        body = '<body pos="0 0 1"><joint type="slide" axis="0 0 1"/><geom size=".1"/></body>'
+        self.model = mujoco.MjModel.from_xml_string(
+            f'<mujoco><worldbody><geom type="plane" size="1 1 1"/>{body}</worldbody></mujoco>'
+        )
+        self.data = mujoco.MjData(self.model)
+
+    def begin(self, seed: int | None) -> None:
+        mujoco.mj_resetData(self.model, self.data)
+        self.model.opt.gravity[2] = self.np_random.uniform(-20, -1)
+        self.model.opt.timestep = self.np_random.uniform(0.05, 0.1)
+        self.model.geom_contype[:] = self.np_random.integers(2)
+
+    def number(self) -> float:
+        mujoco.mj_step(self.model, self.data)
+        return float(self.data.qpos[0])
 
 
 class Noisy(VecEnvWrapper):

@@ -28,6 +28,7 @@ RESTORED: dict[str, tuple[str, ...]] = {
     "Partial": ("dummy",),
     "Closure": ("dummy", "workers"),
     "Wrapped": ("dummy",),
+    "Physics": ("dummy", "workers"),
     "Slots": ("dummy",),
     "ClassAttributes": ("workers", "dummy"),
     "Globals": ("dummy", "workers", "supervised"),

@@ -329,6 +329,8 @@ def test_channels_last_are_turned_and_single_pictures_are_told_how_to_be_stacked
         ({"buffer_size": 7}, "buffer_size must be at least 8"),
         ({"compile": "yes"}, "compile must be"),
         ({"replay_buffer_kwargs": {"horizon": 3}}, "horizon"),
+        ({"replay_buffer_kwargs": {"fade": 0.99}}, "replay_buffer_kwargs has .'fade'.*leave them out"),
+        ({"replay_buffer_kwargs": {"priority_exponent": 0.4}}, "replay_buffer_kwargs has .'priority_exponent'"),
         ({"policy_kwargs": {"channels": (1, 2)}}, "channels"),
         ({"policy_kwargs": {"features_extractor_class": None}}, "features_extractor_class"),
         ({"policy_kwargs": {"net_arch": [3]}}, "net_arch"),
@@ -340,6 +342,12 @@ def test_arguments_out_of_range(kwargs: dict[str, Any], match: str) -> None:
         kwargs = {"policy_kwargs": {**TINY, **kwargs["policy_kwargs"]}}
     with pytest.raises(ValueError, match=match):
         tiny(**kwargs)
+
+
+def test_other_arguments_of_the_optimizer_leave_the_published_epsilon() -> None:
+    model = tiny(policy_kwargs={**TINY, "optimizer_kwargs": {"weight_decay": 0.1}})
+    (group,) = model.policy.optimizer.param_groups
+    assert group["eps"] == 1.5e-4 and group["weight_decay"] == 0.1
 
 
 def test_other_policies_and_a_training_that_is_too_short() -> None:

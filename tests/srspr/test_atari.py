@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from stable_baselines3.common.callbacks import BaseCallback
 
 ale_py = pytest.importorskip("ale_py")
 
@@ -14,8 +15,9 @@ from sb3_sample import SRSPR, make_atari_env, make_env  # noqa: E402
 from sb3_sample.envs.atari import ENV_KWARGS, AreaResize, AtariFrames  # noqa: E402
 from sb3_sample.envs.portable_states import pack, unpack  # noqa: E402
 from sb3_sample.saving.attributes import DoesNotFit  # noqa: E402
-from sb3_sample.srspr.evaluation import evaluate_atari, evaluation_env  # noqa: E402
-from tests.srspr.common import TINY  # noqa: E402
+from sb3_sample.srspr import evaluation  # noqa: E402
+from sb3_sample.srspr.evaluation import AtariEvaluation, evaluate_atari, evaluation_env  # noqa: E402
+from tests.srspr.common import SIZE, TINY, tiny, venv  # noqa: E402
 
 
 def until_a_life_is_lost(env: gym.Env) -> tuple[np.ndarray, dict[str, Any]]:
@@ -142,6 +144,78 @@ def test_the_published_evaluation() -> None:
     assert np.array_equal(returns, again[0])
     env = evaluation_env("ALE/Breakout-v5")
     assert not any(word in str(env) for word in ("EpisodicLife", "ClipReward", "NoopReset", "FireReset"))
+
+
+class Scripted(gym.Env):
+    """Games of 40 decisions, each worth 2.5, that remember their actions."""
+
+    observation_space = gym.spaces.Box(0, 255, (4, SIZE, SIZE), np.uint8)
+    action_space = gym.spaces.Discrete(3)
+
+    def __init__(self) -> None:
+        self.games: list[list[int]] = []
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.games.append([])
+        return np.zeros(self.observation_space.shape, np.uint8), {}
+
+    def step(self, action: int) -> Any:
+        self.games[-1].append(action)
+        return np.zeros(self.observation_space.shape, np.uint8), 2.5, len(self.games[-1]) == 40, False, {}
+
+
+class Player:
+    """Always plays 2, and counts how often it is asked."""
+
+    def __init__(self, rate: float) -> None:
+        self.evaluation_eps, self.action_space, self.asked = rate, Scripted.action_space, 0
+
+    def predict(self, observation: np.ndarray, deterministic: bool = False) -> Any:
+        assert deterministic
+        self.asked += 1
+        return np.array(2), None
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.3, 1.0])
+def test_games_of_an_evaluation(rate: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """First decisions without an action, then the model's or, at the rate, a random one; rewards as they are."""
+    env, player, noops = Scripted(), Player(rate), list[int]()
+    monkeypatch.setattr(evaluation, "evaluation_env", lambda env_id: env)
+    returns, lengths = evaluate_atari(player, "ALE/Breakout-v5", n_episodes=12, seed=1, noops=noops)
+    assert (returns == 100).all() and (lengths == 40).all()
+    assert len(set(noops)) > 5 and all(not any(game[:n]) for game, n in zip(env.games, noops, strict=True))
+    played = [action for game, n in zip(env.games, noops, strict=True) for action in game[n:]]
+    assert abs(player.asked / len(played) - (1 - rate)) < 0.1 and (
+        rate not in (0, 1) or player.asked in (0, len(played))
+    )
+    # A random action is any of three.
+    assert abs(np.mean(np.array(played) == 2) - (1 - 2 / 3 * rate)) < 0.1
+    assert set(played) == ({2} if rate == 0 else {0, 1, 2})
+    # Broken off in the midst of a game.
+    returns, lengths = evaluate_atari(player, "ALE/Breakout-v5", n_episodes=1, max_decisions=30)
+    assert returns == 75 and lengths == 30
+
+
+class Logged(BaseCallback):
+    def _on_step(self) -> bool:
+        self.values = {key: value for key, value in self.logger.name_to_value.items() if key.startswith("eval/")}
+        return True
+
+
+def test_evaluations_while_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evaluation, "evaluation_env", lambda env_id: Scripted())
+    callback, logged = AtariEvaluation("ALE/Breakout-v5", every=10, n_episodes=2), Logged()
+    tiny(venv(2)).learn(24, [callback, logged])
+    assert callback.results == [(10, 100.0), (20, 100.0)]
+    # Breakout's scores of random play and of humans are 1.7 and 30.5.
+    assert logged.values == {"eval/mean_reward": 100.0, "eval/human_normalized": pytest.approx((100 - 1.7) / 28.8)}
+    again = AtariEvaluation("ALE/Breakout-v5")
+    again.load_state_dict(callback.state_dict())
+    assert again.results == callback.results
+    for wrong in ({"every": 0}, {"n_episodes": 0}):
+        with pytest.raises(ValueError, match=f"{next(iter(wrong))} must be an integer of at least 1, not 0"):
+            AtariEvaluation("ALE/Breakout-v5", **wrong)
 
 
 def test_games_that_there_are_not() -> None:
