@@ -209,8 +209,8 @@ class TaskScale(RewardScale):
 
         (max(largest, |smallest|) - alpha * min(target_entropy, 0) / (2 * (1 - gamma))) / max_return
 
-    and at least 1e-8, the temperature alpha being read before the gradient steps that follow an environment step. It is infinite, and the
-    rewards are 0, until the task has finished an episode.
+    and at least 1e-8, the temperature alpha being read before the gradient steps that follow an environment step. It is
+    infinite, and the rewards are 0, until the task has finished an episode.
 
     The task of an environment's step is that of the dict observation that was acted on, key "task", or its info's
     "task"; that of a transition the same key, or the batch's column "task". Without either it is 0.

@@ -15,7 +15,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
-from sb3_sample import SAC, XQC, CrossQ
+from sb3_sample import SAC, XQC, CrossQ, FlashSAC
 from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.learner.target import values
 from sb3_sample.networks import (
@@ -507,6 +507,11 @@ def test_defaults_with_weight_norm() -> None:
     ("agent", "kwargs", "words"),
     [
         ("CrossQ", {"weight_norm": 1}, "weight_norm must be True or False, not 1"),
+        (
+            "CrossQ",
+            {"weight_norm": True, "policy_kwargs": {"critic_network": "mlp"}},
+            "weight_norm=True is of the networks 'crossq', not of critic_network='mlp'",
+        ),
         ("CrossQ", {"weight_decay": -1}, "weight_decay must be at least 0"),
         (
             "CrossQ",
@@ -529,12 +534,22 @@ def test_defaults_with_weight_norm() -> None:
         ("FlashSAC", {"policy_kwargs": {"critic_network_kwargs": {"width": 0}}}, "FlashNet needs width >= 1"),
         ("FlashSAC", {"exploration_kwargs": {"longest": 0}}, "longest must be an integer of at least 1, not 0"),
         ("FlashSAC", {"exploration_kwargs": {"exponent": -1}}, "exponent must be at least 0"),
+        ("FlashSAC", {"target_std": 0.5, "target_entropy": -3}, "target_std=0.5 means nothing with target_entropy=-3"),
         ("FlashSAC", {"target_std": 0}, "target_std must be above 0"),
     ],
 )
 def test_refused(agent: str, kwargs: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         MAKERS[agent](**kwargs)
+
+
+def test_target_std_of_a_loaded_model(tmp_path: Path) -> None:
+    made, other = MAKERS["FlashSAC"](target_std=0.3), MAKERS["FlashSAC"](target_std=0.5)
+    made.save(tmp_path / "model")
+    as_it_was = FlashSAC.load(tmp_path / "model")
+    assert (as_it_was.target_std, as_it_was.target_entropy) == (0.3, made.target_entropy)
+    assert FlashSAC.load(tmp_path / "model", target_std=0.5).target_entropy == other.target_entropy
+    assert FlashSAC.load(tmp_path / "model", target_entropy=-3).target_entropy == -3
 
 
 def test_discount() -> None:
