@@ -230,7 +230,7 @@ def check_uncertainty(uncertainty: str, learner: Learning) -> None:
 
     :param uncertainty: the argument
     :param learner: the learner, whose critics it is of
-    :raises ValueError: if it is unknown, or one of quantiles that they have not
+    :raises ValueError: if it is unknown, or one of quantiles or of several critics that they have not
     """
     if uncertainty not in UNCERTAINTIES:
         raise ValueError(f"uncertainty must be one of {UNCERTAINTIES}, not {uncertainty!r}")
@@ -238,6 +238,11 @@ def check_uncertainty(uncertainty: str, learner: Learning) -> None:
         raise ValueError(
             f"uncertainty={uncertainty!r} needs critics with at least two quantiles, "
             f"not n_quantiles={learner.head.n_quantiles}"
+        )
+    if uncertainty == "epistemic" and learner.critic.n_critics == 1:
+        raise ValueError(
+            "uncertainty='epistemic' of an optimistic actor is the critics' spread, which n_critics=1 has not: pass "
+            "n_critics of at least 2, or n_quantiles and uncertainty='aleatoric'"
         )
 
 

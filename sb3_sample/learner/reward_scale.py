@@ -145,7 +145,7 @@ class StdOrMaxScale(ReturnScale):
     A step is taken in when the next actions are chosen, so that a batch drawn after it does not see it yet.
 
     :param learner: the learner
-    :param max_return: bound of the scaled return; None: the last atom of a categorical head, 5 without one
+    :param max_return: bound of the scaled return; None: the largest ``|atom|`` of a categorical head, 5 without one
     """
 
     def __init__(self, learner: Learning, max_return: float | None = None):
@@ -184,7 +184,7 @@ class Float32Scale(ReturnScale):
     weighs the old variance (1 at the start). G is in float64, its discount in float32. A step is taken in at once.
 
     :param learner: the learner
-    :param max_return: bound of the scaled return; None: the last atom of a categorical head, 5 without one
+    :param max_return: bound of the scaled return; None: the largest ``|atom|`` of a categorical head, 5 without one
     """
 
     def __init__(self, learner: Learning, max_return: float | None = None):
@@ -207,17 +207,17 @@ class TaskScale(RewardScale):
     formed backwards; after the last reward of a truncated one (also if it terminated) stands ``mean reward / (1 -
     gamma)``. With the largest and smallest return of a task ever seen (in float32) the divisor is::
 
-        (max(largest, |smallest|) - alpha * target_entropy / (2 * (1 - gamma))) / max_return
+        (max(largest, |smallest|) - alpha * min(target_entropy, 0) / (2 * (1 - gamma))) / max_return
 
-    the temperature alpha being read before the gradient steps that follow an environment step. It is infinite, and the
-    rewards are 0, until the task has finished an episode.
+    and at least 1e-8, the temperature alpha being read before the gradient steps that follow an environment step. It is
+    infinite, and the rewards are 0, until the task has finished an episode.
 
     The task of an environment's step is that of the dict observation that was acted on, key "task", or its info's
     "task"; that of a transition the same key, or the batch's column "task". Without either it is 0.
 
     :param learner: the learner
     :param n_tasks: number of tasks
-    :param max_return: bound of the scaled return; None: the last atom of a categorical head, 10 without one
+    :param max_return: bound of the scaled return; None: the largest ``|atom|`` of a categorical head, 10 without one
     """
 
     smallest: torch.Tensor
@@ -274,7 +274,9 @@ class TaskScale(RewardScale):
             alpha = learner.temperature().double()
         size = torch.maximum(self.largest, self.smallest.abs()).double()
         entropy = alpha * learner.target_entropy / (2 * (1 - learner.gamma))
-        self.divisors.copy_((size - entropy) / self.max_return)
+        # Only a bonus widens the range of the values: a positive target would turn the sign of small returns.
+        entropy = torch.as_tensor(entropy).clamp(max=0)
+        self.divisors.copy_(((size - entropy) / self.max_return).clamp(min=1e-8))
 
     def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
         return self.divisors[0] if task is None else self.divisors[task]
@@ -287,10 +289,12 @@ class TaskScale(RewardScale):
 
 
 def _bound(learner: Learning, max_return: float | None, otherwise: float) -> float:
-    """Bound of the scaled return: the last atom of a categorical head unless it is given, a number without atoms."""
-    if max_return is None:
-        return float(getattr(learner.head, "v_max", otherwise))
-    return float(check_value("max_return", max_return, ABOVE_0))
+    """Bound of the scaled return: the atoms' largest size unless it is given, a number without atoms."""
+    if max_return is not None:
+        return float(check_value("max_return", max_return, ABOVE_0))
+    head: Any = learner.head
+    # Of costs the support may end at 0 or below.
+    return float(max(abs(head.v_min), abs(head.v_max))) if hasattr(head, "v_max") else otherwise
 
 
 class LinearScale(RewardScale):

@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar
 
+from sb3_sample.arguments import check_unused
 from sb3_sample.constructor import argument
 from sb3_sample.kinds import AT_LEAST_0, integer
 from sb3_sample.learner.categorical import VALUE_HEADS, CategoricalHead
@@ -55,6 +56,10 @@ class BRC(SAC):
         super()._check_arguments()
         checks.check_critics_described_once(self, "critic_width")
         checks.check_weight_decay(self)
+        if self.multitask:
+            check_unused(self, ["embedding_size"], "multitask=True")
+        elif "features_extractor_class" in self.policy_kwargs:
+            check_unused(self, ["embedding_size"], "policy_kwargs['features_extractor_class']")
 
     def _full_value_head_kwargs(self) -> dict[str, Any]:
         kwargs: dict[str, Any] = super()._full_value_head_kwargs()

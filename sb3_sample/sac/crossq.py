@@ -77,6 +77,13 @@ class CrossQ(SAC):
         super()._check_arguments()
         checks.check_batch_size(self)
         checks.check_weight_decay(self)
+        networks = {who: self.policy_kwargs.get(f"{who}_network", "crossq") for who in ("critic", "actor")}
+        others = [f"{who}_network={network!r}" for who, network in networks.items() if network != "crossq"]
+        if self.weight_norm and others:
+            raise ValueError(
+                f"weight_norm=True is of the networks 'crossq', not of {', '.join(others)} in policy_kwargs: leave one "
+                "of them out"
+            )
         for who in ("critic", "actor"):
             if "weight_norm" in (self.policy_kwargs.get(f"{who}_network_kwargs") or {}):
                 raise ValueError(

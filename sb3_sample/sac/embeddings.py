@@ -171,6 +171,7 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
     :param actor_kwargs: ``exploration_noise``, ``target_noise``, ``target_noise_clip``
     :param optimizer_class: optimizer of encoder, actor and critics
     :param optimizer_kwargs: its arguments, but for the learning rate
+    :param width_factor: by which all hidden layers and embeddings are wider than their arguments say
     :raises ValueError: if an argument is out of range
     """
 
@@ -198,6 +199,7 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
         actor_kwargs: dict[str, Any] | None = None,
         optimizer_class: type[torch.optim.Optimizer] = AdamW,
         optimizer_kwargs: dict[str, Any] | None = None,
+        width_factor: int = 1,
     ):
         # The parts of the base class are not these.
         BasePolicy.__init__(
@@ -217,7 +219,8 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
             "action_embedding": ("action_embedding", action_embedding),
             "pair_embedding": ("pair_embedding", pair_embedding),
         }
-        sizes_of_encoder = {key: check_value(*named, integer(1)) for key, named in sizes.items()}
+        check_value("width_factor", width_factor, integer(1))
+        sizes_of_encoder = {key: width_factor * check_value(*named, integer(1)) for key, named in sizes.items()}
         check_value("n_reward_atoms", n_reward_atoms, integer(2))
         check_value("n_critics", n_critics, integer(1))
         check_value("n_outputs", n_outputs, integer(1))
@@ -226,6 +229,7 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
         pi_arch, qf_arch = [512] * 2, [512] * 3
         if net_arch is not None:
             pi_arch, qf_arch = get_actor_critic_arch(net_arch if isinstance(net_arch, dict) else list(net_arch))
+        pi_arch, qf_arch = ([width_factor * width for width in arch] for arch in (pi_arch, qf_arch))
         self.share_features_extractor = True
         self.encoder = Encoder(
             observation_space,
@@ -265,6 +269,7 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
             actor_kwargs=actor_kwargs,
             optimizer_class=optimizer_class,
             optimizer_kwargs=self.optimizer_kwargs,
+            width_factor=width_factor,
         )
 
     def make_actor(self) -> DeterministicActor:

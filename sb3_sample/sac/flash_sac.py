@@ -5,7 +5,8 @@ from typing import Any
 
 from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_sample.constructor import argument
+from sb3_sample.arguments import default_of
+from sb3_sample.constructor import Given, argument
 from sb3_sample.kinds import ABOVE_0
 from sb3_sample.learner.categorical import VALUE_HEADS, CategoricalHead
 from sb3_sample.learner.exploration import Exploration
@@ -75,6 +76,23 @@ class FlashSAC(SAC):
     """rate from which it rises; None: ``learning_rate``, which it then keeps"""
     reward_scale: str | type[RewardScale] | None = argument(default="flashsac")
     """rule by which rewards are divided by a running measure of the return; None for none"""
+
+    def _construct(self, given: Given) -> None:
+        # Of what is passed: a model that is made, or loaded, has the number that "auto" came to beside it.
+        if {"target_std", "target_entropy"} <= set(given.passed) and given["target_entropy"] != "auto":
+            std, entropy = given["target_std"], given["target_entropy"]
+            if std != default_of(type(self), "target_std"):
+                raise ValueError(
+                    f"target_std={std!r} means nothing with target_entropy={entropy!r}: leave one of them out"
+                )
+        super()._construct(given)
+
+    @classmethod
+    def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
+        implied: dict[str, Any] = super()._implied(kwargs)
+        if "target_std" in kwargs and "target_entropy" not in kwargs:
+            implied["target_entropy"] = "auto"
+        return implied
 
     def _auto_target_entropy(self, action_dim: int) -> float:
         return action_dim * math.log(2 * math.pi * math.e * self.target_std**2) / 2

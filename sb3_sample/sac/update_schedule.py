@@ -27,7 +27,8 @@ class UpdateSchedule(DecidesCompiling, UpdatesOwed):
             # Optimizers count their steps over the model's life.
             coming = round(self._updates_in(n_steps))
             self.planned_updates = self._n_updates + coming if coming else None
-            if self.planned_updates is None and n_steps > 0:
+            # With a replay ratio of 0, or below one step in all, the next call that has some plans them.
+            if self.planned_updates is None and n_steps > 0 and self.replay_ratio is None:
                 raise ValueError(
                     f"schedule_steps must be given, as learning_rate_schedule={self.learning_rate_schedule!r} needs to "
                     "know how many gradient steps are planned, and the arguments do not say it"

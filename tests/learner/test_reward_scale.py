@@ -75,6 +75,37 @@ def test_flashsac_by_hand() -> None:
     assert scale.divisor(None).dtype == torch.float32
 
 
+@pytest.mark.parametrize("rule", ["brc", "flashsac", "simbav2"])
+def test_support_of_costs(rule: str) -> None:
+    """Values that end at 0 or below it: the bound is the support's larger end."""
+
+    def divisor(v_min: float, v_max: float) -> float:
+        of = learner()
+        of.head = SimpleNamespace(v_min=v_min, v_max=v_max)
+        scale: Any = REWARD_SCALES[rule](of)
+        scale.on_step(of, np.array([-30.0]), np.array([True]), [{}])
+        scale.on_observations(of, None)
+        scale.before_updates(of)
+        return float(scale.divisor(None))
+
+    assert 0 < divisor(-5, 0) == divisor(-5, -1) == divisor(-5, 5) == divisor(0, 5) < math.inf
+
+
+@pytest.mark.parametrize("temperature", [0.0, 0.5])
+@pytest.mark.parametrize("target", [0.0, 1.0, -1.0, torch.tensor([-0.5, 0.19])])
+def test_brc_of_returns_of_0(target: Any, temperature: float) -> None:
+    """The divisor stays above 0 without an entropy bonus, and with a positive target entropy."""
+    of = learner()
+    of.target_entropy, of.temperature = target, lambda: torch.tensor(temperature)
+    scale: Any = REWARD_SCALES["brc"](of, n_tasks=2)
+    for task in 0, 1:
+        scale.on_step(of, np.zeros(1), np.ones(1, bool), [{"task": task}])
+    scale.before_updates(of)
+    assert (scale.divisors > 0).all() and scale.divisors.isfinite().all()
+    bonus = (-temperature * torch.as_tensor(target).double() / (2 * (1 - of.gamma) * 10)).clamp(min=1e-8)
+    torch.testing.assert_close(scale.divisors, bonus.expand(2), rtol=1e-6, atol=0)
+
+
 def test_brc_by_hand() -> None:
     scale, _ = told("brc", [1.0, 2.0, 4.0], [0, 0, 1])
     # Returns 4, 2 + 3.6, 1 + 5.04; the temperature is 0.5, the target entropy -2, 1 - gamma 0.1.

@@ -14,6 +14,13 @@ from sb3_sample.sac import SAC
 from tests.sac.common import COMPILES, bro, differing, random_batch, sac, state, vec
 
 
+def test_a_learn_without_gradient_steps_plans_nothing() -> None:
+    model = sac(learning_rate_schedule="linear", replay_ratio=0, learning_starts=10).learn(20)
+    assert model.planned_updates is None and model._n_updates == 0
+    model.replay_ratio = 2
+    assert model.learn(15, reset_num_timesteps=False).planned_updates == 30
+
+
 def test_linear_by_hand() -> None:
     schedule = LearningRateSchedule("linear", 1e-4, 5e-5)
     found = [schedule.rate(n, 4) for n in (0, 1, 2, 4, 5, 100)]

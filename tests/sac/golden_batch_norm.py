@@ -40,10 +40,14 @@ XQC_LIMITS = {
     "float64": Limits(1e-7, 2e-9, 1e-9, 5e-8, 5e-8, 1e-9, 1e-9),
     "rawinit": Limits(1e-4, 1e-5, 3e-4, 5e-3, 1e-3, None),
 }
-WEIGHT_NORM_LIMITS = dict.fromkeys(XQC_LIMITS, Limits(1e-5, 1e-6, 3e-6, 1e-4, 2e-5, 1e-6))
+WEIGHT_NORM_LIMITS = {
+    **dict.fromkeys(XQC_LIMITS, Limits(1e-5, 1e-6, 3e-6, 1e-4, 2e-5, 1e-6)),
+    "float64": XQC_LIMITS["float64"],
+}
 FLASH_LIMITS = {
     "start": Limits(1e-5, 3e-5, 3e-6, 1e-3, 2e-5, 3e-5),
     "midtraining": Limits(1e-5, 2e-6, 3e-6, 1e-3, 2e-5, 2e-6),
+    "float64": XQC_LIMITS["float64"],
     "rawinit": Limits(5e-5, 5e-6, 3e-6, 1e-3, 2e-5, 5e-6),
 }
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_sample.networks import BroNet
@@ -142,6 +143,10 @@ def test_one_task_has_no_embedding() -> None:
         ({"policy_kwargs": {"critic_network": "mlp"}}, "pass critic_width=None"),
         ({"critic_width": 0}, "critic_width must be an integer of at least 1, or None for what policy_kwargs say"),
         ({"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0}}}, "weight_decay is an argument of the algorithm"),
+        (
+            {"embedding_size": 7, "policy_kwargs": {"features_extractor_class": FlattenExtractor}},
+            r"embedding_size=7 means nothing with policy_kwargs\['features_extractor_class'\]",
+        ),
         ({"embedding_size": 0}, "embedding_size must be an integer of at least 1, not 0"),
     ],
 )

@@ -939,7 +939,8 @@ def check_parameters(
 
 
 def test_files_are_there() -> None:
-    assert ALL_FILES, f"no file of a method's in {FOLDER}"
+    # A folder of SB3_SAMPLE_GOLDEN may lack any method's.
+    assert ALL_FILES or any(FOLDER.glob("dr_q_*.npz")), f"no file of a method's in {FOLDER}"
     here = {path.stem for path in OWN_FOLDER.glob("*.npz")}
     assert {name for name in METHODS if any(stem.startswith(name) for stem in here)} == METHODS.keys()
     others = [path for path in OWN_FOLDER.glob("*.npz") if not method_of(path, METHODS | SEQUENCES)]

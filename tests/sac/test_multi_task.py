@@ -97,9 +97,14 @@ def test_every_algorithm_can_be_widened() -> None:
             assert getattr(model, trunk).trunk.out_features == 16
     assert make("DAC", multitask=True).explorer.actor.trunk.out_features == 16
     assert make("BROTD3", multitask=True).policy.actor_target.trunk.out_features == 16
+    plain, model = make("DebiasedRQ"), make("DebiasedRQ", multitask=True)
+    for trunk in ["actor", "critic"]:
+        assert getattr(model, trunk).trunk.out_features == 2 * getattr(plain, trunk).trunk.out_features
     model = make("BRC", multitask=True)
     assert isinstance(model.critic.features_extractor, TaskOneHot) and model.critic.trunk.out_features == 16
     assert isinstance(make("BRC").critic.features_extractor, TaskEmbedding)
+    with pytest.raises(ValueError, match="embedding_size=7 means nothing with multitask=True"):
+        make("BRC", multitask=True, embedding_size=7)
     assert widened(MLP, {}, 2) == {"hidden_sizes": [512, 512]} and widened(MLP, {}, 1) == {}
 
     class Fixed(Network):
