@@ -3,6 +3,9 @@
 import importlib.util
 import json
 import math
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -553,3 +556,19 @@ def test_the_example(tmp_path: Path) -> None:
     model = BRC.load(tmp_path / "seed_0" / "final_model")
     # Two for each step of both tasks after the random ones.
     assert model._n_updates == 2 * 15 and model.learning_starts == 10
+
+
+@pytest.mark.slow
+def test_the_published_study(tmp_path: Path) -> None:
+    """The program that trains as published, in small."""
+    given = "--steps 20 --eval-every 10 --episodes 1 --critic-width 8 --batch-size 8 --random-steps 5"
+    subprocess.run(
+        ["sh", ROOT / "studies/papers/brc_multi_task.sh", PENDULUM, *given.split(), "--max-episode-steps", "5"],
+        cwd=tmp_path,
+        env={**os.environ, "SEEDS": "3 4", "PYTHON": sys.executable, "PYTHONPATH": str(ROOT)},
+        check=True,
+    )
+    table = study.load(tmp_path / f"runs/brc_{PENDULUM}.csv")
+    returns = table[table["metric"] == "return"]
+    assert set(returns["agent"]) == {f"BRC {PENDULUM}"} and set(returns["step"]) == {0, 10, 20}
+    assert set(returns["seed"]) == {3, 4} and len(returns) == 6

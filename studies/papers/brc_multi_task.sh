@@ -1,0 +1,18 @@
+#!/bin/sh
+# BRC (Nauman et al. 2025) on many tasks at once, as published: critics 4,096 wide, batch 1,024, two gradient steps for
+# a step of all tasks, 5,000 random steps of each, five seeds. Published means over DMC's seven dog and humanoid tasks
+# at 100k, 200k, 500k and 1M steps of each: 63, 193, 494, 680. For Meta-World's MT10 and MT50 a million steps of each
+# task stand in for steps that are not known here. A gradient step is some 1,700 GFLOP: days on a GPU for each seed.
+#   sh studies/papers/brc_multi_task.sh DMC_HARD|MT10|MT50 [FURTHER ARGUMENTS OF examples/multi_task.py]
+# On a CPU the same with critics 512 wide, about an hour a seed, evaluated at 0, 5,000 and 10,000 steps of each task:
+#   python examples/multi_task.py --tasks MT10 --seed 0 --folder runs/brc_mt10
+# SEEDS="0 1" and PYTHON=... choose seeds and interpreter. Interrupted and started again, each run goes on.
+set -e
+suite=${1:?"name DMC_HARD, MT10, MT50 or a task: sh studies/papers/brc_multi_task.sh MT10"}
+shift
+python=${PYTHON:-python}
+for seed in ${SEEDS:-0 1 2 3 4}; do
+    "$python" "$(dirname "$0")/../../examples/multi_task.py" --tasks "$suite" --critic-width 4096 --random-steps 5000 \
+        --steps 1000000 --eval-every 50000 --seed "$seed" --folder "runs/brc_$suite" "$@"
+done
+"$python" -m sb3_sample.cli study table "BRC $suite=runs/brc_$suite" -o "runs/brc_$suite.csv"
