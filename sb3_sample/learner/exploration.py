@@ -18,6 +18,7 @@ from sb3_sample.learner.scalars import BoundedLogScalar, FixedScalar, LogScalar
 from sb3_sample.learner.target import at_rest, values
 from sb3_sample.networks import NETWORKS, Projected, linear, project_weights, widened
 from sb3_sample.optim import AdamW
+from sb3_sample.warn import warn
 
 
 class Exploration(Part):
@@ -230,7 +231,7 @@ def check_uncertainty(uncertainty: str, learner: Learning) -> None:
 
     :param uncertainty: the argument
     :param learner: the learner, whose critics it is of
-    :raises ValueError: if it is unknown, or one of quantiles or of several critics that they have not
+    :raises ValueError: if it is unknown, or one of quantiles that they have not
     """
     if uncertainty not in UNCERTAINTIES:
         raise ValueError(f"uncertainty must be one of {UNCERTAINTIES}, not {uncertainty!r}")
@@ -240,9 +241,11 @@ def check_uncertainty(uncertainty: str, learner: Learning) -> None:
             f"not n_quantiles={learner.head.n_quantiles}"
         )
     if uncertainty == "epistemic" and learner.critic.n_critics == 1:
-        raise ValueError(
-            "uncertainty='epistemic' of an optimistic actor is the critics' spread, which n_critics=1 has not: pass "
-            "n_critics of at least 2, or n_quantiles and uncertainty='aleatoric'"
+        # No error: models that were trained so are to be loaded.
+        warn(
+            "uncertainty='epistemic' of an optimistic actor is the critics' spread, which is 0 with n_critics=1: it "
+            "follows their mean. Pass n_critics of at least 2, n_quantiles with uncertainty='aleatoric', or "
+            "exploration='actor'"
         )
 
 

@@ -119,11 +119,9 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
         (OAC, {"exploration": "actor", "optimism": 1.0}, ("optimism=1.0", "exploration='actor'")),
     ],
     "`target_subset` above the number of critics": [(SAC, {"target_subset": 3}, ("target_subset", "n_critics", "3"))],
-    "a rule of pessimism, OAC, or an optimistic actor, with one critic or one target": [
+    "a rule of pessimism, or OAC, with one critic or one target": [
         (SAC, {"pessimism": "gpl", "policy_kwargs": {"n_critics": 1}}, ("pessimism='gpl'", "n_critics=1")),
         (OAC, {"policy_kwargs": {"n_critics": 1}}, ("exploration='oac'", "n_critics=1")),
-        (SAC, {"exploration": "optimistic_shift", "policy_kwargs": {"n_critics": 1}}, ("spread", "n_critics=1")),
-        (SimBa, {"exploration": "optimistic_actor", "policy_kwargs": TINY_RESIDUAL}, ("spread", "n_critics=1")),
         (SAC, {"pessimism": "gpl", "target_subset": 1}, ("pessimism='gpl'", "target_subset=1")),
     ],
     "`resets` with `reset_gradient_steps`": [
