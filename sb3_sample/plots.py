@@ -22,7 +22,7 @@ import pandas as pd
 from sb3_sample.envs import published_key
 from sb3_sample.exits import refuse
 from sb3_sample.extras import install
-from sb3_sample.run_logs import EVALUATIONS, monitor_files, read_evaluations, read_monitors
+from sb3_sample.run_logs import EVALUATIONS, is_truncated, monitor_files, read_evaluations, read_monitors
 from sb3_sample.run_settings import read_settings, run_env_id
 
 if TYPE_CHECKING:
@@ -236,13 +236,15 @@ def _ends(folder: Path, episodes: pd.DataFrame) -> np.ndarray:
 def _with_episodes(labelled: Sequence[tuple[str, Path]]) -> list[tuple[str, Path]]:
     """
     :param labelled: labels and folders of runs
-    :return: those that have evaluations or a finished training episode; each of the others, which have just begun, is
-        a line on stderr
+    :return: those that have evaluations or a finished training episode; each of the others, which have just begun or
+        are just writing their evaluations, is a line on stderr
     :raises ValueError: there are none
     """
     found = []
     for label, folder in labelled:
-        if (folder / EVALUATIONS).exists() or len(read_monitors(folder)):
+        if is_truncated(folder):
+            print(f"{folder / EVALUATIONS} is just being written, and the run is left out", file=sys.stderr)
+        elif (folder / EVALUATIONS).exists() or len(read_monitors(folder)):
             found.append((label, folder))
         else:
             print(f"{folder} has no finished episode yet, and is left out", file=sys.stderr)

@@ -211,6 +211,11 @@ def test_a_run_that_has_just_begun_is_left_out(tmp_path: Path, capsys: pytest.Ca
         assert f"{tmp_path / run} has no finished episode yet, and is left out" in errors
     with pytest.raises(SystemExit, match="at least one finished episode; none of them has"):
         plots.main([str(tmp_path / "bro/x_2"), "-o", str(picture)])
+    # One that is just writing its evaluations.
+    (tmp_path / "sac/x_1/evaluations.npz").write_bytes(b"PK")
+    (tmp_path / "sac/x_1/checkpoint-000000000000").mkdir()
+    plots.main([str(tmp_path), "-o", str(picture), "--published", "none"])
+    assert f"{tmp_path}/sac/x_1/evaluations.npz is just being written" in capsys.readouterr().err
 
 
 def test_plot_takes_labels_and_infers_the_environment(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

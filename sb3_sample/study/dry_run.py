@@ -12,10 +12,11 @@ from typing import NamedTuple
 
 from sb3_sample.learner.execution import PAYS_FROM
 from sb3_sample.sac.bro import BRO, BROFast
+from sb3_sample.saving.run_folder import SEGMENTS
 from sb3_sample.study.advice import SUITES
 from sb3_sample.study.cores import free_cores, threads_of_libraries
 from sb3_sample.study.plan import Plan, Run, constructor_arguments, read_plan
-from sb3_sample.study.runs import StudyFolder, checkpointed
+from sb3_sample.study.runs import StudyFolder
 from sb3_sample.study.step_times import StepTimes, cache_file, stored
 from sb3_sample.study.worker import train
 
@@ -205,8 +206,7 @@ def measure(run: Run, threads: int, device: str) -> Cost:
             found = json.loads(times.read_text())
         except FileNotFoundError as error:
             raise MeasurementFailed(run.title, done.stdout[-2000:] + done.stderr[-2000:]) from error
-        replay, rest = _bytes(place)
-        return Cost(found["seconds"] / found["steps"], rest, replay / max(checkpointed(place), 1))
+        return Cost(found["seconds"] / found["steps"], _bytes(place), found["bytes_of_step"])
 
 
 def probe() -> None:
@@ -215,15 +215,16 @@ def probe() -> None:
     train(Run.of_json(order["run"]), Path(sys.argv[1]), order["options"])
 
 
-def _bytes(folder: Path) -> tuple[float, float]:
-    """Bytes of rows of replay buffers, and of everything else when the run has ended."""
-    replay = rest = 0.0
+def _bytes(folder: Path) -> float:
+    """Bytes of everything but rows of replay buffers, when the run has ended."""
+    n_checkpoints = max(len(list(folder.glob("**/checkpoint-*"))), 1)
+    found = 0.0
     for path in folder.rglob("*"):
-        if path.is_file():
+        if path.is_file() and path.parent.name != SEGMENTS:
             size = path.stat().st_size
-            if path.parent.name == "replay":
-                replay += size
+            # Two checkpoints are kept, and the best model besides the last.
+            if path.parent.name.startswith("checkpoint-"):
+                found += size * 2 / n_checkpoints
             else:
-                # Two checkpoints are kept, and the best model besides the last.
-                rest += size * (2 if path.parent.name.startswith("checkpoint-") or path.suffix == ".zip" else 1)
-    return replay, rest
+                found += size * (2 if path.suffix == ".zip" else 1)
+    return found

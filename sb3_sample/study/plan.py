@@ -10,6 +10,7 @@ import difflib
 import functools
 import hashlib
 import importlib
+import inspect
 import itertools
 import json
 import math
@@ -326,7 +327,7 @@ class _Reader:
         if "checkpoint_freq" in entries:
             freq = self._count(entries["checkpoint_freq"].value, "checkpoint_freq")
         measure = self._count(entries["measure"].value, "measure") if "measure" in entries else 0
-        env_kwargs = self._env_kwargs(entries)
+        env_kwargs = self._env_kwargs(entries, tasks)
         variants = list(self._variants(agents, grid))
         if measure:
             self._check_measured(entries["measure"].value, agents)
@@ -533,7 +534,8 @@ class _Reader:
             for values in itertools.product(*grid.values()):
                 point = dict(zip(grid, values, strict=True))
                 arguments = {**agent.arguments, **point}
-                first = seen.setdefault(_key([agent.algo, arguments, agent.data, agent.steps]), agent)
+                key = _key([agent.algo, _without_defaults(agent.algo, arguments), agent.data, agent.steps])
+                first = seen.setdefault(key, agent)
                 if first is not agent:
                     line = first.node.start_mark.line + 1
                     raise self._fail(
@@ -655,13 +657,16 @@ class _Reader:
             )
         return found["every"], found["episodes"]
 
-    def _env_kwargs(self, entries: Mapping[str, _Entry]) -> dict[str, Any]:
+    def _env_kwargs(self, entries: Mapping[str, _Entry], tasks: list[str]) -> dict[str, Any]:
         if "env_kwargs" not in entries:
             return {}
-        return {
-            name: self._plain(value)
-            for name, (_, value) in self._mapping(entries["env_kwargs"].value, "env_kwargs").items()
-        }
+        given = self._mapping(entries["env_kwargs"].value, "env_kwargs")
+        for suite, task in {task.partition("/")[0]: task for task in reversed(tasks)}.items():
+            allowed = _env_arguments(suite, task)
+            for name, (key, _) in given.items():
+                if allowed is not None and name not in allowed:
+                    raise self._fail(key, f"{name!r} of env_kwargs is no argument of {task}{_meant(name, allowed)}")
+        return {name: self._plain(value) for name, (_, value) in given.items()}
 
     def _packages(self, entries: Mapping[str, _Entry]) -> tuple[str, ...]:
         if "gym_packages" not in entries:
@@ -690,8 +695,48 @@ def _nodes(node: yaml.Node) -> Iterator[yaml.Node]:
 
 
 def _key(value: Any) -> str:
-    """Equal for equal values; True is not 1."""
-    return json.dumps(value, sort_keys=True)
+    """Equal for equal values: 1 is 1.0, and True is not 1."""
+    return json.dumps(_with_floats(value), sort_keys=True)
+
+
+def _with_floats(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _with_floats(each) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_with_floats(each) for each in value]
+    return float(value) if type(value) is int and abs(value) < 2**53 else value
+
+
+def _without_defaults(algo: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments less those that are there anyway, since the settings of no task name them."""
+    known, settings = constructor_arguments(algo), _settings(algo).values()
+    named = {name for entry in settings for name in entry or ()}
+    return {
+        name: value
+        for name, value in arguments.items()
+        if name in named
+        or not isinstance(known[name].default, (bool, int, float, str, type(None)))
+        or _key(value) != _key(known[name].default)
+    }
+
+
+@functools.cache
+def _settings(algo: str) -> dict[str, Any]:
+    """What ``hyperparams/<algo>.yml`` holds, by task."""
+    from sb3_sample.zoo import HYPERPARAMS
+
+    found: dict[str, Any] = yaml.safe_load((HYPERPARAMS / f"{algo}.yml").read_text())
+    return found
+
+
+def _env_arguments(suite: str, task: str) -> list[str] | None:
+    """Arguments of a task of this package's; None of another, which is not known before it is made."""
+    if suite not in ("dmc", "metaworld", "myosuite"):
+        return None
+    module: Any = importlib.import_module(f"sb3_sample.envs.{suite}")
+    made: Any = {"dmc": "DMCEnv", "metaworld": "MetaWorldEnv", "myosuite": "MyoSuiteEnv"}[suite]
+    known = inspect.signature(getattr(module, made)).parameters
+    return [name for name in known if name not in gym.spec(task).kwargs]
 
 
 def _meant(name: str, allowed: Collection[str], lists: bool = True) -> str:
@@ -744,11 +789,9 @@ def _make(algo: str, arguments: dict[str, Any]) -> None:
     """
     from rl_zoo3.exp_manager import ExperimentManager
 
-    from sb3_sample.zoo import HYPERPARAMS
-
     arguments = {name: constructor_value(name, value) for name, value in arguments.items()}
     known = constructor_arguments(algo)
-    entries = yaml.safe_load((HYPERPARAMS / f"{algo}.yml").read_text())
+    entries = _settings(algo)
     default = entries.get("default") or entries["atari"]
     settings = {name: value for name, value in default.items() if name in known and not isinstance(value, str)}
     settings = ExperimentManager._preprocess_schedules({**settings, **arguments})

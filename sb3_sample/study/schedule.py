@@ -233,10 +233,14 @@ class Process:
         threading.Thread(target=self._listen, args=(self.process.stdout, events), daemon=True).start()
 
     def _listen(self, answers: IO[str], events: Events) -> None:
-        with answers:
-            for line in answers:
-                events.put((self, json.loads(line)))
-        events.put((self, None))
+        try:
+            with answers:
+                for line in answers:
+                    # A worker that is killed while it answers leaves a last line that is not whole.
+                    if line.endswith("\n"):
+                        events.put((self, json.loads(line)))
+        finally:
+            events.put((self, None))
 
     def give(self, runs: tuple[Run, ...], options: list[str], threads: int) -> None:
         """

@@ -19,7 +19,7 @@ import pandas as pd
 from sb3_sample.envs.suites import published_id, published_key
 from sb3_sample.extras import install
 from sb3_sample.plots import DATA, all_published_curves, find_runs, named_algorithms
-from sb3_sample.run_logs import EVALUATIONS, OFFLINE, read_evaluations, read_monitors
+from sb3_sample.run_logs import EVALUATIONS, OFFLINE, is_truncated, read_evaluations, read_monitors
 from sb3_sample.run_settings import RECORD, RunSettings, plain_id, read_settings
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.study.runs import FORMER, LIST, MAX_LIST, RUNS
@@ -94,8 +94,9 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
 
     A run's values are those of its evaluations, the mean over the episodes of each. A run without evaluations has its
     training episodes instead, a row an episode, at the step at which it ended; a warning says so. One of a study whose
-    other runs have evaluations is before its first, and has none of these values. ``hours`` is the time that the run
-    had taken, and ``diagnostics/...`` what it has logged of itself.
+    other runs have evaluations is before its first, and has none of these values. One under way whose evaluations are
+    truncated, since it is just writing them, is left out with a warning. ``hours`` is the time that the run had taken,
+    and ``diagnostics/...`` what it has logged of itself.
 
     :param sources: folders of runs, or folders with runs at any depth, or tables as :func:`write` writes them.
         ``"LABEL=FOLDER"`` names the agent; else it has the name of the study's plan or, outside of a study, of its
@@ -120,6 +121,7 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
     listed = functools.cache(_list_of_study)
     left_out: list[Path] = []
     early: list[Path] = []
+    writing: list[Path] = []
     for source in given:
         label, path = labelled(source)
         if path.suffix in (".csv", ".parquet") and path.is_file():
@@ -131,6 +133,9 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
         for folder, study, has_evaluations in folders:
             if study is not None and "/".join(folder.absolute().parts[-3:]) in listed(study).former:
                 left_out.append(folder)
+                continue
+            if has_evaluations and is_truncated(folder):
+                writing.append(folder)
                 continue
             run = read_settings(folder)
             if run.task is None:
@@ -162,6 +167,11 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
         warn(
             f"{len(left_out)} runs ({left_out[0]}, ...) are not in their study's plan any more and are left out; "
             "elsewhere their folders are read as any others"
+        )
+    if writing:
+        warn(
+            f"{len(writing)} runs ({', '.join(map(str, writing))}) are just writing their {EVALUATIONS}, or were "
+            "killed while they did, and are left out"
         )
     if early:
         warn(f"{len(early)} runs ({early[0]}, ...) are before their first evaluation and have no return yet")

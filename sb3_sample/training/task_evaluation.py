@@ -15,6 +15,7 @@ from sb3_sample.console import say
 from sb3_sample.kinds import TRUE_OR_FALSE, check_value, integer
 from sb3_sample.run_logs import EVALUATIONS
 from sb3_sample.saving.callbacks import CallbackStates
+from sb3_sample.saving.temporary import becoming
 
 
 class TaskEvaluation(NamedTuple):
@@ -258,7 +259,8 @@ class MultiTaskEvalCallback(EvalCallback):
             }
             if self.evaluations_successes[-1][number]:
                 arrays["successes"] = [each[number] for each in self.evaluations_successes]
-            np.savez(own / EVALUATIONS, **arrays)
+            with becoming(own / EVALUATIONS) as file:  # others may read it meanwhile
+                np.savez(file, **arrays)
 
     def _record(self, task_id: str) -> dict[str, Any]:
         """Head of a task's folder, as the table of runs reads it."""

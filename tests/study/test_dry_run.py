@@ -1,12 +1,16 @@
 """What a plan costs, measured before it is run."""
 
 import dataclasses
+import json
 import os
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
 
 pytest.importorskip("rl_zoo3")
 
@@ -14,6 +18,8 @@ from sb3_sample import cli, study
 from sb3_sample.study import dry_run as module
 from sb3_sample.study.dry_run import Cost
 from sb3_sample.study.plan import Plan, Run
+from sb3_sample.study.stopwatch import Stopwatch
+from sb3_sample.study.worker import train
 
 
 @pytest.mark.slow
@@ -69,6 +75,44 @@ def test_agents_are_measured_on_the_data_that_they_have(tmp_path: Path, monkeypa
     times: Any = SimpleNamespace(gradient_step={"0.55M": 0.5}, how="eager")
     assert module.seconds_of_learning(timed, times) is None
     assert module.seconds_of_learning(dataclasses.replace(timed, data={}), times) == 1.0
+
+
+class _Run:
+    """As much of a training as the stopwatch asks for."""
+
+    def __init__(self, buffer: ReplayBuffer):
+        self.num_timesteps, self._n_updates, self.replay_buffer, self.logger = 0, 0, buffer, None
+
+    def get_env(self) -> None:
+        return None
+
+
+def test_a_run_that_ends_early_is_measured_and_so_is_its_replay_buffer(tmp_path: Path) -> None:
+    observations, actions = spaces.Box(-1, 1, (50,)), spaces.Box(-1, 1, (10,))
+    model: Any = _Run(ReplayBuffer(1000, observations, actions, handle_timeout_termination=False))
+    watch = Stopwatch(str(tmp_path / "times.json"), 1e6)
+    watch.init_callback(model)
+    row = np.zeros((1, 50), np.float32)
+    for step in range(20):
+        watch.on_rollout_start()
+        model.replay_buffer.add(row, row, np.zeros((1, 10)), np.zeros(1), np.zeros(1), [{}])
+        model.num_timesteps, model._n_updates = step + 1, step
+        assert watch.on_step()
+    assert not os.listdir(tmp_path)
+    watch.on_training_end()
+    found = json.loads((tmp_path / "times.json").read_text())
+    assert 0 < found["steps"] < 20 and found["seconds"] > 0
+    assert found["bytes_of_step"] == 4 * (50 + 50 + 10 + 1 + 1 + 1)  # reward, done, timeout
+
+
+@pytest.mark.slow
+def test_the_replay_buffer_that_is_foretold_is_that_of_a_run(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(module, "SECONDS", 1e6)
+    run = Run("A", "sac_sample", {"replay_ratio": 0.1}, {}, "Pendulum-v1", 0, 900, eval_freq=900, eval_episodes=1)
+    found = module.measure(run, 1, "cpu")
+    train(run, tmp_path / "run", ["--device", "cpu"])
+    real = sum(path.stat().st_size for path in (tmp_path / "run/replay").iterdir()) / 900
+    assert real / 2 < found.bytes_of_step < 2 * real
 
 
 @pytest.mark.slow

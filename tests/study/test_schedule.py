@@ -80,6 +80,13 @@ def test_a_process_that_dies_is_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_process_that_dies_while_it_answers_has_ended(tmp_path: Path) -> None:
+    code = "import os; input(); os.write(1, b'[{\"done\": fal'); os.kill(os.getpid(), 9)"
+    plan = nothing.plan(1)
+    found = study.run(plan, tmp_path, workers=1, retries=0, worker=[sys.executable, "-S", "-c", code])
+    assert found.failures == {plan.runs[0].title: "the process that made the run was ended by SIGKILL"}
+
+
 def test_two_schedulers_on_one_folder_share_the_runs(tmp_path: Path) -> None:
     program = (
         "import sys; from sb3_sample import study; from tests.study import nothing\n"

@@ -58,6 +58,26 @@ def test_a_run_that_learned_from_data_first(tmp_path: Path) -> None:
     assert list(losses["step"]) == [2_000, 2_500] and list(losses["value"]) == [4.0, 3.0]
 
 
+def test_a_run_that_is_just_writing_its_evaluations_is_left_out(tmp_path: Path) -> None:
+    folders = [write_run(tmp_path / str(seed), seed=seed) for seed in range(3)]
+    file = folders[1] / "evaluations.npz"
+    whole = file.read_bytes()
+    for length in (len(whole) // 2, 2, 0):
+        file.write_bytes(whole[:length])
+        (folders[1] / "checkpoint-000000000010").mkdir()
+        (folders[1] / "best_model.zip").touch()
+        with pytest.warns(UserWarning, match=rf"1 runs \({folders[1]}\) are just writing their evaluations.npz"):
+            assert set(study.read(tmp_path)["seed"]) == {0, 2}
+        # One that has ended writes nothing any more, and neither does one without checkpoints.
+        (folders[1] / "dmc-cheetah-run-v0.zip").touch()
+        with pytest.raises(ValueError, match="truncated"):
+            study.read(tmp_path)
+        (folders[1] / "dmc-cheetah-run-v0.zip").unlink()
+        (folders[1] / "checkpoint-000000000010").rmdir()
+        with pytest.raises(ValueError, match="truncated"):
+            study.read(tmp_path)
+
+
 def test_steps_are_of_the_simulator(tmp_path: Path) -> None:
     write_run(tmp_path / "a", env_kwargs={"action_repeat": 4}, log=[{"step": 10, "diagnostics/x": 1}])
     table = study.read(tmp_path, ["return", "diagnostics/*", "episode_length", "hours"])
