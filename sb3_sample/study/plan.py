@@ -56,6 +56,8 @@ MAX_PLAN, MAX_NAME = 2**20, 120
 #: Values in one entry, where an alias counts as what it stands for.
 MAX_VALUES = 10_000
 _AGENT = re.compile(r"\w[\w .+()-]*")
+#: Arguments of every environment, which ``gymnasium.make`` takes itself.
+_OF_MAKE = ("max_episode_steps", "disable_env_checker")
 _EXPONENT = re.compile(r"[-+]?(\d[\d_]*)(\.\d*)?[eE][-+]?\d+$")
 
 
@@ -736,7 +738,7 @@ def _env_arguments(suite: str, task: str) -> list[str] | None:
     module: Any = importlib.import_module(f"sb3_sample.envs.{suite}")
     made: Any = {"dmc": "DMCEnv", "metaworld": "MetaWorldEnv", "myosuite": "MyoSuiteEnv"}[suite]
     known = inspect.signature(getattr(module, made)).parameters
-    return [name for name in known if name not in gym.spec(task).kwargs]
+    return [*(name for name in known if name not in gym.spec(task).kwargs), *_OF_MAKE]
 
 
 def _meant(name: str, allowed: Collection[str], lists: bool = True) -> str:
