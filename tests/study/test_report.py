@@ -443,9 +443,13 @@ def test_planned_runs_are_known_by_the_plans_names(tmp_path: Path) -> None:
     plan.write_text(agents + rest)
     found = gather([made_up(runs("SAC (no resets)", "Pendulum-v1", [-900, -800]))], plan=plan)
     assert missing(found) == {("SAC", "Pendulum-v1"): [0, 1]}
+    found = gather([made_up(runs("SAC", "Pendulum-v1", [-900, -800]))], plan=plan)
+    assert missing(found) == {("SAC (no resets)", "Pendulum-v1"): [0, 1]}
     plan.write_text("agents: {SAC (ours): {algo: sac_sample}}\ngrid: {gamma: [0.9, 0.99]}\n" + rest)
     rows = [row for gamma in (0.9, 0.99) for row in runs("SAC (ours)", "Pendulum-v1", [-900, -800], gamma=gamma)]
     assert missing(gather([made_up(rows)], plan=plan)) == {}
+    found = gather([made_up([row for row in rows if row[1]["gamma"] == 0.9])], plan=plan)
+    assert missing(found) == {("SAC (ours) (gamma=0.99)", "Pendulum-v1"): [0, 1]}
     # A table that does not say seeds says of no planned run that it is here.
     seedless = made_up(rows).assign(seed=pd.array([pd.NA] * len(rows), "Int64"))
     assert len(missing(gather([seedless], plan=plan))) == 2

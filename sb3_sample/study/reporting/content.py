@@ -148,8 +148,8 @@ def _of_study(state: Status) -> list[Table | Text]:
     by_agent: dict[str, Counter[str]] = {}
     by_task: dict[tuple[str, str], Counter[str]] = {}
     for each in state.runs:
-        by_agent.setdefault(each.run.variant, Counter())[each.state] += 1
-        by_task.setdefault((each.run.variant, each.run.task), Counter())[each.state] += 1
+        by_agent.setdefault(each.run.label, Counter())[each.state] += 1
+        by_task.setdefault((each.run.label, each.run.task), Counter())[each.state] += 1
 
     def cells(counts: Counter[str]) -> list[Cell]:
         return [Count(counts[name], name) for name in STATES] + [sum(counts.values())]

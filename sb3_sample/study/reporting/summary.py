@@ -33,7 +33,7 @@ def summary(gathered: Gathered, facts: Facts) -> list[tuple[str, list[str]]]:
 def _compared(gathered: Gathered) -> list[str]:
     own = [agent for agent in gathered.agents if agent not in gathered.published]
     if not own:
-        planned = list(dict.fromkeys(each.run.variant for state in gathered.states for each in state.runs))
+        planned = list(dict.fromkeys(each.run.label for state in gathered.states for each in state.runs))
         return ["Nothing yet.", *([f"Planned: {_listed(planned)}."] if planned else [])]
     rows = gathered.table[gathered.table["agent"].isin(own)]
     seeds = rows[RUN].drop_duplicates().groupby(["agent", "task"]).size()
@@ -186,7 +186,7 @@ def missing(gathered: Gathered) -> dict[tuple[str, str], list[int]]:
     """
     found: dict[tuple[str, str], list[int]] = {}
     for run in missing_runs(gathered):
-        found.setdefault((run.variant, run.task), []).append(run.seed)
+        found.setdefault((run.label, run.task), []).append(run.seed)
     return found
 
 
