@@ -178,9 +178,12 @@ def _zoo_plot(function: str) -> Callable[[list[str]], None]:
         # These commands look for the id in the names of the log folders, in which a dash stands for the slash.
         import gymnasium as gym
 
-        import sb3_sample.envs  # noqa: F401  # registers the ids
+        from sb3_sample.envs.registration import is_atari_id  # registers the ids but Atari's
 
-        names = [argument.replace("/", "-") if argument in gym.registry else argument for argument in arguments]
+        names = [
+            argument.replace("/", "-") if argument in gym.registry or is_atari_id(argument) else argument
+            for argument in arguments
+        ]
         module = _zoo_module(f"rl_zoo3.plots.{function}")
         from sb3_sample.zoo.files import PlottedRuns
         from sb3_sample.zoo.patches import reading_monitors, reading_tables

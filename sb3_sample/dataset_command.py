@@ -1,6 +1,8 @@
 """``sb3-sample dataset``: data sets recorded, looked at and converted."""
 
 import argparse
+import ast
+import importlib
 import json
 import warnings
 from collections.abc import Sequence
@@ -12,8 +14,10 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_sample
+from sb3_sample.envs.registration import is_atari_id, register_atari
 from sb3_sample.exits import refuse
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.reading import HDF5, read_dataset
@@ -36,6 +40,15 @@ def parser() -> argparse.ArgumentParser:
     recorded.add_argument("model", type=Path, help="file of a model of this package")
     recorded.add_argument("output", help="new folder of Minari's format, or an id")
     recorded.add_argument("--env", required=True, help="id of the environment")
+    recorded.add_argument("--gym-packages", nargs="+", default=[], help="modules that register environments")
+    recorded.add_argument(
+        "--env-kwargs",
+        nargs="+",
+        default=[],
+        type=_pair,
+        metavar="NAME:VALUE",
+        help="arguments of the environment, those of the training, as for train (action_repeat:2)",
+    )
     recorded.add_argument("--vecnormalize", type=Path, metavar="FILE", help="saved VecNormalize of the model")
     recorded.add_argument("--episodes", type=int, default=100, help="number of episodes (100)")
     recorded.add_argument("--stochastic", action="store_true", help="sample the actions")
@@ -50,6 +63,17 @@ def parser() -> argparse.ArgumentParser:
         each.add_argument("--env", help="of an HDF5 file: id of the environment whose spaces it has")
         each.add_argument("--memory-map", metavar="FOLDER", help="hold the data on the disk of this folder meanwhile")
     return main
+
+
+def _pair(text: str) -> tuple[str, Any]:
+    name, colon, value = text.partition(":")
+    try:
+        if not (colon and name.isidentifier()):
+            raise ValueError
+        return name, ast.literal_eval(value)
+    except (ValueError, SyntaxError):
+        message = f"{text!r} is no name with a value of Python's, as action_repeat:2 or camera:\"'side'\""
+        raise argparse.ArgumentTypeError(message) from None
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -90,7 +114,13 @@ def _recorded(args: argparse.Namespace) -> Dataset:
         raise ValueError(f"model {args.model} is of {name}, none of this package's algorithms")
     model = cls.load(args.model, device="cpu")
     model.set_random_seed(args.seed)
-    env = args.env if args.vecnormalize is None else load_vec_normalize(args.vecnormalize, make_vec_env(args.env))
+    for package in args.gym_packages:
+        importlib.import_module(package)
+    if is_atari_id(args.env):
+        register_atari()
+    env: VecEnv = make_vec_env(args.env, env_kwargs=dict(args.env_kwargs))
+    if args.vecnormalize is not None:
+        env = load_vec_normalize(args.vecnormalize, env)
     return record(model, env, args.episodes, deterministic=not args.stochastic, seed=args.seed)
 
 

@@ -23,7 +23,7 @@ from sb3_sample.envs import published_key
 from sb3_sample.exits import refuse
 from sb3_sample.extras import install
 from sb3_sample.run_logs import EVALUATIONS, is_truncated, monitor_files, read_evaluations, read_monitors
-from sb3_sample.run_settings import read_settings, run_env_id
+from sb3_sample.run_settings import read_settings, run_env_id, study_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -428,7 +428,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         nargs="+",
         metavar="[LABEL=]FOLDER",
         help="folder of a run, or a folder with runs below it (logs/bro, logs). Runs with the same label are the seeds "
-        "of one curve; without a label it is the name of the folder above the run, in the zoo's layout the algorithm",
+        "of one curve; without a label it is the name of the folder above the run, in the zoo's layout the algorithm, "
+        "and in a study that of the agent with its place in the grid",
     )
     parser.add_argument("-e", "--env", help="id of the environment; needed if the runs are of several, or do not say")
     parser.add_argument("-o", "--output", type=Path, help="picture to write (default: the id, as .png)")
@@ -526,7 +527,7 @@ def _labelled_folders(arguments: Sequence[str], env_id: str | None) -> tuple[str
                 continue
             if any(folder.samefile(other) for _, other, _ in labelled):
                 raise ValueError(f"runs must be named once; {folder} is there twice")
-            labelled.append((label or folder.resolve().parent.name, folder, found))
+            labelled.append((label or _name_of(folder), folder, found))
     if not labelled:
         raise ValueError(f"env must be one that the runs are of, not {env_id!r}")
     if env_id is None:
@@ -536,6 +537,12 @@ def _labelled_folders(arguments: Sequence[str], env_id: str | None) -> tuple[str
             raise ValueError(f"env must be given: {what}")
         env_id = found_ids.pop()
     return env_id, [(label, folder) for label, folder, _ in labelled]
+
+
+def _name_of(folder: Path) -> str:
+    """Name of a run's curve: in a study that of the agent's folder, which is above the task's."""
+    folder = folder.resolve()
+    return folder.parent.name if study_of(folder) is None else folder.parents[1].name
 
 
 if __name__ == "__main__":

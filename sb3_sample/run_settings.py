@@ -17,6 +17,8 @@ from sb3_sample.run_logs import monitor_files, monitor_head
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 
 RECORD = "run.json"
+#: In the folder of a study: its runs' folder, and the list of them.
+STUDY_RUNS, STUDY_LIST = "runs", "study.json"
 #: Bytes of a file of settings, and values in such a file.
 _MAX_SETTINGS, _MAX_VALUES = 2**18, 5_000
 #: Settings of a run that say nothing of the agent.
@@ -56,6 +58,16 @@ def run_env_id(folder: Path) -> str | None:
     """
     ids = (monitor_head(file)["env_id"] for file in monitor_files(folder))
     return next((env_id for env_id in ids if env_id is not None), None)
+
+
+def study_of(folder: Path) -> Path | None:
+    """
+    :param folder: a run's
+    :return: the study that it is in as ``runs/<agent and grid>/<task>/<seed>``; None if it is in none
+    """
+    above = folder.absolute().parents
+    is_in_one = len(above) > 3 and above[2].name == STUDY_RUNS and (above[3] / STUDY_LIST).is_file()
+    return above[3] if is_in_one else None
 
 
 def read_settings(folder: Path) -> RunSettings:

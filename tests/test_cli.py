@@ -1,5 +1,6 @@
 """The command line, run in this process where that is enough."""
 
+import io
 import os
 import re
 import shutil
@@ -224,12 +225,33 @@ def test_rliable_plots_of_raw_returns_are_refused(rliable) -> None:
 def test_tasks_of_gymnasium_are_normalised_by_their_ids(task: str, unit: float) -> None:
     pytest.importorskip("rl_zoo3")
     from sb3_sample.zoo.files import RunError
-    from sb3_sample.zoo.scores import _unit
+    from sb3_sample.zoo.scores import _score
 
-    assert _unit(task, {"mean": np.array([0.5]), "last_evals": np.array([[1.0]])}) == unit
+    assert _score(task, {"mean": np.array([0.5]), "last_evals": np.array([[1.0]])}).of(unit) == 1
     for pybullet in ("Half", "Ant"):
         with pytest.raises(RunError, match=f"zoo's for '{pybullet}' are those of PyBullet's.* study aggregate"):
-            _unit(pybullet, {})
+            _score(pybullet, {})
+
+
+def test_games_of_atari_are_between_random_play_and_a_human(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("rl_zoo3")
+    from sb3_sample.zoo.files import PlottedRuns
+    from sb3_sample.zoo.scores import NormalizedRuns
+
+    runs = {"timesteps": np.array([4.0]), "mean": np.array([-20.7, 14.6]), "std_error": np.array([3.53])}
+    monkeypatch.setattr(PlottedRuns, "load", lambda *_: {"ALE-Pong-v5": {"SRSPR-logs": {**runs, "last_evals": 14.6}}})
+    found = NormalizedRuns(False).load(io.BytesIO())["ALE-Pong-v5"]["SRSPR-logs"]
+    np.testing.assert_allclose(found["mean"], [0, 1])
+    np.testing.assert_allclose(found["std_error"], 0.1)
+    assert found["last_evals"] == 1 and found["timesteps"] == 4
+
+
+def test_plots_find_the_folders_of_atari_games(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    plots = pytest.importorskip("rl_zoo3.plots")
+    seen: list[str] = []
+    monkeypatch.setattr(plots, "all_plots", lambda: seen.extend(sys.argv))
+    run("all_plots", "--env", "ALE/Pong-v5")
+    assert seen[-1] == "ALE-Pong-v5"
 
 
 def test_without_rliable_scores_are_as_they_were(rliable) -> None:

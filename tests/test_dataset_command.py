@@ -41,6 +41,30 @@ def test_models_of_all_algorithms_are_recorded(tmp_path: Path, capsys: pytest.Ca
         assert "200 transitions of 1 episodes written to" in capsys.readouterr().out
 
 
+def test_the_environment_of_the_training_can_be_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "my_tasks.py").write_text(
+        "import gymnasium as gym\n"
+        "from gymnasium.envs.classic_control import PendulumEnv\n"
+        "gym.register('MyPendulum-v0', PendulumEnv, max_episode_steps=50)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    sac("Pendulum-v1").save(tmp_path / "model")
+    arguments = ["dataset", "record", str(tmp_path / "model.zip"), str(tmp_path / "set"), "--env", "MyPendulum-v0",
+                 "--episodes", "1", "--gym-packages", "my_tasks"]  # fmt: skip
+    main([*arguments, "--env-kwargs", "g:0.0"])
+    assert "50 transitions of 1 episodes" in capsys.readouterr().out
+    rows = Dataset.from_minari(tmp_path / "set").rows(slice(None))
+    # Without gravity the torque alone changes the speed.
+    speeds = rows["observations"][:, 2]
+    expected = np.clip(speeds[:-1] + rows["actions"][:-1, 0] * 3 * 0.05, -8, 8)
+    np.testing.assert_allclose(speeds[1:], expected, atol=1e-4)
+    with pytest.raises(SystemExit):
+        main([*arguments, "--env-kwargs", "g=0"])
+    assert "'g=0' is no name with a value of Python's" in capsys.readouterr().err
+
+
 def test_a_model_of_normalized_observations_needs_their_statistics(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

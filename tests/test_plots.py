@@ -228,6 +228,16 @@ def test_plot_takes_labels_and_infers_the_environment(tmp_path: Path, capsys: py
     assert "| 10 | theirs | 1 |" in output
 
 
+def test_the_agents_of_a_study_are_curves_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "study.json").write_text("{}")
+    for agent, value in (("Good,gamma=0.9", 900), ("Bad", 100)):
+        for seed in (0, 1):
+            write_run(tmp_path / "runs" / agent / "dmc-cheetah-run-v0" / str(seed), [25_000], [value])
+    plots.main([str(tmp_path), "--env", ENV, "-o", str(tmp_path / "x.png"), "-p", "none"])
+    output = capsys.readouterr().out
+    assert "| 25,000 | Good,gamma=0.9 | 2 | 900 |" in output and "| 25,000 | Bad | 2 | 100 |" in output
+
+
 def test_picture_has_a_line_a_curve_and_the_colour_tells_the_algorithm() -> None:
     pytest.importorskip("matplotlib")
     run = plots.Run("bro_fast", Path("1"), np.array([25_000, 50_000]), np.array([1.0, 2.0]))

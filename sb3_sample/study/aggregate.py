@@ -176,19 +176,23 @@ def group_tasks(groups: Groups | None, tasks: Sequence[str]) -> dict[str, list[s
     """
     :param groups: names of :data:`GROUPS`, or tasks by name of the group; None for :data:`DEFAULT_GROUPS`
     :param tasks: of a table
-    :return: those of each group; groups of :data:`GROUPS` without any are left out
-    :raises ValueError: there is no such group, or a task is not in the table
+    :return: those of each group; groups without any are left out
+    :raises ValueError: there is no such group, a task is not in the table, or no group has a task
     """
     if isinstance(groups, Mapping):
         unknown = sorted(set(itertools.chain(*groups.values())) - set(tasks))
         if unknown:
             raise ValueError(f"groups must be of tasks in the table, not {', '.join(unknown)}")
-        return {name: [task for task in tasks if task in members] for name, members in groups.items()}
-    names = DEFAULT_GROUPS if groups is None else [groups] if isinstance(groups, str) else groups
-    for name in names:
-        if name not in GROUPS:
-            raise ValueError(f"groups must be of {', '.join(GROUPS)}, or tasks by name of the group, not {name!r}")
-    found = {name: [task for task in tasks if GROUPS[name](task)] for name in names}
+        found = {name: [task for task in tasks if task in members] for name, members in groups.items()}
+    else:
+        names = DEFAULT_GROUPS if groups is None else [groups] if isinstance(groups, str) else groups
+        for name in names:
+            if name not in GROUPS:
+                raise ValueError(f"groups must be of {', '.join(GROUPS)}, or tasks by name of the group, not {name!r}")
+        found = {name: [task for task in tasks if GROUPS[name](task)] for name in names}
+    if not any(found.values()):
+        where = ", ".join(found) or "those that were chosen"
+        raise ValueError(f"groups must have a task of the runs, and there is none in {where}")
     return {name: members for name, members in found.items() if members}
 
 

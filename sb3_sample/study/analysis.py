@@ -377,7 +377,7 @@ def heatmap(
         raise ValueError(f"value must be score or of {', '.join(sorted(table['metric'].unique()))}, not {value!r}")
     rows = rows.rename(columns={"value": "score"})
     groups = [group] if isinstance(group, str) else {"tasks": group}
-    (tasks,) = group_tasks(groups, list(table["task"].unique())).values() or [[]]
+    (tasks,) = group_tasks(groups, list(table["task"].unique())).values()
     rows = rows[rows["task"].isin(tasks)]
     if not len(rows):
         raise ValueError(f"group must be one of the table's tasks, and there are none of {group!r}")

@@ -5,7 +5,7 @@ import contextlib
 import math
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -453,12 +453,18 @@ def _draw_grid(axes: Any, values: pd.DataFrame, **kwargs: Any) -> Any:
     image = axes.imshow(values.to_numpy(float), aspect="auto", **kwargs)
     axes.set_xticks(range(values.shape[1]), [str(name) for name in values.columns], rotation=45, ha="right")
     axes.set_yticks(range(values.shape[0]), [str(name) for name in values.index])
-    low, high = image.get_clim()
     for (row, column), value in _cells(values):
-        dark = not math.isnan(value) and 0.3 < (value - low) / ((high - low) or 1) < 0.7
-        text = "" if math.isnan(value) else f"{value:.3g}"
-        axes.text(column, row, text, ha="center", va="center", color="black" if dark else "white", fontsize=8)
+        if not math.isnan(value):
+            color = _readable_on(image.cmap(image.norm(value)))
+            axes.text(column, row, f"{value:.3g}", ha="center", va="center", color=color, fontsize=8)
     return image
+
+
+def _readable_on(color: Sequence[float]) -> str:
+    """The one of black and white that has more contrast with a colour, as WCAG 2 has it."""
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in color[:3]]
+    luminance = sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+    return "black" if (luminance + 0.05) ** 2 > 0.05 * 1.05 else "white"
 
 
 def _cells(values: pd.DataFrame) -> Iterator[tuple[tuple[int, int], float]]:

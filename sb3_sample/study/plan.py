@@ -113,6 +113,12 @@ class Run:
         return _plain(",".join([self.agent, *(f"{name}={_short(value)}" for name, value in self.grid.items())]))
 
     @property
+    def label(self) -> str:
+        """The agent's name in the plan with its place in the grid, as tables of results have it."""
+        grid = [f"{n}={v if isinstance(v, str) else json.dumps(v)}" for n, v in sorted(self.grid.items())]
+        return f"{self.agent} ({', '.join(grid)})" if grid else self.agent
+
+    @property
     def title(self) -> str:
         """The run in words, for messages."""
         grid = "".join(f", {name}={value}" for name, value in self.grid.items())

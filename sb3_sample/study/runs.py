@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_sample.run_logs import EVALUATIONS, OFFLINE, read_evaluations
+from sb3_sample.run_settings import STUDY_LIST, STUDY_RUNS
 from sb3_sample.saving import temporary
 from sb3_sample.saving.locks import Lock, is_taken, take
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.study.plan import Comparison, Plan, Run
 
 #: Content of a study's folder: its runs, the outcome of each, the list of them and the plan as it was read.
-RUNS, STATE, LIST, PLAN = "runs", "state", "study.json", "plan.yml"
+RUNS, STATE, LIST, PLAN = STUDY_RUNS, "state", STUDY_LIST, "plan.yml"
 #: In the list: runs that were in it and are not in the plan any more, by their names.
 FORMER = "former"
 _LOG = "progress.jsonl"

@@ -20,9 +20,9 @@ from sb3_sample.envs.suites import published_id, published_key
 from sb3_sample.extras import install
 from sb3_sample.plots import DATA, all_published_curves, find_runs, named_algorithms
 from sb3_sample.run_logs import EVALUATIONS, OFFLINE, is_truncated, read_evaluations, read_monitors
-from sb3_sample.run_settings import RECORD, RunSettings, plain_id, read_settings
+from sb3_sample.run_settings import RECORD, RunSettings, plain_id, read_settings, study_of
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
-from sb3_sample.study.runs import FORMER, LIST, MAX_LIST, RUNS
+from sb3_sample.study.runs import FORMER, LIST, MAX_LIST
 from sb3_sample.warn import warn
 
 COLUMNS = ["agent", "arguments", "task", "seed", "step", "metric", "value"]
@@ -128,7 +128,7 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
             table = load(path)
             tables.append(table if label is None else table.assign(agent=label))
             continue
-        folders = [(folder, _study_of(folder), (folder / EVALUATIONS).exists()) for folder in find_runs(path)]
+        folders = [(folder, study_of(folder), (folder / EVALUATIONS).exists()) for folder in find_runs(path)]
         with_evaluations = {study for _, study, has_evaluations in folders if study is not None and has_evaluations}
         for folder, study, has_evaluations in folders:
             if study is not None and "/".join(folder.absolute().parts[-3:]) in listed(study).former:
@@ -211,12 +211,6 @@ def _agent_of_study(folder: Path, study: Path | None, listed: Callable[[Path], _
     :return: the agent's name in the plan; None outside of a study
     """
     return None if study is None else listed(study).agents.get(folder.absolute().parents[1].name.partition(",")[0])
-
-
-def _study_of(folder: Path) -> Path | None:
-    """Find the study that a run's folder, ``runs/<agent and grid>/<task>/<seed>``, is in, if it is in one."""
-    above = folder.absolute().parents
-    return above[3] if len(above) > 3 and above[2].name == RUNS and (above[3] / LIST).is_file() else None
 
 
 def _list_of_study(folder: Path) -> _List:

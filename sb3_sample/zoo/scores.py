@@ -11,7 +11,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from sb3_sample.envs.scores import SCORED, score_of
+from sb3_sample.envs.scores import SCORED, Score, score_of
 from sb3_sample.zoo.files import PlottedRuns, RunError
 
 #: Tasks, by their names in the zoo's tables, that its command normalises itself.
@@ -60,14 +60,15 @@ class NormalizedRuns(PlottedRuns):
             if task == "results_table" or task in self._skip or (self._keep and task not in self._keep):
                 continue
             for runs in runs_by_label.values():
-                unit = _unit(task, runs)
+                score = _score(task, runs)
                 for name in runs.keys() - {"timesteps"}:
-                    runs[name] = runs[name] / unit
+                    is_error = name.startswith("std_error")
+                    runs[name] = runs[name] / (score.high - score.low) if is_error else score.of(runs[name])
         return results
 
 
-def _unit(task: str, runs: dict[str, Any]) -> float:
-    """Divisor of a task's scores."""
+def _score(task: str, runs: dict[str, Any]) -> Score:
+    """How the scores of a task are made."""
     score = score_of(_env_id(task))
     if score is not None and score.metric == "success_rate":
         scores = np.concatenate([np.ravel(runs["mean"]), np.ravel(runs["last_evals"])])
@@ -77,9 +78,9 @@ def _unit(task: str, runs: dict[str, Any]) -> float:
                 "there: gather success rates, with all_plots --key successes"
             )
     if score is not None:
-        return score.high
+        return score
     if task in ZOO_REFERENCES:
-        return 1.0
+        return Score("return")
     if task in PYBULLET:
         raise RunError(
             f"--rliable draws scores between 0 and 1, and the zoo's for {task!r} are those of PyBullet's task. Give "
@@ -95,7 +96,7 @@ def _unit(task: str, runs: dict[str, Any]) -> float:
 def _env_id(task: str) -> str:
     """The id of a task of the zoo's tables, in which a dash stands for the slash."""
     suite, dash, name = task.partition("-")
-    return f"{suite}/{name}" if dash and suite in ("dmc", "metaworld", "myosuite") else task
+    return f"{suite}/{name}" if dash and suite in ("dmc", "metaworld", "myosuite", "ALE") else task
 
 
 @contextlib.contextmanager
@@ -103,7 +104,8 @@ def saying_so() -> Iterator[None]:
     """Around the zoo's command, which warns that it does not know the scale of tasks that are normalised already."""
     print(
         "Scores are normalised: returns of DeepMind Control over 1,000, success rates as they are, returns of MuJoCo's "
-        "HalfCheetah, Walker2d, Ant and Humanoid over 8,500, 4,500, 6,625 and 6,125"
+        "HalfCheetah, Walker2d, Ant and Humanoid over 8,500, 4,500, 6,625 and 6,125, those of the games of "
+        "Atari-100k between random play and a human"
     )
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".* not found for normalizing scores")

@@ -252,7 +252,7 @@ def test_two_arguments_against_a_score() -> None:
         ({"x": "size"}, "arguments must be of those of the runs, model_size, replay_ratio, not 'size'"),
         ({"value": "minutes"}, "value must be score or of hours, return, not 'minutes'"),
         ({"step": 1_000}, "step must be within those of the runs, up to 200, not 1,000"),
-        ({"group": "metaworld"}, "there are none of 'metaworld'"),
+        ({"group": "metaworld"}, "there is none in metaworld"),
     ],
 )
 def test_heatmaps_that_there_are_not(arguments: dict, message: str) -> None:

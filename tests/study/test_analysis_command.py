@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from sb3_sample import study
-from sb3_sample.study.analysis_command import COMMANDS, markdown, steps_of
+from sb3_sample.study.analysis_command import COMMANDS, _readable_on, markdown, steps_of
 from sb3_sample.study.plan import Comparison, Plan
 from sb3_sample.study.plan import Run as Run_
 from sb3_sample.study.runs import StudyFolder
@@ -152,6 +152,13 @@ def test_heatmaps_and_costs(run: Run) -> None:
     assert Path("c.png").exists()
 
 
+@pytest.mark.parametrize("name", ["viridis", "RdBu_r"])
+def test_numbers_in_cells_are_legible(name: str) -> None:
+    colormaps = pytest.importorskip("matplotlib").colormaps
+    found = [_readable_on(colormaps[name](share)) for share in (0.0, 0.5, 1.0)]
+    assert found == {"viridis": ["white", "black", "black"], "RdBu_r": ["white", "black", "white"]}[name]
+
+
 def test_scores_of_the_user(run: Run) -> None:
     rows = [("a", {}, "Pendulum-v1", seed, 1, "return", -600.0) for seed in (0, 1)]
     table = made_up([*rows, *[("a", {}, "My/T-v0", seed, 1, "success_rate", 0.25) for seed in (0, 1)]])
@@ -185,6 +192,25 @@ def test_refusals_are_one_line(
     assert error.value.code == 2
     told = capsys.readouterr().err.strip()
     assert told.startswith(f"sb3-sample study {arguments[0]}: ") and message in told and "\n" not in told
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "aggregate",
+        "aggregate --steps 200 --profile 0.5",
+        "marginalize --factor agent",
+        "correlate --metrics hours -o c.png",
+        "cost",
+    ],
+)
+def test_groups_without_a_task_of_the_runs(run: Run, command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    name, *options = command.split()
+    with pytest.raises(SystemExit) as error:
+        run(name, "t.csv", *options, "--groups", "metaworld", table=sized())
+    told = capsys.readouterr().err
+    assert error.value.code == 2 and told.count("\n") == 1
+    assert "groups must have a task of the runs, and there is none in metaworld" in told
 
 
 @pytest.mark.parametrize(

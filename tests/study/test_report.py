@@ -23,6 +23,7 @@ from sb3_sample.study.reporting import facts as facts_module
 from sb3_sample.study.reporting import figures, pieces, published
 from sb3_sample.study.reporting.content import build
 from sb3_sample.study.reporting.curves import _repeats as repeats_of
+from sb3_sample.study.reporting.curves import task_curves
 from sb3_sample.study.reporting.reading import gather
 from sb3_sample.study.reporting.summary import missing
 from sb3_sample.study.runs import Outcome, StudyFolder
@@ -271,6 +272,14 @@ def test_training_episodes_of_runs_that_end_at_other_steps(tmp_path: Path) -> No
     assert "their rows are training episodes, which explore" in text_of(page)
 
 
+def test_training_episodes_of_runs_that_do_not_overlap(tmp_path: Path) -> None:
+    write_monitor(tmp_path / "mine" / "0", CHEETAH, (1_000, 1_000), (1.0, 2.0), (1.0, 2.0))
+    write_monitor(tmp_path / "mine" / "1", CHEETAH, (2_100, 800), (1.0, 2.0), (1.0, 2.0))
+    found = task_curves(gather([tmp_path / "mine"]), CHEETAH, None, [])
+    assert list(found.own["mine"].data["env_step"]) == [2_100, 2_900]
+    assert [list(run.steps) for run in found.under_way["mine"]] == [[1_000, 2_000]]
+
+
 # ---------------------------------------------------------------- a study's folder
 
 
@@ -353,6 +362,27 @@ def test_an_agent_with_failed_runs_is_not_better(tmp_path: Path) -> None:
     assert "A is better than B." in text and "1 failed run of B is not counted" in text
 
 
+def test_what_a_run_logs_after_its_last_evaluation_is_in_no_average(tmp_path: Path) -> None:
+    place = StudyFolder(tmp_path / "s")
+    made = [planned(agent, seed) for agent in ("A", "B") for seed in range(5)]
+    place.enter(Plan("s", tuple(made)))
+    for run in made:
+        values = [100.0 * (run.agent == "A") + run.seed] * 3
+        failed = (run.agent, run.seed) == ("A", 4)
+        n = 2 if failed else 3
+        with place.claim(run):  # type: ignore[union-attr]
+            pass
+        log = [{"step": 2_900, "diagnostics/dormant": 0.5}] if failed else []
+        write_run(place.place(run), seed=run.seed, steps=(1_000, 2_000, 3_000)[:n], values=values[:n], log=log)
+        place.write_outcome(run, Outcome(not failed, steps=3_000, attempts=2))
+    page = written(tmp_path / "r.html", place.path, steps=[2_500])
+    text = text_of(page)
+    assert "1 failed run of A is not counted: the comparison favours it." in text and "better than" not in text
+    assert "1 run has not got to 2,500 steps." in text
+    ends = next(rows for caption, rows in tables_of(page).items() if caption.startswith("Runs that were evaluated"))
+    assert ends[1][-2:] == ["2,000", "3,000"]
+
+
 def test_planned_runs_that_are_not_here_may_have_failed(tmp_path: Path) -> None:
     (tmp_path / "p.yml").write_text(
         f"agents: {{good: {{algo: bro}}, bad: {{algo: bro_fast}}}}\n"
@@ -413,9 +443,13 @@ def test_planned_runs_are_known_by_the_plans_names(tmp_path: Path) -> None:
     plan.write_text(agents + rest)
     found = gather([made_up(runs("SAC (no resets)", "Pendulum-v1", [-900, -800]))], plan=plan)
     assert missing(found) == {("SAC", "Pendulum-v1"): [0, 1]}
+    found = gather([made_up(runs("SAC", "Pendulum-v1", [-900, -800]))], plan=plan)
+    assert missing(found) == {("SAC (no resets)", "Pendulum-v1"): [0, 1]}
     plan.write_text("agents: {SAC (ours): {algo: sac_sample}}\ngrid: {gamma: [0.9, 0.99]}\n" + rest)
     rows = [row for gamma in (0.9, 0.99) for row in runs("SAC (ours)", "Pendulum-v1", [-900, -800], gamma=gamma)]
     assert missing(gather([made_up(rows)], plan=plan)) == {}
+    found = gather([made_up([row for row in rows if row[1]["gamma"] == 0.9])], plan=plan)
+    assert missing(found) == {("SAC (ours) (gamma=0.99)", "Pendulum-v1"): [0, 1]}
     # A table that does not say seeds says of no planned run that it is here.
     seedless = made_up(rows).assign(seed=pd.array([pd.NA] * len(rows), "Int64"))
     assert len(missing(gather([seedless], plan=plan))) == 2

@@ -114,12 +114,11 @@ def _runs(gathered: Gathered) -> Section:
     parts: list[Any] = []
     for state in gathered.states:
         parts += _of_study(state)
-    table = gathered.table
     if absent := missing(gathered):
         lost: list[list[Cell]] = [[agent, task, _ranges(seeds)] for (agent, task), seeds in sorted(absent.items())]
         parts.append(Table("Planned runs that are not here", ["agent", "task", "seeds"], lost, len(lost) > UNFOLDED))
     rows: list[list[Cell]] = []
-    ends = table.groupby(RUN, sort=False, dropna=False)["step"].max().reset_index()
+    ends = gathered.evaluated.groupby(RUN, sort=False, dropna=False)["step"].max().reset_index()
     for (agent, task), found in ends.groupby(["agent", "task"], sort=False):
         rows.append(
             [agent, task, len(found), _ranges(found["seed"]), int(found["step"].min()), int(found["step"].max())]
@@ -149,8 +148,8 @@ def _of_study(state: Status) -> list[Table | Text]:
     by_agent: dict[str, Counter[str]] = {}
     by_task: dict[tuple[str, str], Counter[str]] = {}
     for each in state.runs:
-        by_agent.setdefault(each.run.variant, Counter())[each.state] += 1
-        by_task.setdefault((each.run.variant, each.run.task), Counter())[each.state] += 1
+        by_agent.setdefault(each.run.label, Counter())[each.state] += 1
+        by_task.setdefault((each.run.label, each.run.task), Counter())[each.state] += 1
 
     def cells(counts: Counter[str]) -> list[Cell]:
         return [Count(counts[name], name) for name in STATES] + [sum(counts.values())]

@@ -62,6 +62,11 @@ def task_curves(gathered: Gathered, task: str, scores: Scores | None, names: Seq
         last = max(run.steps[-1] for run in runs)
         # Episodes of a training do not all end at the same step.
         there = [run.steps[-1] + spacing(run.steps) > last or run.steps[-1] == last for run in runs]
+        if max(run.steps[0] for run in itertools.compress(runs, there)) > min(
+            run.steps[-1] for run in itertools.compress(runs, there)
+        ):  # Soon after the start the first episode of one may end after the last of another.
+            farthest = next(i for i, run in enumerate(runs) if run.steps[-1] == last)
+            there = [i == farthest for i in range(len(runs))]
         own[agent] = Curve(agent, summarize(list(itertools.compress(runs, there))))
         under_way[agent] = [run for run, far in zip(runs, there, strict=True) if not far]
     others = [*gathered.curves.get((task, metric), []), *chosen_curves(names, gathered.asked, task, metric)]

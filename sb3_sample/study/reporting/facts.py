@@ -191,12 +191,10 @@ def _comparable(
 
 def _groups(groups: Groups | None, tasks: list[str]) -> dict[str, list[str]]:
     """The groups, of those that were not asked for only the ones that are not all tasks."""
-    found = {name: members for name, members in group_tasks(groups, tasks).items() if members}
+    found = group_tasks(groups, tasks)
     if groups is None:
         all_of_them = found[DEFAULT_GROUPS[0]]
         found = {name: each for name, each in found.items() if name == DEFAULT_GROUPS[0] or each != all_of_them}
-    if not found:
-        raise ValueError(f"groups must have a task of the runs, and there is none in {', '.join(groups or ())}")
     return found
 
 

@@ -67,6 +67,11 @@ class Gathered:
         return sorted(found, key=lambda agent: agent in self.published)
 
     @property
+    def evaluated(self) -> pd.DataFrame:
+        """The rows that scores are of; what a run logs of itself may go on after its last evaluation."""
+        return self.table[self.table["metric"].isin([*_MEASURED, "episode_length"])]
+
+    @property
     def tasks(self) -> list[str]:
         """Tasks of the table, in its order."""
         return list(self.table["task"].unique())

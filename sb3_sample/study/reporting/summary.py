@@ -33,14 +33,15 @@ def summary(gathered: Gathered, facts: Facts) -> list[tuple[str, list[str]]]:
 def _compared(gathered: Gathered) -> list[str]:
     own = [agent for agent in gathered.agents if agent not in gathered.published]
     if not own:
-        planned = list(dict.fromkeys(each.run.variant for state in gathered.states for each in state.runs))
+        planned = list(dict.fromkeys(each.run.label for state in gathered.states for each in state.runs))
         return ["Nothing yet.", *([f"Planned: {_listed(planned)}."] if planned else [])]
     rows = gathered.table[gathered.table["agent"].isin(own)]
     seeds = rows[RUN].drop_duplicates().groupby(["agent", "task"]).size()
-    ends = rows.groupby(RUN, dropna=False)["step"].max()
+    steps = gathered.evaluated.loc[lambda found: found["agent"].isin(own), "step"]
+    up_to = f", up to {steps.max():,} {STEPS}" if len(steps) else ""
     found = [
         f"{_listed(own)}.",
-        f"{counted(rows['task'].nunique(), 'task')}, {range_text(seeds, 'seed')} each, up to {ends.max():,} {STEPS}.",
+        f"{counted(rows['task'].nunique(), 'task')}, {range_text(seeds, 'seed')} each{up_to}.",
     ]
     return found + ([f"Beside them: {_listed(gathered.published)}."] if gathered.published else [])
 
@@ -84,7 +85,7 @@ def _lost(gathered: Gathered, facts: Facts) -> dict[str, list[str]]:
     Sentences by agent on its runs that have failed, or may have, and are in no average: without its worst runs an agent
     looks better than it is.
     """
-    ends = gathered.table.groupby(["agent", "task", "seed"])["step"].max()
+    ends = gathered.evaluated.groupby(["agent", "task", "seed"])["step"].max()
     heads = [
         (row.agent, json.loads(row.arguments))
         for row in gathered.table[["agent", "arguments"]].drop_duplicates().itertuples()
@@ -156,7 +157,7 @@ def _missing(gathered: Gathered, facts: Facts) -> list[str]:
         n = sum(map(len, missing(gathered).values()))
         found.append(f"{len(gathered.planned) - n} of {counted(len(gathered.planned), 'planned run')} are here.")
     if facts.steps:
-        own = gathered.table[~gathered.table["agent"].isin(gathered.published)]
+        own = gathered.evaluated[~gathered.evaluated["agent"].isin(gathered.published)]
         short = int((own.groupby(RUN, dropna=False)["step"].max() < facts.step).sum())
         if short:
             found.append(f"{counted(short, 'run')} {'has' if short == 1 else 'have'} not got to {facts.step:,} steps.")
@@ -185,7 +186,7 @@ def missing(gathered: Gathered) -> dict[tuple[str, str], list[int]]:
     """
     found: dict[tuple[str, str], list[int]] = {}
     for run in missing_runs(gathered):
-        found.setdefault((run.variant, run.task), []).append(run.seed)
+        found.setdefault((run.label, run.task), []).append(run.seed)
     return found
 
 
