@@ -101,5 +101,5 @@ def check_actions(actions: np.ndarray, action_space: spaces.Box) -> None:
             step = first + int(np.flatnonzero(wrong)[0])
             raise ValueError(
                 f"actions must lie within the bounds of action_space={action_space}, in the environment's units, not "
-                f"{actions[step]} as in step {step}"
+                f"{actions[step]} as in step {step}: pass the environment's action_space, of arrays [-1, 1] otherwise"
             )
