@@ -468,8 +468,8 @@ def test_a_table_with_its_plan_and_the_records_beside_it(tmp_path: Path) -> None
     page = written(tmp_path / "r.html", tmp_path / "t.csv", plan=tmp_path / "plan.yml")
     assert "3 of 6 planned runs are here." in text_of(page)
     assert tables_of(page)["Planned runs that are not here"][1:] == [
-        ["SAC,replay_ratio=1", "Pendulum-v1", "2"],
-        ["SAC,replay_ratio=2", "Pendulum-v1", f"1{pieces.DASH}2"],
+        ["SAC (replay_ratio=1)", "Pendulum-v1", "2"],
+        ["SAC (replay_ratio=2)", "Pendulum-v1", f"1{pieces.DASH}2"],
     ]
     made = tables_of(page)["Versions and machines of the runs that say so"]
     assert ["commit", "0123abc", "3"] in made and ["threads", "1", "3"] in made
