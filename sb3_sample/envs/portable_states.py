@@ -35,7 +35,7 @@ _CLOCKS = {"stable_baselines3.common.monitor.Monitor": ("t_start",)}
 #: Arrays whose size depends on the contacts, and on which bodies touch each other; they are computed anew at each step,
 #: before they are read.
 _IN_ARENA = ("efc_", "iefc_", "island_", "map_", "iL", "iM", "iacc", "ifrc")
-#: Of MuJoCo's contacts; it uses those of a model unchecked.
+#: Dimensions of MuJoCo's contacts; it uses those of a model unchecked.
 _CONTACT_DIMENSIONS = (1, 3, 4, 6)
 
 

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_sample.envs.states import BOUND, EnvState, is_simulator, layers_of, restore_state, state_attributes
+from sb3_sample.envs.states import BOUND, EPISODES, EnvState, is_simulator, layers_of, restore_state, state_attributes
 
 
 class Follower(Protocol):
@@ -168,7 +168,7 @@ def _wrapped_like(wrapper: gym.Wrapper, env: gym.Env) -> gym.Env:
     if isinstance(wrapper, Monitor):
         monitor: Any = Monitor(env, None, info_keywords=wrapper.info_keywords)
         # Nobody asks for its episodes, and they would fill the memory.
-        for name in ("episode_returns", "episode_lengths", "episode_times"):
+        for name in EPISODES:
             setattr(monitor, name, collections.deque(maxlen=0))
         return monitor  # type: ignore[no-any-return]
     if isinstance(wrapper, gym.wrappers.RecordVideo):
@@ -187,7 +187,7 @@ def _wrapped_like(wrapper: gym.Wrapper, env: gym.Env) -> gym.Env:
             )
     like = copy.copy(wrapper)
     like.env = env
-    # What is bound to the wrapper or to what it wraps is bound to the others then.
+    # Methods that are bound to the wrapper or to what it wraps are bound to the others then.
     layers = zip(layers_of(wrapper), layers_of(like), strict=True)
     others: dict[int, Any] = {id(layer): other for layer, other in layers}
     copied = state_attributes(wrapper)

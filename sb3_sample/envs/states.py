@@ -33,8 +33,8 @@ _GENERATORS = (np.random.Generator, np.random.RandomState)
 _NOT_STATE = (
     gym.Env, gym.Space, gym.envs.registration.EnvSpec, io.IOBase, type, types.ModuleType, types.FunctionType
 )  # fmt: skip
-#: Attributes of Monitor that report on all episodes so far, and its clock: nothing follows from them.
-_REPORTS = ("episode_returns", "episode_lengths", "episode_times", "t_start")
+#: Attributes of Monitor that report on all episodes so far. Nothing follows from them, nor from its clock.
+EPISODES = ("episode_returns", "episode_lengths", "episode_times")
 #: Ends of the names of integer arrays of MuJoCo's model that are masks, switches and classes.
 _SWITCHES = (
     "contype", "conaffinity", "condim", "_priority", "_group", "limited", "_active0", "_active", "_castshadow",
@@ -140,7 +140,7 @@ def check_restorable(env: gym.Env, other: gym.Env | None = None, n_steps: int = 
     actions = [random_action(env.action_space, rng) for _ in range(n_steps)]
     first = list(_follow(env, actions))
     other = env if other is None else other
-    # What a reset draws must come back, too.
+    # Numbers that a reset draws must come back, too.
     other.reset(seed=seed + 1)
     message = (
         f"env must be an environment whose state can be saved and restored, as those of dmc/, Gymnasium's MuJoCo and "
@@ -302,7 +302,7 @@ def state_attributes(layer: Any) -> dict[str, Any]:
     :return: its attributes that are data through and through, by name, themselves and no copies. Not Monitor's lists of
         all episodes, which grow with the training
     """
-    left_out = _REPORTS if isinstance(layer, Monitor) else ()
+    left_out = (*EPISODES, "t_start") if isinstance(layer, Monitor) else ()
     return {name: value for name, value in vars(layer).items() if name not in left_out and _is_state(value, set())}
 
 

@@ -18,7 +18,7 @@ from sb3_sample.replay.weighted import WindowReplay
 _SMALL = 1e-10
 
 
-#: Of ``WindowReplay``: windows do not fade, and the priority of one is the root of its loss.
+#: Settings of ``WindowReplay``: windows do not fade, and the priority of one is the root of its loss.
 SETTINGS = {"fade": 1.0, "fade_floor": 0.1, "priority_exponent": 0.5, "smallest_error": 0.0}
 
 

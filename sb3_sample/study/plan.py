@@ -115,7 +115,7 @@ class Run:
     @property
     def label(self) -> str:
         """The agent's name in the plan with its place in the grid, as tables of results have it."""
-        grid = [f"{n}={v if isinstance(v, str) else json.dumps(v)}" for n, v in sorted(self.grid.items())]
+        grid = [f"{n}={_short(v)}" for n, v in sorted(self.grid.items())]
         return f"{self.agent} ({', '.join(grid)})" if grid else self.agent
 
     @property
@@ -730,7 +730,7 @@ def _without_defaults(algo: str, arguments: Mapping[str, Any]) -> dict[str, Any]
 
 @functools.cache
 def _settings(algo: str) -> dict[str, Any]:
-    """What ``hyperparams/<algo>.yml`` holds, by task."""
+    """Content of ``hyperparams/<algo>.yml``, by task."""
     from sb3_sample.zoo import HYPERPARAMS
 
     found: dict[str, Any] = yaml.safe_load((HYPERPARAMS / f"{algo}.yml").read_text())

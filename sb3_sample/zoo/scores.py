@@ -68,7 +68,7 @@ class NormalizedRuns(PlottedRuns):
 
 
 def _score(task: str, runs: dict[str, Any]) -> Score:
-    """How the scores of a task are made."""
+    """Scale of a task's scores."""
     score = score_of(_env_id(task))
     if score is not None and score.metric == "success_rate":
         scores = np.concatenate([np.ravel(runs["mean"]), np.ravel(runs["last_evals"])])
