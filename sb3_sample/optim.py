@@ -1,5 +1,6 @@
 """Adam with decoupled weight decay that is exact in float32, and sharpness-aware gradients around any optimizer."""
 
+import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
@@ -165,16 +166,16 @@ class AdamW(Optimizer):
                 for j, _, _ in used:
                     steps[..., j].add_(1)
             rows: list[tuple[torch.Tensor, ...]] = [
-                (p, _laid_out_like(p, g), self.state[p]["exp_avg"], self.state[p]["exp_avg_sq"], steps[..., j])
-                for j, p, g in used
+                (p, _laid_out_like(p, g), self.state[p]["exp_avg"], self.state[p]["exp_avg_sq"]) for _, p, g in used
             ]
+            places = [j for j, _, _ in used]
             differ = self._rates.dim() > 1 or self.counts_differ or isinstance(group["weight_decay"], torch.Tensor)
             if is_tracing() or differ:
-                _plain_adamw(group, rows, self._rates[i])
+                _plain_adamw(group, rows, self._rates[i], steps, places)
                 continue
-            if steps.dim() > 1:
-                # The learners side by side have taken as many.
-                rows = [(*tensors, step[0]) for *tensors, step in rows]
+            # Learners side by side have taken as many steps.
+            counts = steps[0] if steps.dim() > 1 else steps
+            rows = [(*tensors, counts[j]) for tensors, j in zip(rows, places, strict=True)]
             rate = self._rates[i] if self.capturable else group["lr"]
             if group["weight_decay"] == 0:
                 _adam(group, rate, *zip(*rows, strict=True))
@@ -186,28 +187,48 @@ class AdamW(Optimizer):
                 torch._foreach_add_(list(p), change)
 
 
-def _plain_adamw(group: dict[str, Any], rows: list[tuple[torch.Tensor, ...]], rate: torch.Tensor) -> None:
+def _plain_adamw(
+    group: dict[str, Any],
+    rows: list[tuple[torch.Tensor, ...]],
+    rate: torch.Tensor,
+    steps: torch.Tensor,
+    places: Sequence[int],
+) -> None:
     """
     The step written out for all parameters at once, which a compiler fuses. The corrections, 1 minus nearly 1, need
     float64. Counts of steps, rates and decays may be those of S learners, whose parameters are stacked.
+
+    :param rows: parameter, gradient, moments
+    :param rate: the group's learning rate, or (S,)
+    :param steps: taken by each of the group's parameters, (P,) or (S, P)
+    :param places: of the rows' parameters among the P
     """
     beta1, beta2 = group["betas"]
-    p, grad, exp_avg, exp_avg_sq, step = map(list, zip(*rows, strict=True))
-    sizes, roots = [], []
-    for of, n in zip(p, step, strict=True):
-        n = n.double()
-        sizes.append(_by_learner(rate / (1 - beta1**n), of))
-        roots.append(_by_learner((1 - beta2**n).rsqrt(), of))
+    p, grad, exp_avg, exp_avg_sq = map(list, zip(*rows, strict=True))
+    dtype = functools.reduce(torch.promote_types, (of.dtype for of in p))
+    steps = steps.double()
+    sizes = (rate.unsqueeze(-1) / (1 - beta1**steps)).to(dtype)
+    roots = (1 - beta2**steps).rsqrt().to(dtype)
     torch._foreach_lerp_(exp_avg, grad, 1 - beta1)
     torch._foreach_lerp_(exp_avg_sq, torch._foreach_mul(grad, grad), 1 - beta2)
-    change = torch._foreach_mul(torch._foreach_sqrt(exp_avg_sq), roots)
+    change = torch._foreach_sqrt(exp_avg_sq)
+    change = torch._foreach_mul(change, [_column(roots, j, of) for j, of in zip(places, p, strict=True)])
     change = torch._foreach_div(exp_avg, torch._foreach_add(change, group["eps"]))
-    change = torch._foreach_mul(change, sizes)
+    change = torch._foreach_mul(change, [_column(sizes, j, of) for j, of in zip(places, p, strict=True)])
     decay = group["weight_decay"]
     if isinstance(decay, torch.Tensor) or decay != 0:
         decays = [_by_learner(rate * decay, of) for of in p]
         change = torch._foreach_add(change, torch._foreach_mul(p, decays))
     torch._foreach_sub_(p, change)
+
+
+def _column(values: torch.Tensor, place: int, p: torch.Tensor) -> torch.Tensor:
+    """
+    What a table with a column for each parameter, (P,) or (S, P), has for one parameter. A view of memory, other than
+    an index, has the compiler compute the table once; it would repeat the powers for every eight elements of ``p``.
+    """
+    values = values.contiguous()
+    return _by_learner(values.as_strided(values.shape[:-1], values.stride()[:-1], place), p)
 
 
 def _by_learner(values: torch.Tensor, p: torch.Tensor) -> torch.Tensor:
