@@ -4,8 +4,8 @@ logs and the seeds of the authors' code.
 
     OMP_NUM_THREADS=1 python benchmarks/bro_log.py --task cheetah-run --seed 0 --steps 50000
 
-``--same-start``: the reset returns to the run's own first parameters. The authors' code draws those of every reset from
-the key with which the run began.
+``--resets-to fresh``: the reset draws new parameters, other than the published code, whose runs return to their own
+first ones.
 
 A line of JSON every ``--every`` steps goes to ``OUTPUT/TASK/rr<replay ratio>_seed<seed>.jsonl``: means of the metrics
 since the line before, norms of all parameters of actor, optimistic actor and critics, and at multiples of
@@ -13,7 +13,6 @@ since the line before, norms of all parameters of actor, optimistic actor and cr
 """
 
 import argparse
-import copy
 import json
 import time
 from collections import defaultdict
@@ -27,6 +26,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_sample import BROFast
+from sb3_sample.learner.plasticity import RESETS_TO
 
 
 class Logged(BROFast):
@@ -42,20 +42,6 @@ class Logged(BROFast):
 
 SUMS: dict[str, float] = defaultdict(float)
 COUNTS: dict[str, int] = defaultdict(int)
-
-
-def return_to_first(model: BROFast) -> None:
-    """Have each reset return to the parameters that the model has now."""
-    learner = model.learner
-    kept = {module: copy.deepcopy(module.state_dict()) for module in (learner.networks, learner.explorer)}
-    drawn_anew = learner.reinitialize
-
-    def reinitialize(*args: Any, **kwargs: Any) -> None:
-        drawn_anew(*args, **kwargs)
-        for module, state in kept.items():
-            module.load_state_dict(state)
-
-    learner.reinitialize = reinitialize  # type: ignore[method-assign]
 
 
 def norm(module: torch.nn.Module) -> float:
@@ -96,7 +82,7 @@ def main() -> None:
     parser.add_argument("--model-size", default="0.55M")
     parser.add_argument("--every", type=int, default=500)
     parser.add_argument("--eval-freq", type=int, default=12_500)
-    parser.add_argument("--same-start", action="store_true")
+    parser.add_argument("--resets-to", default="start", choices=RESETS_TO)
     parser.add_argument("--output", type=Path, default=Path("runs"))
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -107,10 +93,8 @@ def main() -> None:
     env_id = f"dmc/{args.task}-v0"
     model = Logged(
         "MlpPolicy", make_vec_env(env_id, seed=args.seed), replay_ratio=args.replay_ratio, model_size=args.model_size,
-        seed=args.seed, device="cpu",
+        seed=args.seed, resets_to=args.resets_to, device="cpu",
     )  # fmt: skip
-    if args.same_start:
-        return_to_first(model)
     log = Log(file, args.every, args.eval_freq, make_vec_env(env_id, seed=args.seed + 1_000))
     model.learn(args.steps, callback=log)
 

@@ -4,6 +4,7 @@ Learner of the off-policy family: networks, targets, learned numbers, optimizers
 ``Learner.gradient_step`` is the whole gradient step, in the order of BRO's pseudo-code (BRO, algorithm 2).
 """
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -14,6 +15,7 @@ import torch
 from torch import nn
 from torch.optim import Optimizer
 
+from sb3_sample.kinds import check_value, one_of
 from sb3_sample.learner import first_step, losses
 from sb3_sample.learner.batch import (
     SLOTS,
@@ -37,7 +39,7 @@ from sb3_sample.learner.observation_statistics import ObservationStatistics
 from sb3_sample.learner.observations import Observations
 from sb3_sample.learner.parts import Part, logged
 from sb3_sample.learner.pessimism import LearnedPessimism, Pessimism, pessimistic_value
-from sb3_sample.learner.plasticity import ReDo, Resets
+from sb3_sample.learner.plasticity import RESETS_TO, ReDo, Resets
 from sb3_sample.learner.q_values import evaluate
 from sb3_sample.learner.randomness import OwnGenerators
 from sb3_sample.learner.reward_scale import RewardScale, task_of
@@ -183,22 +185,26 @@ class Learner(Executable):
         self.n_tasks, self._n_envs = n_tasks, 1
         super().__init__(Counts() if counts is None else counts)
         self._generators, self.head = generators, head.to(self.device)
+        self.plasticity, self.redo = plasticity, redo
         with self._random():
-            self.networks = make_networks().to(self.device) if networks is None else networks
+            if networks is None:
+                networks = plasticity.first("networks", make_networks).to(self.device)
+            else:
+                plasticity.starts["networks"] = networks.drawn_from
+            self.networks = networks
             self.target_entropy: float | torch.Tensor = 0.0
             self.set_target_entropy(-self.actor.action_dim / 2 if target_entropy is None else target_entropy)
-            self.temperature = make_temperature(self)
-            self.pessimism_rule = self.make_pessimism()
-            self.explorer = self.make_explorer()
+            self.temperature = plasticity.first("temperature", lambda: make_temperature(self))
+            self.pessimism_rule = plasticity.first("pessimism", self.make_pessimism)
+            self.explorer = plasticity.first("explorer", self.make_explorer)
             self.reward_scaler = None if make_reward_scaler is None else make_reward_scaler(self).to(self.device)
             made: list[Any] = [make(self).to(self.device) for make in make_transforms]
             self.transforms: Any = nn.ModuleList(made)
             #: Copies of each transition in the TD target and in the critics' loss, by the transforms.
             self.target_copies = math.prod(each.target_copies for each in made)
             self.online_copies = math.prod(each.online_copies for each in made)
-            self.objective = self._make_objective(self)
+            self.objective = plasticity.first("objective", lambda: self._make_objective(self))
         self.observation_statistics = None if self.observation_norm is None else ObservationStatistics()
-        self.plasticity, self.redo = plasticity, redo
         if redo is not None:
             redo.check(self)
         self.temperature_optimizer: AdamW | None = None
@@ -1030,15 +1036,19 @@ class Learner(Executable):
 
     # ---------------------------------------------------------------- starting anew
 
-    def reinitialize(self, shrink: float = 0.0, keep: Sequence[str] = ()) -> None:
+    def reinitialize(self, shrink: float = 0.0, keep: Sequence[str] = (), to: str = "fresh") -> None:
         """
         Start every network, optimizer and learned number anew, in place.
 
         :param shrink: share of the old parameters that stays
         :param keep: what stays as it is: "encoder" for the critics' encoder, that of their targets, and their moments
             and counts of steps in the optimizer
+        :param to: "fresh" for new parameters, "start" for the run's own first ones
+        :raises ValueError: if ``to`` is neither
         """
-        fresh = self._make_networks()
+        check_value("to", to, one_of(RESETS_TO))
+        again = functools.partial(self.plasticity.again, to=to)
+        fresh = again("networks", self._make_networks)
         encoders: list[nn.Module] = self.networks.encoders() if "encoder" in keep else []
         if encoders:
             for own, other in zip(encoders, fresh.encoders(), strict=True):
@@ -1047,11 +1057,11 @@ class Learner(Executable):
             # They describe the replay, which stays.
             fresh.observation_norm.load_state_dict(self.observation_norm.state_dict())
         self.restart(self.networks, fresh, shrink)
-        self.restart(self.temperature, self._make_temperature(self), shrink)
+        self.restart(self.temperature, again("temperature", lambda: self._make_temperature(self)), shrink)
         # The explorer's start may depend on the pessimism in force.
-        self.restart(self.pessimism_rule, self.make_pessimism(), shrink)
-        self.restart(self.explorer, self.make_explorer(), shrink)
-        self.restart(self.objective, self._make_objective(self), shrink)
+        self.restart(self.pessimism_rule, again("pessimism", self.make_pessimism), shrink)
+        self.restart(self.explorer, again("explorer", self.make_explorer), shrink)
+        self.restart(self.objective, again("objective", lambda: self._make_objective(self)), shrink)
         kept: set[Any] = {parameter for encoder in encoders for parameter in encoder.parameters()}
         for optimizer in self.optimizers().values():
             state = {parameter: values for parameter, values in optimizer.state.items() if parameter in kept}

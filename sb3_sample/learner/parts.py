@@ -178,12 +178,13 @@ class Learning(Protocol):
         :param shrink: share of the old parameters that stays
         """
 
-    def reinitialize(self, shrink: float = 0.0, keep: Sequence[str] = ()) -> None:
+    def reinitialize(self, shrink: float = 0.0, keep: Sequence[str] = (), to: str = "fresh") -> None:
         """
         Start every network, optimizer and learned number anew, in place.
 
         :param shrink: share of the old parameters that stays
         :param keep: what stays as it is, "encoder" for the critics' encoder and that of their targets
+        :param to: "fresh" for new parameters, "start" for the first ones
         """
 
 

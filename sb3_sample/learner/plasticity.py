@@ -1,17 +1,22 @@
 """Plasticity: resets and recycling of neurons, which keep the networks able to learn."""
 
 import itertools
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
 from sb3_sample.console import say
-from sb3_sample.kinds import is_integer
+from sb3_sample.kinds import check_value, is_integer, one_of
 from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.parts import Learning, Part
 from sb3_sample.networks.dormant import recycle
+
+T = TypeVar("T")
+
+#: What a reset returns to.
+RESETS_TO = ("fresh", "start")
 
 
 class Resets(Part):
@@ -31,12 +36,16 @@ class Resets(Part):
     2022: every 2,560,000). After each such number of them the reset comes before the next one is taken, so that
     networks that have learned nothing neither act nor are saved.
 
+    New parameters are drawn, or with ``to="start"``, as in BRO's published code, the run's first ones again, from the
+    states of torch's generator that they came from, which are saved with the model.
+
     :param steps: transitions at which to reset, above 0, strictly ascending; an integer for every so many; none by
         default
     :param shrink: share of the old parameters that stays, in [0, 1)
     :param gradient_steps: gradient steps between two resets; None for none
     :param keep: what stays as it is, "encoder" for an encoder that the critics share with the actors (Nikishin et al.
         2022, whose resets from pixels leave the convolutions)
+    :param to: "fresh" for new parameters, "start" for the run's own first ones
     :raises ValueError: if the steps are not positive integers in ascending order, or another argument is out of range
     """
 
@@ -46,8 +55,10 @@ class Resets(Part):
         shrink: float = 0.0,
         gradient_steps: int | None = None,
         keep: Sequence[str] = (),
+        to: str = "fresh",
     ):
         super().__init__()
+        check_value("resets_to", to, one_of(RESETS_TO))
         if not 0 <= shrink < 1:
             raise ValueError(f"reset_shrink must lie in [0, 1), not {shrink}")
         if gradient_steps is not None and (not is_integer(gradient_steps) or gradient_steps < 1):
@@ -55,7 +66,9 @@ class Resets(Part):
                 f"reset_gradient_steps must be an integer of at least 1, or None for no such resets, not "
                 f"{gradient_steps!r}"
             )
-        self.shrink, self.gradient_steps, self.keep = shrink, gradient_steps, tuple(keep)
+        self.shrink, self.gradient_steps, self.keep, self.returns_to = shrink, gradient_steps, tuple(keep), to
+        #: States of torch's generator from which the parts of the learner were first drawn, by the part's name.
+        self.starts: dict[str, torch.Tensor] = {}
         self.period: int | None = None
         self.steps: tuple[int, ...] = ()
         self.n_done = 0
@@ -99,20 +112,41 @@ class Resets(Part):
             self._reset(learner, f"after {taken} gradient steps")
         return min(n, self.gradient_steps - taken % self.gradient_steps)
 
+    def first(self, name: str, make: Callable[[], T]) -> T:
+        """
+        :param name: of a part of the learner
+        :param make: makes it
+        :return: the part that the run begins with
+        """
+        self.starts[name] = torch.get_rng_state()
+        return make()
+
+    def again(self, name: str, make: Callable[[], T], to: str) -> T:
+        """
+        :param name: of a part of the learner
+        :param make: makes it
+        :param to: "fresh" or "start"
+        :return: the part that a reset begins with
+        """
+        if to == "fresh":
+            return make()
+        # Parameters are drawn on the CPU, wherever they are moved afterwards.
+        with torch.random.fork_rng(devices=[]):
+            torch.set_rng_state(self.starts[name])
+            return make()
+
     def _reset(self, learner: Learning, when: str) -> None:
-        if self.keep:
-            learner.reinitialize(self.shrink, self.keep)
-        else:
-            learner.reinitialize(self.shrink)
+        learner.reinitialize(self.shrink, self.keep, self.returns_to)
         self.n_done += 1
         if learner.verbose >= 1:
-            say(f"Reset of all parameters{' but the ' + ', '.join(self.keep) + ',' if self.keep else ''} {when}")
+            kept = f" but the {', '.join(self.keep)}," if self.keep else ""
+            say(f"Reset of all parameters{kept}{' to those of the start' if self.returns_to == 'start' else ''} {when}")
 
     def get_extra_state(self) -> dict[str, Any]:
-        return {"reached": self._reached, "n_done": self.n_done}
+        return {"reached": self._reached, "n_done": self.n_done, "starts": self.starts}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self._reached, self.n_done = state["reached"], state["n_done"]
+        self._reached, self.n_done, self.starts = state["reached"], state["n_done"], dict(state["starts"])
 
 
 class ReDo(Part):

@@ -30,6 +30,7 @@ from sb3_sample.learner.categorical import VALUE_HEADS
 from sb3_sample.learner.exploration import EXPLORATIONS, Exploration
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.learner.pessimism import Pessimism
+from sb3_sample.learner.plasticity import RESETS_TO
 from sb3_sample.learner.reward_scale import REWARD_SCALES, RewardScale
 from sb3_sample.learner.schedules import SCHEDULES
 from sb3_sample.learner.transforms import BatchTransform
@@ -186,6 +187,9 @@ class SACArguments(Resumable):
     )
     """what a reset leaves as it is: ``("encoder",)`` for the features extractor that actors share with the critics,
     that of the targets and their part of the optimizer (the primacy bias, Nikishin et al. 2022, from pixels)"""
+    resets_to: str = argument(default="fresh", kind=one_of(RESETS_TO))
+    """what a reset returns to: "fresh", newly drawn parameters, or "start", those that the model began with, as in
+    BRO's published code"""
     redo_period: int | None = argument(default=None, kind=integer(1).or_none("no recycling"))
     """gradient steps between two recyclings of the critics' dormant neurons (ReDo; the original: 1,000); None for
     none"""

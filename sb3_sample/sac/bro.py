@@ -89,6 +89,8 @@ class BRO(SAC):
     resets: Sequence[int] | int = argument(default=BRO_RESETS)
     """environment steps at which all parameters start anew, counted in transitions over the model's life; or one
     integer for every so many"""
+    resets_to: str = argument(default="start")
+    """what a reset returns to: "start", the parameters that the model began with, or "fresh", newly drawn ones"""
 
     temperature_beta1: ClassVar[float] = 0.5
 

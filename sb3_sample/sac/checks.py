@@ -52,7 +52,7 @@ def check(agent: Any) -> None:
             "everything starts anew: pass one of them"
         )
     if agent.reset_gradient_steps is None and not has_resets(agent.resets):
-        check_unused(agent, ["reset_shrink"], "no resets")
+        check_unused(agent, ["reset_shrink", "resets_to"], "no resets")
     if agent.compile not in (True, False, "auto") or not isinstance(agent.compile, (bool, str)):
         raise ValueError(f"compile must be True, False or 'auto', not {agent.compile!r}")
     if agent.value_head is None:

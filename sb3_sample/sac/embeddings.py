@@ -201,6 +201,7 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
         width_factor: int = 1,
     ):
+        drawn_from = torch.get_rng_state()
         # The parts of the base class are not these.
         BasePolicy.__init__(
             self,
@@ -213,6 +214,7 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
             squash_output=True,
             normalize_images=normalize_images,
         )
+        self.drawn_from = drawn_from
         sizes = {
             "width": ("encoder_width", encoder_width),
             "state_embedding": ("state_embedding", state_embedding),

@@ -195,7 +195,9 @@ class HasLearner:
             make_temperature=self._make_temperature,
             make_pessimism=self.make_pessimism,
             make_explorer=self.make_explorer,
-            plasticity=Resets(self.resets, self.reset_shrink, self.reset_gradient_steps, self.resets_keep),
+            plasticity=Resets(
+                self.resets, self.reset_shrink, self.reset_gradient_steps, self.resets_keep, self.resets_to
+            ),
             redo=None if self.redo_period is None else ReDo(self.redo_period, self.redo_threshold),
             make_transforms=[
                 *(functools.partial(_make_transform, *each) for each in enumerate(self.batch_transforms)),
@@ -385,14 +387,16 @@ class HasLearner:
     def _get_torch_save_params(self: Any) -> tuple[list[str], list[str]]:
         return ["policy", "temperature", *self.learner.parts_with_state(), *self._optimizers()], []
 
-    def reinitialize(self: Any, shrink: float = 0.0, keep: Sequence[str] = ()) -> None:
+    def reinitialize(self: Any, shrink: float = 0.0, keep: Sequence[str] = (), to: str = "fresh") -> None:
         """
         Start every network, optimizer and learned number anew, in place; the replay buffer stays.
 
         :param shrink: share of the old parameters that stays
         :param keep: what stays as it is, "encoder" for an encoder that the critics share with the actors
+        :param to: "fresh" for new parameters, "start" for those that the model began with
+        :raises ValueError: if ``to`` is neither
         """
-        self.learner.reinitialize(shrink, keep)
+        self.learner.reinitialize(shrink, keep, to)
 
     def _make_augmentation(self: Any, learner: Learner) -> BatchTransform:
         cls, kwargs = AUGMENTATIONS[self.augmentation], self._full_augmentation_kwargs()

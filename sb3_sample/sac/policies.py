@@ -117,6 +117,7 @@ class SACPolicy(BasePolicy):
         projection: int | None = None,
         projection_gain: float = 1.0,
     ):
+        drawn_from = torch.get_rng_state()
         check_value("share_features_extractor", share_features_extractor, TRUE_OR_FALSE)
         check_value("target_encoder", target_encoder, one_of(("own", "online")))
         check_value("actor_features", actor_features, one_of(("after", "before")))
@@ -141,6 +142,8 @@ class SACPolicy(BasePolicy):
             squash_output=True,
             normalize_images=normalize_images,
         )
+        #: State of torch's generator from which the parameters were drawn.
+        self.drawn_from = drawn_from
         check_value("n_critics", n_critics, integer(1))
         check_value("n_outputs", n_outputs, integer(1))
         check_value("normalize_observations", normalize_observations, TRUE_OR_FALSE)

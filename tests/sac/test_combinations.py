@@ -127,7 +127,9 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
     "`resets` with `reset_gradient_steps`": [
         (SAC, {"resets": 20, "reset_gradient_steps": 20}, ("resets=20", "reset_gradient_steps=20")),
     ],
-    "`reset_shrink` without resets, `redo_threshold` without `redo_period`": [
+    "`reset_shrink`, `resets_to` without resets, `redo_threshold` without `redo_period`": [
+        (SAC, {"resets_to": "start"}, ("resets_to='start'", "no resets")),
+        (BRO, {"resets_to": "fresh", "resets": ()}, ("resets_to='fresh'", "no resets")),
         (SAC, {"reset_shrink": 0.5}, ("reset_shrink=0.5", "no resets")),
         (SAC, {"redo_threshold": 0.5}, ("redo_threshold=0.5", "redo_period=None")),
     ],

@@ -21,9 +21,9 @@ class Recorder:
         self.at: list[int] = []
         original = model.learner.reinitialize
 
-        def reinitialize(shrink: float = 0.0) -> None:
+        def reinitialize(*args: Any) -> None:
             self.at.append(model.num_transitions)
-            original(shrink)
+            original(*args)
 
         model.learner.reinitialize = reinitialize
 
@@ -118,6 +118,86 @@ def test_everything_starts_anew(maker: str) -> None:
         assert model.explorer.kl_weight().item() == pytest.approx(0.25, rel=1e-5)
     np.testing.assert_array_equal(model.replay_buffer.observations, stored)
     assert model.replay_buffer.size() == 40
+
+
+def begun(model: Any) -> dict[str, torch.Tensor]:
+    """A copy of what a reset starts anew: networks and learned numbers, without counts that go on."""
+    parts = {
+        name: getattr(model, name) for name in ("policy", "temperature", "pessimism_rule", "explorer", "objective")
+    }
+    return {
+        f"{name}.{key}": value.detach().clone()
+        for name, part in parts.items()
+        for key, value in part.named_parameters()
+    }
+
+
+@pytest.mark.parametrize("name", sampled(MAKERS))
+def test_back_to_the_start(name: str) -> None:
+    """With ``resets_to="start"`` a run returns to its own first parameters, whatever was drawn since."""
+    model = MAKERS[name](seed=1)
+    before = begun(model)
+    model.learn(24)
+    numbers = torch.get_rng_state()
+    model.reinitialize(to="start")
+    assert torch.equal(torch.get_rng_state(), numbers), "a reset to the start takes no random numbers"
+    after = begun(model)
+    assert before.keys() == after.keys()
+    for key in before:
+        assert torch.equal(after[key], before[key]), key
+    assert not any(optimizer.state for optimizer in model._optimizers().values())
+    model.learn(12)
+    model.reinitialize(to="fresh")
+    assert any(not torch.equal(value, before[key]) for key, value in begun(model).items())
+
+
+@pytest.mark.parametrize(("maker", "to"), [("BRO", "start"), ("BROFast", "start"), ("SAC", "fresh")])
+def test_what_resets_return_to_by_default(maker: str, to: str) -> None:
+    """BRO's published code draws the parameters of every reset from the key of the start; SAC's are new draws."""
+    model = MAKERS[maker](resets=(20,), seed=1)
+    assert model.resets_to == to
+    before, after = begun(model), {}
+    reinitialize = model.learner.reinitialize
+
+    def then_look(*args: Any) -> None:
+        reinitialize(*args)
+        after.update(begun(model))
+
+    model.learner.reinitialize = then_look
+    model.learn(24)
+    same = [torch.equal(after[key], value) for key, value in before.items()]
+    assert all(same) if to == "start" else not all(same)
+
+
+@pytest.mark.parametrize("to", ["start", "fresh"])
+def test_the_start_is_saved(to: str, tmp_path: Path) -> None:
+    """A loaded model returns to the parameters that the run began with, not to those of its own construction."""
+    model = bro(resets=(20,), seed=1)
+    before = begun(model)
+    model.learn(15)
+    model.save(tmp_path / "m")
+    loaded = BRO.load(tmp_path / "m", **({} if to == "start" else {"resets_to": to}))
+    loaded.reinitialize(loaded.reset_shrink, loaded.resets_keep, loaded.resets_to)
+    same = [torch.equal(value, before[key]) for key, value in begun(loaded).items()]
+    assert all(same) if to == "start" else not all(same)
+
+
+def test_shrinking_towards_the_start() -> None:
+    model = bro(resets=(20,), seed=1)
+    first = model.critic.trunk.dense.weight.detach().clone()
+    model.learn(15)
+    learned = model.critic.trunk.dense.weight.detach().clone()
+    model.reinitialize(0.25, to="start")
+    torch.testing.assert_close(model.critic.trunk.dense.weight.detach(), 0.25 * learned + 0.75 * first)
+
+
+def test_resets_to_is_checked() -> None:
+    with pytest.raises(ValueError, match="resets_to.*'elsewhere'"):
+        sac(resets=(20,), resets_to="elsewhere")
+    with pytest.raises(ValueError, match="resets_to.*no resets"):
+        sac(resets_to="start")
+    with pytest.raises(ValueError, match="to must be one of"):
+        sac().reinitialize(to="elsewhere")
 
 
 def test_optimizers_work_after_a_reset() -> None:
@@ -277,9 +357,9 @@ class UpdateRecorder:
         self.after: list[int] = []
         original = model.learner.reinitialize
 
-        def reinitialize(shrink: float = 0.0) -> None:
+        def reinitialize(*args: Any) -> None:
             self.after.append(model._n_updates)
-            original(shrink)
+            original(*args)
 
         model.learner.reinitialize = reinitialize
 
@@ -468,7 +548,7 @@ def test_shrink_is_what_the_resets_use() -> None:
     shrinks = []
     model = sac(resets=(20,), reset_shrink=0.4)
     reinitialize = model.learner.reinitialize
-    model.learner.reinitialize = lambda shrink: shrinks.append(shrink) or reinitialize(shrink)
+    model.learner.reinitialize = lambda shrink, *others: shrinks.append(shrink) or reinitialize(shrink, *others)
     model.learn(25)
     assert shrinks == [0.4]
 
