@@ -79,17 +79,22 @@ class FlashSAC(SAC):
 
     def _construct(self, given: Given) -> None:
         # Of what is passed: a model that is made, or loaded, has the number that "auto" came to beside it.
-        if {"target_std", "target_entropy"} <= set(given.passed) and given["target_entropy"] != "auto":
-            std, entropy = given["target_std"], given["target_entropy"]
-            if std != default_of(type(self), "target_std"):
-                raise ValueError(
-                    f"target_std={std!r} means nothing with target_entropy={entropy!r}: leave one of them out"
-                )
+        if "target_std" in given.passed and given["target_std"] != default_of(type(self), "target_std"):
+            self._check_one_target({name: value for name, value in given.items() if name in given.passed})
         super()._construct(given)
+
+    @staticmethod
+    def _check_one_target(passed: dict[str, Any]) -> None:
+        if "target_std" in passed and passed.get("target_entropy", "auto") != "auto":
+            raise ValueError(
+                f"target_std={passed['target_std']!r} means nothing with target_entropy="
+                f"{passed['target_entropy']!r}: leave one of them out"
+            )
 
     @classmethod
     def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
         implied: dict[str, Any] = super()._implied(kwargs)
+        cls._check_one_target(kwargs)
         if "target_std" in kwargs and "target_entropy" not in kwargs:
             implied["target_entropy"] = "auto"
         return implied

@@ -549,6 +549,8 @@ def test_target_std_of_a_loaded_model(tmp_path: Path) -> None:
     as_it_was = FlashSAC.load(tmp_path / "model")
     assert (as_it_was.target_std, as_it_was.target_entropy) == (0.3, made.target_entropy)
     assert FlashSAC.load(tmp_path / "model", target_std=0.5).target_entropy == other.target_entropy
+    with pytest.raises(ValueError, match=r"target_std=0\.15 means nothing with target_entropy=-3"):
+        FlashSAC.load(tmp_path / "model", target_std=0.15, target_entropy=-3)
     assert FlashSAC.load(tmp_path / "model", target_entropy=-3).target_entropy == -3
 
 
