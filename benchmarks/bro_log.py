@@ -4,7 +4,7 @@ logs and the seeds of the authors' code.
 
     OMP_NUM_THREADS=1 python benchmarks/bro_log.py --task cheetah-run --seed 0 --steps 50000
 
-``--resets-to fresh``: the reset draws new parameters, other than the published code, whose runs return to their own
+``--resets-to fresh``: the reset draws new parameters, unlike the published code, whose runs return to their own
 first ones.
 
 A line of JSON every ``--every`` steps goes to ``OUTPUT/TASK/rr<replay ratio>_seed<seed>.jsonl``: means of the metrics

@@ -412,7 +412,9 @@ def train(env_id: str, config: Config, n_steps: int, seed: int, eval_every: int)
         buffer.add(observation, action, float(reward), float(terminated), next_observation)
         observation = env.reset()[0] if terminated or truncated else next_observation
         if step in config.resets:  # Full-parameter reset: everything but the replay buffer (BRO, section 2.2).
-            agent = Agent(*sizes, config)
+            with torch.random.fork_rng(devices=[]):  # As published: the first parameters again.
+                torch.manual_seed(seed)
+                agent = Agent(*sizes, config)
         for _ in range(0 if warm_up else config.replay_ratio):
             metrics = agent.update(buffer.sample(config.batch_size, rng), torch.randn(3, config.batch_size, sizes[1]))
         if step % eval_every == 0 or step == n_steps:

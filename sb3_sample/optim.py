@@ -224,8 +224,8 @@ def _plain_adamw(
 
 def _column(values: torch.Tensor, place: int, p: torch.Tensor) -> torch.Tensor:
     """
-    What a table with a column for each parameter, (P,) or (S, P), has for one parameter. A view of memory, other than
-    an index, has the compiler compute the table once; it would repeat the powers for every eight elements of ``p``.
+    What a table with a column for each parameter, (P,) or (S, P), has for one parameter. Read through a view of memory,
+    since Inductor inlines an index: it would then repeat the powers for every eight elements of ``p``.
     """
     values = values.contiguous()
     return _by_learner(values.as_strided(values.shape[:-1], values.stride()[:-1], place), p)

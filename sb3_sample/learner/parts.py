@@ -213,9 +213,11 @@ class Networks(Protocol):
 
     ``actor.optimizer`` and ``critic.optimizer`` are theirs; ``actor_target`` is the actor of the TD targets if it is
     not the actor itself. ``encodes_once`` and ``encodes_next_once`` say whether observations and next observations are
-    encoded once for the whole gradient step, by ``features``.
+    encoded once for the whole gradient step, by ``features``. ``drawn_from`` is the state of torch's generator from
+    which the parameters were drawn.
     """
 
+    drawn_from: torch.Tensor
     encodes_once: bool
     encodes_next_once: bool
 

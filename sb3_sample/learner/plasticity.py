@@ -10,7 +10,9 @@ import torch
 from sb3_sample.console import say
 from sb3_sample.kinds import check_value, is_integer, one_of
 from sb3_sample.learner.batch import Batch
+from sb3_sample.learner.execution import CAPTURING
 from sb3_sample.learner.parts import Learning, Part
+from sb3_sample.learner.randomness import checked_state
 from sb3_sample.networks.dormant import recycle
 
 T = TypeVar("T")
@@ -130,8 +132,9 @@ class Resets(Part):
         """
         if to == "fresh":
             return make()
-        # Parameters are drawn on the CPU, wherever they are moved afterwards.
-        with torch.random.fork_rng(devices=[]):
+        # Parameters are drawn on the CPU, wherever they are moved afterwards. The lock keeps the acting thread of
+        # asynchronous learning, which draws from the same generator, from drawing in between.
+        with CAPTURING, torch.random.fork_rng(devices=[]):
             torch.set_rng_state(self.starts[name])
             return make()
 
@@ -140,13 +143,15 @@ class Resets(Part):
         self.n_done += 1
         if learner.verbose >= 1:
             kept = f" but the {', '.join(self.keep)}," if self.keep else ""
-            say(f"Reset of all parameters{kept}{' to those of the start' if self.returns_to == 'start' else ''} {when}")
+            first = ", to the first ones of the run" if self.returns_to == "start" else ""
+            say(f"Reset of all parameters{kept} {when}{first}")
 
     def get_extra_state(self) -> dict[str, Any]:
         return {"reached": self._reached, "n_done": self.n_done, "starts": self.starts}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self._reached, self.n_done, self.starts = state["reached"], state["n_done"], dict(state["starts"])
+        starts = {name: checked_state(start, f"what {name} came from") for name, start in state["starts"].items()}
+        self._reached, self.n_done, self.starts = state["reached"], state["n_done"], starts
 
 
 class ReDo(Part):

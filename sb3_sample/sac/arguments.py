@@ -189,7 +189,8 @@ class SACArguments(Resumable):
     that of the targets and their part of the optimizer (the primacy bias, Nikishin et al. 2022, from pixels)"""
     resets_to: str = argument(default="fresh", kind=one_of(RESETS_TO))
     """what a reset returns to: "fresh", newly drawn parameters, or "start", those that the model began with, as in
-    BRO's published code"""
+    BRO's published code; with the parameters of a file (``load``, ``set_parameters``), those that its model began
+    with"""
     redo_period: int | None = argument(default=None, kind=integer(1).or_none("no recycling"))
     """gradient steps between two recyclings of the critics' dormant neurons (ReDo; the original: 1,000); None for
     none"""

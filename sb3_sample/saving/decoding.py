@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
+from sb3_sample.learner.randomness import checked_state
 from sb3_sample.saving.classes import (
     DTYPE_TEXT,
     ENUMERATIONS,
@@ -262,7 +263,8 @@ class _Decoder:
 
     def _torch_generator(self, tree: Any, whole: Any, name: str, depth: int) -> Any:
         made = torch.Generator(_read_device(whole["device"], name))
-        made.set_state(self.decode(tree, name, depth + 1))
+        state = self.decode(tree, name, depth + 1)
+        made.set_state(checked_state(state, name) if made.device.type == "cpu" else state)
         return made
 
 

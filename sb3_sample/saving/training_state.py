@@ -21,6 +21,7 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 
+from sb3_sample.learner.randomness import checked_state
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.saving.attributes import Describer, Node, Opaque, Restorer, without_generators
 from sb3_sample.saving.classes import NotPortable
@@ -100,7 +101,7 @@ def restore_generators(state: dict[str, Any], device: torch.device) -> None:
     check_python_state(state["python"], "Python")
     random.setstate(state["python"])
     set_numpy_state(state["numpy"])
-    torch.set_rng_state(state["torch"])
+    torch.set_rng_state(checked_state(state["torch"], "the generator of torch"))
     if device.type == "cuda" and state["cuda"] is not None:
         torch.cuda.set_rng_state(state["cuda"], device)
 

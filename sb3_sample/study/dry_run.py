@@ -27,8 +27,8 @@ WARM_UP = 500
 #: Algorithms whose step times may be known, and arguments that change neither these nor how steps are run.
 _TIMED = {"bro": BRO, "bro_fast": BROFast}
 _UNTIMED = {
-    "replay_ratio", "model_size", "resets", "reset_gradient_steps", "learning_starts", "buffer_size", "learning_rate",
-    "gamma", "tau",
+    "replay_ratio", "model_size", "resets", "reset_gradient_steps", "resets_to", "learning_starts", "buffer_size",
+    "learning_rate", "gamma", "tau",
 }  # fmt: skip
 #: Gradient steps an environment step of a probe whose step time is known: too few to count.
 _HARDLY_ANY = 1e-3

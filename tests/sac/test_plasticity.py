@@ -182,6 +182,21 @@ def test_the_start_is_saved(to: str, tmp_path: Path) -> None:
     assert all(same) if to == "start" else not all(same)
 
 
+@pytest.mark.parametrize("kind", ["text", "short", "floats", "past the end"])
+def test_a_damaged_start_is_refused_at_once(kind: str) -> None:
+    """And not at the reset, hours later; torch would read what lies behind the last kind's numbers."""
+    model = bro(resets=(20,))
+    state = model.plasticity.get_extra_state()
+    start = state["starts"]["explorer"].clone()
+    wrong: Any = {"text": "start", "short": start[:10], "floats": start.float()}.get(kind, start)
+    if kind == "past the end":
+        start[8:12] = torch.from_numpy(np.array([624], np.int32).view(np.uint8))
+        start[16:24] = torch.from_numpy(np.array([624], np.int64).view(np.uint8))
+    with pytest.raises(ValueError, match="what explorer came from"):
+        model.plasticity.set_extra_state({**state, "starts": {**state["starts"], "explorer": wrong}})
+    model.plasticity.set_extra_state(state)
+
+
 def test_shrinking_towards_the_start() -> None:
     model = bro(resets=(20,), seed=1)
     first = model.critic.trunk.dense.weight.detach().clone()
