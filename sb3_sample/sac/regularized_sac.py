@@ -54,6 +54,9 @@ class RegularizedSAC(SAC):
     ``reset_gradient_steps``"""
     reset_gradient_steps: int | None = argument(default=None)
     """for "resets", gradient steps between two instead"""
+    resets_to: str = argument(default="start")
+    """what they return to: "start", the parameters that the model began with, as in the study's code, or "fresh",
+    newly drawn ones"""
     redo_period: int | None = argument(default=None)
     """for "redo", gradient steps between two recyclings; None: 1,000"""
     pessimism: float | str | type[Pessimism] | None = argument(  # type: ignore[assignment]  # None until it is stored

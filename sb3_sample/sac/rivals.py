@@ -152,3 +152,6 @@ class SRSAC(SAC):
     resets: Sequence[int] | int = argument(default=SR_SAC_RESETS)
     """environment steps between two resets, or the steps of all of them; the default gives way to
     ``reset_gradient_steps``"""
+    resets_to: str = argument(default="start")
+    """what a reset returns to: "start", the parameters that the model began with, as in the original's code, or
+    "fresh", newly drawn ones"""

@@ -151,9 +151,11 @@ def test_back_to_the_start(name: str) -> None:
     assert any(not torch.equal(value, before[key]) for key, value in begun(model).items())
 
 
-@pytest.mark.parametrize(("maker", "to"), [("BRO", "start"), ("BROFast", "start"), ("SAC", "fresh")])
+@pytest.mark.parametrize(
+    ("maker", "to"), [("BRO", "start"), ("BROFast", "start"), ("SRSAC", "start"), ("SAC", "fresh")]
+)
 def test_what_resets_return_to_by_default(maker: str, to: str) -> None:
-    """BRO's published code draws the parameters of every reset from the key of the start; SAC's are new draws."""
+    """The published code of BRO and of SR-SAC draws every reset's parameters from the key of the start."""
     model = MAKERS[maker](resets=(20,), seed=1)
     assert model.resets_to == to
     before, after = begun(model), {}
