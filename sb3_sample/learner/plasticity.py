@@ -69,8 +69,9 @@ class Resets(Part):
                 f"{gradient_steps!r}"
             )
         self.shrink, self.gradient_steps, self.keep, self.returns_to = shrink, gradient_steps, tuple(keep), to
-        #: States of torch's generator from which the parts of the learner were first drawn, by the part's name.
-        self.starts: dict[str, torch.Tensor] = {}
+        #: By the part of the learner, the state of torch's generator from which it was first drawn; None if it draws
+        #: nothing.
+        self.starts: dict[str, torch.Tensor | None] = {}
         self.period: int | None = None
         self.steps: tuple[int, ...] = ()
         self.n_done = 0
@@ -120,8 +121,10 @@ class Resets(Part):
         :param make: makes it
         :return: the part that the run begins with
         """
-        self.starts[name] = torch.get_rng_state()
-        return make()
+        before = torch.get_rng_state()
+        made = make()
+        self.starts[name] = None if torch.equal(before, torch.get_rng_state()) else before
+        return made
 
     def again(self, name: str, make: Callable[[], T], to: str) -> T:
         """
@@ -130,12 +133,13 @@ class Resets(Part):
         :param to: "fresh" or "start"
         :return: the part that a reset begins with
         """
-        if to == "fresh":
+        start = None if to == "fresh" else self.starts[name]
+        if start is None:
             return make()
         # Parameters are drawn on the CPU, wherever they are moved afterwards. The lock keeps the acting thread of
         # asynchronous learning, which draws from the same generator, from drawing in between.
         with CAPTURING, torch.random.fork_rng(devices=[]):
-            torch.set_rng_state(self.starts[name])
+            torch.set_rng_state(start)
             return make()
 
     def _reset(self, learner: Learning, when: str) -> None:
@@ -150,8 +154,11 @@ class Resets(Part):
         return {"reached": self._reached, "n_done": self.n_done, "starts": self.starts}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        starts = {name: checked_state(start, f"what {name} came from") for name, start in state["starts"].items()}
-        self._reached, self.n_done, self.starts = state["reached"], state["n_done"], starts
+        self._reached, self.n_done = state["reached"], state["n_done"]
+        self.starts = {
+            name: None if start is None else checked_state(start, f"what {name} came from")
+            for name, start in state["starts"].items()
+        }
 
 
 class ReDo(Part):
