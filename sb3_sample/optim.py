@@ -207,14 +207,13 @@ def _plain_adamw(
     p, grad, exp_avg, exp_avg_sq = map(list, zip(*rows, strict=True))
     dtype = functools.reduce(torch.promote_types, (of.dtype for of in p))
     steps = steps.double()
-    sizes = (rate.unsqueeze(-1) / (1 - beta1**steps)).to(dtype)
-    roots = (1 - beta2**steps).rsqrt().to(dtype)
+    sizes = _columns((rate.unsqueeze(-1) / (1 - beta1**steps)).to(dtype), places, p)
+    roots = _columns((1 - beta2**steps).rsqrt().to(dtype), places, p)
     torch._foreach_lerp_(exp_avg, grad, 1 - beta1)
     torch._foreach_lerp_(exp_avg_sq, torch._foreach_mul(grad, grad), 1 - beta2)
-    change = torch._foreach_sqrt(exp_avg_sq)
-    change = torch._foreach_mul(change, [_column(roots, j, of) for j, of in zip(places, p, strict=True)])
+    change = torch._foreach_mul(torch._foreach_sqrt(exp_avg_sq), roots)
     change = torch._foreach_div(exp_avg, torch._foreach_add(change, group["eps"]))
-    change = torch._foreach_mul(change, [_column(sizes, j, of) for j, of in zip(places, p, strict=True)])
+    change = torch._foreach_mul(change, sizes)
     decay = group["weight_decay"]
     if isinstance(decay, torch.Tensor) or decay != 0:
         decays = [_by_learner(rate * decay, of) for of in p]
@@ -222,13 +221,14 @@ def _plain_adamw(
     torch._foreach_sub_(p, change)
 
 
-def _column(values: torch.Tensor, place: int, p: torch.Tensor) -> torch.Tensor:
+def _columns(table: torch.Tensor, places: Sequence[int], p: Sequence[torch.Tensor]) -> list[torch.Tensor]:
     """
-    What a table with a column for each parameter, (P,) or (S, P), has for one parameter. Read through a view of memory,
-    since Inductor inlines an index: it would then repeat the powers for every eight elements of ``p``.
+    Read columns of a table that has one for each parameter, (P,) or (S, P), as views of memory, since Inductor inlines
+    an index: it would then repeat the powers for every eight elements of each parameter.
     """
-    values = values.contiguous()
-    return _by_learner(values.as_strided(values.shape[:-1], values.stride()[:-1], place), p)
+    table = table.contiguous()
+    columns = [table.as_strided(table.shape[:-1], table.stride()[:-1], place) for place in places]
+    return [_by_learner(column, of) for column, of in zip(columns, p, strict=True)]
 
 
 def _by_learner(values: torch.Tensor, p: torch.Tensor) -> torch.Tensor:

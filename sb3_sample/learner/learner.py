@@ -187,11 +187,8 @@ class Learner(Executable):
         self._generators, self.head = generators, head.to(self.device)
         self.plasticity, self.redo = plasticity, redo
         with self._random():
-            if networks is None:
-                networks = plasticity.first("networks", make_networks).to(self.device)
-            else:
-                plasticity.starts["networks"] = networks.drawn_from
-            self.networks = networks
+            self.networks = make_networks().to(self.device) if networks is None else networks
+            plasticity.starts["networks"] = self.networks.drawn_from
             self.target_entropy: float | torch.Tensor = 0.0
             self.set_target_entropy(-self.actor.action_dim / 2 if target_entropy is None else target_entropy)
             self.temperature = plasticity.first("temperature", lambda: make_temperature(self))

@@ -17,7 +17,7 @@ from sb3_sample.networks.dormant import recycle
 
 T = TypeVar("T")
 
-#: What a reset returns to.
+#: Destinations of a reset: newly drawn parameters, or the first ones.
 RESETS_TO = ("fresh", "start")
 
 

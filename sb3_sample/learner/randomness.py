@@ -86,3 +86,4 @@ class OwnGenerators:
         :param state: from :meth:`state_dict`
         """
         self._state = {name: value.clone() for name, value in state.items()}
+        self._state["torch"] = checked_state(self._state["torch"], "the learner's generator of torch")

@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 from sb3_sample.envs.portable_states import HELPER, pack, pack_all, unpack, unpack_all
 from sb3_sample.envs.workers import SupervisedSubprocVecEnv
+from sb3_sample.learner.randomness import checked_state
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name
 from sb3_sample.saving.statistics import ARGUMENTS, check_normalization, shapes_of
 from sb3_sample.warn import warn
@@ -87,8 +88,8 @@ def _restore_global_generators(state: Any) -> None:
     if not isinstance(state, dict) or {name: type(value) for name, value in state.items()} != kinds:
         raise DoesNotFit("the generators of a worker are not described as they must be")
     try:
-        torch.set_rng_state(state["torch"])
-    except (RuntimeError, TypeError) as error:
+        torch.set_rng_state(checked_state(state["torch"], "its state"))
+    except ValueError as error:
         raise DoesNotFit(f"the state of torch's generator in a worker is none: {error}") from error
     random.setstate(state["python"].getstate())
     np.random.set_state(state["numpy"].get_state())  # noqa: NPY002

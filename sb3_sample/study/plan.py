@@ -739,11 +739,10 @@ def _settings(algo: str) -> dict[str, Any]:
 
 def _env_arguments(suite: str, task: str) -> list[str] | None:
     """Arguments of a task of this package's; None of another, which is not known before it is made."""
-    if suite not in ("dmc", "metaworld", "myosuite"):
+    made = {"dmc": "DMCEnv", "metaworld": "MetaWorldEnv", "myosuite": "MyoSuiteEnv"}.get(suite)
+    if made is None:
         return None
-    module: Any = importlib.import_module(f"sb3_sample.envs.{suite}")
-    made: Any = {"dmc": "DMCEnv", "metaworld": "MetaWorldEnv", "myosuite": "MyoSuiteEnv"}[suite]
-    known = inspect.signature(getattr(module, made)).parameters
+    known = inspect.signature(getattr(importlib.import_module(f"sb3_sample.envs.{suite}"), made)).parameters
     return [*(name for name in known if name not in gym.spec(task).kwargs), *_OF_MAKE]
 
 
