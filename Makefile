@@ -75,7 +75,7 @@ lint: $(VENV)/.all
 	$(BIN)/lint-imports
 
 test: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -m "not slow" -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -m "not slow" -n 2 --dist worksteal
 
 # On a GPU: torch, NumPy, SciPy, pytest and their like are there; what is carried along is put beside them.
 GPU_FOLDER := .gpu
@@ -105,7 +105,7 @@ demo-imports: setup.cfg $(LOCK)
 # With Ray too, which [all] leaves out.
 test-all: lint demo-imports
 	$(PIP) -e ".[cluster]"
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -n 2 --durations=60
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -n 2 --dist worksteal --durations=60
 
 WORKERS ?= 1
 evidence:

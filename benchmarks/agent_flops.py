@@ -20,7 +20,7 @@ from stable_baselines3.common.logger import Logger
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_sample import study
-from sb3_sample.study.plan import constructor_value
+from sb3_sample.study.trial_agents import constructor_value
 from sb3_sample.zoo import ALGORITHMS, HYPERPARAMS
 
 #: Gradient steps that are counted: a multiple of every ``policy_delay`` in use, 1, 2 and 3.

@@ -93,6 +93,7 @@ def _parameters(line: str) -> str:
     return text
 
 
+@pytest.mark.slow
 def test_a_type_checker_refuses_what_is_no_argument(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     program = (

@@ -203,7 +203,7 @@ def normalized(space: Any = None, **kwargs: Any) -> VecNormalize:
     return env
 
 
-@pytest.mark.parametrize("family", ["sac", "ppo"])
+@pytest.mark.parametrize("family", ["sac", pytest.param("ppo", marks=pytest.mark.slow)])
 def test_normalisation_is_inside(family: str, tmp_path: Path) -> None:
     env = normalized()
     model = shake(sac(env) if family == "sac" else tiny(env=env))
@@ -340,7 +340,7 @@ def test_refused(tmp_path: Path) -> None:
         model.export(tmp_path / "file" / "policy")
 
 
-@pytest.mark.parametrize("family", ["sac", "ppo"])
+@pytest.mark.parametrize("family", ["sac", pytest.param("ppo", marks=pytest.mark.slow)])
 def test_statistics_that_are_missing_are_asked_for(family: str, tmp_path: Path) -> None:
     env = VecNormalize(vec())
     model = sac(env).learn(12) if family == "sac" else tiny(MBMAPPO, env).learn(16)
@@ -365,7 +365,7 @@ def test_statistics_that_a_plain_environment_lacks_are_warned_of(tmp_path: Path)
         sac().export(tmp_path / "policy")
 
 
-@pytest.mark.parametrize("family", ["sac", "ppo"])
+@pytest.mark.parametrize("family", ["sac", pytest.param("ppo", marks=pytest.mark.slow)])
 def test_without_normalisation_no_statistics_are_asked_for(family: str, tmp_path: Path) -> None:
     model = sac().learn(12) if family == "sac" else tiny(MBMAPPO).learn(16)
     model.save(tmp_path / "m")

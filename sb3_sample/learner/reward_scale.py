@@ -11,6 +11,7 @@ from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.parts import Learning
 from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.networks.normalization import RunningMoments
+from sb3_sample.warn import warn
 
 
 class RewardScale(BatchTransform):
@@ -210,7 +211,8 @@ class TaskScale(RewardScale):
         (max(largest, |smallest|) - alpha * min(target_entropy, 0) / (2 * (1 - gamma))) / max_return
 
     and at least 1e-8, the temperature alpha being read before the gradient steps that follow an environment step. It is
-    infinite, and the rewards are 0, until the task has finished an episode.
+    infinite, and the rewards are 0, until the task has finished an episode; learning that begins before that is warned
+    of, once.
 
     The task of an environment's step is that of the dict observation that was acted on, key "task", or its info's
     "task"; that of a transition the same key, or the batch's column "task". Without either it is 0.
@@ -238,6 +240,7 @@ class TaskScale(RewardScale):
         # Rewards of each environment's episode so far, and the tasks that their observations told.
         self._episodes: list[list[float]] = []
         self._tasks: list[int] = []
+        self._is_looked_at = False
 
     def on_observations(self, learner: Learning, observations: Any) -> None:
         told = observations.get("task") if isinstance(observations, dict) else None
@@ -270,6 +273,14 @@ class TaskScale(RewardScale):
         self._episodes = []
 
     def before_updates(self, learner: Learning) -> None:
+        if not self._is_looked_at:  # once: on a GPU the look waits for the device
+            self._is_looked_at = True
+            if n_without := int(self.largest.isinf().sum()):
+                of_tasks = f" of {n_without} of the {len(self.largest)} tasks" if len(self.largest) > 1 else ""
+                warn(
+                    f"learning begins before an episode{of_tasks} has ended: with reward_scale='brc' the rewards are 0 "
+                    "until one has. More learning_starts, or shorter episodes (gymnasium.wrappers.TimeLimit), avoid it"
+                )
         with torch.no_grad():
             alpha = learner.temperature().double()
         size = torch.maximum(self.largest, self.smallest.abs()).double()

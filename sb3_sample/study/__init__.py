@@ -8,7 +8,8 @@ from sb3_sample.study.aggregate import aggregate, performance_profiles, probabil
 from sb3_sample.study.analysis import correlate, cost, heatmap, marginalize, regress
 from sb3_sample.study.comparison import comparison
 from sb3_sample.study.dry_run import Estimate, estimate
-from sb3_sample.study.plan import Comparison, Plan, PlanError, Run, read_plan
+from sb3_sample.study.plan import Comparison, Plan, PlanError, Run
+from sb3_sample.study.plan_file import read_plan
 from sb3_sample.study.reporting.command import report
 from sb3_sample.study.runs import Outcome, StudyError
 from sb3_sample.study.schedule import Stopped, run

@@ -13,7 +13,8 @@ from sb3_sample.study import analysis_command
 from sb3_sample.study.cluster import check
 from sb3_sample.study.cores import free_cores
 from sb3_sample.study.dry_run import MeasurementFailed, estimate
-from sb3_sample.study.plan import PlanError, read_plan
+from sb3_sample.study.plan import PlanError
+from sb3_sample.study.plan_file import read_plan
 from sb3_sample.study.reporting import command as report_command
 from sb3_sample.study.runs import StudyError
 from sb3_sample.study.schedule import Stopped, run

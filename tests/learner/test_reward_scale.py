@@ -1,6 +1,7 @@
 """Rewards scaled by the running return, and normalised observations: by hand, saved, and in training."""
 
 import math
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -115,9 +116,18 @@ def test_brc_by_hand() -> None:
     scale, _ = told("brc", [-1.0, -3.0], [0, 2])
     returns = [-3 + 0.9 * -2 / 0.1, -1 + 0.9 * (-3 + 0.9 * -2 / 0.1)]
     assert scale.divisor(None).item() == pytest.approx((max(map(abs, returns)) + 5) / 10, rel=1e-6)
-    # Before an episode is over, rewards are 0.
-    scale, _ = told("brc", [1.0, 2.0], [0, 0])
+
+
+def test_brc_before_an_episode_is_over() -> None:
+    with pytest.warns(UserWarning, match="learning begins before an episode has ended: .* the rewards are 0 until"):
+        scale, of = told("brc", [1.0, 2.0], [0, 0])
     assert scale.divisor(None).item() == math.inf
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scale.before_updates(of)
+        told("brc", [1.0, 2.0], [0, 1])
+    with pytest.warns(UserWarning, match="before an episode of 2 of the 3 tasks has ended"):
+        told("brc", [1.0], [1], n_tasks=3)
 
 
 def test_brc_by_task() -> None:

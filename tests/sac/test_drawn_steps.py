@@ -146,7 +146,7 @@ def test_transitions_are_held_out_of_draws_on_the_host_too() -> None:
     assert same(ours, theirs)
 
 
-@pytest.mark.parametrize("maker", sampled(ABLE))
+@pytest.mark.parametrize("maker", sampled(ABLE, ("BRO", "VPLSAC", "SAC")))
 @pytest.mark.parametrize("how", ["eager", "captured"])
 def test_it_is_the_gradient_step_on_what_it_draws(maker: str, how: str) -> None:
     ours, theirs = model_of(maker), model_of(maker)
@@ -200,7 +200,7 @@ def test_a_training_goes_on_bit_by_bit(cls: type[SAC], compiles: bool, tmp_path:
 
 
 @pytest.mark.parametrize("how", ["eager", "captured", pytest.param("compiled", marks=[COMPILES, pytest.mark.slow])])
-@pytest.mark.parametrize("gammas", [(0.9, 0.9, 0.9), (0.9, 0.99, 0.999)])
+@pytest.mark.parametrize("gammas", [pytest.param((0.9, 0.9, 0.9), marks=pytest.mark.slow), (0.9, 0.99, 0.999)])
 @pytest.mark.parametrize("maker", sampled(["SAC", "VPLSAC", "OPLSAC"], ["VPLSAC"]))
 def test_learners_draw_together(maker: str, how: str, gammas: tuple[float, ...]) -> None:
     ours, theirs = ([model_of(maker, seed=s, gamma=gamma) for s, gamma in enumerate(gammas)] for _ in range(2))

@@ -488,7 +488,7 @@ def test_trains_as_with_stable_baselines3s_buffer(make: Any) -> None:
 # ---------------------------------------------------------------- files
 
 
-@pytest.mark.parametrize("make", [drq, drqv2])
+@pytest.mark.parametrize("make", [drq, pytest.param(drqv2, marks=pytest.mark.slow)])
 def test_saved_loaded_exported_and_resumed(make: Any, tmp_path: Path) -> None:
     kwargs: dict[str, Any] = {"buffer_size": 40}
     if make is drqv2:

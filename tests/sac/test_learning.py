@@ -65,6 +65,7 @@ def test_untrained_is_bad() -> None:
     assert score(small_bro(0)) < 2 * GOOD
 
 
+@pytest.mark.slow
 def test_sac_learns_pendulum() -> None:
     assert score(small_sac(0).learn(3_000)) > GOOD
 

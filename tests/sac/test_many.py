@@ -27,7 +27,7 @@ from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.sac import many
 from sb3_sample.saving import training_state
 from sb3_sample.saving.run_folder import RunFolder, common_starts
-from tests.sac.common import TINY_BRO, TINY_DR_Q, TINY_SAC, Toy, state
+from tests.sac.common import TINY_BRO, TINY_DR_Q, TINY_SAC, Toy, sampled, state
 
 SEEDS = (3, 0, 5)
 STEPS, EVERY = 48, 16
@@ -161,7 +161,7 @@ def alone(name: str) -> list[tuple[dict[str, Any], Noting]]:
     return found
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "DebiasedRQ")) for n in CASES])
+@pytest.mark.parametrize("name", sampled(CASES, ("BRO", "VPLSAC", "episodes")))
 def test_each_learner_is_what_it_is_alone(name: str, joint: Any) -> None:
     cls, arguments, n_envs = CASES[name]
     noting = [Noting() for _ in SEEDS]

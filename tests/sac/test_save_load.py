@@ -59,7 +59,7 @@ def test_save_load_gives_the_same_model(maker: str, trained: bool, tmp_path: Pat
         np.testing.assert_array_equal(loaded.predict(seen_by(model), deterministic=deterministic)[0], ours)
 
 
-@pytest.mark.parametrize("maker", sampled(OFF_POLICY))
+@pytest.mark.parametrize("maker", sampled(OFF_POLICY, ("BRO", "VPLSAC", "TOPSAC", "DebiasedRQ")))
 def test_loaded_model_trains_on_identically(maker: str, tmp_path: Path) -> None:
     interval = {} if maker == "SRSPR" else {"target_update_interval": 2}
     model = OFF_POLICY[maker](**resetting(maker, 18, 50), replay_ratio=1.5, **interval).learn(30)

@@ -22,7 +22,7 @@ from sb3_sample import (
 from sb3_sample.learner.batch import SLOTS, Windows
 from sb3_sample.replay.weights import DrawWeights
 from sb3_sample.saving.container import BadFile
-from tests.sac.common import MAKERS, bro, differing, sac, state, vec
+from tests.sac.common import MAKERS, bro, differing, sac, sampled, state, vec
 
 OBSERVATION, ACTION = spaces.Box(-1e6, 1e6, (1,), np.float32), spaces.Box(-1, 1, (1,), np.float32)
 
@@ -189,7 +189,7 @@ def test_nothing_is_computed_without_priorities() -> None:
     assert model._n_updates and model.learner.td_errors is None
 
 
-@pytest.mark.parametrize("maker", ["SAC", "BRO", "BROTD3"])
+@pytest.mark.parametrize("maker", sampled(["SAC", "BRO", "BROTD3"], ["BRO"]))
 def test_prioritised_in_other_agents(maker: str, tmp_path: Path) -> None:
     kwargs: dict[str, Any] = {"replay_buffer_class": PrioritizedReplayBuffer, "replay_ratio": 2,
                               "replay_buffer_kwargs": {"fade": 0.99, "smallest_error": 0.1}}  # fmt: skip

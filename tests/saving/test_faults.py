@@ -163,8 +163,14 @@ def test_an_exception_and_an_end_in_one_step(tmp_path: Path) -> None:
         sac(compile=False).learn(60, CallbackList([at(30, broken), Stops()]), checkpoint=tmp_path, checkpoint_freq=20)
 
 
-@pytest.mark.parametrize("cls", [SubprocVecEnv, SupervisedSubprocVecEnv])
-@pytest.mark.parametrize("family", ["SAC", "PPO"])
+@pytest.mark.parametrize(
+    ("family", "cls"),
+    [
+        ("SAC", SubprocVecEnv), ("PPO", SupervisedSubprocVecEnv),
+        pytest.param("SAC", SupervisedSubprocVecEnv, marks=pytest.mark.slow),
+        pytest.param("PPO", SubprocVecEnv, marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
 def test_a_dead_worker_leaves_the_last_checkpoint(family: str, cls: Any, tmp_path: Path) -> None:
     def envs() -> Any:
         return cls([lambda: Monitor(Toy()) for _ in range(2)], start_method="fork")

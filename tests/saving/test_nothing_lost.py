@@ -814,7 +814,12 @@ CHECKPOINTED: dict[str, Callable[[], dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize(
-    ("make", "kind"), [*((sac, kind) for kind in CHECKPOINTED), (tiny, "closure"), (tiny, "local class")]
+    ("make", "kind"),
+    [
+        pytest.param(sac, kind, marks=[pytest.mark.slow] * (kind not in ("closure", "partial", "local class")))
+        for kind in CHECKPOINTED
+    ]
+    + [(tiny, "closure"), pytest.param(tiny, "local class", marks=pytest.mark.slow)],
 )
 def test_a_run_with_what_the_program_passes_anew_goes_on_bit_by_bit(make: Any, kind: str, tmp_path: Path) -> None:
     whole = make(**CHECKPOINTED[kind]()).learn(96)

@@ -15,7 +15,8 @@ pytest.importorskip("rl_zoo3")
 from sb3_sample import cli, study
 from sb3_sample.saving.locks import take
 from sb3_sample.study import cluster
-from sb3_sample.study.plan import Plan, Run, read_plan
+from sb3_sample.study.plan import Plan, Run
+from sb3_sample.study.plan_file import read_plan
 from sb3_sample.study.runs import StudyFolder
 from sb3_sample.study.schedule import _batches
 from sb3_sample.study.worker import attempt_all

@@ -12,8 +12,9 @@ pytest.importorskip("rl_zoo3")
 
 from sb3_sample import cli, study
 from sb3_sample.envs import suites
-from sb3_sample.study import Plan, PlanError, Run, read_plan
+from sb3_sample.study import Plan, PlanError, Run, read_plan, trial_agents
 from sb3_sample.study.runs import StudyError, StudyFolder
+from sb3_sample.study.trial_agents import check_actions
 from tests.study.made_up import write_run
 
 ROOT = Path(__file__).parents[2]
@@ -386,3 +387,44 @@ def test_a_run_that_was_taken_out_of_the_plan_is_not_forgotten(tmp_path: Path) -
     shutil.rmtree(folder.place(first))
     folder.enter(Plan("s", (changed, other)))
     assert folder.runs() == [changed, other]
+
+
+@pytest.mark.parametrize(
+    ("agent", "task", "words"),
+    [
+        ("algo: sac_sample", "CartPole-v1", r"env must have a bounded Box action space, not Discrete\(2\)"),
+        ("algo: dac, policy: CnnPolicy, augmentation: shift", "CartPole-v1", "bounded Box action space"),
+        ("algo: bro, policy: MultiInputPolicy", "CartPole-v1", "bounded Box"),
+        ("algo: srspr", "Pendulum-v1", "Discrete"),
+        ("algo: srspr", "dmc/cheetah-run-v0", "Discrete"),
+    ],
+)
+def test_an_agent_that_cannot_act_in_a_task_is_refused_before_anything_runs(
+    plan_of, tmp_path: Path, agent: str, task: str, words: str
+) -> None:
+    tasks = f"[dmc/cheetah-run-v0, {task}]" if task == "CartPole-v1" else f"[{task}]"
+    plan_of(f"agents: {{A: {{{agent}}}}}\ntasks: {tasks}\nseeds: 1\nsteps: 30_000\n")
+    with pytest.raises(PlanError, match=f"agent 'A' cannot act in task '{task}': .*{words}"):
+        study.run(tmp_path / "some.yml", tmp_path / "runs")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_an_agent_that_can_act_in_a_task_is_not_made_again(plan_of, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = plan_of(
+        "agents: {A: {algo: mbma_ppo}, B: {algo: sac_sample}}\ntasks: [Pendulum-v1, dmc/cheetah-run-v0]\nseeds: 2\n"
+        "steps: 30_000\n"
+    )
+    monkeypatch.setattr(trial_agents, "make", lambda *_: pytest.fail("made"))
+    check_actions(plan)
+
+
+def test_discrete_actions_of_an_agent_that_takes_them(plan_of) -> None:
+    check_actions(plan_of("agents: {A: {algo: mbma_ppo}}\ntasks: [CartPole-v1]\nseeds: 1\nsteps: 30_000\n"))
+
+
+def test_a_task_that_cannot_be_made_is_left_to_its_runs(plan_of) -> None:
+    plan = plan_of(
+        "agents: {A: {algo: sac_sample}}\ntasks: [CartPole-v1]\nseeds: 1\nsteps: 30_000\nenv_kwargs: {colour: red}\n"
+    )
+    with pytest.warns(UserWarning, match="CartPole-v1 cannot be made here, so that .* not judged .*colour"):
+        check_actions(plan)

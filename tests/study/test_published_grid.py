@@ -45,8 +45,10 @@ def published(heading: str) -> dict[tuple[str, str], list[float]]:
     ("group", "heading", "unit", "digit"),
     [
         ("dmc", "15 DeepMind Control tasks (return, 0 to 1,000): IQM", 1_000, 1.0),
-        ("metaworld", "15 Meta-World v2 tasks (success rate in percent): IQM", 100, 0.1),
-        ("myosuite", "10 MyoSuite tasks (success rate in percent): IQM", 100, 0.1),
+        pytest.param(
+            "metaworld", "15 Meta-World v2 tasks (success rate in percent): IQM", 100, 0.1, marks=pytest.mark.slow
+        ),
+        pytest.param("myosuite", "10 MyoSuite tasks (success rate in percent): IQM", 100, 0.1, marks=pytest.mark.slow),
     ],
 )
 def test_the_grid_of_bro(grid: pd.DataFrame, group: str, heading: str, unit: float, digit: float) -> None:

@@ -151,6 +151,7 @@ def held_out(found: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+@pytest.mark.slow
 def test_the_two_largest_replay_ratios_are_predicted(found: pd.DataFrame) -> None:
     errors = held_out(found)
     assert len(errors) == 100

@@ -86,8 +86,10 @@ def test_a_dmc_task_with_arguments_and_a_longer_trajectory(
     assert "delta = 0.333" in out
 
 
-@pytest.mark.parametrize("safe", [False, True])
-@pytest.mark.parametrize("normalized", [False, True])
+@pytest.mark.parametrize(
+    ("normalized", "safe"),
+    [(True, True), (False, False), *(pytest.param(a, not a, marks=pytest.mark.slow) for a in (False, True))],
+)
 def test_a_saved_model(normalized: bool, safe: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     venv: Any = DummyVecEnv([lambda: gym.make("Pendulum-v1")])
     arguments = ["--model", str(tmp_path / "model.zip"), "-o", str(tmp_path / "picture.png")]

@@ -52,8 +52,8 @@ def exact(limit: int | None = None, bandit: bool = False, baseline: bool = True)
     ("kwargs", "of_exact"),
     [
         ({}, {}),
-        ({"baseline": False}, {"baseline": False}),
-        ({"n_actions": 3, "n_returns": 3}, {}),
+        pytest.param({"baseline": False}, {"baseline": False}, marks=pytest.mark.slow),
+        pytest.param({"n_actions": 3, "n_returns": 3}, {}, marks=pytest.mark.slow),
         ({"limit": 4}, {"limit": 4}),
         ({"bandit": True}, {"bandit": True}),
     ],

@@ -14,7 +14,8 @@ from sb3_sample.run_logs import EVALUATIONS
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.study import table as tables
 from sb3_sample.study.aggregate import named_apart
-from sb3_sample.study.plan import Run, read_plan
+from sb3_sample.study.plan import Run
+from sb3_sample.study.plan_file import read_plan
 from sb3_sample.study.reporting.pieces import counted
 from sb3_sample.study.runs import LIST, PLAN, checkpointed
 from sb3_sample.study.states import Status, status

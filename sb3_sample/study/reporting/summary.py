@@ -70,9 +70,14 @@ def _result(gathered: Gathered, facts: Facts) -> list[str]:
         chance = Interval(best["probability"], best["low"], best["high"])
         favoured = best["x"] if chance.value > 0.5 else best["y"]
         verdict = _verdict(
-            cut(best["x"]), cut(best["y"]), chance, best["p"], 1 - facts.confidence, is_whole=favoured not in lost
+            cut(best["x"]),
+            cut(best["y"]),
+            chance,
+            best["p"],
+            1 - facts.confidence,
+            is_whole=not any(favoured in counts for counts in lost.values()),
         )
-    verdict += [sentence for agent in rows["agent"] for sentence in lost.get(agent, [])]
+    verdict += _lost_text(lost, list(rows["agent"]))
     if (rows["runs"] == rows["tasks"]).all():
         verdict.append("There are no intervals, since no task has a second run: nothing is certain here.")
     elif single := [agent for agent, value in found if math.isnan(value.low)]:
@@ -80,10 +85,10 @@ def _result(gathered: Gathered, facts: Facts) -> list[str]:
     return [*verdict, words]
 
 
-def _lost(gathered: Gathered, facts: Facts) -> dict[str, list[str]]:
+def _lost(gathered: Gathered, facts: Facts) -> dict[str, Counter[str]]:
     """
-    Sentences by agent on its runs that have failed, or may have, and are in no average: without its worst runs an agent
-    looks better than it is.
+    Numbers by agent of its runs that have failed, or may have (planned, but not here), and are in no average: without
+    its worst runs an agent looks better than it is.
     """
     ends = gathered.evaluated.groupby(["agent", "task", "seed"])["step"].max()
     heads = [
@@ -109,17 +114,25 @@ def _lost(gathered: Gathered, facts: Facts) -> dict[str, list[str]]:
         for state, label in zip(gathered.states, gathered.labels, strict=True)
         for each in state.of(FAILED)
     ]
-    found: dict[str, list[str]] = {}
-    for agent, n in counts(failed).items():
-        found.setdefault(agent, []).append(
-            f"{counted(n, 'failed run')} of {cut(agent)} {'is' if n == 1 else 'are'} not counted: the comparison "
-            "favours it."
-        )
-    for agent, n in counts([(run.agent, run) for run in missing_runs(gathered)]).items():
-        found.setdefault(agent, []).append(
-            f"{counted(n, 'planned run')} of {cut(agent)} {'is' if n == 1 else 'are'} not here: if failed, the "
-            "comparison favours it."
-        )
+    return {"failed": counts(failed), "planned": counts([(run.agent, run) for run in missing_runs(gathered)])}
+
+
+def _lost_text(lost: Mapping[str, Counter[str]], agents: Sequence[str]) -> list[str]:
+    """Sentences on runs that are in no average, one for all agents that lack as many."""
+    found = []
+    for kind, counts in lost.items():
+        together: dict[int, list[str]] = {}
+        for agent in agents:
+            if n := counts[agent]:
+                together.setdefault(n, []).append(agent)
+        for n, those in together.items():
+            runs, one = counted(n, f"{kind} run"), n == 1 and len(those) == 1
+            whose = cut(those[0]) if len(those) == 1 else f"each of {_listed(those)}"
+            if kind == "failed":
+                what = f"{'is' if one else 'are'} not counted:"
+            else:
+                what = f"{'is' if one else 'are'} not here: if failed,"
+            found.append(f"{runs} of {whose} {what} the comparison favours {'it' if len(those) == 1 else 'them'}.")
     return found
 
 

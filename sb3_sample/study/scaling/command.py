@@ -10,7 +10,7 @@ import pandas as pd
 
 from sb3_sample.study import table as tables
 from sb3_sample.study.analysis_command import add_scores, add_sources, refusing
-from sb3_sample.study.plan import read_plan
+from sb3_sample.study.plan_file import read_plan
 from sb3_sample.study.scaling import figures
 from sb3_sample.study.scaling.budget import DELTA
 from sb3_sample.study.scaling.files import read_laws, write_laws
