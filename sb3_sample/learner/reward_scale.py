@@ -240,7 +240,7 @@ class TaskScale(RewardScale):
         # Rewards of each environment's episode so far, and the tasks that their observations told.
         self._episodes: list[list[float]] = []
         self._tasks: list[int] = []
-        self._is_looked_at = False
+        self._has_looked = False
 
     def on_observations(self, learner: Learning, observations: Any) -> None:
         told = observations.get("task") if isinstance(observations, dict) else None
@@ -273,13 +273,14 @@ class TaskScale(RewardScale):
         self._episodes = []
 
     def before_updates(self, learner: Learning) -> None:
-        if not self._is_looked_at:  # once: on a GPU the look waits for the device
-            self._is_looked_at = True
+        if not self._has_looked:  # once: on a GPU the look waits for the device
+            self._has_looked = True
             if n_without := int(self.largest.isinf().sum()):
-                of_tasks = f" of {n_without} of the {len(self.largest)} tasks" if len(self.largest) > 1 else ""
+                n_tasks = len(self.largest)
+                which = f"in {n_without} of the {n_tasks} tasks; their" if n_tasks > 1 else "and"
                 warn(
-                    f"learning begins before an episode{of_tasks} has ended: with reward_scale='brc' the rewards are 0 "
-                    "until one has. More learning_starts, or shorter episodes (gymnasium.wrappers.TimeLimit), avoid it"
+                    f"learning begins before an episode has ended {which} rewards are 0 with reward_scale='brc' until "
+                    "one has. More learning_starts, or shorter episodes (gymnasium.wrappers.TimeLimit), avoid it"
                 )
         with torch.no_grad():
             alpha = learner.temperature().double()

@@ -19,7 +19,7 @@ from sb3_sample.study.plan import Plan, Run
 from sb3_sample.study.plan_file import read_plan
 from sb3_sample.study.runs import StudyFolder
 from sb3_sample.study.step_times import StepTimes, cache_file, stored
-from sb3_sample.study.trial_agents import check_actions, constructor_arguments
+from sb3_sample.study.trial_agents import constructor_arguments
 from sb3_sample.study.worker import train
 
 #: Seconds for which the step time of an agent on a task is measured.
@@ -118,7 +118,6 @@ def estimate(
     :raises MeasurementFailed: a training that was to be measured has failed
     """
     plan = plan if isinstance(plan, Plan) else read_plan(plan)
-    check_actions(plan)
     place = StudyFolder(Path("runs") / plan.name if folder is None else folder)
     at_once = max(free_cores() // threads, 1) if workers is None else workers
     left = [run for run in plan.runs if not place.outcome(run).done]

@@ -36,7 +36,15 @@ from sb3_sample.study.plan import (
     Run,
     part_of_path,
 )
-from sb3_sample.study.trial_agents import algorithms, constructor_arguments, constructor_value, make, settings_of
+from sb3_sample.study.trial_agents import (
+    action_space,
+    algorithms,
+    constructor_arguments,
+    constructor_value,
+    make,
+    settings_of,
+    why_not_acting,
+)
 
 #: Entries of a plan; those after the first four have defaults.
 ENTRIES = (
@@ -146,6 +154,7 @@ class _Reader:
         measure = self._count(entries["measure"].value, "measure") if "measure" in entries else 0
         env_kwargs = self._env_kwargs(entries, tasks)
         variants = list(self._variants(agents, grid))
+        self._check_actions(variants, tasks, env_kwargs)
         if measure:
             self._check_measured(entries["measure"].value, agents)
         runs = tuple(
@@ -364,16 +373,28 @@ class _Reader:
                 yield agent, arguments, point
 
     def _check_made(self, agent: _Agent, arguments: dict[str, Any], point: dict[str, Any]) -> None:
-        if arguments.get("policy", "MlpPolicy") != "MlpPolicy":
-            return  # which observations it is for is the task's to say
-        if "prior_data" in agent.data:
-            # They are read when a run begins; without them their share means nothing.
-            arguments = {name: value for name, value in arguments.items() if name != "prior_share"}
         try:
-            make(agent.algo, arguments)
+            make(agent.algo, _without_data(agent, arguments))
         except (ValueError, TypeError, AssertionError) as error:
             where = f" with {', '.join(f'{k}={v!r}' for k, v in point.items())} of grid" if point else ""
             raise self._fail(agent.node, f"agent {agent.name!r}{where} cannot be made: {error}") from error
+
+    def _check_actions(
+        self,
+        variants: list[tuple[_Agent, dict[str, Any], dict[str, Any]]],
+        tasks: list[str],
+        env_kwargs: dict[str, Any],
+    ) -> None:
+        """Whether each agent takes the actions of its tasks."""
+        of_tasks = {task: action_space(task, env_kwargs) for task in tasks}
+        for agent, arguments, _ in variants:
+            tried = set()
+            for task, actions in of_tasks.items():
+                if actions is None or repr(actions) in tried or not _has_data_on(agent.data, task):
+                    continue
+                tried.add(repr(actions))
+                if why := why_not_acting(agent.algo, _without_data(agent, arguments), actions):
+                    raise self._fail(agent.node, f"agent {agent.name!r} cannot act in task {task!r}: {why}")
 
     def _check_measured(self, node: yaml.Node, agents: list[_Agent]) -> None:
         """The noise scale is of the critics of the off-policy family."""
@@ -499,6 +520,11 @@ class _Reader:
                 ) from error
             names.append(name)
         return tuple(names)
+
+
+def _without_data(agent: _Agent, arguments: dict[str, Any]) -> dict[str, Any]:
+    """Arguments less the share of prior data, which are read when a run begins: without them it means nothing."""
+    return {name: value for name, value in arguments.items() if name != "prior_share" or "prior_data" not in agent.data}
 
 
 def _has_data_on(data: Mapping[str, Any], task: str) -> bool:

@@ -28,7 +28,6 @@ from sb3_sample.study.plan import Plan, Run
 from sb3_sample.study.plan_file import read_plan
 from sb3_sample.study.runs import Outcome, StudyFolder, checkpointed
 from sb3_sample.study.states import DONE, FAILED, RUNNING, WAITING, RunStatus, Status
-from sb3_sample.study.trial_agents import check_actions
 
 #: Command of a process that makes runs, before the study's folder.
 WORKER = (sys.executable, "-c", "from sb3_sample.study.worker import serve; serve()")
@@ -99,8 +98,6 @@ def run(
         raise ValueError(f"gpus is for runs in a Ray cluster: leave it out, or give ray, not gpus={gpus!r} alone")
     if not isinstance(plan, Plan):
         plan = read_plan(plan)
-    if tuple(worker) == WORKER:  # else agents are another's to make
-        check_actions(plan)
     place = StudyFolder(Path("runs") / plan.name if folder is None else folder)
     place.enter(plan)
     crew: Crew

@@ -10,7 +10,6 @@ import yaml
 from gymnasium import spaces
 
 from sb3_sample.envs.no_environment import NoEnvironment
-from sb3_sample.study.plan import Plan, PlanError, Run
 from sb3_sample.warn import warn
 
 #: Arguments of the constructors that are the run's, not the agent's.
@@ -53,7 +52,7 @@ def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | Non
     together.
 
     :param algo: its algorithm
-    :param arguments: its arguments; a ``policy`` decides what the task's observations are
+    :param arguments: its arguments; the observations of the task are those that ``policy`` is for
     :param actions: action space of the task; None: one that the algorithm is for
     :raises ValueError: they do not go together, or one is out of range; a ``TypeError`` where they are of another kind
     """
@@ -67,15 +66,20 @@ def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | Non
     settings = ExperimentManager._preprocess_schedules({**settings, **arguments})
     algorithm: Any = algorithms()[algo].algorithm
     policy = settings.setdefault("policy", "MlpPolicy" if "MlpPolicy" in algorithm.policy_aliases else "CnnPolicy")
-    if policy == "MlpPolicy" and actions is None:
-        settings["env"] = "Pendulum-v1"
-    else:
-        settings["env"] = NoEnvironment(
-            _observations(algo, policy), usual_actions(algo) if actions is None else actions
-        )
     if policy == "CnnPolicy" and "buffer_size" in known:
         settings["buffer_size"] = 1_000  # pictures, of which hardly anything is stored here
-    algorithm(**{"device": "cpu", **settings})
+    envs: list[Any] = ["Pendulum-v1", "CartPole-v1"] if policy == "MlpPolicy" and actions is None else [None]
+    errors: list[Exception] = []
+    for env in envs:
+        if env is None:
+            env = NoEnvironment(_observations(algo, policy), usual_actions(algo) if actions is None else actions)
+        try:
+            algorithm(**{"device": "cpu", **settings, "env": env})
+            return
+        except (ValueError, TypeError, AssertionError) as error:
+            errors.append(error)
+    # All actions of a discrete space, say, are only there where actions are discrete.
+    raise errors[0]
 
 
 def usual_actions(algo: str) -> "spaces.Space[Any]":
@@ -99,56 +103,52 @@ def _observations(algo: str, policy: str) -> "spaces.Space[Any]":
     return numbers if policy == "MlpPolicy" else spaces.Dict({"observation": numbers})
 
 
-def check_actions(plan: Plan) -> None:
+def action_space(task: str, env_kwargs: dict[str, Any]) -> "spaces.Space[Any] | None":
     """
-    Check that the agents of a plan can act in its tasks. An environment that cannot be made here, or that the settings
-    wrap, is left to its runs, and so is an agent that cannot be made on a small task of the kind that it is for.
+    Look up the action space of a task, which is made for that, unless it is of this package: bounded numbers.
 
-    :param plan: the plan
-    :raises PlanError: one cannot, the message names agent, task and reason; or its algorithm is none
+    :param task: id of the environment, which is registered
+    :param env_kwargs: its arguments
+    :return: the space; None, with a warning, if the environment cannot be made here
     """
-    spaces_of: dict[str, spaces.Space[Any] | None] = {}
-    tried: set[tuple[str, str]] = set()
-    for run in plan.runs:
-        if run.algo not in algorithms():
-            raise PlanError(f"algo of agent {run.agent!r} must be one of {', '.join(algorithms())}, not {run.algo!r}")
-        if run.task not in spaces_of:
-            spaces_of[run.task] = _action_space(run)
-        space, usual = spaces_of[run.task], usual_actions(run.algo)
-        if space is None or (run.variant, repr(space)) in tried or _is_wrapped(run):
-            continue
-        tried.add((run.variant, repr(space)))
-        if type(space) is type(usual) and (not isinstance(space, spaces.Box) or space.is_bounded()):
-            continue
-        # Prior data are read when a run begins; without them their share means nothing.
-        arguments = {name: value for name, value in run.arguments.items() if name != "prior_share"}
-        if _why_not_made(run.algo, arguments, usual) is None and (why := _why_not_made(run.algo, arguments, space)):
-            raise PlanError(f"agent {run.agent!r} cannot act in task {run.task!r}: {why}")
-
-
-def _is_wrapped(run: Run) -> bool:
-    """Whether the settings of the run's task put a wrapper around it, which may change its actions."""
-    return "env_wrapper" in (settings_of(run.algo).get(run.task) or {})
-
-
-def _action_space(run: Run) -> "spaces.Space[Any] | None":
-    """Action space of a run's task; None if that cannot be made. Those of this package are of bounded numbers."""
+    if str(gym.spec(task).entry_point).startswith("sb3_sample.envs."):
+        return spaces.Box(-1, 1, (1,), np.float32)
     try:
-        if str(gym.spec(run.task).entry_point).startswith("sb3_sample.envs."):
-            return spaces.Box(-1, 1, (1,), np.float32)
-        with contextlib.closing(gym.make(run.task, **run.env_kwargs)) as env:
-            return env.action_space
+        env = gym.make(task, **env_kwargs)
     except Exception as error:  # its own code; the run that meets it again says so
-        warn(f"{run.task} cannot be made here, so that its actions are not judged before the runs: {error}")
+        warn(f"{task} cannot be made here, so that nothing is known of its actions before the runs: {error}")
         return None
+    with contextlib.suppress(Exception):
+        env.close()
+    return env.action_space
 
 
-def _why_not_made(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any]") -> str | None:
+def why_not_acting(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any]") -> str | None:
+    """
+    Find why an agent does not take an action space. One that resets its environment when it is made (``RewoundPPO``)
+    cannot be judged so, nor can one that cannot be made on the space that its algorithm is for.
+
+    :param algo: its algorithm
+    :param arguments: its arguments
+    :param actions: action space of the task
+    :return: the reason; None if it takes them or cannot be judged
+    """
+    usual = usual_actions(algo)
+    if isinstance(actions, type(usual)) and _is_plain(actions):
+        return None
     try:
         make(algo, arguments, actions)
     except (ValueError, TypeError, AssertionError) as error:
-        return str(error)
+        with contextlib.suppress(Exception):
+            make(algo, arguments, usual)
+            return str(error)
     return None
+
+
+def _is_plain(actions: "spaces.Space[Any]") -> bool:
+    if isinstance(actions, spaces.Box):
+        return actions.is_bounded() and bool((actions.low < actions.high).all())
+    return bool(getattr(actions, "start", 0) == 0)
 
 
 @functools.cache

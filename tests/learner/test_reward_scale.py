@@ -119,14 +119,14 @@ def test_brc_by_hand() -> None:
 
 
 def test_brc_before_an_episode_is_over() -> None:
-    with pytest.warns(UserWarning, match="learning begins before an episode has ended: .* the rewards are 0 until"):
+    with pytest.warns(UserWarning, match="before an episode has ended and rewards are 0 with reward_scale='brc' until"):
         scale, of = told("brc", [1.0, 2.0], [0, 0])
     assert scale.divisor(None).item() == math.inf
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         scale.before_updates(of)
         told("brc", [1.0, 2.0], [0, 1])
-    with pytest.warns(UserWarning, match="before an episode of 2 of the 3 tasks has ended"):
+    with pytest.warns(UserWarning, match="before an episode has ended in 2 of the 3 tasks; their rewards are 0"):
         told("brc", [1.0], [1], n_tasks=3)
 
 

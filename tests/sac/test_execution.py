@@ -152,9 +152,9 @@ def updates(model: Any, n: int, seed: int = 0, each: Callable[[int], None] = lam
 
 
 # test_golden.py has the published files' steps compiled, test_drq.py those from pixels, with a tolerance for their
-# convolutions. DAC's, with two actors, is the one that the short tests compile.
+# convolutions. SAC's is the one that the short tests compile.
 @COMPILES
-@pytest.mark.parametrize("maker", sampled((name for name in OFF_POLICY if name not in PIXEL_MAKERS), ()))
+@pytest.mark.parametrize("maker", sampled((name for name in OFF_POLICY if name not in PIXEL_MAKERS), ("SAC",)))
 def test_compiled_is_eager(maker: str) -> None:
     model, compiled = pair(maker, compile=True)
     n = FEW_STEPS.get(maker, 50)

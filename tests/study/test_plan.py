@@ -12,9 +12,8 @@ pytest.importorskip("rl_zoo3")
 
 from sb3_sample import cli, study
 from sb3_sample.envs import suites
-from sb3_sample.study import Plan, PlanError, Run, read_plan, trial_agents
+from sb3_sample.study import Plan, PlanError, Run, plan_file, read_plan, trial_agents
 from sb3_sample.study.runs import StudyError, StudyFolder
-from sb3_sample.study.trial_agents import check_actions
 from tests.study.made_up import write_run
 
 ROOT = Path(__file__).parents[2]
@@ -399,32 +398,45 @@ def test_a_run_that_was_taken_out_of_the_plan_is_not_forgotten(tmp_path: Path) -
         ("algo: srspr", "dmc/cheetah-run-v0", "Discrete"),
     ],
 )
-def test_an_agent_that_cannot_act_in_a_task_is_refused_before_anything_runs(
-    plan_of, tmp_path: Path, agent: str, task: str, words: str
-) -> None:
+def test_an_agent_that_cannot_act_in_a_task_is_refused(plan_of, agent: str, task: str, words: str) -> None:
     tasks = f"[dmc/cheetah-run-v0, {task}]" if task == "CartPole-v1" else f"[{task}]"
-    plan_of(f"agents: {{A: {{{agent}}}}}\ntasks: {tasks}\nseeds: 1\nsteps: 30_000\n")
-    with pytest.raises(PlanError, match=f"agent 'A' cannot act in task '{task}': .*{words}"):
-        study.run(tmp_path / "some.yml", tmp_path / "runs")
-    assert not (tmp_path / "runs").exists()
+    with pytest.raises(PlanError, match=rf"some.yml, line 2: agent 'A' cannot act in task '{task}': .*{words}"):
+        plan_of(f"agents:\n  A: {{{agent}}}\ntasks: {tasks}\nseeds: 1\nsteps: 30_000\n")
+
+
+def test_the_actions_are_those_of_the_task_with_its_arguments(plan_of) -> None:
+    text = "agents: {A: {algo: sac_sample}}\ntasks: [MountainCar-v0]\nseeds: 1\nsteps: 30_000\n"
+    with pytest.raises(PlanError, match="cannot act in task 'MountainCar-v0'"):
+        plan_of(text)
+    plan_of(text.replace("MountainCar-v0", "MountainCarContinuous-v0"))
 
 
 def test_an_agent_that_can_act_in_a_task_is_not_made_again(plan_of, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = plan_of(
+    made = []
+    monkeypatch.setattr(plan_file, "make", lambda *given: made.append(given))
+    monkeypatch.setattr(trial_agents, "make", lambda *_: pytest.fail("made"))
+    plan_of(
         "agents: {A: {algo: mbma_ppo}, B: {algo: sac_sample}}\ntasks: [Pendulum-v1, dmc/cheetah-run-v0]\nseeds: 2\n"
         "steps: 30_000\n"
     )
-    monkeypatch.setattr(trial_agents, "make", lambda *_: pytest.fail("made"))
-    check_actions(plan)
+    assert len(made) == 2
 
 
-def test_discrete_actions_of_an_agent_that_takes_them(plan_of) -> None:
-    check_actions(plan_of("agents: {A: {algo: mbma_ppo}}\ntasks: [CartPole-v1]\nseeds: 1\nsteps: 30_000\n"))
+@pytest.mark.parametrize("agent", ["algo: mbma_ppo", "algo: rewound_ppo, sample_actions: all"])
+def test_discrete_actions_of_an_agent_that_takes_them(plan_of, agent: str) -> None:
+    plan = plan_of(f"agents: {{A: {{{agent}}}}}\ntasks: [CartPole-v1]\nseeds: 1\nsteps: 30_000\n")
+    assert len(plan.runs) == 1
 
 
 def test_a_task_that_cannot_be_made_is_left_to_its_runs(plan_of) -> None:
-    plan = plan_of(
-        "agents: {A: {algo: sac_sample}}\ntasks: [CartPole-v1]\nseeds: 1\nsteps: 30_000\nenv_kwargs: {colour: red}\n"
-    )
-    with pytest.warns(UserWarning, match="CartPole-v1 cannot be made here, so that .* not judged .*colour"):
-        check_actions(plan)
+    text = "agents: {A: {algo: sac_sample}}\ntasks: [CartPole-v1]\nseeds: 1\nsteps: 30_000\n"
+    with pytest.warns(UserWarning, match="CartPole-v1 cannot be made here, .* its actions .*colour"):
+        assert len(plan_of(f"{text}env_kwargs: {{colour: red}}\n").runs) == 1
+
+
+def test_arguments_of_an_agent_with_another_policy_are_checked(plan_of) -> None:
+    with pytest.raises(PlanError, match="agent 'A' cannot be made: .*model_size"):
+        plan_of(
+            "agents: {A: {algo: bro, policy: MultiInputPolicy, model_size: 0.56M}}\ntasks: [dmc/cheetah-run-v0]\n"
+            "seeds: 1\nsteps: 30_000\n"
+        )

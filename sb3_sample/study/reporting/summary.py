@@ -118,7 +118,7 @@ def _lost(gathered: Gathered, facts: Facts) -> dict[str, Counter[str]]:
 
 
 def _lost_text(lost: Mapping[str, Counter[str]], agents: Sequence[str]) -> list[str]:
-    """Sentences on runs that are in no average, one for all agents that lack as many."""
+    """Sentences on runs that are in no average, one for all agents that lack equally many."""
     found = []
     for kind, counts in lost.items():
         together: dict[int, list[str]] = {}
@@ -126,13 +126,15 @@ def _lost_text(lost: Mapping[str, Counter[str]], agents: Sequence[str]) -> list[
             if n := counts[agent]:
                 together.setdefault(n, []).append(agent)
         for n, those in together.items():
-            runs, one = counted(n, f"{kind} run"), n == 1 and len(those) == 1
-            whose = cut(those[0]) if len(those) == 1 else f"each of {_listed(those)}"
-            if kind == "failed":
-                what = f"{'is' if one else 'are'} not counted:"
+            state = f"{'is' if n == 1 else 'are'} {'not counted' if kind == 'failed' else 'not here'}"
+            favoured = f": {'' if kind == 'failed' else 'if failed, '}the comparison favours "
+            if len(those) == 1:
+                whose, end = cut(those[0]), f"{favoured}it"
+            elif len(those) == len(agents):
+                whose, end = "each agent", ""
             else:
-                what = f"{'is' if one else 'are'} not here: if failed,"
-            found.append(f"{runs} of {whose} {what} the comparison favours {'it' if len(those) == 1 else 'them'}.")
+                whose, end = f"each of {', '.join(map(cut, those))}", f"{favoured}them"
+            found.append(f"{counted(n, f'{kind} run')} of {whose} {state}{end}.")
     return found
 
 
