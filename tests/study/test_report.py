@@ -381,6 +381,8 @@ def test_missing_runs_of_several_agents_are_one_sentence(tmp_path: Path, n_of_c:
     place.enter(Plan("s", tuple(made)))
     for run in made:
         if run.seed < (n_of_c if run.agent == "C" else 3):
+            with place.claim(run):  # type: ignore[union-attr]
+                pass
             write_run(place.place(run), seed=run.seed, values=(100.0 * (run.agent == "A") + run.seed,) * 3)
             place.write_outcome(run, Outcome(True, steps=3_000))
     text = text_of(written(tmp_path / "r.html", place.path, steps=[3_000]))
