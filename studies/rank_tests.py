@@ -2,21 +2,26 @@
 Do two sets of runs differ at a step? The Mann-Whitney test on each task, and all tasks together by Fisher's method.
 
     python studies/published_grid.py bro_grid.npz published.csv --ratios 2 --sizes 0.55M
-    python studies/rank_tests.py docs/evidence/bro_fast_seeds.csv published.csv --step 50k
+    python studies/rank_tests.py docs/evidence/bro_fast_seeds.csv published.csv --step 25k 50k [--markdown PAGE]
 
 Both tables are as ``sb3-sample study table`` writes them, with one agent each. Printed: seeds, means and ranges of
 both, and p of the first table's returns being lower (one-sided) and of the two being unlike (two-sided), exact where no
-returns are equal. Tasks that only one table has are left out, and named.
+returns are equal. Tasks that only one table has are left out, and named. ``--markdown`` puts the same as a table into a
+page, in the place of what is between its lines ``<!-- begin: rank tests -->`` and ``<!-- end: rank tests -->``.
 """
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from scipy import stats
 
 from sb3_sample import study
 from sb3_sample.study.analysis_command import steps_of
+
+#: Lines of a page between which the table stands.
+BEGIN, END = "<!-- begin: rank tests -->", "<!-- end: rank tests -->"
 
 
 def rank_tests(ours: pd.DataFrame, others: pd.DataFrame, step: int, metric: str = "return") -> pd.DataFrame:
@@ -54,24 +59,63 @@ def rank_tests(ours: pd.DataFrame, others: pd.DataFrame, step: int, metric: str 
     return pd.concat([result, pd.DataFrame([{"task": "all", **together}])], ignore_index=True)
 
 
+def _mean_and_range(row: dict[Any, Any], of: str) -> str:
+    return f"{row['mean' + of]:.0f} ({row['low' + of]:.0f} to {row['high' + of]:.0f})"
+
+
+def markdown(found: dict[int, pd.DataFrame]) -> str:
+    """
+    :param found: results of ``rank_tests`` by step
+    :return: a table in Markdown
+    """
+    lines = [
+        "| step | task | seeds | mean (range) | others' seeds | mean (range) | p, two-sided | p, the first is lower |",
+        "| ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    for step, result in found.items():
+        for row in result.to_dict("records"):
+            cells = ["", "", "", ""]
+            if row["task"] != "all":
+                cells = [x for o in ("", "_others") for x in (f"{row['n' + o]:.0f}", _mean_and_range(row, o))]
+            lines.append(f"| {step:,} | {row['task']} | {' | '.join(cells)} | {row['p']:.2f} | {row['p_lower']:.2f} |")
+    return "\n".join(lines)
+
+
+def put(page: Path, text: str) -> None:
+    """
+    :param page: a file with the lines between which the text belongs
+    :param text: what is to stand there
+    :raises ValueError: the file does not have these lines, in this order
+    """
+    before, begin, rest = page.read_text(encoding="utf-8").partition(f"{BEGIN}\n")
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"{page} must have a line {BEGIN} and one {END} after it")
+    page.write_text(f"{before}{begin}{text}\n{end}{after}", encoding="utf-8")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("ours", type=Path)
     parser.add_argument("others", type=Path)
-    parser.add_argument("--step", type=steps_of, required=True)
+    parser.add_argument("--step", type=steps_of, required=True, nargs="+")
     parser.add_argument("--metric", default="return")
+    parser.add_argument("--markdown", type=Path)
     args = parser.parse_args()
     ours, others = study.load(args.ours), study.load(args.others)
-    result = rank_tests(ours, others, args.step, args.metric)
+    found = {step: rank_tests(ours, others, step, args.metric) for step in args.step}
     if missing := sorted(set(ours["task"]) ^ set(others["task"])):
         print("In one table only:", ", ".join(missing))
-    for row in result.to_dict("records"):
-        words = [
-            f"  {row['n' + o]:.0f} seeds, mean {row['mean' + o]:.0f} ({row['low' + o]:.0f} to {row['high' + o]:.0f});"
-            for o in ("", "_others")
-            if row["task"] != "all"
-        ]
-        print(f"{row['task']}:{''.join(words)}  p {row['p']:.3f}, lower {row['p_lower']:.3f}")
+    for step, result in found.items():
+        for row in result.to_dict("records"):
+            words = [
+                f"  {row['n' + o]:.0f} seeds, mean {_mean_and_range(row, o)};"
+                for o in ("", "_others")
+                if row["task"] != "all"
+            ]
+            print(f"{step:,} steps, {row['task']}:{''.join(words)}  p {row['p']:.3f}, lower {row['p_lower']:.3f}")
+    if args.markdown:
+        put(args.markdown, markdown(found))
 
 
 if __name__ == "__main__":
