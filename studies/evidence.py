@@ -44,7 +44,7 @@ COMPLETE = ".complete"
 #: How often a run is tried that fails.
 ATTEMPTS = 2
 #: Settings of a run that change no result.
-FREE = {"checkpoint_freq", "gym_packages", "measure"}
+FREE = {"checkpoint_freq", "gym_packages", "measure", "diagnostics"}
 
 
 # ---------------------------------------------------------------- with the standard library: what runs where

@@ -198,7 +198,9 @@ def measure(run: Run, threads: int, device: str) -> Cost:
             arguments["learning_starts"] = WARM_UP
         # As many steps as the run has, since what is compiled depends on them.
         order = {
-            "run": dataclasses.replace(run, arguments=arguments, eval_freq=run.steps, measure=0).as_json(),
+            "run": dataclasses.replace(
+                run, arguments=arguments, eval_freq=run.steps, measure=0, diagnostics=0
+            ).as_json(),
             "options": ["--num-threads", str(threads), "--device", device],
         }
         env = {**os.environ, **threads_of_libraries(threads)}

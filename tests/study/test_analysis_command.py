@@ -178,7 +178,10 @@ def test_scores_of_the_user(run: Run) -> None:
         (["aggregate", "t.csv", "--steps", "1", "--improvement", "--common"], "--common is not of"),
         (["aggregate", "-p", "SAC"], "agents must be of BRO"),
         (["marginalize", "t.csv", "--order", "3"], "order must be"),
-        (["correlate", "t.csv"], "metrics must be of return, not 'diagnostics/overestimation'"),
+        (
+            ["correlate", "t.csv"],
+            "not 'diagnostics/overestimation', which DiagnosticsCallback records: 'diagnostics: 10_000' in a plan",
+        ),
         (["correlate", "t.csv", "--metrics", "return", "--regress", "--by", "x"], "--regress is task by task"),
         (["heatmap", "t.csv", "-x", "size", "-y", "critic"], "arguments must be of those"),
         (["cost", "t.csv"], "'hours' of at least one run"),
