@@ -117,6 +117,15 @@ def test_aggregates(run: Run) -> None:
     assert list(pd.read_csv("t.csv")["step"].unique()) == [100_000, 1_000_000]
 
 
+def test_published_runs_are_not_pooled_with_ones_own_of_the_same_name(run: Run) -> None:
+    mine = made_up([("BRO", {"replay_ratio": 10}, CHEETAH, 0, 25_000, "return", 999.0)])
+    out = run(
+        "aggregate", "t.csv", "--steps", "25k", "--groups", "all", "--reps", "3", "--common", "-p", "BRO", table=mine
+    )
+    assert "| BRO | all | 25,000 | 0.999 |" in out and "| BRO, published | all | 25,000 |" in out
+    assert "| BRO | all | 25,000 |" in run("aggregate", "--steps", "25k", "--groups", "all", "--reps", "3", "-p", "BRO")
+
+
 def test_profiles_and_improvement(run: Run) -> None:
     shared = ("aggregate", "-p", "BRO", "BRO Fast", "--groups", "myosuite", "--reps", "3", "--steps", "200_000")
     assert "| BRO | BRO Fast | myosuite | 200,000 | 0.6" in run(*shared, "--improvement")
