@@ -66,7 +66,7 @@ class Estimate(NamedTuple):
     """
     :param n_runs: runs of the plan
     :param n_done: those of them that are done
-    :param hours: of one core for each of the run's threads, for those that are not
+    :param hours: of one core for each of the run's threads, for what those that are not done have left
     :param workers: runs at once
     :param n_bytes: what their folders will hold
     """
@@ -108,7 +108,8 @@ def estimate(
     Where ``sb3-sample advise`` has kept the times of BRO's gradient steps, these are taken and not measured again.
 
     :param plan: a plan or its file
-    :param folder: the study's, of which what is done is not counted; ``runs/<name of the plan>`` if None
+    :param folder: the study's, of which what is done is not counted, nor are the steps that runs under way have made;
+        ``runs/<name of the plan>`` if None
     :param workers: runs at once; as many as there are free cores for, if None
     :param threads: of each run
     :param device: of each run
@@ -146,7 +147,9 @@ def estimate(
                     cost = cost._replace(seconds=cost.seconds + learning)
                 costs[pair] = cost
         first, agent, task = (costs[pair] for pair in pairs)
-        seconds += run.steps * agent.seconds * task.seconds / first.seconds
+        # Of a run that was begun, what is left of it.
+        n_left = run.steps - min(place.progress(run).steps, run.steps)
+        seconds += n_left * agent.seconds * task.seconds / first.seconds
         # Networks are the agent's, observations the task's.
         n_bytes += agent.bytes_of_run * task.bytes_of_run / first.bytes_of_run
         n_bytes += min(run.steps, _buffer_size(run)) * (task.bytes_of_step if agent.bytes_of_step else 0.0)
