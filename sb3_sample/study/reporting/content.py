@@ -43,10 +43,10 @@ from sb3_sample.version import __version__
 UNFOLDED = 12
 #: Letters of an agent's name in a pair.
 PAIR = 12
-#: Circumstances of checkpoints, in the order of the table.
+#: Circumstances of checkpoints and of records beside tables, in the order of the table.
 _MADE_WITH = (
     "sb3_sample", "commit", "torch", "stable_baselines3", "gymnasium", "mujoco", "numpy", "python", "processor",
-    "device", "threads", "torch threads",
+    "device", "threads", "torch threads", "made_by",
 )  # fmt: skip
 _STATISTICS = {"iqm": "IQM", "mean": "mean", "median": "median", "optimality_gap": "optimality gap"}
 
