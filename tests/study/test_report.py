@@ -320,6 +320,7 @@ def test_a_study_says_what_is_done_and_what_has_failed(folder: StudyFolder, tmp_
         page = written(tmp_path / "r.html", folder.path)
     text = text_of(page)
     assert "2 of 6 planned runs are done; 1 running, 1 failed, 2 waiting." in text
+    assert "those of the games of Atari-100k between random play and a human; others as they were given" in text
     by_agent = tables_of(page)["Runs of the study"]
     assert by_agent[0] == ["agent", "done", "running", "failed", "waiting", "planned"]
     assert by_agent[1] == ["A", "2", "0", "0", "1", "3"] and by_agent[2][1:] == ["0", "1", "1", "1", "3"]

@@ -200,7 +200,8 @@ def _normalised(facts: Facts) -> str:
     which = "all of them" if n == of else f"of {of}: those that every agent has reached {facts.step:,} steps on"
     return (
         "Scores: DeepMind Control's returns over 1,000; success rates as they are; MuJoCo's returns over a "
-        "reference's; others as they were given. Nothing is clipped. Averages are over "
+        "reference's; those of the games of Atari-100k between random play and a human; others as they were given. "
+        "Nothing is clipped. Averages are over "
         f"{counted(n, 'task')} ({which})."
     )
 
