@@ -252,7 +252,7 @@ MANY = {
 }  # fmt: skip
 #: Runs of the papers' studies: agents, tasks and seeds as the papers state them.
 RUNS = {
-    "bro": 5 * 40 * 10,
+    "bro": 6 * 40 * 10,
     "bro_offline_adroit": 6 * 9 * 10,
     "bro_offline_antmaze": 6 * 6 * 10,
     "bro_scaling": 5 * 5 * 40 * 10,
