@@ -69,6 +69,7 @@ class Estimate(NamedTuple):
     :param hours: of one core for each of the run's threads, for what those that are not done have left
     :param workers: runs at once
     :param n_bytes: what their folders will hold
+    :param n_episodes: of their evaluations, which the hours do not count
     """
 
     n_runs: int
@@ -76,12 +77,13 @@ class Estimate(NamedTuple):
     hours: float
     workers: int
     n_bytes: float
+    n_episodes: int
 
     def __str__(self) -> str:
         return (
             f"{self.n_runs} runs, {self.n_done} of them done. The others take {self.hours:.2f} hours, "
-            f"{self.hours / self.workers:.2f} with {self.workers} at once (evaluations apart), and "
-            f"{_size(self.n_bytes)} of disk"
+            f"{self.hours / self.workers:.2f} with {self.workers} at once (evaluations of "
+            f"{self.n_episodes:,} episodes apart), and {_size(self.n_bytes)} of disk"
         )
 
 
@@ -126,6 +128,7 @@ def estimate(
     times = stored(threads, device)
     costs: dict[tuple[str, str], Cost] = {}
     seconds = n_bytes = 0.0
+    n_episodes = 0
     of_plan = {(run.variant, run.task): run for run in plan.runs}
     for run in left:
         base = left[0]
@@ -148,14 +151,14 @@ def estimate(
                 costs[pair] = cost
         first, agent, task = (costs[pair] for pair in pairs)
         # Of a run that was begun, what is left of it.
-        n_left = run.steps - min(place.progress(run).steps, run.steps)
-        seconds += n_left * agent.seconds * task.seconds / first.seconds
+        made = min(place.progress(run).steps, run.steps)
+        seconds += (run.steps - made) * agent.seconds * task.seconds / first.seconds
+        n_episodes += (run.steps // run.eval_freq - made // run.eval_freq) * run.eval_episodes
         # Networks are the agent's, observations the task's.
         n_bytes += agent.bytes_of_run * task.bytes_of_run / first.bytes_of_run
         n_bytes += min(run.steps, _buffer_size(run)) * (task.bytes_of_step if agent.bytes_of_step else 0.0)
-    return Estimate(
-        len(plan.runs), len(plan.runs) - len(left), seconds / 3600, min(at_once, max(len(left), 1)), n_bytes
-    )
+    n_done, at_once = len(plan.runs) - len(left), min(at_once, max(len(left), 1))
+    return Estimate(len(plan.runs), n_done, seconds / 3600, at_once, n_bytes, n_episodes)
 
 
 def seconds_of_learning(run: Run, times: StepTimes) -> float | None:
