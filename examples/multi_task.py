@@ -1,8 +1,9 @@
 """
-Train BRC on several tasks at once, MT10 of Meta-World by default, and evaluate each task. Interrupted and started
-again, it goes on where it was.
+Train BRC on several tasks at once, MT10 of Meta-World by default, and evaluate each task; or BRO Fast or SAC with all
+widths doubled, as in BRO's figure 19. Interrupted and started again, it goes on where it was.
 
     python examples/multi_task.py --steps 10000 --seed 0
+    python examples/multi_task.py --steps 10000 --seed 0 --agent bro_fast --folder runs/multi_task_bro_fast
 
 With critics 512 wide, the default, MT10 takes two gradient steps of 28 GFLOP for each step of its ten tasks: hours on a
 core of a CPU. The published width is 4096.
@@ -10,8 +11,9 @@ core of a CPU. The published width is 4096.
 
 import argparse
 from pathlib import Path
+from typing import Any
 
-from sb3_sample import BRC, MultiTaskEvalCallback, multi_task_env
+from sb3_sample import BRC, SAC, BROFast, MultiTaskEvalCallback, multi_task_env
 
 
 def main(given: list[str] | None = None) -> None:
@@ -24,12 +26,15 @@ def main(given: list[str] | None = None) -> None:
     parser.add_argument("--random-steps", type=int, default=500, help="of each task, before the first gradient step")
     parser.add_argument("--eval-every", type=int, default=5_000, help="steps of each task between two evaluations")
     parser.add_argument("--episodes", type=int, default=10, help="of each task in an evaluation")
-    parser.add_argument("--critic-width", type=int, default=512)
-    parser.add_argument("--batch-size", type=int, default=1024)
+    parser.add_argument("--agent", choices=["brc", "bro_fast", "sac"], default="brc")
+    parser.add_argument("--critic-width", type=int, help="of brc (default: 512)")
+    parser.add_argument("--batch-size", type=int, help="default: 1024 for brc, 128 for bro_fast, 256 for sac")
     parser.add_argument("--max-episode-steps", type=int, help="time limit; that of the environments if left out")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folder", default="runs/multi_task", help="where results go")
     args = parser.parse_args(given)
+    if args.agent != "brc" and args.critic_width is not None:
+        parser.error(f"--critic-width is of brc, and --agent is {args.agent}: leave it out")
 
     folder = Path(args.folder) / f"seed_{args.seed}"
     env_kwargs = {} if args.max_episode_steps is None else {"max_episode_steps": args.max_episode_steps}
@@ -40,15 +45,21 @@ def main(given: list[str] | None = None) -> None:
         eval_freq=args.eval_every,
         log_path=folder / "tasks",
     )
-    model = BRC(
-        "MultiInputPolicy",
-        env,
-        critic_width=args.critic_width,
-        batch_size=args.batch_size,
-        learning_starts=args.random_steps * env.num_envs,
-        seed=args.seed,
-        verbose=1,
-    )
+    shared: dict[str, Any] = {
+        "learning_starts": args.random_steps * env.num_envs,
+        "seed": args.seed,
+        "verbose": 1,
+    }
+    if args.batch_size is not None:
+        shared["batch_size"] = args.batch_size
+    model: SAC
+    if args.agent == "brc":
+        shared = {"batch_size": 1024, **shared}
+        model = BRC("MultiInputPolicy", env, critic_width=args.critic_width or 512, **shared)
+    elif args.agent == "bro_fast":
+        model = BROFast("MultiInputPolicy", env, multitask=True, **shared)
+    else:
+        model = SAC("MultiInputPolicy", env, multitask=True, replay_ratio=2, **shared)
     model.learn(
         args.steps * env.num_envs,
         callback=evaluation,

@@ -8,7 +8,7 @@ A run that is begun is made from the last commit, in a git worktree and an envir
 of the checkout; one that was interrupted goes on under the commit that it began with. All this lies in
 ``~/.cache/sb3_sample/evidence``, which may be removed: what has not ended then begins anew. What has ended is written
 to ``docs/evidence`` of the checkout: evaluations as a table (``<plan>.csv``, as ``sb3-sample study table`` has it), and
-settings, commit and machine of each run (``<plan>.json``).
+settings, commit, versions and machine of each run (``<plan>.json``).
 
 A program of a plan's name, ``<plan>.py`` beside it, makes what its runs read, such as data sets; it is called before
 each of them, and makes what is not there.
@@ -44,7 +44,7 @@ COMPLETE = ".complete"
 #: How often a run is tried that fails.
 ATTEMPTS = 2
 #: Settings of a run that change no result.
-FREE = {"checkpoint_freq", "gym_packages", "measure"}
+FREE = {"checkpoint_freq", "gym_packages", "measure", "diagnostics"}
 
 
 # ---------------------------------------------------------------- with the standard library: what runs where
@@ -388,6 +388,7 @@ def collect(root: Path, results: Path) -> None:
     from sb3_sample import study
     from sb3_sample.saving.temporary import becoming
     from sb3_sample.saving.training_state import processor
+    from sb3_sample.study.reporting.reading import made_with
     from sb3_sample.study.table import RUN
 
     for name in dict.fromkeys(name for name, _ in queue()):
@@ -403,6 +404,7 @@ def collect(root: Path, results: Path) -> None:
             records.append(
                 {
                     "run": run.as_json(),
+                    **made_with(here.folder.place(run)),
                     "commit": here.commit,
                     "python": platform.python_version(),
                     "processor": processor(),

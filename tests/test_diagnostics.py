@@ -693,6 +693,10 @@ def test_arguments(kwargs: dict[str, Any], message: str) -> None:
 def test_environments_that_do_not_fit() -> None:
     with pytest.raises(TypeError, match="eval_env .* 'Pendulum-v1'"):
         DiagnosticsCallback("Pendulum-v1")  # type: ignore[arg-type]
+    with pytest.raises(
+        ValueError, match="eval_env must be an environment, not None: only sb3-sample train and studies"
+    ):
+        ready(sac(), None)
     with pytest.raises(ValueError, match="eval_env must hold one environment, not 2"):
         DiagnosticsCallback(vec(2))
     with pytest.raises(ValueError, match="eval_env has the observation_space"):

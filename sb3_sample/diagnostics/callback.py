@@ -68,7 +68,8 @@ class DiagnosticsCallback(PeriodicMeasurement):
     Nothing is measured while the algorithm still acts at random (``learning_starts``).
 
     :param eval_env: environment for the rollouts, a single one, not the training environment; its normalisation, if
-        any, has to be as that of the training environment
+        any, has to be as that of the training environment. None, the default, is for ``sb3-sample train`` and plans of
+        studies, which make one as for their evaluations
     :param every: environment steps between two measurements, taken at the first step at or after each multiple
     :param n_start_states: rollouts a measurement, each with one start pair (5 in VPL's paper)
     :param rollout_length: most steps of a rollout, over several episodes if they are short. Choose it well above the
@@ -81,7 +82,8 @@ class DiagnosticsCallback(PeriodicMeasurement):
     :param seed: of the rollouts' noise and of ``eval_env``; the model's if None
     :param verbose: 0 nothing, 1 a line for each measurement
     :raises TypeError: if ``eval_env`` is no environment, or, when training starts, the model no ``SAC`` of this package
-    :raises ValueError: if an argument is out of range, or, when training starts, ``eval_env`` does not fit the model
+    :raises ValueError: if an argument is out of range, or, when training starts, ``eval_env`` is missing or does not
+        fit the model
     """
 
     TITLE = "Diagnostics"
@@ -89,7 +91,7 @@ class DiagnosticsCallback(PeriodicMeasurement):
 
     def __init__(
         self,
-        eval_env: GymEnv,
+        eval_env: GymEnv | None = None,
         every: int = 10_000,
         n_start_states: int = 5,
         rollout_length: int = 1_000,
@@ -101,7 +103,7 @@ class DiagnosticsCallback(PeriodicMeasurement):
         verbose: int = 0,
     ):
         super().__init__(every, verbose)
-        if not isinstance(eval_env, (gym.Env, VecEnv)):
+        if not isinstance(eval_env, (gym.Env, VecEnv, type(None))):
             raise TypeError(f"eval_env must be a gymnasium.Env or a VecEnv, not {eval_env!r}")
         if isinstance(eval_env, VecEnv) and eval_env.num_envs != 1:
             raise ValueError(f"eval_env must hold one environment, not {eval_env.num_envs}")
@@ -152,6 +154,8 @@ class DiagnosticsCallback(PeriodicMeasurement):
 
     def _checked_env(self) -> VecEnv:
         """The environment of the rollouts, vectorised and below its normalisation."""
+        if self.eval_env is None:
+            raise ValueError("eval_env must be an environment, not None: only sb3-sample train and studies make one")
         if _environments(self.eval_env) & _environments(self.training_env):
             raise ValueError("eval_env is the training environment: its rollouts need an environment of their own")
         env = self.model._wrap_env(self.eval_env, monitor_wrapper=False)

@@ -77,7 +77,10 @@ def final(
     for metric in metrics:
         rows = table[table["metric"] == metric].sort_values("step", kind="stable")
         if not len(rows):
-            raise ValueError(f"metrics must be of {', '.join(sorted(table['metric'].unique()))}, not {metric!r}")
+            how = ""
+            if metric.startswith("diagnostics/"):
+                how = ", which DiagnosticsCallback records: 'diagnostics: 10_000' in a plan, every 10,000 steps"
+            raise ValueError(f"metrics must be of {', '.join(sorted(table['metric'].unique()))}, not {metric!r}{how}")
         found = found.join(_ends(rows, "value", last).rename(metric))
     return found.reset_index()
 

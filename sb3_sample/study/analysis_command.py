@@ -176,7 +176,10 @@ def _read(options: argparse.Namespace, *more: str) -> pd.DataFrame:
     if options.sources:
         parts.append(tables.read(options.sources, (*tables.METRICS, *more)))
     if options.published:
-        parts.append(tables.published_runs(options.published))
+        theirs = tables.published_runs(options.published)
+        if parts:  # of which some may have the same names
+            theirs = theirs.assign(agent=tables.marked_published(theirs["agent"]))
+        parts.append(theirs)
     if curves:
         parts.append(tables.published_curves(curves))
     return pd.concat(parts, ignore_index=True)

@@ -66,9 +66,10 @@ class Estimate(NamedTuple):
     """
     :param n_runs: runs of the plan
     :param n_done: those of them that are done
-    :param hours: of one core for each of the run's threads, for those that are not
+    :param hours: of one core for each of the run's threads, for what those that are not done have left
     :param workers: runs at once
     :param n_bytes: what their folders will hold
+    :param n_episodes: of their evaluations, which the hours do not count
     """
 
     n_runs: int
@@ -76,12 +77,13 @@ class Estimate(NamedTuple):
     hours: float
     workers: int
     n_bytes: float
+    n_episodes: int
 
     def __str__(self) -> str:
         return (
             f"{self.n_runs} runs, {self.n_done} of them done. The others take {self.hours:.2f} hours, "
-            f"{self.hours / self.workers:.2f} with {self.workers} at once (evaluations apart), and "
-            f"{_size(self.n_bytes)} of disk"
+            f"{self.hours / self.workers:.2f} with {self.workers} at once (evaluations of "
+            f"{self.n_episodes:,} episodes apart), and {_size(self.n_bytes)} of disk"
         )
 
 
@@ -108,7 +110,8 @@ def estimate(
     Where ``sb3-sample advise`` has kept the times of BRO's gradient steps, these are taken and not measured again.
 
     :param plan: a plan or its file
-    :param folder: the study's, of which what is done is not counted; ``runs/<name of the plan>`` if None
+    :param folder: the study's, of which what is done is not counted, nor are the steps that runs under way have made;
+        ``runs/<name of the plan>`` if None
     :param workers: runs at once; as many as there are free cores for, if None
     :param threads: of each run
     :param device: of each run
@@ -124,6 +127,7 @@ def estimate(
     times = stored(threads, device)
     costs: dict[tuple[str, str], Cost] = {}
     seconds = n_bytes = 0.0
+    n_episodes = 0
     of_plan = {(run.variant, run.task): run for run in plan.runs}
     for run in left:
         base = left[0]
@@ -145,13 +149,15 @@ def estimate(
                     cost = cost._replace(seconds=cost.seconds + learning)
                 costs[pair] = cost
         first, agent, task = (costs[pair] for pair in pairs)
-        seconds += run.steps * agent.seconds * task.seconds / first.seconds
+        # Of a run that was begun, what is left of it.
+        made = min(place.progress(run).steps, run.steps)
+        seconds += (run.steps - made) * agent.seconds * task.seconds / first.seconds
+        n_episodes += (run.steps // run.eval_freq - made // run.eval_freq) * run.eval_episodes
         # Networks are the agent's, observations the task's.
         n_bytes += agent.bytes_of_run * task.bytes_of_run / first.bytes_of_run
         n_bytes += min(run.steps, _buffer_size(run)) * (task.bytes_of_step if agent.bytes_of_step else 0.0)
-    return Estimate(
-        len(plan.runs), len(plan.runs) - len(left), seconds / 3600, min(at_once, max(len(left), 1)), n_bytes
-    )
+    n_done, at_once = len(plan.runs) - len(left), min(at_once, max(len(left), 1))
+    return Estimate(len(plan.runs), n_done, seconds / 3600, at_once, n_bytes, n_episodes)
 
 
 def seconds_of_learning(run: Run, times: StepTimes) -> float | None:
@@ -197,7 +203,9 @@ def measure(run: Run, threads: int, device: str) -> Cost:
             arguments["learning_starts"] = WARM_UP
         # As many steps as the run has, since what is compiled depends on them.
         order = {
-            "run": dataclasses.replace(run, arguments=arguments, eval_freq=run.steps, measure=0).as_json(),
+            "run": dataclasses.replace(
+                run, arguments=arguments, eval_freq=run.steps, measure=0, diagnostics=0
+            ).as_json(),
             "options": ["--num-threads", str(threads), "--device", device],
         }
         env = {**os.environ, **threads_of_libraries(threads)}

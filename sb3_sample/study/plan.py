@@ -44,6 +44,7 @@ class Run:
     :param measure: environment steps between two measurements of the noise scale and of overfitting, none if 0
     :param data: data sets that it learns from, ``dataset`` and ``prior_data`` as ``train`` has them, and the
         ``offline_steps``; those that there are
+    :param diagnostics: environment steps between two measurements of ``DiagnosticsCallback``, none if 0
     """
 
     agent: str
@@ -60,6 +61,7 @@ class Run:
     gym_packages: tuple[str, ...] = ()
     measure: int = 0
     data: dict[str, Any] = dataclasses.field(default_factory=dict)
+    diagnostics: int = 0
 
     @functools.cached_property
     def name(self) -> str:
@@ -107,8 +109,13 @@ class Run:
             home = isinstance(value, str) and value.startswith("~")
             command += [f"--{name.replace('_', '-')}", str(Path(value).expanduser() if home else value)]
         arguments = dict(self.arguments)
-        if self.measure:
-            arguments["callback"] = {"sb3_sample.diagnostics.NoiseScaleCallback": {"every": self.measure}}
+        callbacks = [
+            {f"sb3_sample.diagnostics.{name}": {"every": every}}
+            for name, every in (("NoiseScaleCallback", self.measure), ("DiagnosticsCallback", self.diagnostics))
+            if every
+        ]
+        if callbacks:
+            arguments["callback"] = callbacks if len(callbacks) > 1 else callbacks[0]
         if arguments:
             command += ["-params", *(f"{name}:{value!r}" for name, value in arguments.items())]
         return command
@@ -119,7 +126,7 @@ class Run:
         """
         found = {**dataclasses.asdict(self), "gym_packages": list(self.gym_packages)}
         # As runs were written before there were these.
-        for name in ("measure", "data"):
+        for name in ("measure", "data", "diagnostics"):
             if not found[name]:
                 del found[name]
         return found

@@ -49,7 +49,7 @@ from sb3_sample.study.trial_agents import (
 #: Entries of a plan; those after the first four have defaults.
 ENTRIES = (
     "agents", "tasks", "seeds", "steps", "evaluation", "grid", "checkpoint_freq", "env_kwargs", "gym_packages",
-    "groups", "factors", "measure",
+    "groups", "factors", "measure", "diagnostics",
 )  # fmt: skip
 REQUIRED = ENTRIES[:4]
 #: Entries of an agent besides its arguments.
@@ -151,12 +151,12 @@ class _Reader:
         freq = CHECKPOINT_FREQ
         if "checkpoint_freq" in entries:
             freq = self._count(entries["checkpoint_freq"].value, "checkpoint_freq")
-        measure = self._count(entries["measure"].value, "measure") if "measure" in entries else 0
+        measured = {n: self._count(entries[n].value, n) for n in ("measure", "diagnostics") if n in entries}
         env_kwargs = self._env_kwargs(entries, tasks)
         variants = list(self._variants(agents, grid))
         self._check_actions(variants, tasks, env_kwargs)
-        if measure:
-            self._check_measured(entries["measure"].value, agents)
+        for name in measured:
+            self._check_measured(name, entries[name].value, agents)
         runs = tuple(
             Run(
                 agent.name,
@@ -171,8 +171,8 @@ class _Reader:
                 freq,
                 env_kwargs,
                 packages,
-                measure,
-                _data_on(agent.data, task),
+                data=_data_on(agent.data, task),
+                **measured,
             )
             for seed in seeds
             for task in tasks
@@ -396,14 +396,14 @@ class _Reader:
                 if why := why_not_acting(agent.algo, _without_data(agent, arguments), actions):
                     raise self._fail(agent.node, f"agent {agent.name!r} cannot act in task {task!r}: {why}")
 
-    def _check_measured(self, node: yaml.Node, agents: list[_Agent]) -> None:
-        """The noise scale is of the critics of the off-policy family."""
+    def _check_measured(self, name: str, node: yaml.Node, agents: list[_Agent]) -> None:
+        """What is measured is of the networks of the off-policy family."""
         from sb3_sample.sac import SAC
 
         for agent in agents:
             if not issubclass(algorithms()[agent.algo].algorithm, SAC):
                 raise self._fail(
-                    node, f"measure is of off-policy agents, and {agent.name!r} is {agent.algo}: leave it out"
+                    node, f"{name} is of off-policy agents, and {agent.name!r} is {agent.algo}: leave it out"
                 )
 
     def _groups(self, entries: Mapping[str, _Entry], tasks: list[str]) -> dict[str, list[str]]:

@@ -78,10 +78,14 @@ class Progress(NamedTuple):
 
     :param steps: environment steps
     :param last_return: mean return of the last evaluation; None before the first
+    :param timed_steps: those of the steps whose time its log has told, of all attempts; 0 before the first line
+    :param seconds: that time
     """
 
     steps: int
     last_return: float | None
+    timed_steps: int = 0
+    seconds: float = 0.0
 
 
 class StudyFolder:
@@ -253,12 +257,14 @@ class StudyFolder:
         :return: how far it is, by its checkpoints, its log and its evaluations, of which the last counts
         """
         folder = self.place(run)
-        steps = max(checkpointed(folder), _logged(folder / _LOG))
+        logged, timed_steps, seconds = _logged(folder / _LOG)
+        steps = max(checkpointed(folder), logged)
         try:
             found = read_evaluations(folder / EVALUATIONS)
         except (OSError, BadFile):  # none so far, or one is being written
-            return Progress(steps, None)
-        return Progress(max(steps, int(found["timesteps"][-1])), float(found["results"][-1].mean()))
+            return Progress(steps, None, timed_steps, seconds)
+        steps = max(steps, int(found["timesteps"][-1]))
+        return Progress(steps, float(found["results"][-1].mean()), timed_steps, seconds)
 
 
 def _are_texts(value: Any) -> bool:
@@ -279,22 +285,26 @@ def checkpointed(folder: Path) -> int:
     return max((int(m[1]) for name in names if (m := re.fullmatch(r"checkpoint-(\d{12,})", name))), default=0)
 
 
-def _logged(path: Path) -> int:
-    """Environment steps by the last whole line of a run's log."""
+def _logged(path: Path) -> tuple[int, int, float]:
+    """Environment steps by the last whole line of a run's log, and steps and seconds by the last that has a time."""
     try:
         with path.open("rb") as file:
             file.seek(max(file.seek(0, os.SEEK_END) - TAIL, 0))
             lines = file.read().split(b"\n")
     except OSError:
-        return 0
+        return 0, 0, 0.0
+    last = 0
     for line in reversed(lines[:-1]):
         try:
-            steps = json.loads(line)["time/total_timesteps"]
+            found = json.loads(line)
+            steps, seconds = found["time/total_timesteps"], found.get("time/time_elapsed")
         except (ValueError, KeyError, TypeError):
             continue
         if type(steps) is int:
-            return steps
-    return 0
+            last = last or steps
+            if type(seconds) in (int, float):  # an evaluation's line has none
+                return last, steps, seconds
+    return last, 0, 0.0
 
 
 def _write(path: Path, text: str) -> None:

@@ -71,17 +71,20 @@ class Status:
 
     def seconds_left(self, progress: list[tuple[Run, Progress]]) -> float | None:
         """
-        Estimate how long the rest takes, by the seconds that an environment step took in the runs that are done, of
-        the same agent and task where there are some, and by how many runs go on at once.
+        Estimate how long the rest takes, by the seconds that an environment step took in the runs that are done and,
+        by their logs, in those that are running, of the same agent and task where there are some, and by how many runs
+        go on at once.
 
         :param progress: of the runs that are running
-        :return: seconds; None while no run is done
+        :return: seconds; None while none of them has logged a time and none is done
         """
         steps, seconds = {"": 0}, {"": 0.0}
-        for each in self.of(DONE):
-            for key in ("", each.run.kind):
-                steps[key] = steps.get(key, 0) + each.outcome.steps_made
-                seconds[key] = seconds.get(key, 0.0) + each.outcome.seconds
+        made = [(each.run, each.outcome.steps_made, each.outcome.seconds) for each in self.of(DONE)]
+        made += [(run, found.timed_steps, found.seconds) for run, found in progress]
+        for run, n_made, took in made:
+            for key in ("", run.kind):
+                steps[key] = steps.get(key, 0) + n_made
+                seconds[key] = seconds.get(key, 0.0) + took
         if not steps[""] or not progress:
             return None
         rest = [(run, run.steps - min(found.steps, run.steps)) for run, found in progress]

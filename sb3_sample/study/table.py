@@ -368,6 +368,14 @@ def published_runs(agents: Sequence[str] | None = None, tasks: Sequence[str] | N
     return rows.table()
 
 
+def marked_published(agents: Iterable[str]) -> list[str]:
+    """
+    :param agents: names of agents that others have measured, which may be those of one's own
+    :return: names that say so
+    """
+    return [name if "published" in name.lower() else f"{name}, published" for name in agents]
+
+
 def published_curves(agents: Sequence[str] | None = None, tasks: Sequence[str] | None = None) -> pd.DataFrame:
     """
     The published curves, of which only statistics over the seeds are there: metrics ``return/mean``, ``return/iqm``,

@@ -31,6 +31,7 @@ from stable_baselines3.common.monitor import Monitor, get_monitor_files
 from stable_baselines3.common.utils import get_latest_run_id
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_sample.diagnostics import DiagnosticsCallback
 from sb3_sample.lockstep import Seat, present
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.reading import read_dataset
@@ -547,6 +548,12 @@ class Manager(ExperimentManager):
                 "the environment"
             )
         return found
+
+    def create_callbacks(self) -> None:
+        super().create_callbacks()
+        for callback in self.callbacks:
+            if isinstance(callback, DiagnosticsCallback) and callback.eval_env is None:
+                callback.eval_env = self.create_envs(1, eval_env=True)
 
     def _train(self, model: Any, total_timesteps: int, **arguments: Any) -> BaseAlgorithm:
         """As the zoo has it, ``learn``; or what takes its place."""

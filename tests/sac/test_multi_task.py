@@ -26,7 +26,7 @@ from sb3_sample.learner.batch import Noise
 from sb3_sample.learner.scalars import TaskLogScalar
 from sb3_sample.learner.target import next_step
 from sb3_sample.networks import MLP, BroNet, Network, widened
-from sb3_sample.sac import BRC, BRO
+from sb3_sample.sac import BRC, BRO, SAC, BROFast
 from sb3_sample.sac.multi_task import TaskEmbedding, TaskOneHot
 from tests.sac.common import COMPILES, MAKERS, Toy, bro, differing, sac, state, vec
 
@@ -556,6 +556,23 @@ def test_the_example(tmp_path: Path) -> None:
     model = BRC.load(tmp_path / "seed_0" / "final_model")
     # Two for each step of both tasks after the random ones.
     assert model._n_updates == 2 * 15 and model.learning_starts == 10
+
+
+@pytest.mark.slow
+def test_the_published_study_of_bro(tmp_path: Path) -> None:
+    """The program that trains as published, in small, up to its networks and its table."""
+    given = "--steps 10 --eval-every 10 --episodes 1 --batch-size 8 --random-steps 9 --max-episode-steps 5"
+    subprocess.run(
+        ["sh", ROOT / "studies/papers/bro_multi_task.sh", PENDULUM, *given.split()],
+        cwd=tmp_path,
+        env={**os.environ, "SEEDS": "3", "PYTHON": sys.executable, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        check=True,
+    )
+    table = study.load(tmp_path / f"runs/bro_multi_task_{PENDULUM}.csv")
+    assert set(table["agent"]) == {f"BRO Fast {PENDULUM}", f"SAC {PENDULUM}"} and set(table["seed"]) == {3}
+    for name, agent in (("bro_fast", BROFast), ("sac", SAC)):
+        model = agent.load(tmp_path / f"runs/bro_multi_task_{PENDULUM}/{name}/seed_3/final_model")
+        assert model.multitask and model.replay_ratio == 2 and model.learning_starts == 9
 
 
 @pytest.mark.slow

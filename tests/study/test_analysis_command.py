@@ -117,6 +117,15 @@ def test_aggregates(run: Run) -> None:
     assert list(pd.read_csv("t.csv")["step"].unique()) == [100_000, 1_000_000]
 
 
+def test_published_runs_are_not_pooled_with_ones_own_of_the_same_name(run: Run) -> None:
+    mine = made_up([("BRO", {"replay_ratio": 10}, CHEETAH, 0, 25_000, "return", 999.0)])
+    out = run(
+        "aggregate", "t.csv", "--steps", "25k", "--groups", "all", "--reps", "3", "--common", "-p", "BRO", table=mine
+    )
+    assert "| BRO | all | 25,000 | 0.999 |" in out and "| BRO, published | all | 25,000 |" in out
+    assert "| BRO | all | 25,000 |" in run("aggregate", "--steps", "25k", "--groups", "all", "--reps", "3", "-p", "BRO")
+
+
 def test_profiles_and_improvement(run: Run) -> None:
     shared = ("aggregate", "-p", "BRO", "BRO Fast", "--groups", "myosuite", "--reps", "3", "--steps", "200_000")
     assert "| BRO | BRO Fast | myosuite | 200,000 | 0.6" in run(*shared, "--improvement")
@@ -178,7 +187,10 @@ def test_scores_of_the_user(run: Run) -> None:
         (["aggregate", "t.csv", "--steps", "1", "--improvement", "--common"], "--common is not of"),
         (["aggregate", "-p", "SAC"], "agents must be of BRO"),
         (["marginalize", "t.csv", "--order", "3"], "order must be"),
-        (["correlate", "t.csv"], "metrics must be of return, not 'diagnostics/overestimation'"),
+        (
+            ["correlate", "t.csv"],
+            "not 'diagnostics/overestimation', which DiagnosticsCallback records: 'diagnostics: 10_000' in a plan",
+        ),
         (["correlate", "t.csv", "--metrics", "return", "--regress", "--by", "x"], "--regress is task by task"),
         (["heatmap", "t.csv", "-x", "size", "-y", "critic"], "arguments must be of those"),
         (["cost", "t.csv"], "'hours' of at least one run"),

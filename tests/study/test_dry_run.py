@@ -18,6 +18,7 @@ from sb3_sample import cli, study
 from sb3_sample.study import dry_run as module
 from sb3_sample.study.dry_run import Cost
 from sb3_sample.study.plan import Plan, Run
+from sb3_sample.study.runs import StudyFolder
 from sb3_sample.study.stopwatch import Stopwatch
 from sb3_sample.study.worker import train
 
@@ -56,6 +57,19 @@ def test_a_pair_that_was_not_measured_is_the_product_of_two_ratios(tmp_path: Pat
     assert found.hours == pytest.approx(2 * (1 + 2 + 3 + 3 * 2))
     # Of each run all but the replay buffer, and its 20 rows.
     assert found.n_bytes == pytest.approx(2 * (100 + 200 + 400 + 800 + 20 * (10 + 50 + 10 + 50)))
+
+
+def test_steps_that_runs_under_way_have_made_are_not_counted(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(module, "measure", lambda run, threads, device: Cost(1.0, 100.0, 10.0))
+    monkeypatch.setattr(module, "check_actions", lambda plan: None)  # of a made-up task
+    base = Run("A", "sac_sample", {}, {}, "x", 0, 3600, 500, 3)
+    runs = [base, dataclasses.replace(base, seed=1)]
+    (StudyFolder(tmp_path).place(base) / "checkpoint-000000000900").mkdir(parents=True)
+    found = study.estimate(Plan("made up", tuple(runs)), tmp_path, workers=1)
+    assert found.hours == pytest.approx(1.75) and found.n_done == 0
+    # Seven evaluations of three episodes, and six that are left of the other's.
+    assert found.n_episodes == 39 and "1.75 with 1 at once (evaluations of 39 episodes apart)" in str(found)
+    assert found.n_bytes == pytest.approx(2 * (100 + 3600 * 10))
 
 
 def test_agents_are_measured_on_the_data_that_they_have(tmp_path: Path, monkeypatch) -> None:

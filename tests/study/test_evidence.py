@@ -210,6 +210,23 @@ def test_results_are_whole_after_a_kill_between_their_files(
     ]
 
 
+def test_what_is_recorded_of_a_run_has_the_versions_of_its_checkpoint(program: Any, tmp_path: Path) -> None:
+    root, results = tmp_path / "root", tmp_path / "results"
+    first, second = program.plan_of("small").runs
+    make_done(program, root, first)
+    make_done(program, root, second)
+    checkpoint = StudyFolder(root / "studies" / "small" / "abc").place(first) / "checkpoint-000000000600"
+    checkpoint.mkdir()
+    versions = {"torch": "2.0", "numpy": "1.26", "commit": "abc-dirty", "device": "cpu"}
+    (checkpoint / "manifest.json").write_text(json.dumps({"circumstances": versions}))
+    program.collect(root, results)
+    records = {record["run"]["seed"]: record for record in program.recorded(results, "small")}
+    assert (records[0]["torch"], records[0]["numpy"], records[0]["device"]) == ("2.0", "1.26", "cpu")
+    assert records[0]["commit"] == "abc" and records[0]["threads"] == 1
+    # Whose checkpoint says nothing.
+    assert "torch" not in records[1] and records[1]["commit"] == "abc"
+
+
 def test_a_folder_that_a_killed_process_has_begun_is_passed_over(program: Any, tmp_path: Path) -> None:
     root = tmp_path / "root"
     run, _ = program.plan_of("small").runs

@@ -85,6 +85,23 @@ def test_a_plan_whose_runs_measure_their_gradients(plan_of) -> None:
         plan_of(ppo + "measure: 10\n")
 
 
+def test_a_plan_whose_runs_have_diagnostics(plan_of) -> None:
+    run = plan_of(GOOD + "diagnostics: 10_000\n").runs[0]
+    theirs = "{'sb3_sample.diagnostics.DiagnosticsCallback': {'every': 10000}}"
+    assert run.command(Path("x"))[-1] == f"callback:{theirs}"
+    assert Run.of_json(run.as_json()) == run and run.kind == plan_of(GOOD).runs[0].kind
+    assert "diagnostics" not in plan_of(GOOD).runs[0].as_json()
+    both = plan_of(GOOD + "diagnostics: 10_000\nmeasure: 1_000\n").runs[0]
+    measure = "{'sb3_sample.diagnostics.NoiseScaleCallback': {'every': 1000}}"
+    assert both.command(Path("x"))[-1] == f"callback:[{measure}, {theirs}]"
+    with pytest.raises(PlanError, match="line 14: diagnostics must be a whole number of at least 1, not 0"):
+        plan_of(GOOD + "diagnostics: 0\n")
+    ppo = GOOD.replace("  BRO Fast:\n    algo: bro_fast\n    model_size: 0.55M\n", "").replace("sac_sample", "mbma_ppo")
+    ppo = ppo.replace("    learning_starts: 500\n", "").replace("grid:\n  replay_ratio: [1, 2]\n", "")
+    with pytest.raises(PlanError, match="diagnostics is of off-policy agents, and 'SAC' is mbma_ppo: leave it out"):
+        plan_of(ppo + "diagnostics: 10\n")
+
+
 def test_a_suite_is_its_tasks_each_once(plan_of) -> None:
     text = GOOD.replace("[Pendulum-v1, dmc/cheetah-run-v0]", "[bro-dmc, VPL_DMC, Pendulum-v1]")
     tasks = list(dict.fromkeys(run.task for run in plan_of(text.replace("[0, 7]", "2")).runs))
@@ -234,7 +251,7 @@ MANY = {
 }  # fmt: skip
 #: Runs of the papers' studies: agents, tasks and seeds as the papers state them.
 RUNS = {
-    "bro": 5 * 40 * 10,
+    "bro": 6 * 40 * 10,
     "bro_offline_adroit": 6 * 9 * 10,
     "bro_offline_antmaze": 6 * 6 * 10,
     "bro_scaling": 5 * 5 * 40 * 10,

@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("rl_zoo3")
 
 from sb3_sample import cli, study
+from sb3_sample.diagnostics import DiagnosticsCallback
 from sb3_sample.study.plan import Run
 
 COMMAND = [
@@ -59,3 +60,34 @@ def test_a_run_that_measures_its_gradients(tmp_path: Path, monkeypatch: pytest.M
     assert not np.allclose(found["return"], found["online_return"])
     for name in ("gradient_square_64", "gradient_square_1024", "overfitting_newest", "parameter_norm_critic"):
         assert list(found[f"diagnostics/{name}"].index) == [150, 300]
+
+
+def test_a_run_whose_plan_asks_for_diagnostics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its environment is made as that of the evaluations: with the arguments of the training's, and its statistics."""
+    monkeypatch.setattr(sys, "argv", ["sb3-sample"])
+    arguments = {
+        "learning_starts": 50, "buffer_size": 500, "replay_ratio": 0.1, "policy_kwargs": {"net_arch": [8]},
+        "normalize": True,
+    }  # fmt: skip
+    run = Run(
+        "SAC", "sac_sample", arguments, {}, "Pendulum-v1", 0, 400, 200, 1, 200, {"max_episode_steps": 20},
+        measure=200, diagnostics=150,
+    )  # fmt: skip
+    made = []
+    init = DiagnosticsCallback._init_callback
+
+    def watched(callback: DiagnosticsCallback) -> None:
+        init(callback)
+        made.append(callback)
+
+    monkeypatch.setattr(DiagnosticsCallback, "_init_callback", watched)
+    cli.main(["train", *run.command(tmp_path), "--device", "cpu", "--num-threads", "1"])
+    (callback,) = made
+    assert callback._time_limit == 20
+    normalize = callback.model.get_vec_normalize_env()
+    assert normalize is not None and callback._env is not normalize.venv
+    table = study.read(tmp_path, [*study.analysis.VARIABLES, "diagnostics/gradient_square_64"])
+    steps = {name: list(rows["step"]) for name, rows in table.groupby("metric")}
+    assert steps.pop("diagnostics/gradient_square_64") == [200, 400]
+    assert steps.pop("diagnostics/parameter_norm_critic") == [150, 200, 300, 400]  # which both measure
+    assert steps == {name: [150, 300] for name in study.analysis.VARIABLES if "parameter_norm" not in name}

@@ -320,6 +320,7 @@ def test_a_study_says_what_is_done_and_what_has_failed(folder: StudyFolder, tmp_
         page = written(tmp_path / "r.html", folder.path)
     text = text_of(page)
     assert "2 of 6 planned runs are done; 1 running, 1 failed, 2 waiting." in text
+    assert "those of the games of Atari-100k between random play and a human; others as they were given" in text
     by_agent = tables_of(page)["Runs of the study"]
     assert by_agent[0] == ["agent", "done", "running", "failed", "waiting", "planned"]
     assert by_agent[1] == ["A", "2", "0", "0", "1", "3"] and by_agent[2][1:] == ["0", "1", "1", "1", "3"]
@@ -485,7 +486,8 @@ def test_a_table_with_its_plan_and_the_records_beside_it(tmp_path: Path) -> None
     """As ``make evidence`` leaves them in docs/evidence."""
     rows = runs("SAC", "Pendulum-v1", [-900, -800], replay_ratio=1) + runs("SAC", "Pendulum-v1", [-700], replay_ratio=2)
     study.write(made_up(rows), tmp_path / "t.csv")
-    records = [{"run": {}, "commit": "0123abc", "python": "3.11.7", "processor": "A chip", "threads": 1}] * 3
+    record = {"run": {}, "commit": "0123abc", "torch": "2.0", "python": "3.11.7", "processor": "A chip", "threads": 1}
+    records = [record, record, {**record, "made_by": "a program"}]
     (tmp_path / "t.json").write_text(json.dumps(records))
     (tmp_path / "plan.yml").write_text(
         "agents: {SAC: {algo: sac_sample}}\ngrid: {replay_ratio: [1, 2]}\ntasks: [Pendulum-v1]\nseeds: 3\nsteps: 200\n"
@@ -498,7 +500,8 @@ def test_a_table_with_its_plan_and_the_records_beside_it(tmp_path: Path) -> None
         ["SAC (replay_ratio=2)", "Pendulum-v1", f"1{pieces.DASH}2"],
     ]
     made = tables_of(page)["Versions and machines of the runs that say so"]
-    assert ["commit", "0123abc", "3"] in made and ["threads", "1", "3"] in made
+    assert ["commit", "0123abc", "3"] in made and ["threads", "1", "3"] in made and ["torch", "2.0", "3"] in made
+    assert ["made_by", "a program", "1"] in made
     for other in ("[1, 2]", "{}", "no JSON"):  # a file of something else
         (tmp_path / "t.json").write_text(other)
         assert "Versions and machines" not in written(tmp_path / "r.html", tmp_path / "t.csv")

@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import io
+import json
 import signal
 import subprocess
 import sys
@@ -200,6 +201,29 @@ def test_lines_and_the_live_table(tmp_path: Path, capsys) -> None:
     lines(found)
     said = "done: Nothing on nothing-v0, seed 0, last return -3.2\nfailed: Nothing on nothing-v0, seed 1\n"
     assert capsys.readouterr().out == said
+
+
+def test_the_time_left_while_no_run_is_done(tmp_path: Path) -> None:
+    plan, folder = nothing.plan(3), StudyFolder(tmp_path)
+    runs = [dataclasses.replace(run, steps=1_000) for run in plan.runs]
+    folder.enter(plan._replace(runs=tuple(runs)))
+    found = Status(
+        folder,
+        [
+            RunStatus(run, state, Outcome(False))
+            for run, state in zip(runs, ("running", "running", "waiting"), strict=True)
+        ],
+    )
+    assert "left" not in found.line()
+    folder.place(runs[0]).mkdir(parents=True)
+    lines = [
+        {"step": 200, "time/total_timesteps": 200, "time/time_elapsed": 50},
+        {"step": 250, "time/total_timesteps": 250},
+    ]
+    (folder.place(runs[0]) / "progress.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    # 750, 1,000 and 1,000 steps of a quarter of a second each, two runs at once.
+    assert folder.progress(runs[0]) == (250, None, 200, 50)
+    assert found.line().endswith("about 0:05:44 left")
 
 
 @pytest.mark.slow

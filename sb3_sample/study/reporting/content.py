@@ -43,10 +43,10 @@ from sb3_sample.version import __version__
 UNFOLDED = 12
 #: Letters of an agent's name in a pair.
 PAIR = 12
-#: Circumstances of checkpoints, in the order of the table.
+#: Circumstances of checkpoints and of records beside tables, in the order of the table.
 _MADE_WITH = (
     "sb3_sample", "commit", "torch", "stable_baselines3", "gymnasium", "mujoco", "numpy", "python", "processor",
-    "device", "threads", "torch threads",
+    "device", "threads", "torch threads", "made_by",
 )  # fmt: skip
 _STATISTICS = {"iqm": "IQM", "mean": "mean", "median": "median", "optimality_gap": "optimality gap"}
 
@@ -200,7 +200,8 @@ def _normalised(facts: Facts) -> str:
     which = "all of them" if n == of else f"of {of}: those that every agent has reached {facts.step:,} steps on"
     return (
         "Scores: DeepMind Control's returns over 1,000; success rates as they are; MuJoCo's returns over a "
-        "reference's; others as they were given. Nothing is clipped. Averages are over "
+        "reference's; those of the games of Atari-100k between random play and a human; others as they were given. "
+        "Nothing is clipped. Averages are over "
         f"{counted(n, 'task')} ({which})."
     )
 

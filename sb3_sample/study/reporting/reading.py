@@ -121,7 +121,7 @@ def gather(
     theirs = _measured([_published(name, found) for name in published], found)
     if given:
         theirs = theirs[theirs["task"].isin(own["task"].unique())]
-        theirs = theirs.assign(agent=[_marked(agent) for agent in theirs["agent"]])
+        theirs = theirs.assign(agent=tables.marked_published(theirs["agent"]))
         found.published = list(theirs["agent"].unique())
         if published and not len(theirs):
             found.notes.append("The published runs have none of the tasks here, and are left out.")
@@ -130,10 +130,6 @@ def gather(
     kept = [part for part in (own, theirs) if len(part)]
     found.table = pd.concat(kept, ignore_index=True) if kept else own
     return found
-
-
-def _marked(agent: str) -> str:
-    return agent if "published" in agent.lower() else f"{agent}, published"
 
 
 def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
