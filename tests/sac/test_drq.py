@@ -502,6 +502,14 @@ def test_copies_that_nothing_learns_from(cls: Any, name: str, words: str) -> Non
         cls("CnnPolicy", frames(), augmentation="shift", augmentation_kwargs={name: 2}, buffer_size=20, **kwargs)
 
 
+def test_a_learner_chooses_its_policy_by_the_observations() -> None:
+    pictures, actions = spaces.Box(0, 255, (3, 40, 40), np.uint8), spaces.Box(-1, 1, (2,), np.float32)
+    learners = [DrQ.learner(IMAGE, actions, policy_kwargs=TINY, device="cpu")]
+    learners.append(SAC.learner(pictures, actions, augmentation="shift", device="cpu"))
+    for learner, cls in zip(learners, (ConvEncoder, NatureCNN), strict=True):
+        assert type(learner.critic.features_extractor) is cls
+
+
 # ---------------------------------------------------------------- replay
 
 
