@@ -392,6 +392,11 @@ def test_a_game_without_its_rom_is_refused(tmp_path: Path, monkeypatch: pytest.M
         manager.create_envs(1, no_log=True)
 
 
+def test_frames_that_are_stacked_are_not_stacked_again(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="frame_stack=3 would be the zoo's VecFrameStack .* srspr .* leave it out"):
+        atari_run(tmp_path, frame_stack=3)
+
+
 # ---------------------------------------------------------------- killed
 
 
