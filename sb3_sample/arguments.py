@@ -17,6 +17,7 @@ from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
+from sb3_sample.envs.registration import check_game, is_atari_id
 from sb3_sample.errors import ParametersDoNotFit
 from sb3_sample.kinds import AT_LEAST_0, DICT, VERBOSE, Kind, check_value, integer, maker
 from sb3_sample.warn import warn
@@ -186,6 +187,13 @@ def check_device(device: Any) -> None:
         warn(f"device={str(device)!r}: torch finds no such device here, so {used} is used")
 
 
+def _check_env(env: Any) -> None:
+    """An environment as an argument. Gymnasium is told of Atari's games, which it does not know by itself."""
+    check_value("env", env, _ENVIRONMENT.or_none())
+    if is_atari_id(env):
+        check_game(env)
+
+
 def check_program(cls: type, given: Mapping[str, Any]) -> None:
     """
     Check what Stable-Baselines3's constructor makes use of.
@@ -193,9 +201,10 @@ def check_program(cls: type, given: Mapping[str, Any]) -> None:
     :param cls: class of an algorithm
     :param given: its arguments by name; env is None where a model is loaded
     :raises ValueError: if one of them is of another kind
+    :raises ImportError: if env is the id of an Atari game without ``ale-py``, or without its ROM
     """
     check_policy_class(cls, given["policy"])
-    check_value("env", given["env"], _ENVIRONMENT.or_none())
+    _check_env(given["env"])
     check_device(given["device"])
     check_value("verbose", given["verbose"], VERBOSE)
 
@@ -250,8 +259,9 @@ def check_load(cls: type, base: type, env: Any, device: Any, kwargs: dict[str, A
     :param device: where it is to be loaded
     :param kwargs: what ``load`` is to change
     :raises ValueError: if one of them is no argument of the class, or of another kind where that is not found later
+    :raises ImportError: if env is the id of an Atari game without ``ale-py``, or without its ROM
     """
-    check_value("env", env, _ENVIRONMENT.or_none())
+    _check_env(env)
     check_device(device)
     if "verbose" in kwargs:
         check_value("verbose", kwargs["verbose"], VERBOSE)

@@ -1,5 +1,6 @@
 """Runs of ``sb3-sample train`` with checkpoints: started, interrupted, started again."""
 
+import argparse
 import csv
 import json
 import os
@@ -25,7 +26,7 @@ from sb3_sample.run_logs import read_monitors
 from sb3_sample.saving import container
 from sb3_sample.saving.decoding import decode
 from sb3_sample.zoo.files import RunError
-from sb3_sample.zoo.runs import Record, RunFiles, plan, train_parser
+from sb3_sample.zoo.runs import Data, Manager, Record, RunFiles, plan, train_parser
 from sb3_sample.zoo.watch import model_path
 
 zoo.register()
@@ -360,6 +361,40 @@ def test_help_has_both_kinds_of_options(run, capsys: pytest.CaptureFixture[str])
     assert exit_.value.code == 0
     output = capsys.readouterr().out
     assert all(option in output for option in ("--run-dir DIR", "--checkpoint-freq N", "--resume", "--save-freq"))
+
+
+# ---------------------------------------------------------------- Atari
+
+
+def atari_run(folder: Path, **hyperparams: Any) -> Manager:
+    """A manager of a run of SR-SPR on a game, whose settings are read."""
+    pytest.importorskip("ale_py")
+    args = argparse.Namespace(algo="srspr", optimize_hyperparameters=False)
+    options: dict[str, Any] = {"eval_freq": -1, "device": "cpu", "verbose": 0, "hyperparams": hyperparams}
+    found = Manager(Data(), args, "srspr", "ALE/Breakout-v5", str(folder), **options)
+    _, found.env_wrapper, _, _ = found._preprocess_hyperparams(found.read_hyperparameters()[0])
+    return found
+
+
+def test_games_are_evaluated_whole_and_with_their_own_rewards(tmp_path: Path) -> None:
+    manager = atari_run(tmp_path)
+    for eval_env in (True, False, True):
+        env: Any = manager.create_envs(1, eval_env=eval_env, no_log=True)
+        words = str(env.envs[0])
+        assert "NoopReset" in words and env.observation_space.shape == (4, 84, 84)
+        assert [each in words for each in ("EpisodicLife", "ClipReward")] == [not eval_env] * 2
+
+
+def test_a_game_without_its_rom_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    manager = atari_run(tmp_path)
+    monkeypatch.setenv("ALE_ROMS_DIR", str(tmp_path))
+    with pytest.raises(RunError, match="ALE/Breakout-v5 .*ALE_ROMS_DIR"):
+        manager.create_envs(1, no_log=True)
+
+
+def test_frames_that_are_stacked_are_not_stacked_again(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="frame_stack=3 would be the zoo's VecFrameStack .* srspr .* leave it out"):
+        atari_run(tmp_path, frame_stack=3)
 
 
 # ---------------------------------------------------------------- killed

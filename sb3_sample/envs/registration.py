@@ -7,7 +7,9 @@ worker is SB3's ``CloudpickleWrapper``; :func:`register_in_workers` has multipro
 registers the ids before the environment is made.
 """
 
+import contextlib
 import difflib
+import os
 from collections.abc import Callable
 from multiprocessing.reduction import ForkingPickler
 from typing import Any
@@ -156,6 +158,30 @@ def register_atari() -> None:
     gym.register_envs(ale_py)
 
 
+def check_game(env_id: str) -> None:
+    """
+    Register the games with Gymnasium, and check that one of them can be made.
+
+    :param env_id: ``"ALE/<Game>-v5"``; an id that is not registered is left to ``gym.make``
+    :raises ImportError: ``ale-py`` is not installed, or finds no ROM of the game; the message says what to do
+    """
+    register_atari()
+    spec = gym.registry.get(env_id.removeprefix(f"{PACKAGE}:"))
+    if spec is None:
+        return
+    from ale_py import roms
+
+    try:
+        with contextlib.redirect_stdout(None):
+            roms.get_rom_path(spec.kwargs["game"])
+    except OSError as error:
+        folder = os.environ.get("ALE_ROMS_DIR")
+        todo = f"install ale-py again, which has the ROMs: {install('atari')}"
+        if folder:
+            todo = f"the environment variable ALE_ROMS_DIR is {folder!r}: unset it, or name the folder of the ROMs"
+        raise ImportError(f"{env_id} cannot be made without its ROM ({error}); {todo}") from error
+
+
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:
     """
     Make an environment by its id: the same as ``gym.make(f"sb3_sample:{env_id}", **kwargs)``.
@@ -166,12 +192,13 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
         (``action_repeat`` for ``dmc/``; ``width``, ``height``, ``camera``).
     :return: The environment.
     :raises gymnasium.error.UnregisteredEnv: There is no such id; the message names the closest ones.
-    :raises ImportError: The environment's library is not installed; the message says how to install it.
+    :raises ImportError: The environment's library is not installed, or has no ROM of the game; the message says what
+        to do.
     """
     register_all()
     env_id = env_id.removeprefix(f"{PACKAGE}:")
     if is_atari_id(env_id):
-        register_atari()
+        check_game(env_id)
     try:
         return gym.make(env_id, **kwargs)
     except (gym.error.UnregisteredEnv, gym.error.DeprecatedEnv) as error:

@@ -549,7 +549,8 @@ class Learner(Executable):
         Take one gradient step, after what is due before it: resets, and the parts' work after environment steps.
 
         :param batch: transitions, on the learner's device
-        :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly
+        :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly, unless
+            transforms draw for the transitions of ``extra``, which is done by torch's generator each time
         :param extra: further transitions for a rule of pessimism that learns from some, from its ``draw``
         :return: what to log, by name, scalars on the learner's device
         :raises ValueError: if the batch is none
@@ -631,7 +632,8 @@ class Learner(Executable):
         Draw the noise, take one gradient step, and count it; without what :meth:`update` does before it.
 
         :param batch: transitions
-        :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly.
+        :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly, unless
+            transforms draw for the transitions of ``extra``, which is done by torch's generator each time
         :param extra: further transitions for the rule of pessimism
         :param eager: neither compiled nor captured this time, which leaves the gradients in ``.grad``
         :return: what to log, by name, scalars on the learner's device, computed with the parameters from before

@@ -96,6 +96,12 @@ class RewoundPPO(ExtraSamplesPPO):
         return self.n_actions - 1
 
     def _check_arguments(self) -> None:
+        if self.n_actions == 1 and self.horizon is not None:
+            # It is in hyperparams/rewound_ppo.yml, and no user's own.
+            raise ValueError(
+                f"horizon={self.horizon!r} means nothing with {self.plain}: leave it out, or at None (in the zoo, "
+                "whose file has one, -params n_actions:1 horizon:None; horizon: null in a plan)"
+            )
         super()._check_arguments()
         if self.sample_actions == "all" and not isinstance(self.action_space, spaces.Discrete):
             raise ValueError(

@@ -209,7 +209,8 @@ class SACArguments(Resumable):
     it is learned from"""
     augmentation: str | None = argument(default=None, kind=one_of(AUGMENTATIONS).or_none("images as they are"))
     """"shift": every image of a batch is shifted by a few pixels at random (DrQ), after ``batch_transforms``. Actors
-    then share the critics' features extractor, unless ``policy_kwargs`` has ``share_features_extractor=False``"""
+    then share the critics' features extractor, but for BC's and IQL's, unless ``policy_kwargs`` has
+    ``share_features_extractor=False``"""
     augmentation_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
     """its arguments: ``pad``, 4 pixels, and DrQ's K and M, ``target_copies`` and ``online_copies``, 1 each"""
     reward_scale: str | type[RewardScale] | None = argument(

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.preprocessing import get_action_dim, is_image_space
 from stable_baselines3.common.utils import get_device
 from torch import nn
 
@@ -76,7 +76,8 @@ def _maker(cls: Any) -> Callable[..., Learner]:
         :param observation_space: observation space
         :param action_space: action space, a bounded Box; batches have actions in [-1, 1]
         :param seed: seed of the learner's own generators: initial weights, noise, acting
-        :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class; None: by the observation space
+        :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class; None: by the observation space,
+            "CnnPolicy" for one of images
         :param device: "auto", "cpu", "cuda", ...
         :param arguments: arguments of the class that say what is learned and how
         :return: the learner
@@ -96,7 +97,7 @@ def _maker(cls: Any) -> Callable[..., Learner]:
             names = ", ".join(kind.__name__ for kind in kinds)
             raise ValueError(f"observation_space must be a space of Gymnasium's, {names}, not {observation_space!r}")
         if policy is None:
-            policy = "MultiInputPolicy" if isinstance(observation_space, spaces.Dict) else "MlpPolicy"
+            policy = _usual_policy(cls, observation_space)
         generators = OwnGenerators(seed, get_device(device))
         model = cls(policy, None, device=device, _init_setup_model=False, **arguments)
         model.observation_space, model.action_space, model.n_envs = observation_space, action_space, 1
@@ -109,6 +110,15 @@ def _maker(cls: Any) -> Callable[..., Learner]:
 
     learner.__qualname__ = f"{cls.__name__}.learner"
     return learner
+
+
+def _usual_policy(cls: Any, space: spaces.Space) -> str:
+    """Name of the policy for such observations, or the only one that the class has."""
+    if len(cls.policy_aliases) == 1:
+        return str(next(iter(cls.policy_aliases)))
+    if isinstance(space, spaces.Dict):
+        return "MultiInputPolicy"
+    return "CnnPolicy" if is_image_space(space) else "MlpPolicy"
 
 
 def check_action_space(space: spaces.Space, argument: str = "env") -> None:

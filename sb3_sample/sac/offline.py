@@ -1,5 +1,6 @@
 """Agents that learn from data sets: BC, IQL, TD3+BC."""
 
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from stable_baselines3.common.preprocessing import get_action_dim
@@ -34,6 +35,7 @@ class BC(SAC):
         super()._construct(given)
 
     def _check_arguments(self) -> None:
+        _check_keeps_no_encoder(self)
         super()._check_arguments()
         backbone = "td3" if self.deterministic else "sac"
         if self.backbone != backbone:
@@ -50,7 +52,8 @@ class BC(SAC):
             raise ValueError(f"policy_kwargs describe critics ({', '.join(given)}), which BC has not")
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
-        kwargs = {**super()._full_policy_kwargs(), "n_critics": 1}
+        # Not shared with an augmentation either: the encoder would be the critics', which do not learn.
+        kwargs = {**super()._full_policy_kwargs(), "n_critics": 1, "share_features_extractor": False}
         arch = kwargs.get("net_arch")
         if arch is None:
             kwargs["critic_network_kwargs"] = {"hidden_sizes": (1,)}
@@ -62,6 +65,7 @@ class BC(SAC):
         return FixedScalar(0.0).to(self.device)
 
     def make_objective(self, learner: Learner) -> Objective:
+        _check_copies(learner, ("target_copies", "online_copies"), "BC has no critics to learn from them")
         return Cloning()
 
     def learn(self, *args: Any, **kwargs: Any) -> Any:
@@ -95,6 +99,7 @@ class IQL(SAC):
     """weight of the advantage in an action's weight, ``min(exp(inverse_temperature * advantage), 100)``"""
 
     def _check_arguments(self) -> None:
+        _check_keeps_no_encoder(self)
         super()._check_arguments()
         _check_no_entropy(self)
         check_unused(self, ("backbone",), "IQL, whose actor is a distribution")
@@ -117,6 +122,7 @@ class IQL(SAC):
                 f"critic_network={type(learner.critic.trunk).__name__} sees the actor's next actions in its critics' "
                 "step, of which IQL takes none: choose another critic_network in policy_kwargs"
             )
+        _check_copies(learner, ("target_copies",), "IQL's critics learn from its value network, which sees one copy")
         return ImplicitQ(learner, self.expectile, self.inverse_temperature)
 
 
@@ -165,6 +171,21 @@ def _check_no_entropy(agent: SAC) -> None:
     # A number once a model is made.
     if agent.target_entropy not in ("auto", -get_action_dim(agent.action_space) / 2):
         check_unused(agent, ["target_entropy"], f"{type(agent).__name__}, which rewards no entropy")
+
+
+def _check_keeps_no_encoder(agent: SAC) -> None:
+    if agent.resets_keep:
+        raise ValueError(
+            f"resets_keep={agent.resets_keep!r} keeps one encoder that actors share with the critics, and the networks "
+            f"of {type(agent).__name__} share none: leave it out"
+        )
+
+
+def _check_copies(learner: Learner, names: Sequence[str], why: str) -> None:
+    """Whether an augmentation makes copies of transitions that nothing would learn from."""
+    for name in names:
+        if (n := getattr(learner, name)) > 1:
+            raise ValueError(f"{name}={n} of the augmentation means nothing here, since {why}: leave it out")
 
 
 def _check_explores_by_actor(agent: SAC) -> None:

@@ -12,10 +12,10 @@ from gymnasium import spaces
 from sb3_sample.envs.no_environment import NoEnvironment
 from sb3_sample.warn import warn
 
-#: Arguments of the constructors that are the run's, not the agent's.
+#: Arguments of the constructors that are the run's, not the agent's; ``frame_stack`` is the zoo's VecFrameStack.
 NOT_OF_AGENTS = {
-    "_init_setup_model", "action_space", "device", "env", "observation_space", "prior_data", "seed", "tensorboard_log",
-    "verbose",
+    "_init_setup_model", "action_space", "device", "env", "frame_stack", "observation_space", "prior_data", "seed",
+    "tensorboard_log", "verbose",
 }  # fmt: skip
 
 

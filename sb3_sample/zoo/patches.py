@@ -132,9 +132,16 @@ def _adapt_experiment_manager(module: Any) -> None:
         original_optimize(self)
 
     # ``read_hyperparameters`` makes environments for evaluation with the ``env_kwargs`` of the command line only, not
-    # those of the file, and gives what a trial with HerReplayBuffer has stored to any other buffer.
+    # those of the file, and gives what a trial with HerReplayBuffer has stored to any other buffer. And the zoo makes a
+    # VecFrameStack of ``frame_stack``, stacks of stacks where an algorithm has an argument of that name.
     def read_hyperparameters(self: Any) -> Any:
         hyperparams, saved = original_read(self)
+        ours: Any = ALGORITHMS[self.algo].algorithm if self.algo in ALGORITHMS else None
+        if "frame_stack" in hyperparams and "frame_stack" in getattr(ours, "constructor_arguments", ()):
+            raise ValueError(
+                f"frame_stack={hyperparams['frame_stack']!r} would be the zoo's VecFrameStack around the stacks of "
+                f"frames that {self.algo} is given, which are of 4 frames in the zoo: leave it out"
+            )
         buffer = hyperparams.get("replay_buffer_kwargs")
         goals = sorted(HER_SPACE.keys() & buffer.keys()) if isinstance(buffer, dict) else []
         if self.algo in ALGORITHMS and goals and "replay_buffer_class" not in hyperparams:

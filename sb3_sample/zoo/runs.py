@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import rl_zoo3.exp_manager
 import rl_zoo3.train
 from rl_zoo3.exp_manager import ExperimentManager
-from rl_zoo3.utils import ALGOS
+from rl_zoo3.utils import ALGOS, get_wrapper_class
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat, configure
@@ -32,6 +32,8 @@ from stable_baselines3.common.utils import get_latest_run_id
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.diagnostics import DiagnosticsCallback
+from sb3_sample.envs.atari import AtariFrames
+from sb3_sample.envs.registration import check_game, is_atari_id
 from sb3_sample.lockstep import Seat, present
 from sb3_sample.replay.dataset import Dataset
 from sb3_sample.replay.reading import read_dataset
@@ -485,7 +487,7 @@ def can_train_together(algo: str) -> bool:
 class Manager(ExperimentManager):
     """
     The zoo's manager, which names hyperparameters that there are not, does not take an interrupted run for a finished
-    one, and learns from data too.
+    one, learns from data too, and evaluates whole games of Atari.
 
     :param data: data sets to learn from
     :param args: what the zoo has parsed of the command line
@@ -521,10 +523,12 @@ class Manager(ExperimentManager):
             raise RunError(f"--{name.replace('_', '-')} {source}: {error}") from error
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+        wrapper = hyperparams.get("env_wrapper")
         try:
             found = super()._preprocess_hyperparams(hyperparams)
         except (SyntaxError, NameError) as error:
             raise RunError(f"a hyperparameter that is a text of Python is none: {error}") from error
+        self._evaluated_in = get_wrapper_class({"env_wrapper": _for_evaluation(wrapper)})
         known = (argument_names(ALGOS[self.algo]) | _OF_NOISE) - _OF_OPTIONS
         for name in found[0].keys() - known:
             near = difflib.get_close_matches(name, known, 1)
@@ -554,6 +558,20 @@ class Manager(ExperimentManager):
         for callback in self.callbacks:
             if isinstance(callback, DiagnosticsCallback) and callback.eval_env is None:
                 callback.eval_env = self.create_envs(1, eval_env=True)
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        if is_atari_id(self.env_name.gym_id):
+            try:
+                check_game(self.env_name.gym_id)
+            except ImportError as error:
+                raise RunError(str(error)) from error
+        wrapper = self.env_wrapper
+        if eval_env:
+            self.env_wrapper = self._evaluated_in
+        try:
+            return super().create_envs(n_envs, eval_env, no_log)
+        finally:
+            self.env_wrapper = wrapper
 
     def _train(self, model: Any, total_timesteps: int, **arguments: Any) -> BaseAlgorithm:
         """As the zoo has it, ``learn``; or what takes its place."""
@@ -694,6 +712,16 @@ class RunManager(Manager):
             # Of a run that was interrupted between the two.
             warnings.filterwarnings("ignore", "Nothing is left to train")
             super()._learn_first(model, dataset, gradient_steps, **{**arguments, "checkpoint": self._folder / OFFLINE})
+
+
+def _for_evaluation(wrapper: Any) -> Any:
+    """What ``env_wrapper`` is for evaluation: Atari's games are whole ones there, their rewards as they are."""
+    if isinstance(wrapper, list):
+        return [_for_evaluation(each) for each in wrapper]
+    path, arguments = next(iter(wrapper.items())) if isinstance(wrapper, dict) and len(wrapper) == 1 else (wrapper, {})
+    if path not in (AtariFrames, f"{AtariFrames.__module__}.{AtariFrames.__name__}"):
+        return wrapper
+    return {path: {**arguments, "episodic_life": False, "clip_reward": False}}
 
 
 def _check_data(data: Data, args: argparse.Namespace) -> None:

@@ -551,7 +551,7 @@ def test_environments_that_differ() -> None:
         ({"copies": 0}, "copies must be an integer of at least 1, not 0"),
         ({"sample_actions": "some"}, "sample_actions must be 'draw' or 'all', not 'some'"),
         ({"sample_actions": "all"}, "sample_actions='all' takes every action of a Discrete space.*'draw'"),
-        ({"n_actions": 1, "horizon": 3}, "horizon=3 means nothing with n_actions=1"),
+        ({"n_actions": 1, "horizon": 3}, "horizon=3 means nothing with n_actions=1.* -params n_actions:1 horizon:None"),
         ({"n_actions": 1, "copies": 3}, "copies=3 means nothing with n_actions=1"),
         ({"use_sde": True}, "use_sde=True .* pass n_actions=1"),
     ],

@@ -67,7 +67,8 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
         )
         for cls in (FadedReplayBuffer, PrioritizedReplayBuffer)
     ],
-    '`replay_buffer_kwargs={"memory_map": …}` with `n_steps` above 1 or a buffer that does not know it': [
+    '`replay_buffer_kwargs={"memory_map": …}` with `n_steps` above 1, unless frames are stacked, or a buffer that does '
+    "not know it": [
         (SAC, {"replay_buffer_kwargs": {"memory_map": "x"}, "n_steps": 3}, ("memory_map", "n_steps=3")),
         (
             SAC,
@@ -217,9 +218,10 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
         (SAC, {"augmentation": "shift"}, ("augmentation='shift'", "one image")),
         (DebiasedRQ, {"augmentation": "shift"}, ("DebiasedRQ has augmentation=None",)),
     ],
-    "`resets_keep` without resets, or without `share_features_extractor`": [
+    "`resets_keep` without resets, or without `share_features_extractor`, or with `BC`, `IQL`": [
         (SAC, {"resets_keep": ("encoder",)}, ("resets_keep", "no resets")),
         (SAC, {"resets": 5, "resets_keep": ("encoder",)}, ("resets_keep", "share_features_extractor=True")),
+        *((cls, {"resets": 5, "resets_keep": ("encoder",)}, ("resets_keep", cls.__name__)) for cls in (BC, IQL)),
     ],
     "`target_encoder`, `actor_features`, `encoder_learning_rate` without `share_features_extractor`, the first two "
     "with networks that stack rows": [

@@ -10,11 +10,14 @@ import pytest
 import torch
 import torch.nn.functional as F
 from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.torch_layers import NatureCNN
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from sb3_sample import (
+    BC,
     BRO,
+    IQL,
     SAC,
     CompactNStepReplayBuffer,
     CompactReplayBuffer,
@@ -27,11 +30,12 @@ from sb3_sample import (
 from sb3_sample.learner.augmentation import RandomShift, shifted
 from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.sac.encoders import ConvEncoder
-from tests.sac.common import COMPILES, differing, sac, state
+from tests.sac.common import COMPILES, MAKERS, differing, sac, sampled, state
 from tests.sac.pixels import TINY, TINY_DRQ, Frames, drq, drqv2, frames
 from tests.sac.streams import same_bits
 
 IMAGE = spaces.Box(0, 255, (3, 8, 8), np.uint8)
+TINY_ENCODER = {"features_extractor_kwargs": TINY["features_extractor_kwargs"]}
 
 
 def batch_of(n: int, seed: int = 0, gamma: float = 0.9, shape: tuple[int, ...] = (3, 8, 8)) -> Batch:
@@ -442,6 +446,68 @@ def test_the_shift_for_bro() -> None:
     assert model.policy.share_features_extractor and model.plasticity.n_done == 1
     assert model.explorer.trunk.projection[0].out_features == 5, "the optimistic actor has a projection of its own"
     assert model.replay_buffer.frame_stack == 3
+
+
+def _shifting(make: Any, **kwargs: Any) -> Any:
+    """An agent of :data:`MAKERS` that learns from shifted pictures by small convolutions."""
+    plain = make()
+    encoder = {"features_extractor_class": ConvEncoder, **TINY_ENCODER}
+    if plain.normalize_observations:
+        kwargs["normalize_observations"] = False
+    env = DummyVecEnv([lambda: Monitor(Frames())])
+    return make(
+        env, policy="CnnPolicy", augmentation="shift", augmentation_kwargs={"pad": 1},
+        policy_kwargs={**plain.policy_kwargs, **encoder}, **kwargs,
+    )  # fmt: skip
+
+
+def _convolutions(model: SAC) -> list[torch.Tensor]:
+    """Those by which the actor acts."""
+    own = model.actor.features_extractor
+    encoder = model.policy.encoders()[0] if own is None else own
+    return [p.detach().clone() for p in encoder.parameters() if p.dim() == 4]
+
+
+@pytest.mark.parametrize("name", sampled([name for name in MAKERS if name != "DebiasedRQ"], ("SAC", "IQL", "TD3BC")))
+def test_the_shift_for_every_agent(name: str) -> None:
+    model = _shifting(MAKERS[name])
+    before = _convolutions(model)
+    model.learn(20)
+    assert before and model._n_updates > 5
+    assert all((old != new).any() for old, new in zip(before, _convolutions(model), strict=True))
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_the_shift_for_cloning(deterministic: bool) -> None:
+    """The actor learns its own convolutions: nothing else would, since critics do not."""
+    model = _shifting(lambda env=None, **kwargs: sac(env, cls=BC, **kwargs), deterministic=deterministic)
+    before = _convolutions(model)
+    for i in range(3):
+        model.learner.update(batch_of(4, i))
+    assert not model.policy.share_features_extractor
+    assert all((old != new).any() for old, new in zip(before, _convolutions(model), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("cls", "name", "words"),
+    [
+        (IQL, "target_copies", "target_copies=2 .* value network"),
+        (BC, "target_copies", "target_copies=2 .* no critics"),
+        (BC, "online_copies", "online_copies=2 .* no critics"),
+    ],
+)
+def test_copies_that_nothing_learns_from(cls: Any, name: str, words: str) -> None:
+    kwargs: dict[str, Any] = {"policy_kwargs": {"features_extractor_class": ConvEncoder, **TINY_ENCODER}}
+    with pytest.raises(ValueError, match=words):
+        cls("CnnPolicy", frames(), augmentation="shift", augmentation_kwargs={name: 2}, buffer_size=20, **kwargs)
+
+
+def test_a_learner_chooses_its_policy_by_the_observations() -> None:
+    pictures, actions = spaces.Box(0, 255, (3, 40, 40), np.uint8), spaces.Box(-1, 1, (2,), np.float32)
+    learners = [DrQ.learner(IMAGE, actions, policy_kwargs=TINY, device="cpu")]
+    learners.append(SAC.learner(pictures, actions, augmentation="shift", device="cpu"))
+    for learner, cls in zip(learners, (ConvEncoder, NatureCNN), strict=True):
+        assert type(learner.critic.features_extractor) is cls
 
 
 # ---------------------------------------------------------------- replay

@@ -11,7 +11,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 ale_py = pytest.importorskip("ale_py")
 
-from sb3_sample import SRSPR, make_atari_env, make_env  # noqa: E402
+from sb3_sample import SRSPR, RewoundPPO, make_atari_env, make_env  # noqa: E402
+from sb3_sample.envs import registration  # noqa: E402
 from sb3_sample.envs.atari import ENV_KWARGS, AreaResize, AtariFrames  # noqa: E402
 from sb3_sample.envs.portable_states import pack, unpack  # noqa: E402
 from sb3_sample.saving.attributes import DoesNotFit  # noqa: E402
@@ -74,6 +75,31 @@ def test_rewards_are_clipped_in_training_only() -> None:
             if terminated or truncated:
                 env.reset()
     assert rewards[True] <= {-1, 0, 1} and 20 in rewards[False]
+
+
+def test_a_missing_rom_is_said_to_be_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ALE_ROMS_DIR", str(tmp_path))
+    for make in (make_env, make_atari_env, lambda env_id: SRSPR("CnnPolicy", env_id, device="cpu")):
+        with pytest.raises(ImportError, match=f"ALE/Pong-v5 .*pong.bin.*ALE_ROMS_DIR is '{tmp_path}': unset it"):
+            make("ALE/Pong-v5")
+
+
+def test_every_agent_takes_the_id_of_a_game(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    games = {env_id: spec for env_id, spec in gym.registry.items() if env_id.startswith("ALE/")}
+
+    def forget() -> None:
+        """As in a program that has not imported ale-py."""
+        for env_id in games:
+            monkeypatch.delitem(gym.registry, env_id)
+
+    monkeypatch.setattr(registration, "register_atari", lambda: gym.registry.update(games))
+    forget()
+    small = {"features_extractor_kwargs": {"features_dim": 4}}
+    arguments: dict[str, Any] = {"n_steps": 4, "batch_size": 4, "policy_kwargs": small, "device": "cpu"}
+    model = RewoundPPO("CnnPolicy", "ALE/Pong-v5", n_actions=1, **arguments)
+    model.save(tmp_path / "model")
+    forget()
+    assert RewoundPPO.load(tmp_path / "model", env="ALE/Pong-v5", device="cpu").get_env() is not None
 
 
 def test_pictures_are_reduced_by_areas() -> None:

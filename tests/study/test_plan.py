@@ -124,6 +124,11 @@ def test_what_is_merged_can_be_there_often(plan_of) -> None:
     assert [run.arguments["policy_kwargs"] for run in runs[:4]] == [{"net_arch": [16]}] * 4
 
 
+def test_frames_are_stacked_by_the_game_and_not_by_a_plan(plan_of) -> None:
+    with pytest.raises(PlanError, match="'frame_stack' of agent 'A' is no argument of srspr"):
+        plan_of("agents: {A: {algo: srspr, frame_stack: 2}}\ntasks: [Pendulum-v1]\nseeds: 1\nsteps: 30_000\n")
+
+
 def test_a_value_that_holds_itself_is_refused(plan_of) -> None:
     with pytest.raises(PlanError, match="line 4: this is more than 10,000 values, or holds itself"):
         plan_of(GOOD.replace("learning_starts: 500", "learning_starts: &itself [*itself]"))
