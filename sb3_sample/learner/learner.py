@@ -189,6 +189,9 @@ class Learner(Executable):
         with self._random():
             self.networks = make_networks().to(self.device) if networks is None else networks
             plasticity.starts["networks"] = self.networks.drawn_from
+            for critics in (self.critic, self.critic_target):
+                # Past nn.Module's own setattr, which would register it.
+                vars(critics)["value_head"] = self.head
             self.target_entropy: float | torch.Tensor = 0.0
             self.set_target_entropy(-self.actor.action_dim / 2 if target_entropy is None else target_entropy)
             self.temperature = plasticity.first("temperature", lambda: make_temperature(self))
@@ -1045,6 +1048,7 @@ class Learner(Executable):
         """
         check_value("to", to, one_of(RESETS_TO))
         again = functools.partial(self.plasticity.again, to=to)
+        self.plasticity.began_at = self.n_updates
         fresh = again("networks", self._make_networks)
         encoders: list[nn.Module] = self.networks.encoders() if "encoder" in keep else []
         if encoders:

@@ -46,7 +46,8 @@ def _mixture(*group: str) -> Suggest:
 
 # ---------------------------------------------------------------- search spaces
 # ``one_minus_<x>`` and ``<x>_pow`` are 1 - x and log2(x): the scales on which a change by the same amount means as much
-# anywhere in the range. ``final_share_of_<rate>`` is what is left of a rate that decays to ``final_<rate>``. The ranges contain the defaults of the classes.
+# anywhere in the range. ``final_share_of_<rate>`` is ``final_<rate>`` as a share of the rate, so that none rises. The
+# ranges contain the defaults of the classes.
 
 _FINAL_SHARE = "final_share_of_"
 #: With ``HerReplayBuffer``, in addition.
