@@ -100,7 +100,7 @@ class DebiasedRQLearner(Learner):
         """How many steps of the encoder, on a batch of windows each, come before the next gradient step."""
         period = self.target_update_interval or self.policy_delay
         # A reset leaves an encoder that has learned nothing.
-        is_due = self.n_updates % period == 0 or self.n_updates == self.plasticity.began_at
+        is_due = self.n_updates % period == 0 or self.n_updates == self._counts._began_at
         return period if is_due else 0
 
     def update(

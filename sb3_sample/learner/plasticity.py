@@ -75,8 +75,6 @@ class Resets(Part):
         self.period: int | None = None
         self.steps: tuple[int, ...] = ()
         self.n_done = 0
-        #: Gradient steps after which everything last started anew.
-        self.began_at = 0
         self._reached = 0
         if is_integer(steps):
             self.period = int(steps)
@@ -153,12 +151,10 @@ class Resets(Part):
             say(f"Reset of all parameters{kept} {when}{first}")
 
     def get_extra_state(self) -> dict[str, Any]:
-        return {"reached": self._reached, "n_done": self.n_done, "began_at": self.began_at, "starts": self.starts}
+        return {"reached": self._reached, "n_done": self.n_done, "starts": self.starts}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self._reached, self.n_done = state["reached"], state["n_done"]
-        # Files of before have none, and nothing that would have been due.
-        self.began_at = state.get("began_at", 0)
         self.starts = {
             name: None if start is None else checked_state(start, f"what {name} came from")
             for name, start in state["starts"].items()
