@@ -1,11 +1,14 @@
 """
 Time of one gradient step, beside what the machine can do and beside the peers, all in one run.
 
-    python benchmarks/update_speed.py [--threads 2] [--rounds 5] [--only SAC]
+    python benchmarks/update_speed.py [--threads 2] [--rounds 5] [--only SAC] [--agents published]
 
 Peers are measured where they are installed: ``pip install sb3-contrib`` (TQC, CrossQ) and ``pip install sbx-rl`` (SAC,
 TQC, CrossQ in JAX). All have the same networks (two layers of 256), the same batch of 256 and the same task shapes. A
-gradient step includes drawing its batch; BRO has its own networks and its batch of 128.
+gradient step includes drawing its batch; BRO has its own networks and its batch of 128. With ``--agents published`` the
+agents after BRO are measured beside BRO 4.92M and SAC, each with its published networks and batch (BRC's critics 512
+wide); where actors move every so many steps, figures are the mean over as many. DR.Q takes as many steps of its encoder
+as of values and policy, so that its update is the sum of its two lines.
 
 The contenders take turns, so that a drift of the machine's speed touches all alike; figures are medians over the
 rounds, with the range, and the ratios medians of each round's ratio. Leave the machine alone meanwhile: with a busy
@@ -56,6 +59,19 @@ PEERS = {
     "TQC (sbx)": ("sbx", "TQC"),
     "CrossQ (sbx)": ("sbx", "CrossQ"),
 }
+#: Ours by label: class, arguments, batch size (None: its own); by what ``--agents`` calls them.
+AGENTS: dict[str, dict[str, tuple[str, dict[str, Any], int | None]]] = {
+    "family": {
+        **{f"BRO {size}": ("BRO", {"model_size": size}, 128) for size in MODEL_SIZES},
+        **{name: (name, {}, 256) for name in ("SAC", "DAC", "VPLSAC")},
+    },
+    "published": {
+        "BRO 4.92M": ("BRO", {"model_size": "4.92M"}, 128),
+        "SAC": ("SAC", {}, 256),
+        "BRC 512": ("BRC", {"critic_width": 512}, None),
+        **{name: (name, {}, None) for name in ("SimBa", "SimbaV2", "XQC", "CrossQ", "FlashSAC", "DebiasedRQ")},
+    },
+}
 #: What was aimed at: label, numerator, denominator (None: the step's matrix multiplications), ratio.
 AIMS = [
     ("BRO 4.92M / its matmul", "BRO 4.92M, compiled", None, 1 / 0.7),
@@ -97,7 +113,21 @@ def build(algorithm: Any, **kwargs: Any) -> Any:
 
 def training_step(model: Any, batch_size: int) -> Callable[[], None]:
     """One gradient step as training takes it, with sampling of the batch."""
+    if isinstance(model, sb3_sample.DebiasedRQ):
+        # Between two blocks of the encoder, which are measured by themselves.
+        model.target_update_interval, model._n_updates = 10**9, 1
     return lambda: model.train(gradient_steps=1, batch_size=batch_size)
+
+
+def encoder_step(model: Any) -> Callable[[], None]:
+    """One step of DR.Q's encoder, with sampling of its windows."""
+
+    def step() -> None:
+        model.learner.prepared_execution()
+        for windows in model._source.windows(1, model.batch_size):
+            model.learner.update_encoder(windows)
+
+    return step
 
 
 def acting(model: Any) -> Callable[[], None]:
@@ -122,15 +152,16 @@ def loss_step(loss: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> Cal
     return lambda: torch.autograd.grad(loss(q, target), q)
 
 
-def measure(contenders: dict[str, Callable[[], Any]], rounds: int) -> dict[str, list[float]]:
-    """Seconds a call by name, one figure a round; the contenders take turns."""
+def measure(contenders: dict[str, Callable[[], Any]], rounds: int, periods: dict[str, int]) -> dict[str, list[float]]:
+    """Seconds a call by name, one figure a round; the contenders take turns, each for whole periods of its calls."""
     repeats = {}
     for name, call in contenders.items():
         for _ in range(3):
             call()
         start = time.perf_counter()
         call()
-        repeats[name] = max(3, int(0.2 / (time.perf_counter() - start)))
+        period, n = periods.get(name, 1), max(3, int(0.2 / (time.perf_counter() - start)))
+        repeats[name] = period * math.ceil(n / period)
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(rounds):
         for name, call in contenders.items():
@@ -150,19 +181,21 @@ def our_steps(args: argparse.Namespace) -> tuple[dict[str, Callable[[], Any]], d
     steps: dict[str, Callable[[], Any]] = {}
     models: dict[str, Any] = {}
     compiling: dict[str, float] = {}
-    agents = {f"BRO {size}": ("BRO", {"model_size": size}, 128) for size in MODEL_SIZES}
-    agents |= {name: (name, {}, 256) for name in ("SAC", "DAC", "VPLSAC")}
-    for name, (cls, kwargs, batch_size) in agents.items():
+    for name, (cls, kwargs, batch_size) in AGENTS[args.agents].items():
         for how, compile in (("eager", False), ("compiled", True)):
-            label = f"{name}, {how}"
-            if not wanted(args, label):
+            if not wanted(args, f"{name}, {how}"):
                 continue
             model = build(getattr(sb3_sample, cls), compile=compile, device=args.device, **kwargs)
-            models[label], steps[label] = model, training_step(model, batch_size)
-            start = time.perf_counter()
-            steps[label]()
-            if compile:
-                compiling[label] = time.perf_counter() - start
+            made = {f"{name}, {how}": training_step(model, batch_size or model.batch_size)}
+            if name == "DebiasedRQ":
+                made[f"{name} encoder, {how}"] = encoder_step(model)
+            for label, step in made.items():
+                models[label], steps[label] = model, step
+                start = time.perf_counter()
+                for _ in range(model.policy_delay):
+                    step()
+                if compile:
+                    compiling[label] = time.perf_counter() - start
     return steps, models, compiling
 
 
@@ -190,7 +223,7 @@ def median_interval(values: list[float]) -> tuple[float, float]:
 def compare(args: argparse.Namespace) -> None:
     """The gradient steps of this checkout and of another one."""
     trees = {"here": Path(__file__).parents[1], "there": args.against.resolve()}
-    options = ["--serve", "--threads", str(args.threads), "--device", args.device]
+    options = ["--serve", "--threads", str(args.threads), "--device", args.device, "--agents", args.agents]
     options += [] if args.only is None else ["--only", *args.only]
     servers: dict[str, subprocess.Popen[str]] = {}
     told: dict[str, Any] = {}
@@ -247,6 +280,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--only", nargs="*", help="contenders whose name begins with one of these")
+    parser.add_argument("--agents", choices=list(AGENTS), default="family", help="which agents of this package")
     parser.add_argument("--device", default="cpu", help="of the models; the ratios to matmul are a CPU's")
     parser.add_argument("--against", type=Path, metavar="WORKTREE", help="another checkout, to compare this one with")
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
@@ -262,14 +296,16 @@ def main() -> None:
         return call if args.device == "cpu" else lambda: (call(), torch.cuda.synchronize())
 
     steps, models, compiling = our_steps(args)
-    flops: dict[str, int] = {}
+    flops: dict[str, float] = {}
+    periods = {label: model.policy_delay for label, model in models.items()}
     for label in steps:
         if label in compiling:
             flops[label] = flops.get(label.replace("compiled", "eager"), 0)
         else:
             with FlopCounterMode(display=False) as counter:
-                steps[label]()
-            flops[label] = counter.get_total_flops()
+                for _ in range(periods[label]):
+                    steps[label]()
+            flops[label] = counter.get_total_flops() / periods[label]
     versions = [f"torch {torch.__version__}", f"stable_baselines3 {stable_baselines3.__version__}"]
     for label, (module, cls) in PEERS.items():
         if not wanted(args, label):
@@ -299,7 +335,7 @@ def main() -> None:
 
         contenders["quantile Huber, sorted (eager)"] = loss_step(quantile_huber)
         contenders["quantile Huber, by definition"] = loss_step(pairwise_quantile_huber)
-    seconds = measure(contenders, args.rounds)
+    seconds = measure(contenders, args.rounds, periods)
 
     matmul_flops = 2 * 2 * 128 * 512 * 512
     #: Ratios of the times in one and the same round.
@@ -327,7 +363,7 @@ def main() -> None:
     if same:
         best = min(same, key=lambda name: statistics.median(seconds[name]))
         print(f"\nAt the same networks and batch, over {best}, the fastest peer:")
-        for name in [n for n in seconds if n.startswith(("SAC", "DAC", "VPL", "TQC", "CrossQ"))]:
+        for name in [n for n in seconds if n in PEERS or n.startswith(("SAC", "DAC", "VPL"))]:
             ratio = statistics.median(a / b for a, b in zip(seconds[name], seconds[best], strict=True))
             print(f"{name:32}{ratio:9.2f}")
     print(f"\n{'':40}{'aim':>8}{'measured':>10}")

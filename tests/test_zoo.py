@@ -24,7 +24,7 @@ from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import StoreDict
 
-from sb3_sample import BRO, DAC, MBMAPPO, SAC, BROFast, RegularizedSAC, zoo
+from sb3_sample import BRO, DAC, MBMAPPO, SAC, XQC, BROFast, RegularizedSAC, zoo
 from sb3_sample.envs import suites
 from sb3_sample.ppo import ExtraSamplesPPO
 from sb3_sample.sac.bro import BRO_RESETS
@@ -166,6 +166,9 @@ def test_the_defaults_lie_in_the_search_space(name: str) -> None:
             return 1 - defaults[key.removeprefix("one_minus_")]
         if key.endswith("_pow"):
             return round(math.log2(defaults[key.removesuffix("_pow")]))
+        if key.startswith("final_share_of_"):
+            rate = key.removeprefix("final_share_of_")
+            return defaults[f"final_{rate}"] / defaults[rate]
         return in_force[key] if defaults[key] is None else defaults[key]
 
     stored = {key: encode(key) for key in trial.params}
@@ -298,9 +301,12 @@ def test_the_tasks_of_p1_have_entries_with_its_settings(name: str) -> None:
             assert ours[env_id]["dynamics_buffer_size"] == 2_000_000 and ours[env_id]["dynamics_batch_size"] == 256
 
 
-def test_the_tasks_of_dr_q_have_its_action_repeat() -> None:
-    ours = {env_id: entry for env_id, entry in entries("dr_q").items() if env_id.startswith("dmc/")}
+@pytest.mark.parametrize("name", ["dr_q", "simba", "simbav2", "xqc"])
+def test_the_published_tasks_have_the_published_action_repeat(name: str) -> None:
+    ours = {env_id: entry for env_id, entry in entries(name).items() if env_id.startswith("dmc/")}
     assert len(ours) == 28
+    default: Any = arguments_of(name)["gamma"]
+    assert default == XQC.discount(1_000, 2) and not any("gamma" in entry for entry in ours.values())
     assert all(entry["env_kwargs"] == {"action_repeat": 2} for entry in ours.values())
     assert {2 * entry["n_timesteps"] for entry in ours.values()} == {1e6}
 

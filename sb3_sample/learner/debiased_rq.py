@@ -31,9 +31,9 @@ class DebiasedRQLearner(Learner):
     from a specification of the update.
 
     The gradient step of values and policy is the family's, on networks that read embeddings and give the encoder no
-    gradient. Before every ``target_update_interval``-th of them, the first included, all targets become copies of
-    their networks, and the encoder takes as many steps on windows, towards the embeddings of the target encoder just
-    copied. Nothing else moves encoder and targets.
+    gradient. Before every ``target_update_interval``-th of them, and the first from the start and from each reset, all
+    targets become copies of their networks, and the encoder takes as many steps on windows, towards the embeddings of
+    the target encoder just copied. Nothing else moves encoder and targets.
 
     :param args: as of :class:`Learner`
     :param embedding_loss: the encoder's loss
@@ -99,7 +99,9 @@ class DebiasedRQLearner(Learner):
     def n_encoder_steps_due(self) -> int:
         """How many steps of the encoder, on a batch of windows each, come before the next gradient step."""
         period = self.target_update_interval or self.policy_delay
-        return period if self.n_updates % period == 0 else 0
+        # A reset leaves an encoder that has learned nothing.
+        is_due = self.n_updates % period == 0 or self.n_updates == self._counts._began_at
+        return period if is_due else 0
 
     def update(
         self,

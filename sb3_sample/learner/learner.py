@@ -80,6 +80,8 @@ class Counts:
     def __init__(self) -> None:
         #: Gradient steps taken.
         self._n_updates = 0
+        #: Gradient steps taken when everything last started anew.
+        self._began_at = 0
         #: Transitions reported by :meth:`Learner.on_step`.
         self.num_transitions = 0
         #: The same of each task, where several take a step together.
@@ -189,6 +191,9 @@ class Learner(Executable):
         with self._random():
             self.networks = make_networks().to(self.device) if networks is None else networks
             plasticity.starts["networks"] = self.networks.drawn_from
+            for critics in (self.critic, self.critic_target):
+                # Past nn.Module's own setattr, which would register it.
+                vars(critics)["value_head"] = self.head
             self.target_entropy: float | torch.Tensor = 0.0
             self.set_target_entropy(-self.actor.action_dim / 2 if target_entropy is None else target_entropy)
             self.temperature = plasticity.first("temperature", lambda: make_temperature(self))
@@ -992,6 +997,7 @@ class Learner(Executable):
         state = {name: owner.state_dict() for name, owner in self._owners_of_state().items()}
         counts = {
             "n_updates": self.n_updates,
+            "began_at": self._counts._began_at,
             "num_transitions": self.num_transitions,
             "num_task_steps": self._counts.num_task_steps,
             "planned_updates": self.planned_updates,
@@ -1015,6 +1021,8 @@ class Learner(Executable):
         counts = state["counts"]
         self._counts._n_updates, self._counts.num_transitions = counts["n_updates"], counts["num_transitions"]
         self._counts.num_task_steps = counts["num_task_steps"]
+        # States of before have none.
+        self._counts._began_at = counts.get("began_at", 0)
         self.planned_updates, self._heard = counts["planned_updates"], counts["heard"]
         if self._generators is not None:
             self._generators.load_state_dict(state["generators"])
@@ -1047,6 +1055,7 @@ class Learner(Executable):
         """
         check_value("to", to, one_of(RESETS_TO))
         again = functools.partial(self.plasticity.again, to=to)
+        self._counts._began_at = self.n_updates
         fresh = again("networks", self._make_networks)
         encoders: list[nn.Module] = self.networks.encoders() if "encoder" in keep else []
         if encoders:

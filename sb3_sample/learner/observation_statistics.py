@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from sb3_sample.learner.batch import for_each
 from sb3_sample.learner.parts import Learning, Part
 
 
@@ -27,7 +28,7 @@ class ObservationStatistics(Part):
     def on_observations(self, learner: Learning, observations: Any) -> None:
         if self._stepped:
             norm = learner.observation_norm
-            norm.update(torch.as_tensor(observations, device=norm.mean.device))
+            norm.update(for_each(lambda part: torch.as_tensor(part, device=norm.mean.device), observations))
         self._stepped = False
 
     def on_environment_reset(self, learner: Learning) -> None:

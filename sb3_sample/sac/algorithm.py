@@ -163,6 +163,8 @@ class SAC(  # type: ignore[misc]  # actor
         self.num_transitions = 0
         #: The same of each task, where several take a step together.
         self.num_task_steps = 0
+        # Gradient steps taken when everything last started anew.
+        self._began_at = 0
         #: Gradient steps of ``learn_offline`` over the model's life.
         self._n_offline_updates = 0
         # The data set of a ``learn_offline`` under way, and what a file names of the prior data.

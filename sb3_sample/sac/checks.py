@@ -295,6 +295,12 @@ def _check_schedule(agent: Any) -> None:
             f"learning_rate={agent.learning_rate!r} is a schedule, and so is "
             f"learning_rate_schedule={agent.learning_rate_schedule!r}: pass a number, or learning_rate_schedule=None"
         )
+    if agent.final_learning_rate > agent.learning_rate:
+        raise ValueError(
+            f"final_learning_rate={agent.final_learning_rate} lies above learning_rate={agent.learning_rate}, from "
+            f"which learning_rate_schedule={agent.learning_rate_schedule!r} decays: pass final_learning_rate= too, at "
+            "most learning_rate, or learning_rate_schedule=None for none"
+        )
     if agent.schedule_steps is not None and agent.schedule_steps <= agent.warm_up_steps:
         raise ValueError(
             f"schedule_steps={agent.schedule_steps} must exceed warm_up_steps={agent.warm_up_steps}, which are part of "

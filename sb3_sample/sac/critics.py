@@ -42,6 +42,8 @@ class CriticEnsemble(NetworkFeatures, BaseModel):
     at_rest: Any = None
     #: Whether the features extractor is that of other critics.
     shares_encoder: bool = False
+    #: The learner's value head, which says what the outputs mean; None without a learner.
+    value_head: Any = None
     _encoder: Any
 
     def __init__(
@@ -122,10 +124,20 @@ class CriticEnsemble(NetworkFeatures, BaseModel):
 
         :param obs: observations, (B, O), or a dict of them
         :param actions: actions in [-1, 1], (B, A)
-        :return: the first critic's value, the mean of its quantiles if it has some, (B, 1). Of critics that are
-            classifiers it is the mean of logits, no value: ``learner.head.values`` of :meth:`q_values` has theirs
+        :return: the first critic's value, (B, 1): the mean of its quantiles if it has some, the expectation over its
+            atoms if it is a classifier
+        :raises ValueError: if the critics have several outputs and belong to no learner, whose value head says what
+            they mean
         """
-        return self.q_values(obs, actions)[0].mean(dim=1, keepdim=True)
+        outputs = self.q_values(obs, actions)
+        if self.value_head is not None:
+            outputs = self.value_head.values(outputs)
+        elif outputs.shape[-1] > 1:
+            raise ValueError(
+                f"q1_forward: a model's value head says what {outputs.shape[-1]} outputs a critic mean, and these "
+                "critics have none: call it on those of a model (model.critic), or q_values for the outputs"
+            )
+        return outputs[0].mean(dim=1, keepdim=True)
 
     @property
     def q_networks(self) -> list[Callable[[torch.Tensor], torch.Tensor]]:

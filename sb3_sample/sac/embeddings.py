@@ -11,7 +11,6 @@ from stable_baselines3.common.policies import BaseModel, BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
-    CombinedExtractor,
     FlattenExtractor,
     NatureCNN,
     get_actor_critic_arch,
@@ -29,6 +28,7 @@ from sb3_sample.optim import AdamW
 from sb3_sample.sac.actors import DeterministicActor
 from sb3_sample.sac.critics import CriticEnsemble
 from sb3_sample.sac.features import TensorFeatures
+from sb3_sample.sac.multi_task import dict_extractor
 from sb3_sample.sac.policies import SACPolicy
 
 
@@ -312,8 +312,13 @@ class DebiasedRQCnnPolicy(DebiasedRQPolicy):
 
 
 class DebiasedRQMultiInputPolicy(DebiasedRQPolicy):
-    """The same with an extractor for dict observations before the encoder."""
+    """
+    The same with an extractor for dict observations before the encoder; ``TaskOneHot`` if they tell the task beside a
+    vector.
 
-    def __init__(self, *args: Any, **kwargs: Any):
-        kwargs.setdefault("features_extractor_class", CombinedExtractor)
-        super().__init__(*args, **kwargs)
+    :param observation_space: observation space
+    """
+
+    def __init__(self, observation_space: spaces.Space, *args: Any, **kwargs: Any):
+        kwargs.setdefault("features_extractor_class", dict_extractor(observation_space))
+        super().__init__(observation_space, *args, **kwargs)

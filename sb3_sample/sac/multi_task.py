@@ -7,8 +7,10 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
 from torch import nn
+
+from sb3_sample.networks import RunningNorm
 
 
 def is_multi_task(space: spaces.Space | None) -> bool:
@@ -58,6 +60,14 @@ class TaskOneHot(BaseFeaturesExtractor):
         return torch.cat((vectors, observations["task"].flatten(1)), dim=1) if self.n_tasks > 1 else vectors
 
 
+def dict_extractor(space: spaces.Space) -> type[BaseFeaturesExtractor]:
+    """
+    :param space: of dict observations
+    :return: class of the features extractor that reads them unless another is asked for
+    """
+    return TaskOneHot if reads_one_hot(space) else CombinedExtractor
+
+
 class TaskEmbedding(BaseFeaturesExtractor):
     """
     Observation and the embedding of its task, a learned vector divided by its length (BRC).
@@ -81,6 +91,26 @@ class TaskEmbedding(BaseFeaturesExtractor):
         rows = observations["task"].flatten(1) @ self.table
         lengths = torch.linalg.vector_norm(rows, dim=1, keepdim=True)
         return torch.cat((observations["observation"].flatten(1), rows / lengths), dim=1)
+
+
+class TaskRunningNorm(RunningNorm):
+    """Running normalisation of observations that tell their task, which it leaves as it is: one for all tasks."""
+
+    def update(self, values: Any, more_count: float = 0.0) -> None:
+        """
+        Add observations.
+
+        :param values: "observation", (n, ...), and "task"
+        :param more_count: as of :class:`RunningNorm`
+        """
+        super().update(values["observation"], more_count)
+
+    def forward(self, x: Any) -> Any:
+        """
+        :param x: "observation", (B, ...), and "task"
+        :return: the same with the observation normalised
+        """
+        return {**x, "observation": super().forward(x["observation"])}
 
 
 def told_task(space: spaces.Dict, observation: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,6 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
-    CombinedExtractor,
     FlattenExtractor,
     NatureCNN,
     get_actor_critic_arch,
@@ -27,7 +26,7 @@ from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.optim import AdamW
 from sb3_sample.sac.actors import BACKBONES, Actor, DeterministicActor
 from sb3_sample.sac.critics import CriticEnsemble, ValueNetwork
-from sb3_sample.sac.multi_task import TaskOneHot, reads_one_hot
+from sb3_sample.sac.multi_task import TaskRunningNorm, dict_extractor, is_multi_task
 from sb3_sample.sac.trunks import network_args
 
 
@@ -160,7 +159,7 @@ class SACPolicy(BasePolicy):
         self._projection = projection, projection_gain
         self.observation_norm: RunningNorm | None = None
         if normalize_observations:
-            self.observation_norm = RunningNorm(_normalized_shape(observation_space))
+            self.observation_norm = _running_norm(observation_space)
 
         def critics(encoder: Any = None) -> CriticEnsemble:
             extractor: Any = self.make_features_extractor() if encoder is None else encoder
@@ -416,6 +415,13 @@ class SACPolicy(BasePolicy):
         self.training = mode
 
 
+def _running_norm(space: spaces.Space) -> RunningNorm:
+    """Running normalisation of observations, without their task if they tell one."""
+    if is_multi_task(space):
+        return TaskRunningNorm(_normalized_shape(space["observation"]))  # type: ignore[index]
+    return RunningNorm(_normalized_shape(space))
+
+
 def _normalized_shape(space: spaces.Space) -> tuple[int, ...]:
     """Shape of observations whose running normalisation makes sense."""
     if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and not is_image_space(space):
@@ -449,6 +455,5 @@ class MultiInputPolicy(SACPolicy):
     """
 
     def __init__(self, observation_space: spaces.Space, *args: Any, **kwargs: Any):
-        extractor = TaskOneHot if reads_one_hot(observation_space) else CombinedExtractor
-        kwargs.setdefault("features_extractor_class", extractor)
+        kwargs.setdefault("features_extractor_class", dict_extractor(observation_space))
         super().__init__(observation_space, *args, **kwargs)

@@ -29,9 +29,14 @@ class SB3Names(HasLearner):
     def log_ent_coef(self, value: Any) -> None:
         if not isinstance(self.temperature, LogScalar):
             raise ValueError(f"log_ent_coef cannot be set to {value}: the temperature is not learned")
-        if not math.isfinite(float(value)):
+        own = self.temperature.log_value
+        given = torch.as_tensor(value, dtype=own.dtype, device=own.device)
+        if given.numel() != 1 and given.shape != own.shape:
+            shape = f"a number for each of the {own.numel()} tasks, or one for all" if own.dim() else "one number"
+            raise ValueError(f"log_ent_coef must be {shape}, not {value}")
+        if not given.isfinite().all():
             raise ValueError(f"log_ent_coef must be finite, not {value}")
-        self.temperature.log_value.data.fill_(float(value))
+        own.data.copy_(given.detach() if given.shape == own.shape else given.detach().reshape(()))
 
     @property
     def ent_coef_tensor(self) -> torch.Tensor:

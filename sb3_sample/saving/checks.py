@@ -40,7 +40,7 @@ MAX_BUFFER_BYTES = 2**44
 #: Counts of what was done, and what is owed: less than a gradient step, but for rounding, at the end of each turn.
 _COUNTS = (
     "num_timesteps", "_num_timesteps_at_start", "_total_timesteps", "_episode_num", "_n_updates", "num_transitions",
-    "_iteration", "_n_new", "_n_offline_updates", "num_rewound_steps", "num_task_steps",
+    "_iteration", "_n_new", "_n_offline_updates", "num_rewound_steps", "num_task_steps", "_began_at",
 )  # fmt: skip
 _MAX_COUNT = 2**53
 _NUMBER = (int, float, np.integer, np.floating)

@@ -46,8 +46,10 @@ def _mixture(*group: str) -> Suggest:
 
 # ---------------------------------------------------------------- search spaces
 # ``one_minus_<x>`` and ``<x>_pow`` are 1 - x and log2(x): the scales on which a change by the same amount means as much
-# anywhere in the range. The ranges contain the defaults of the classes.
+# anywhere in the range. ``final_share_of_<rate>`` is ``final_<rate>`` as a share of the rate, so that none rises. The
+# ranges contain the defaults of the classes.
 
+_FINAL_SHARE = "final_share_of_"
 #: With ``HerReplayBuffer``, in addition.
 HER_SPACE: Space = {
     "n_sampled_goal": _int(1, 5),
@@ -121,7 +123,7 @@ SIMBA_SPACE: Space = {
 SIMBAV2_SPACE: Space = {
     **OFF_POLICY_SPACE,
     "n_critics": _int(1, 2),
-    "final_learning_rate": _float(1e-6, 1e-3, log=True),
+    "final_share_of_learning_rate": _float(0.01, 1.0, log=True),
     "replay_ratio": _int(1, 8, log=True),
 }
 CROSSQ_SPACE: Space = {
@@ -132,13 +134,13 @@ CROSSQ_SPACE: Space = {
 }
 XQC_SPACE: Space = {
     **OFF_POLICY_SPACE,
-    "final_learning_rate": _float(1e-6, 1e-3, log=True),
+    "final_share_of_learning_rate": _float(0.01, 1.0, log=True),
     "policy_delay": _int(1, 4),
     "replay_ratio": _int(1, 8, log=True),
 }
 FLASH_SPACE: Space = {
     **OFF_POLICY_SPACE,
-    "final_learning_rate": _float(1e-6, 1e-3, log=True),
+    "final_share_of_learning_rate": _float(0.01, 1.0, log=True),
     "target_std": _float(0.05, 0.5, log=True),
     "policy_delay": _int(1, 4),
     "replay_ratio": _int(1, 4),
@@ -234,12 +236,16 @@ REGULARIZED_SPACE: Space = {
 def decode(params: dict[str, Any]) -> dict[str, Any]:
     """
     :param params: suggested parameters, as Optuna stores them
-    :return: arguments of the constructor: ``one_minus_gamma`` is ``gamma``, ``batch_size_pow`` ``batch_size``, and the
-        parameters of ``HER_SPACE`` are ``replay_buffer_kwargs``
+    :return: arguments of the constructor: ``one_minus_gamma`` is ``gamma``, ``batch_size_pow`` ``batch_size``,
+        ``final_share_of_learning_rate`` times the rate ``final_learning_rate``, and the parameters of ``HER_SPACE`` are
+        ``replay_buffer_kwargs``
     """
     arguments: dict[str, Any] = {}
     for name, value in params.items():
-        if name in HER_SPACE:
+        if name.startswith(_FINAL_SHARE):
+            rate = name.removeprefix(_FINAL_SHARE)
+            arguments[f"final_{rate}"] = value * params[rate]
+        elif name in HER_SPACE:
             arguments.setdefault("replay_buffer_kwargs", {})[name] = value
         elif name.startswith("one_minus_"):
             arguments[name.removeprefix("one_minus_")] = 1 - value

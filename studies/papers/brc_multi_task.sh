@@ -4,7 +4,8 @@
 # at 100k, 200k, 500k and 1M steps of each: 63, 193, 494, 680. For Meta-World's MT10 and MT50 a million steps of each
 # task stand in for steps that are not known here. A gradient step is some 1,700 GFLOP: days on a GPU for each seed.
 #   sh studies/papers/brc_multi_task.sh DMC_HARD|MT10|MT50 [FURTHER ARGUMENTS OF examples/multi_task.py]
-# On a CPU the same with critics 512 wide, about an hour a seed, evaluated at 0, 5,000 and 10,000 steps of each task:
+# On a CPU the same with critics 512 wide, evaluated at 0, 5,000 and 10,000 steps of each task: 19,000 gradient steps of
+# 28 GFLOP, at least 1.6 hours a seed on a core of 90 GFLOP/s:
 #   python examples/multi_task.py --tasks MT10 --seed 0 --folder runs/brc_mt10
 # SEEDS="0 1" and PYTHON=... choose seeds and interpreter. Interrupted and started again, each run goes on.
 set -e

@@ -10,7 +10,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import ConstantSchedule
 
 from sb3_sample.learner.schedules import LearningRateSchedule
-from sb3_sample.sac import SAC
+from sb3_sample.sac import SAC, XQC
 from tests.sac.common import COMPILES, bro, differing, random_batch, sac, state, vec
 
 
@@ -154,6 +154,10 @@ def test_a_learner_alone() -> None:
         (
             {"learning_rate_schedule": "linear", "learning_rate": lambda p: p},
             "learning_rate=.* is a schedule, and so is learning_rate_schedule='linear'",
+        ),
+        (
+            {"cls": XQC, "learning_rate": 1e-5},
+            "final_learning_rate=3e-05 lies above learning_rate=1e-05, .* pass final_learning_rate= too",
         ),
         (
             {"learning_rate_schedule": "linear", "schedule_steps": 5, "warm_up_steps": 5},

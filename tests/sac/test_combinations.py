@@ -270,6 +270,9 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
             ("warm_up_steps=5",),
         ),
     ],
+    "`final_learning_rate` above `learning_rate`": [
+        (SimbaV2, {"policy_kwargs": TINY_RESIDUAL, "learning_rate": 1e-5}, ("final_learning_rate=5e-05", "=1e-05")),
+    ],
     "`normalize_observations` with observations other than a Box of floats": [
         (
             SAC,

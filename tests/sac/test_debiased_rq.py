@@ -157,6 +157,21 @@ def test_a_reset_starts_the_encoder_anew_too() -> None:
     assert model.plasticity.n_done == 1 and not same(copies(model.encoder), before)
 
 
+def test_a_block_of_the_encoder_follows_a_reset_at_once(tmp_path: Path) -> None:
+    model = dr_q(learning_starts=20).learn(30)
+    learner: Any = model.learner
+    step = learner.n_updates
+    assert step % 5 not in (0, 4) and learner.n_encoder_steps_due == 0
+    model.reinitialize()
+    assert learner.n_encoder_steps_due == 5
+    model.save(tmp_path / "m")
+    loaded: Any = DebiasedRQ.load(tmp_path / "m")
+    assert loaded.learner.n_encoder_steps_due == 5
+    model.train(1)
+    assert model.encoder.optimizer.state[model.encoder.action.weight]["step"].item() == 5
+    assert learner.n_updates == step + 1 and learner.n_encoder_steps_due == 0
+
+
 # ---------------------------------------------------------------- spaces and wrappers
 
 

@@ -457,6 +457,27 @@ def test_critics_as_one_tensor() -> None:
         _ = q.colour
 
 
+@pytest.mark.parametrize("name", ["SAC", "BRO", "BRC", "DebiasedRQ"])
+def test_values_of_critics_whatever_their_outputs(name: str, tmp_path: Path) -> None:
+    model = MAKERS[name]()
+    batch = random_batch(model)
+    given = batch.observations, batch.actions
+    outputs = model.critic.q_values(*given)
+    expected = (
+        (outputs.softmax(dim=2) * torch.linspace(-10, 10, 21)).sum(dim=2) if name == "BRC" else outputs.mean(dim=2)
+    )
+    torch.testing.assert_close(model.head.values(model.critic(*given)).mean(dim=2).T, expected.T)
+    torch.testing.assert_close(model.critic.q1_forward(*given), expected[0][:, None])
+    torch.testing.assert_close(model.critic_target.q1_forward(*given), expected[0][:, None])
+    model.policy.save(tmp_path / "p")
+    alone = type(model.policy).load(tmp_path / "p").critic
+    if outputs.shape[2] == 1:
+        assert torch.equal(alone.q1_forward(*given), model.critic.q1_forward(*given))
+    else:
+        with pytest.raises(ValueError, match=f"says what {outputs.shape[2]} outputs a critic mean"):
+            alone.q1_forward(*given)
+
+
 @pytest.mark.parametrize("make", [sac, bro])
 def test_critics_one_by_one(make: Any) -> None:
     model = make().learn(15)

@@ -32,6 +32,8 @@ from tests.sac.common import COMPILES, MAKERS, Toy, bro, differing, sac, state, 
 
 ROOT = Path(__file__).parents[2]
 PENDULUM, CAR = "Pendulum-v1", "MountainCarContinuous-v0"
+#: A Dict that tells no task.
+GOALS = spaces.Dict({name: spaces.Box(-10, 10, (3,), np.float32) for name in ("observation", "goal")})
 #: Of episodes of eight steps.
 SHORT = {"max_episode_steps": 8}
 
@@ -53,14 +55,15 @@ def told(task: Any, n: int | None = None) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("policy", ["MlpPolicy", "MultiInputPolicy"])
-@pytest.mark.parametrize("name", ["BRC", "BRO", "SAC"])
+@pytest.mark.parametrize("name", ["BRC", "BRO", "SAC", "SimBa", "DebiasedRQ"])
 def test_one_task_is_single_task_bit_by_bit(name: str, policy: str) -> None:
     """Nothing is appended and nothing widened, whatever is asked of several tasks."""
-    asked: dict[str, Any] = {"task_temperatures": True, "target_entropy": [-0.5]}
+    asked: dict[str, Any] = {} if name == "DebiasedRQ" else {"task_temperatures": True, "target_entropy": [-0.5]}
     asked |= {} if name == "BRC" else {"multitask": True}
     multi = make(name, tasks(PENDULUM), policy, **asked).learn(40)
     single = make(name, make_vec_env(PENDULUM, seed=0, env_kwargs=SHORT), "MlpPolicy").learn(40)
-    assert multi._n_updates == single._n_updates == 30
+    # DR.Q's random steps include the ends of episodes.
+    assert multi._n_updates == single._n_updates == (31 if name == "DebiasedRQ" else 30)
     assert len(state(single)) > 30 and not differing(state(multi), state(single))
     single_action, _ = single.predict(told(0)["observation"], deterministic=True)
     assert np.array_equal(multi.predict(told(0), deterministic=True)[0], single_action)
@@ -90,6 +93,24 @@ def test_the_multitask_bro_reads_the_one_hot_vector_and_is_twice_as_wide() -> No
     features = model.actor.features(observations)
     assert features[:, :3].numpy().tolist() == told(0, 2)["observation"].tolist()
     assert features[:, 3:].tolist() == [[1, 0], [0, 1]]
+
+
+def test_one_running_norm_is_of_the_observations_of_all_tasks(tmp_path: Path) -> None:
+    model = make("SimbaV2").learn(40)
+    norm = model.learner.observation_norm
+    # Of 20 steps of each task, without the first observation.
+    assert norm.mean.shape == (3,) and norm.count.item() == pytest.approx(2 * 19, abs=1e-3)
+    seen = model.policy.obs_to_tensor(told(np.array([0, 1]), 2))[0]
+    expected = (seen["observation"] - norm.mean) / (norm.var + 1e-8).sqrt()
+    features = model.actor.features(seen)
+    torch.testing.assert_close(features[:, :3], expected.float())
+    assert features[:, 3:].tolist() == [[1, 0], [0, 1]]
+    model.save(tmp_path / "m")
+    loaded = type(model).load(tmp_path / "m", env=tasks())
+    assert not differing(state(model), state(loaded)) and loaded.learn(10, reset_num_timesteps=False)._n_updates > 0
+    model.policy.save(tmp_path / "p")
+    action, _ = type(model.policy).load(tmp_path / "p").predict(told(np.array([0, 1]), 2), deterministic=True)
+    assert np.array_equal(action, model.predict(told(np.array([0, 1]), 2), deterministic=True)[0])
 
 
 def test_every_algorithm_can_be_widened() -> None:
@@ -161,6 +182,23 @@ def batch_of(model: Any, n: int = 6, seed: int = 0) -> Any:
     model.learn(30)
     batch = next(iter(model._source.batches(1, n)))
     return batch._replace(**{name: {"observation": value, "task": task} for name, value in random.items()})
+
+
+def test_temperatures_are_set_one_by_one_or_all_at_once() -> None:
+    model = make("SAC", task_temperatures=True)
+    model.log_ent_coef = [-1.0, -2.0]
+    model.log_ent_coef = model.log_ent_coef
+    assert model.log_ent_coef is model.temperature.log_value and model.log_ent_coef.tolist() == [-1.0, -2.0]
+    model.log_ent_coef = -3
+    assert model.log_ent_coef.tolist() == [-3.0, -3.0]
+    for value, words in (
+        ([1.0, 2.0, 3.0], "a number for each of the 2 tasks, or one for"),
+        ([0.0, math.nan], "finite"),
+    ):
+        with pytest.raises(ValueError, match=f"log_ent_coef must be {words}"):
+            model.log_ent_coef = value
+    with pytest.raises(ValueError, match="log_ent_coef must be one number"):
+        make("SAC").log_ent_coef = [1.0, 2.0]
 
 
 @pytest.mark.parametrize("target_entropy", ["auto", [-0.25, -2.0]])
@@ -498,7 +536,7 @@ def test_validation_goes_with_tasks() -> None:
         ("SAC", {"policy_kwargs": {"width_factor": 2}}, "width_factor is an argument of the algorithm"),
         ("SAC", {"policy": "CnnPolicy"}, "CnnPolicy"),
         ("SAC", {"n_steps": 3}, "n_steps=3 is not supported with Dict"),
-        ("SimBa", {}, "normalize_observations=True needs observations of a Box of floats, not of Dict"),
+        ("SimBa", {"env": vec(obs_space=GOALS)}, "normalize_observations=True needs observations of a Box of floats"),
     ],
 )
 def test_refused(name: str, kwargs: dict[str, Any], words: str) -> None:

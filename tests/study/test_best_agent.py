@@ -80,7 +80,7 @@ def test_all_agents_have_action_repeat_1(name: str, agent_flops: Any) -> None:
 
 def test_action_repeat_of_a_plan_that_does_not_say_it_is_the_zoos(plan: Plan, agent_flops: Any) -> None:
     repeats = {run.agent: agent_flops.action_repeat(dataclasses.replace(run, env_kwargs={})) for run in plan.runs}
-    assert repeats == {name: 2 if name == "DR.Q narrow" else 1 for name in names("best_agent")}
+    assert repeats == {name: 1 if name in ("BRO", "BRO categorical") else 2 for name in names("best_agent")}
 
 
 def test_what_goes_into_the_final_is_as_it_was_screened(screening: dict[str, Run]) -> None:
