@@ -61,7 +61,6 @@ def test_a_pair_that_was_not_measured_is_the_product_of_two_ratios(tmp_path: Pat
 
 def test_steps_that_runs_under_way_have_made_are_not_counted(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(module, "measure", lambda run, threads, device: Cost(1.0, 100.0, 10.0))
-    monkeypatch.setattr(module, "check_actions", lambda plan: None)  # of a made-up task
     base = Run("A", "sac_sample", {}, {}, "x", 0, 3600, 500, 3)
     runs = [base, dataclasses.replace(base, seed=1)]
     (StudyFolder(tmp_path).place(base) / "checkpoint-000000000900").mkdir(parents=True)
