@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
+from unittest import mock
 
 import torch
 from torch.fx import GraphModule
@@ -16,6 +17,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from torch.overrides import TorchFunctionMode
 
 _local = threading.local()
+_compiling = threading.Lock()
 
 
 def is_tracing() -> bool:
@@ -95,5 +97,28 @@ def compile_graph(graph: GraphModule, inputs: Sequence[torch.Tensor]) -> Callabl
 
     # In torch 2.11 it fails on steps of many tensors at once, which the optimizers take.
     patches = {"loop_ordering_after_fusion": False}
-    compiled: Any = compile_fx(graph, list(inputs), config_patches=patches)
+    with _users_that_read_nothing():
+        compiled: Any = compile_fx(graph, list(inputs), config_patches=patches)
     return compiled  # type: ignore[no-any-return]
+
+
+@contextmanager
+def _users_that_read_nothing() -> Iterator[None]:
+    """
+    Let Inductor ask loops how they read a buffer that they do not read. Its C++ backend asks all users of a buffer that
+    could stay within fused loops, also those that only have to wait for it, such as the write to a parameter from whose
+    old value it was computed, and fails with a KeyError (pytorch/pytorch#196570, open in torch 2.14). Answered with
+    None, it keeps the buffer where it is.
+    """
+    from torch._inductor.loop_body import LoopBody
+
+    read = LoopBody.get_read_expr
+
+    def read_or_none(self: Any, name: str) -> Any:
+        try:
+            return read(self, name)
+        except KeyError:
+            return None
+
+    with _compiling, mock.patch.object(LoopBody, "get_read_expr", read_or_none):
+        yield

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sb3_sample import BRO, SRSPR, DiagnosticsCallback
+from sb3_sample import BRO, SRSPR, DiagnosticsCallback, tracing
 from sb3_sample.learner import execution
 from sb3_sample.learner.execution import Execution, foreign_parts, old_torch, why_not_compiled
 from sb3_sample.learner.heads import ValueHead
@@ -149,6 +149,18 @@ def updates(model: Any, n: int, seed: int = 0, each: Callable[[int], None] = lam
     for i in range(n):
         each(i)
         model.train(1, 8)
+
+
+def test_a_loop_that_reads_nothing_of_a_buffer_is_no_error_of_inductor() -> None:
+    """FlashSAC's weights of unit norm have it, compiled: test_golden.py."""
+    loop_body = pytest.importorskip("torch._inductor.loop_body")
+    of_no_reads = SimpleNamespace(memory_usage={loop_body.MemoryUsageType.LOAD: []})
+    read = loop_body.LoopBody.get_read_expr
+    with tracing._users_that_read_nothing():
+        assert loop_body.LoopBody.get_read_expr(of_no_reads, "buf0") is None
+    assert loop_body.LoopBody.get_read_expr is read
+    with pytest.raises(KeyError):
+        read(of_no_reads, "buf0")
 
 
 # test_golden.py has the published files' steps compiled, test_drq.py those from pixels, with a tolerance for their
