@@ -28,8 +28,8 @@ from tests.test_architecture import circles, imports
 
 ROOT = Path(__file__).parents[1]
 ZOO = sorted((ROOT / "sb3_sample/zoo").glob("*.py"))
-#: What other files of the zoo's commands may set: the command line, which the zoo reads, the writer of a TensorBoard log
-#: that a run goes on with, and the environment of this package's own callback.
+#: What other files of the zoo's commands may set: the command line, which the zoo reads, the writer of a TensorBoard
+#: log that a run goes on with, and the environment of this package's own callback.
 OWN = {"sys.argv", "each.writer", "model.num_timesteps", "callback.eval_env"}
 #: What ``register`` replaces in ``rl_zoo3``.
 FOR_GOOD = {
