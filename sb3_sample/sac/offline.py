@@ -182,7 +182,7 @@ def _check_keeps_no_encoder(agent: SAC) -> None:
 
 
 def _check_copies(learner: Learner, names: Sequence[str], why: str) -> None:
-    """Whether an augmentation makes copies of transitions that nothing would learn from."""
+    """Check that an augmentation makes no copies of transitions that nothing would learn from."""
     for name in names:
         if (n := getattr(learner, name)) > 1:
             raise ValueError(f"{name}={n} of the augmentation means nothing here, since {why}: leave it out")

@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-#: What an agent learns from besides the environment, and for how many steps.
+#: Data that an agent learns from besides the environment, and the steps that it takes on them.
 DATA = ("dataset", "offline_steps", "prior_data")
 #: The published curves' evaluation.
 EVERY, EPISODES = 25_000, 5

@@ -294,7 +294,7 @@ class _Reader:
         return value
 
     def _check_data(self, agent: _Agent, steps: int, tasks: list[str]) -> None:
-        """Whether an agent can learn from its data so."""
+        """Check that an agent can learn from its data so."""
         data, entries = agent.data, agent.entries
         for name in ("dataset", "prior_data"):
             for task in data[name] if isinstance(data.get(name), dict) else ():
@@ -385,7 +385,7 @@ class _Reader:
         tasks: list[str],
         env_kwargs: dict[str, Any],
     ) -> None:
-        """Whether each agent takes the actions of its tasks."""
+        """Check that each agent takes the actions of its tasks."""
         of_tasks = {task: action_space(task, env_kwargs) for task in tasks}
         for agent, arguments, _ in variants:
             tried = set()
@@ -397,7 +397,7 @@ class _Reader:
                     raise self._fail(agent.node, f"agent {agent.name!r} cannot act in task {task!r}: {why}")
 
     def _check_measured(self, name: str, node: yaml.Node, agents: list[_Agent]) -> None:
-        """What is measured is of the networks of the off-policy family."""
+        """Check that all agents are of the off-policy family, of whose networks the measurements are."""
         from sb3_sample.sac import SAC
 
         for agent in agents:
@@ -528,7 +528,7 @@ def _without_data(agent: _Agent, arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def _has_data_on(data: Mapping[str, Any], task: str) -> bool:
-    """Whether there is a data set for a task wherever they are named by task."""
+    """Check whether there is a data set for a task wherever they are named by task."""
     return all(task in value for value in data.values() if isinstance(value, dict))
 
 

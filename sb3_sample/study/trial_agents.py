@@ -68,11 +68,11 @@ def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | Non
     policy = settings.setdefault("policy", "MlpPolicy" if "MlpPolicy" in algorithm.policy_aliases else "CnnPolicy")
     if policy == "CnnPolicy" and "buffer_size" in known:
         settings["buffer_size"] = 1_000  # pictures, of which hardly anything is stored here
-    envs: list[Any] = ["Pendulum-v1", "CartPole-v1"] if policy == "MlpPolicy" and actions is None else [None]
+    envs: list[Any] = ["Pendulum-v1", "CartPole-v1"]
+    if policy != "MlpPolicy" or actions is not None:
+        envs = [NoEnvironment(_observations(algo, policy), usual_actions(algo) if actions is None else actions)]
     errors: list[Exception] = []
     for env in envs:
-        if env is None:
-            env = NoEnvironment(_observations(algo, policy), usual_actions(algo) if actions is None else actions)
         try:
             algorithm(**{"device": "cpu", **settings, "env": env})
             return
@@ -91,7 +91,7 @@ def usual_actions(algo: str) -> "spaces.Space[Any]":
 
 
 def _is_for_games(algo: str) -> bool:
-    """Whether an algorithm is for Atari's games alone."""
+    """Check whether an algorithm is for Atari's games alone."""
     algorithm: Any = algorithms()[algo].algorithm
     return "MlpPolicy" not in algorithm.policy_aliases and not hasattr(algorithm, "learn_offline")
 

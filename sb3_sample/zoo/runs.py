@@ -715,7 +715,7 @@ class RunManager(Manager):
 
 
 def _for_evaluation(wrapper: Any) -> Any:
-    """What ``env_wrapper`` is for evaluation: Atari's games are whole ones there, their rewards as they are."""
+    """Adapt ``env_wrapper`` to evaluation: Atari's games are whole ones there, their rewards as they are."""
     if isinstance(wrapper, list):
         return [_for_evaluation(each) for each in wrapper]
     path, arguments = next(iter(wrapper.items())) if isinstance(wrapper, dict) and len(wrapper) == 1 else (wrapper, {})

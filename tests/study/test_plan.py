@@ -71,35 +71,27 @@ def test_a_run_is_a_command_of_train(plan_of) -> None:
     ]  # fmt: skip
 
 
-def test_a_plan_whose_runs_measure_their_gradients(plan_of) -> None:
-    run = plan_of(GOOD + "measure: 1_000\n").runs[0]
-    measure = "callback:{'sb3_sample.diagnostics.NoiseScaleCallback': {'every': 1000}}"
-    assert run.command(Path("x"))[-3:] == ["learning_starts:500", "replay_ratio:1", measure]
-    assert Run.of_json(run.as_json()) == run and run.kind == plan_of(GOOD).runs[0].kind
-    assert "measure" not in plan_of(GOOD).runs[0].as_json()
-    with pytest.raises(PlanError, match="line 14: measure must be a whole number of at least 1, not 0"):
-        plan_of(GOOD + "measure: 0\n")
-    ppo = GOOD.replace("  BRO Fast:\n    algo: bro_fast\n    model_size: 0.55M\n", "").replace("sac_sample", "mbma_ppo")
-    ppo = ppo.replace("    learning_starts: 500\n", "").replace("grid:\n  replay_ratio: [1, 2]\n", "")
-    with pytest.raises(PlanError, match="measure is of off-policy agents, and 'SAC' is mbma_ppo: leave it out"):
-        plan_of(ppo + "measure: 10\n")
+MEASURE = "{'sb3_sample.diagnostics.NoiseScaleCallback': {'every': 1000}}"
+DIAGNOSTICS = "{'sb3_sample.diagnostics.DiagnosticsCallback': {'every': 1000}}"
 
 
-def test_a_plan_whose_runs_have_diagnostics(plan_of) -> None:
-    run = plan_of(GOOD + "diagnostics: 10_000\n").runs[0]
-    theirs = "{'sb3_sample.diagnostics.DiagnosticsCallback': {'every': 10000}}"
-    assert run.command(Path("x"))[-1] == f"callback:{theirs}"
+@pytest.mark.parametrize(("entry", "callback"), [("measure", MEASURE), ("diagnostics", DIAGNOSTICS)])
+def test_a_plan_whose_runs_measure_their_networks(plan_of, entry: str, callback: str) -> None:
+    run = plan_of(f"{GOOD}{entry}: 1_000\n").runs[0]
+    assert run.command(Path("x"))[-3:] == ["learning_starts:500", "replay_ratio:1", f"callback:{callback}"]
     assert Run.of_json(run.as_json()) == run and run.kind == plan_of(GOOD).runs[0].kind
-    assert "diagnostics" not in plan_of(GOOD).runs[0].as_json()
-    both = plan_of(GOOD + "diagnostics: 10_000\nmeasure: 1_000\n").runs[0]
-    measure = "{'sb3_sample.diagnostics.NoiseScaleCallback': {'every': 1000}}"
-    assert both.command(Path("x"))[-1] == f"callback:[{measure}, {theirs}]"
-    with pytest.raises(PlanError, match="line 14: diagnostics must be a whole number of at least 1, not 0"):
-        plan_of(GOOD + "diagnostics: 0\n")
+    assert entry not in plan_of(GOOD).runs[0].as_json()
+    with pytest.raises(PlanError, match=f"line 14: {entry} must be a whole number of at least 1, not 0"):
+        plan_of(f"{GOOD}{entry}: 0\n")
     ppo = GOOD.replace("  BRO Fast:\n    algo: bro_fast\n    model_size: 0.55M\n", "").replace("sac_sample", "mbma_ppo")
     ppo = ppo.replace("    learning_starts: 500\n", "").replace("grid:\n  replay_ratio: [1, 2]\n", "")
-    with pytest.raises(PlanError, match="diagnostics is of off-policy agents, and 'SAC' is mbma_ppo: leave it out"):
-        plan_of(ppo + "diagnostics: 10\n")
+    with pytest.raises(PlanError, match=f"{entry} is of off-policy agents, and 'SAC' is mbma_ppo: leave it out"):
+        plan_of(f"{ppo}{entry}: 10\n")
+
+
+def test_a_plan_whose_runs_measure_both(plan_of) -> None:
+    run = plan_of(GOOD + "diagnostics: 1_000\nmeasure: 1_000\n").runs[0]
+    assert run.command(Path("x"))[-1] == f"callback:[{MEASURE}, {DIAGNOSTICS}]"
 
 
 def test_a_suite_is_its_tasks_each_once(plan_of) -> None:
