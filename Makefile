@@ -2,6 +2,7 @@
 # make test      set up, lint, types, tests (what CI runs)
 # make test-all  the same with the long tests
 # make evidence  go on with the runs of studies/evidence (WORKERS=2: two at once)
+# make evidence-pages  write what has come of them into the pages of docs
 # make gpu       tests and benchmark of a GPU, with that machine's own torch; without a package registry there, take
 #                along what `make gpu-wheels` gathers into .gpu/wheels on a machine with one
 # make gpu-evidence  ten seeds of BRO Fast on a GPU, six minutes
@@ -44,7 +45,7 @@ endif
 endif
 endif
 
-.PHONY: demo demo-imports test test-all lint evidence gpu gpu-wheels gpu-evidence lock clean
+.PHONY: demo demo-imports test test-all lint evidence evidence-pages gpu gpu-wheels gpu-evidence lock clean
 
 
 $(BIN)/python:
@@ -110,6 +111,9 @@ test-all: lint demo-imports
 WORKERS ?= 1
 evidence:
 	$(PYTHON) studies/evidence.py --workers $(WORKERS)
+
+evidence-pages: $(VENV)/.all
+	$(BIN)/python studies/evidence_pages.py
 
 # Resolves the lock files anew, for maintainers: needs uv (pip install uv), installs nothing. A version stays where it
 # still fits; empty a file to have its Python's newest ones. Nothing is built but this package's own metadata (first, for

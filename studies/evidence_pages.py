@@ -1,0 +1,152 @@
+"""
+Write what make evidence has made into the pages of ``docs``: a report for each plan of studies/evidence/QUEUE that has
+runs in ``docs/evidence``, by ``sb3-sample study report``, between the two lines of its title.
+
+    make evidence-pages
+    python studies/evidence_pages.py [PLAN ...] [--grid bro_grid.npz]
+
+The published runs of BRO Fast with critics of 0.55M parameters, which stand beside ours, are read from ``bro_grid.npz``
+(see ``published_grid.py``): ``--grid``, else in the folder that ``SB3_SAMPLE_REFERENCE`` names, or in
+``../shared/reference``. Without this file the pages of ``bro_fast`` and ``bro_fast_seeds`` stay as they are, and the
+program says so.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+import pandas as pd
+from evidence import CHECKOUT, plan_file, queue
+from published_grid import read_grid
+from rank_tests import markdown, put, rank_tests
+
+from sb3_sample import study
+
+#: The published runs of ``bro_fast`` and ``bro_fast_seeds``, as in these plans.
+GRID = {"agent": "BRO Fast 0.55M", "ratios": [2], "sizes": ["0.55M"]}
+
+
+class Page(NamedTuple):
+    """
+    Where a plan's report stands.
+
+    :param page: file in ``docs``
+    :param title: of the report
+    :param options: of ``study report``
+    :param beside_grid: whether the published runs of ``GRID`` stand beside it
+    :param tested_at: simulator steps at which the rank tests against them are made
+    """
+
+    page: str
+    title: str
+    options: tuple[str, ...] = ()
+    beside_grid: bool = False
+    tested_at: tuple[int, ...] = ()
+
+
+PAGES = {
+    "bro_fast_seeds": Page(
+        "results.md",
+        "BRO Fast, 0.55M, two tasks",
+        ("--groups", "all", "--steps", "50k", "--curves", "none"),
+        beside_grid=True,
+        tested_at=(25_000, 50_000),
+    ),
+    "bro_fast": Page("results.md", "BRO Fast, 0.55M, 14 tasks", ("--curves", "none"), beside_grid=True),
+    "sac_dac_vpl": Page("results.md", "SAC, DAC and VPL-SAC", ("--groups", "all")),
+    "mbma_figure1_small": Page("many_actions.md", "CartPole, rewound", ("--score", "CartPole-v0=200")),
+    "published_agents": Page(
+        "after_bro.md", "SimBa, XQC and DR.Q", ("--groups", "all", "--curves", "SimBa (RR=2)", "XQC", "DR.Q")
+    ),
+    "crossq": Page("after_bro.md", "CrossQ", ("--groups", "all", "--curves", "CrossQ")),
+    "brc": Page("after_bro.md", "BRC, 512 wide", ("--groups", "all", "--curves", "BRO Fast")),
+    "simbav2": Page("after_bro.md", "SimbaV2", ("--groups", "all", "--curves", "SimbaV2 (RR=2)")),
+    "flash_sac": Page("after_bro.md", "FlashSAC", ("--groups", "all", "--curves", "FlashSAC")),
+    "best_agent": Page("best_agent.md", "Screening"),
+    "best_agent_final": Page("best_agent.md", "Final"),
+    "drq": Page("drq.md", "DrQ at 64 by 64", ("--groups", "all", "--curves", "none")),
+    "drqv2": Page("drq.md", "DrQ-v2", ("--groups", "all", "--curves", "none")),
+    "srspr": Page("srspr.md", "SR-SPR on Breakout", ("--groups", "all", "--curves", "none")),
+    "offline": Page("offline_study.md", "Figure 11 on data of our own"),
+}
+#: Plans whose page takes more than a report, and where it says so.
+ELSEWHERE = {"scaling": "docs/scaling.md has the commands, which fit its laws first"}
+
+
+def grid() -> Path | None:
+    """
+    :return: ``bro_grid.npz`` of the reference data, where it is there
+    """
+    folder = os.environ.get("SB3_SAMPLE_REFERENCE") or CHECKOUT.parent / "shared" / "reference"
+    path = Path(folder) / "bro_grid.npz"
+    return path if path.exists() else None
+
+
+def published(plan: str, path: Path) -> pd.DataFrame:
+    """
+    :param plan: name of a plan
+    :param path: ``bro_grid.npz``
+    :return: the published runs of the plan's tasks
+    """
+    tasks = {run.task for run in study.read_plan(plan_file(plan)).runs}
+    table = read_grid(path, GRID["agent"], GRID["ratios"], GRID["sizes"])
+    return table[table["task"].isin(tasks)]
+
+
+def write(plan: str, docs: Path, path: Path | None) -> str | None:
+    """
+    Write a plan's report into its page.
+
+    :param plan: name of the plan
+    :param docs: folder of the pages; tables and pictures are in ``evidence`` there
+    :param path: ``bro_grid.npz``
+    :return: why there is nothing to write; None if it is written
+    :raises CalledProcessError: the report cannot be made, which it has said
+    """
+    table, page = docs / "evidence" / f"{plan}.csv", PAGES[plan]
+    if not table.exists():
+        return "no run has ended"
+    if page.beside_grid and path is None:
+        return "bro_grid.npz is not here: --grid FILE"
+    with tempfile.TemporaryDirectory() as folder:
+        # The report names files as they are given: as in the checkout, wherever this runs.
+        here = Path(folder)
+        (here / "docs").symlink_to(docs.resolve())
+        (here / "studies").symlink_to(CHECKOUT / "studies")
+        command = ["study", "report", f"docs/evidence/{plan}.csv"]
+        command += ["--plan", str(plan_file(plan).relative_to(CHECKOUT)), "--title", page.title, *page.options]
+        command += ["--markdown", f"docs/{page.page}", "--pictures", f"docs/evidence/{plan}"]
+        if page.beside_grid:
+            others = published(plan, path)
+            study.write(others, here / "published.csv")
+            command += ["--published", "published.csv"]
+            if page.tested_at:
+                ours = study.load(table)
+                put(docs / page.page, markdown({step: rank_tests(ours, others, step) for step in page.tested_at}))
+        subprocess.run([sys.executable, "-m", "sb3_sample.cli", *command], cwd=here, check=True)
+    return None
+
+
+def main(given: list[str] | None = None) -> None:
+    """
+    :param given: arguments of the command line; None: the program's own
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("plans", nargs="*", metavar="PLAN", help="default: all of the queue that have runs")
+    parser.add_argument("--grid", type=Path, help="bro_grid.npz")
+    options = parser.parse_args(given)
+    if unknown := [plan for plan in options.plans if plan not in PAGES]:
+        parser.error(f"no page for {', '.join(unknown)}: a plan is one of {', '.join(PAGES)}")
+    if options.grid is not None and not options.grid.exists():
+        parser.error(f"--grid: no file {options.grid}")
+    for plan in options.plans or dict.fromkeys(name for name, _ in queue()):
+        reason = ELSEWHERE.get(plan) or write(plan, CHECKOUT / "docs", options.grid or grid())
+        print(f"{plan}: {reason or f'docs/{PAGES[plan].page}'}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""Reports of the project's own runs in the pages of docs: every plan has its place, and results fill it."""
+
+import importlib
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sb3_sample import study
+from sb3_sample.study.table import COLUMNS
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def module(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.syspath_prepend(str(ROOT / "studies"))
+    names = ("evidence_pages", "evidence", "published_grid", "rank_tests")
+    yield importlib.import_module("evidence_pages")
+    for name in names:
+        sys.modules.pop(name, None)
+
+
+def mark(side: str, title: str) -> str:
+    return f"<!-- {side}: sb3-sample study report: {title} -->"
+
+
+def runs(plan: str) -> pd.DataFrame:
+    """A table of all runs of a plan whose returns are their seeds."""
+    rows = [
+        (run.agent, "{}", run.task, run.seed, step, "return", float(run.seed))
+        for run in study.read_plan(ROOT / "studies" / "evidence" / f"{plan}.yml").runs
+        for step in (25_000, 50_000)
+    ]
+    return pd.DataFrame(rows, columns=COLUMNS)
+
+
+def grid(path: Path) -> None:
+    """A ``bro_grid.npz`` of three tasks at BRO Fast's size and ratio, ten seeds with the returns 10 to 19."""
+    tasks = ["cheetah-run", "walker-run", "dog-run"]
+    returns = np.broadcast_to(np.arange(10, 20.0)[:, None], (1, 1, len(tasks), 10, 2))
+    np.savez(
+        path,
+        returns=returns,
+        n_runs=np.full((1, 1, len(tasks)), 10),
+        env_steps=np.array([25_000, 50_000]),
+        replay_ratio=np.array([2]),
+        size=np.array(["0.55M"]),
+        seed=np.arange(10),
+        suite=np.array(["dmc"] * len(tasks)),
+        task=np.array(tasks),
+    )
+
+
+def test_every_plan_of_the_queue_has_its_place(module: Any) -> None:
+    queued = {name for name, _ in module.queue()}
+    assert queued == module.PAGES.keys() | module.ELSEWHERE.keys()
+    for page in module.PAGES.values():
+        text = (ROOT / "docs" / page.page).read_text(encoding="utf-8")
+        assert text.count(mark("begin", page.title)) == text.count(mark("end", page.title)) == 1
+
+
+def test_results_are_put_into_their_page(module: Any, tmp_path: Path) -> None:
+    plan, title = "bro_fast_seeds", module.PAGES["bro_fast_seeds"].title
+    (tmp_path / "evidence").mkdir()
+    page = tmp_path / "results.md"
+    lines = ["before", module.put.__globals__["BEGIN"], module.put.__globals__["END"], "between"]
+    page.write_text("\n".join([*lines, mark("begin", title), mark("end", title), "after\n"]))
+
+    assert module.write(plan, tmp_path, None) == "no run has ended"
+    study.write(runs(plan), tmp_path / "evidence" / f"{plan}.csv")
+    assert "bro_grid.npz" in module.write(plan, tmp_path, None)
+    assert page.read_text().count("\n") == 7
+
+    grid(tmp_path / "bro_grid.npz")
+    assert module.write(plan, tmp_path, tmp_path / "bro_grid.npz") is None
+    text = page.read_text()
+    assert text.startswith("before\n") and text.endswith("after\n")
+    # Ten ranks below ten others: one of the 184,756 ways to place them.
+    assert "| 50,000 | dmc/cheetah-run-v0 | 10 | 4 (0 to 9) | 10 | 14 (10 to 19) | 0.00 | 0.00 |" in text
+    assert "BRO Fast 0.55M, published" in text and "dog-run" not in text
+    assert (tmp_path / "evidence" / plan / "tasks.png").exists()
+    # Files are named as in the checkout.
+    assert f"of docs/evidence/{plan}.csv, published.csv;" in text and str(tmp_path) not in text
+
+
+def test_unknown_plan_and_missing_grid_are_refused(module: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    for given, said in ((["bro_fats"], "no page for bro_fats"), (["--grid", "nowhere.npz"], "no file nowhere.npz")):
+        with pytest.raises(SystemExit):
+            module.main(given)
+        assert said in capsys.readouterr().err
