@@ -241,7 +241,7 @@ def test_groups_and_factors_come_with_the_folder(plan_of, tmp_path: Path) -> Non
 
 #: Plans with many agents or large critics, each of which is made once to have its arguments checked.
 MANY = {
-    "bro_ablation", "bro_offline_adroit", "bro_scaling", "bro_scaling_small", "drq", "mbma", "mbma_figure1",
+    "bro_ablation", "bro_architecture", "bro_architecture_small", "bro_components", "bro_components_small", "bro_offline_adroit", "bro_scaling", "bro_scaling_small", "drq", "mbma", "mbma_figure1",
     "mbma_small", "mbma_table1", "regularization", "regularization_pixels", "regularization_pixels_humanoid",
     "regularization_pixels_humanoid_small", "regularization_pixels_small", "regularization_small", "scaling_dmc",
     "scaling_dmc_small", "scaling_gym", "scaling_gym_small",
@@ -253,15 +253,24 @@ RUNS = {
     "bro_offline_antmaze": 6 * 6 * 10,
     "bro_scaling": 5 * 5 * 40 * 10,
     "bro_ablation": 2 * 7 * 10 * 10,
+    "bro_architecture": (5 * 3 + 2 + 5 * 3) * 10 * 10,
+    "bro_components": 7 * 3 * 10 * 10,
+    "bro_target": 2 * 2 * 40 * 10,
+    "bro_batch_size": 2 * 3 * 40 * 10,
+    "bro_td3": 4 * 40 * 10,
+    "bro_long": 4 * 7 * 5,
     "bro_atari": 4 * 3 * 5,
     "dac": 2 * 6 * 30 * 10,
     "dac_design": 2 * 5 * 15 * 10,
     "dac_table1": 2 * 8 * 15 * 10,
+    "dac_overestimation": 2 * 4 * 15 * 10,
     "vpl_sac": 2 * 5 * 20 * 10,
     "vpl_sac_regret": (1 + 4 + 4) * 4 * 10,
     "vpl_sac_learning_rate": 3 * 4 * 4 * 10,
     "vpl_sac_design": 6 * 4 * 10,
     "regularization": 64 * 2 * 14 * 10,
+    "regularization_redo": 4 * 4 * 14 * 10,
+    "regularization_dogs": 3 * 2 * 2 * 10,
     "mbma": 4 * 14 * 15,
     "mbma_figure1": 4 * 4 * 45,
     "mbma_table1": 2 * 6 * 10,
@@ -272,6 +281,8 @@ RUNS = {
     "scaling_dmc": 4 * 5 * 4 * 7 * 10,
     "scaling_gym": 4 * 3 * 5 * 4 * 8,
 }
+#: Their steps, where they are neither a million nor half of one.
+OTHER_STEPS = {"bro_atari": {100_000}, "bro_long": {3_000_000, 5_000_000}, "regularization_dogs": {4_000_000}}
 
 
 @pytest.mark.parametrize(
@@ -289,8 +300,8 @@ def test_the_plans_that_come_with_it_are_good(path: Path) -> None:
     if path.parent.name == "papers":
         assert len(plan.runs) == RUNS[path.stem] and f"{len(plan.runs):,} runs of" in text
         assert f"| {len(plan.runs):,}" in (ROOT / "docs/studies.md").read_text()
-        if path.stem == "bro_atari":
-            assert {run.steps for run in plan.runs} == {100_000}
+        if path.stem in OTHER_STEPS:
+            assert {run.steps for run in plan.runs} == OTHER_STEPS[path.stem]
         # Others are counted in steps of the simulator, or shorter.
         elif not path.stem.startswith(("mbma", "regularization_pixels")):
             assert {run.steps for run in plan.runs} == {500_000 if "half a million" in text else 1_000_000}
