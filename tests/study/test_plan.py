@@ -241,8 +241,9 @@ def test_groups_and_factors_come_with_the_folder(plan_of, tmp_path: Path) -> Non
 
 #: Plans with many agents or large critics, each of which is made once to have its arguments checked.
 MANY = {
-    "bro_ablation", "bro_architecture", "bro_architecture_small", "bro_components", "bro_components_small", "bro_offline_adroit", "bro_scaling", "bro_scaling_small", "drq", "mbma", "mbma_figure1",
-    "mbma_small", "mbma_table1", "regularization", "regularization_pixels", "regularization_pixels_humanoid",
+    "bro_ablation", "bro_architecture", "bro_architecture_small", "bro_components", "bro_components_small",
+    "bro_offline_adroit", "bro_scaling", "bro_scaling_small", "drq", "mbma", "mbma_figure1", "mbma_small",
+    "mbma_table1", "regularization", "regularization_pixels", "regularization_pixels_humanoid",
     "regularization_pixels_humanoid_small", "regularization_pixels_small", "regularization_small", "scaling_dmc",
     "scaling_dmc_small", "scaling_gym", "scaling_gym_small",
 }  # fmt: skip
