@@ -81,16 +81,19 @@ def encoder_of(model: Any) -> torch.nn.Module:
 
 
 def encoder_rate(model: Any, rounds: int) -> float:
-    """GFLOP/s of the encoder, forward and backward, on a batch."""
+    """GFLOP/s of the encoder, forward and backward, on a batch in the layout in which it is quicker."""
     encoder, images = encoder_of(model), torch.rand(model.batch_size, *model.observation_space.shape)
     with FlopCounterMode(display=False) as counter:
         encoder(images).sum().backward()
-    seconds = []
-    for _ in range(rounds):
-        start = time.perf_counter()
-        encoder(images).sum().backward()
-        seconds.append(time.perf_counter() - start)
-    return counter.get_total_flops() / 1e9 / statistics.median(seconds)
+    medians = []
+    for layout in (torch.contiguous_format, torch.channels_last):
+        turned, seconds = images.contiguous(memory_format=layout), []
+        for _ in range(rounds + 1):
+            start = time.perf_counter()
+            encoder(turned).sum().backward()
+            seconds.append(time.perf_counter() - start)
+        medians.append(statistics.median(seconds[1:]))
+    return counter.get_total_flops() / 1e9 / min(medians)
 
 
 def main() -> None:
