@@ -1,6 +1,6 @@
 """
-Write what make evidence has made into the pages of ``docs``: a report for each plan of studies/evidence/QUEUE that has
-runs in ``docs/evidence``, by ``sb3-sample study report``, between the two lines of its title.
+Write a report of each plan of studies/evidence/QUEUE that has finished runs into its page of ``docs``, between the two
+marker lines with the report's title (``sb3-sample study report --markdown``).
 
     make evidence-pages
     python studies/evidence_pages.py [PLAN ...] [--grid bro_grid.npz]
@@ -124,10 +124,10 @@ def write(plan: str, docs: Path, path: Path | None) -> str | None:
             others = published(plan, path)
             study.write(others, here / "published.csv")
             command += ["--published", "published.csv"]
-            if page.tested_at:
-                ours = study.load(table)
-                put(docs / page.page, markdown({step: rank_tests(ours, others, step) for step in page.tested_at}))
         subprocess.run([sys.executable, "-m", "sb3_sample.cli", *command], cwd=here, check=True)
+    if page.tested_at:
+        ours = study.load(table)
+        put(docs / page.page, markdown({step: rank_tests(ours, others, step) for step in page.tested_at}))
     return None
 
 
@@ -139,13 +139,21 @@ def main(given: list[str] | None = None) -> None:
     parser.add_argument("plans", nargs="*", metavar="PLAN", help="default: all of the queue that have runs")
     parser.add_argument("--grid", type=Path, help="bro_grid.npz")
     options = parser.parse_args(given)
-    if unknown := [plan for plan in options.plans if plan not in PAGES]:
-        parser.error(f"no page for {', '.join(unknown)}: a plan is one of {', '.join(PAGES)}")
+    known = PAGES.keys() | ELSEWHERE.keys()
+    if unknown := [plan for plan in options.plans if plan not in known]:
+        parser.error(f"no page for {', '.join(unknown)}: a plan is one of {', '.join(sorted(known))}")
     if options.grid is not None and not options.grid.exists():
         parser.error(f"--grid: no file {options.grid}")
+    failed = False
     for plan in options.plans or dict.fromkeys(name for name, _ in queue()):
-        reason = ELSEWHERE.get(plan) or write(plan, CHECKOUT / "docs", options.grid or grid())
+        try:
+            reason = ELSEWHERE.get(plan) or write(plan, CHECKOUT / "docs", options.grid or grid())
+        except (ValueError, subprocess.CalledProcessError) as error:
+            # The other pages are written all the same.
+            reason, failed = f"not written: {error}", True
         print(f"{plan}: {reason or f'docs/{PAGES[plan].page}'}", flush=True)
+    if failed:
+        sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -247,7 +247,7 @@ MANY = {
     "regularization_pixels_humanoid_small", "regularization_pixels_small", "regularization_small", "scaling_dmc",
     "scaling_dmc_small", "scaling_gym", "scaling_gym_small",
 }  # fmt: skip
-#: Runs of the papers' studies: agents, tasks and seeds as the papers state them.
+#: Runs of the papers' studies: agents, tasks and seeds as the papers state them, or as the head of the plan says.
 RUNS = {
     "bro": 6 * 40 * 10,
     "bro_offline_adroit": 6 * 9 * 10,
