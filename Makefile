@@ -1,7 +1,7 @@
 # make demo      set up and train BRO on a DeepMind Control task (2 minutes on 2 free cores)
 # make test      set up, lint, types, tests (what CI runs)
 # make test-all  the same with the long tests
-# make evidence  go on with the runs of studies/evidence (WORKERS=2: two at once)
+# make evidence  go on with the runs of studies/evidence (WORKERS=2: two at once; THREADS=2: of each)
 # make evidence-pages  write what has come of them into the pages of docs
 # make gpu       tests and benchmark of a GPU, with that machine's own torch; without a package registry there, take
 #                along what `make gpu-wheels` gathers into .gpu/wheels on a machine with one
@@ -109,8 +109,9 @@ test-all: lint demo-imports
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -n 2 --dist worksteal --durations=60
 
 WORKERS ?= 1
+THREADS ?= 1
 evidence:
-	$(PYTHON) studies/evidence.py --workers $(WORKERS)
+	$(PYTHON) studies/evidence.py --workers $(WORKERS) --threads $(THREADS)
 
 evidence-pages: $(VENV)/.all
 	$(BIN)/python studies/evidence_pages.py

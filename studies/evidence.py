@@ -2,7 +2,7 @@
 Makes the project's own evidence: the runs of the plans in studies/evidence and studies/small, in the order of the file
 QUEUE of the first.
 
-    make evidence [WORKERS=2]
+    make evidence [WORKERS=2] [THREADS=1]
 
 A run that is begun is made from the last commit, in a git worktree and an environment of its own, never from the files
 of the checkout; one that was interrupted goes on under the commit that it began with. All this lies in
@@ -13,8 +13,8 @@ settings, commit, versions and machine of each run (``<plan>.json``).
 A program of a plan's name, ``<plan>.py`` beside it, makes what its runs read, such as data sets; it is called before
 each of them, and makes what is not there.
 
-Runs have a low priority and one thread each. Ctrl-C and SIGTERM have them save and end; after
-``kill -9`` they do so by themselves. To pause one, ``kill -STOP`` its number, which is said when a run begins.
+Runs have a low priority and one thread each, unless THREADS says otherwise. Ctrl-C and SIGTERM have them save and end;
+after ``kill -9`` they do so by themselves. To pause one, ``kill -STOP`` its number, which is said when a run begins.
 """
 
 import argparse
@@ -43,6 +43,8 @@ TREES, ENVIRONMENTS, STUDIES = "trees", "environments", "studies"
 COMPLETE = ".complete"
 #: How often a run is tried that fails.
 ATTEMPTS = 2
+#: Variable of the environment that tells a run how many threads it has.
+THREADS = "OMP_NUM_THREADS"
 #: Settings of a run that change no result.
 FREE = {"checkpoint_freq", "gym_packages", "measure", "diagnostics"}
 
@@ -71,10 +73,11 @@ class Evidence:
     :param root: folder of worktrees, environments and studies
     :param results: folder of the results
     :param python: interpreter of all runs, which has what they need; None: an environment of their own
+    :param threads: of each run
     """
 
-    def __init__(self, root: Path, results: Path, python: str | None):
-        self.root, self.results, self._python = root.resolve(), results, python
+    def __init__(self, root: Path, results: Path, python: str | None, threads: int = 1):
+        self.root, self.results, self._python, self._threads = root.resolve(), results, python, threads
         self.root.mkdir(parents=True, exist_ok=True)
 
     def tree(self, commit: str) -> Path:
@@ -118,7 +121,7 @@ class Evidence:
         :return: a process
         """
         tree = self.tree(commit)
-        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+        threads = dict.fromkeys((THREADS, "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(self._threads))
         # The checkout's own variables are not the worktree's.
         inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "MAKE"))}
         environment = {**inherited, **threads, "PYTHONPATH": str(tree)}
@@ -456,7 +459,8 @@ def run(folder: str, name: str) -> None:
     place = StudyFolder(folder)
     prepare(place.path.parent.name)
     (chosen,) = (each for each in place.runs() if each.name == name)
-    outcome = attempt(place, chosen, ["--num-threads", "1", "--device", "cpu"], threads=1)
+    threads = int(os.environ[THREADS])
+    outcome = attempt(place, chosen, ["--num-threads", str(threads), "--device", "cpu"], threads=threads)
     if outcome is not None and outcome.traceback:
         print(f"failed: {chosen.title}\n{outcome.traceback}", file=sys.stderr)
         raise SystemExit(1)
@@ -474,6 +478,7 @@ def main() -> None:
         return print(json.dumps(None if order is None else order._asdict()))
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="runs at once (default: 1)")
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="of each run (default: 1)")
     parser.add_argument("--most", type=int, metavar="N", help="how many runs to make or to go on with (default: all)")
     parser.add_argument("--root", type=Path, default=Path("~/.cache/sb3_sample/evidence").expanduser())
     parser.add_argument("--results", type=Path, default=CHECKOUT / "docs" / "evidence")
@@ -481,11 +486,13 @@ def main() -> None:
         "--python", help="interpreter that has all that is needed, instead of an environment of its own"
     )
     options = parser.parse_args()
-    if options.workers < 1 or (options.most is not None and options.most < 1):
-        parser.error(f"--workers and --most must be at least 1, not {options.workers} and {options.most}")
+    for name in ("workers", "threads", "most"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            parser.error(f"--{name} must be at least 1, not {value}")
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda number, _: sys.exit(128 + number))
-    evidence = Evidence(options.root, options.results.resolve(), options.python)
+    evidence = Evidence(options.root, options.results.resolve(), options.python, options.threads)
     if failed := evidence.make(options.workers, options.most):
         sys.exit("failed: " + ", ".join(failed))
 

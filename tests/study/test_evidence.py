@@ -103,10 +103,11 @@ def test_a_killed_run_goes_on_under_its_commit_and_new_ones_have_the_last(checko
     # What is being edited is not what runs.
     (checkout / "sb3_sample" / "__init__.py").write_text("raise RuntimeError('half an edit')")
 
-    lines = said(evidence(checkout))
+    lines = said(evidence(checkout, "--threads", "2"))
 
     assert [line.split(": commit ")[1][:12] for line in lines if line.startswith("began")] == [first[:12], second[:12]]
     assert [(record["run"]["seed"], record["commit"]) for record in results(checkout)] == [(0, first), (1, second)]
+    assert [record["threads"] for record in results(checkout)] == [2, 2]
     table = study.read(checkout / "docs" / "evidence" / "small.csv")
     evaluations = table[table["metric"] == "return"]
     assert set(evaluations["agent"]) == {"SAC"} and set(evaluations["task"]) == {"Pendulum-v1"}
