@@ -56,7 +56,9 @@ PAGES = {
         beside_grid=True,
         tested_at=(25_000, 50_000),
     ),
-    "bro_fast": Page("results.md", "BRO Fast, 0.55M, 14 tasks", ("--curves", "none"), beside_grid=True),
+    "bro_fast": Page(
+        "results.md", "BRO Fast, 0.55M, 14 tasks", ("--curves", "none"), beside_grid=True, tested_at=(50_000, 100_000)
+    ),
     "sac_dac_vpl": Page("results.md", "SAC, DAC and VPL-SAC", ("--groups", "all")),
     "mbma_figure1_small": Page("many_actions.md", "CartPole, rewound", ("--score", "CartPole-v0=200")),
     "published_agents": Page(
@@ -127,7 +129,7 @@ def write(plan: str, docs: Path, path: Path | None) -> str | None:
         subprocess.run([sys.executable, "-m", "sb3_sample.cli", *command], cwd=here, check=True)
     if page.tested_at:
         ours = study.load(table)
-        put(docs / page.page, markdown({step: rank_tests(ours, others, step) for step in page.tested_at}))
+        put(docs / page.page, page.title, markdown({step: rank_tests(ours, others, step) for step in page.tested_at}))
     return None
 
 

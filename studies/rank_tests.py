@@ -2,12 +2,11 @@
 Do two sets of runs differ at a step? The Mann-Whitney test on each task, and all tasks together by Fisher's method.
 
     python studies/published_grid.py bro_grid.npz published.csv --ratios 2 --sizes 0.55M
-    python studies/rank_tests.py docs/evidence/bro_fast_seeds.csv published.csv --step 25k 50k [--markdown PAGE]
+    python studies/rank_tests.py docs/evidence/bro_fast_seeds.csv published.csv --step 25k 50k
 
 Both tables are as ``sb3-sample study table`` writes them, with one agent each. Printed: seeds, means and ranges of
 both, and p of the first table's returns being lower (one-sided) and of the two being unlike (two-sided), exact where no
-returns are equal. Tasks that only one table has are left out, and named. ``--markdown`` puts the same as a table into a
-page, in the place of what is between its lines ``<!-- begin: rank tests -->`` and ``<!-- end: rank tests -->``.
+returns are equal. Tasks that only one table has are left out, and named. ``evidence_pages.py`` puts such into pages.
 """
 
 import argparse
@@ -19,9 +18,6 @@ from scipy import stats
 
 from sb3_sample import study
 from sb3_sample.study.analysis_command import steps_of
-
-#: Lines of a page between which the table stands.
-BEGIN, END = "<!-- begin: rank tests -->", "<!-- end: rank tests -->"
 
 
 def rank_tests(ours: pd.DataFrame, others: pd.DataFrame, step: int, metric: str = "return") -> pd.DataFrame:
@@ -81,17 +77,21 @@ def markdown(found: dict[int, pd.DataFrame]) -> str:
     return "\n".join(lines)
 
 
-def put(page: Path, text: str) -> None:
+def put(page: Path, title: str, text: str) -> None:
     """
-    :param page: a file with the lines between which the text belongs
+    Put a table into a page, between its lines ``<!-- begin: rank tests: TITLE -->`` and ``<!-- end: ... -->``.
+
+    :param page: file with these lines
+    :param title: of the report that the table belongs to
     :param text: what is to stand there
     :raises ValueError: the file does not have these lines, in this order
     """
-    before, begin, rest = page.read_text(encoding="utf-8").partition(f"{BEGIN}\n")
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise ValueError(f"{page} must have a line {BEGIN} and one {END} after it")
-    page.write_text(f"{before}{begin}{text}\n{end}{after}", encoding="utf-8")
+    begin, end = (f"<!-- {side}: rank tests: {title} -->" for side in ("begin", "end"))
+    before, found, rest = page.read_text(encoding="utf-8").partition(f"{begin}\n")
+    _, ended, after = rest.partition(end)
+    if not found or not ended:
+        raise ValueError(f"{page} must have a line {begin} and one {end} after it")
+    page.write_text(f"{before}{found}{text}\n{ended}{after}", encoding="utf-8")
 
 
 def main() -> None:
@@ -100,7 +100,6 @@ def main() -> None:
     parser.add_argument("others", type=Path)
     parser.add_argument("--step", type=steps_of, required=True, nargs="+")
     parser.add_argument("--metric", default="return")
-    parser.add_argument("--markdown", type=Path)
     args = parser.parse_args()
     ours, others = study.load(args.ours), study.load(args.others)
     found = {step: rank_tests(ours, others, step, args.metric) for step in args.step}
@@ -114,8 +113,6 @@ def main() -> None:
                 if row["task"] != "all"
             ]
             print(f"{step:,} steps, {row['task']}:{''.join(words)}  p {row['p']:.3f}, lower {row['p_lower']:.3f}")
-    if args.markdown:
-        put(args.markdown, markdown(found))
 
 
 if __name__ == "__main__":

@@ -70,7 +70,7 @@ def test_results_are_put_into_their_page(module: Any, tmp_path: Path) -> None:
     module.PAGES[plan] = page_of._replace(options=(*page_of.options, "--reps", "50"))
     (tmp_path / "evidence").mkdir()
     page = tmp_path / "results.md"
-    lines = ["before", module.put.__globals__["BEGIN"], module.put.__globals__["END"], "between"]
+    lines = ["before", *(f"<!-- {side}: rank tests: {title} -->" for side in ("begin", "end")), "between"]
     page.write_text("\n".join([*lines, mark("begin", title), mark("end", title), "after\n"]))
 
     assert module.write(plan, tmp_path, None) == "no run has ended"

@@ -52,10 +52,8 @@ def test_tables_without_a_comparison_are_refused() -> None:
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     study.write(table("ours", {"dmc/a-v0": [1, 2, 3], "dmc/only-v0": [0]}), tmp_path / "ours.csv")
     study.write(table("others", {"dmc/a-v0": [4, 5, 6]}), tmp_path / "others.csv")
-    page = tmp_path / "page.md"
-    page.write_text("# Before\n\n<!-- begin: rank tests -->\nold\n<!-- end: rank tests -->\n\nafter\n")
     files = [str(tmp_path / "ours.csv"), str(tmp_path / "others.csv")]
-    monkeypatch.setattr("sys.argv", ["x", *files, "--step", "25k", "50k", "--markdown", str(page)])
+    monkeypatch.setattr("sys.argv", ["x", *files, "--step", "25k", "50k"])
     runpy.run_path(SCRIPT, run_name="__main__")
     p = "p 0.100, lower 0.050"
     assert capsys.readouterr().out.splitlines() == [
@@ -65,12 +63,22 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
         f"50,000 steps, dmc/a-v0:  3 seeds, mean 2 (1 to 3);  3 seeds, mean 5 (4 to 6);  {p}",
         f"50,000 steps, all:  {p}",
     ]
+
+
+def test_a_table_in_a_page(tmp_path: Path) -> None:
+    module = runpy.run_path(SCRIPT)
+    ours, others = table("ours", {"dmc/a-v0": [1, 2, 3]}), table("others", {"dmc/a-v0": [4, 5, 6]})
+    text = module["markdown"]({step: module["rank_tests"](ours, others, step) for step in (25_000, 50_000)})
+    page = tmp_path / "page.md"
+    marks = ["<!-- begin: rank tests: A -->", "<!-- end: rank tests: A -->"]
+    page.write_text(f"# Before\n\n{marks[0]}\nold\n{marks[1]}\n\nafter\n")
+    module["put"](page, "A", text)
     lines = page.read_text().splitlines()
-    assert lines[:3] == ["# Before", "", "<!-- begin: rank tests -->"]
-    assert lines[-3:] == ["<!-- end: rank tests -->", "", "after"]
+    assert lines[:3] == ["# Before", "", marks[0]]
+    assert lines[-3:] == [marks[1], "", "after"]
     assert lines[7] == "| 50,000 | dmc/a-v0 | 3 | 2 (1 to 3) | 3 | 5 (4 to 6) | 0.10 | 0.05 |"
     assert len(lines) == 12 and "old" not in lines
-    page.write_text("no marks\n")
-    with pytest.raises(ValueError, match="must have a line <!-- begin: rank tests -->"):
-        runpy.run_path(SCRIPT, run_name="__main__")
-    assert page.read_text() == "no marks\n"
+    before = page.read_text()
+    with pytest.raises(ValueError, match="must have a line <!-- begin: rank tests: B -->"):
+        module["put"](page, "B", text)
+    assert page.read_text() == before
