@@ -13,6 +13,7 @@ program says so.
 
 import argparse
 import os
+import runpy
 import subprocess
 import sys
 import tempfile
@@ -127,9 +128,12 @@ def write(plan: str, docs: Path, path: Path | None) -> str | None:
             study.write(others, here / "published.csv")
             command += ["--published", "published.csv"]
         subprocess.run([sys.executable, "-m", "sb3_sample.cli", *command], cwd=here, check=True)
+    ours = study.load(table)
     if page.tested_at:
-        ours = study.load(table)
         put(docs / page.page, page.title, markdown({step: rank_tests(ours, others, step) for step in page.tested_at}))
+    if plan == "mbma_figure1_small":
+        figure = runpy.run_path(str(CHECKOUT / "benchmarks" / "rewound_actions.py"))["figure"]
+        put(docs / page.page, page.title, figure(ours))
     return None
 
 

@@ -1,6 +1,7 @@
 """Reports of the project's own runs in the pages of docs: every plan has its place, and results fill it."""
 
 import importlib
+import runpy
 import sys
 from pathlib import Path
 from typing import Any
@@ -70,7 +71,7 @@ def test_results_are_put_into_their_page(module: Any, tmp_path: Path) -> None:
     module.PAGES[plan] = page_of._replace(options=(*page_of.options, "--reps", "50"))
     (tmp_path / "evidence").mkdir()
     page = tmp_path / "results.md"
-    lines = ["before", *(f"<!-- {side}: rank tests: {title} -->" for side in ("begin", "end")), "between"]
+    lines = ["before", *(f"<!-- {side}: table: {title} -->" for side in ("begin", "end")), "between"]
     page.write_text("\n".join([*lines, mark("begin", title), mark("end", title), "after\n"]))
 
     assert module.write(plan, tmp_path, None) == "no run has ended"
@@ -95,3 +96,17 @@ def test_unknown_plan_and_missing_grid_are_refused(module: Any, capsys: pytest.C
         with pytest.raises(SystemExit):
             module.main(given)
         assert said in capsys.readouterr().err
+
+
+def test_figure_1_by_hand() -> None:
+    """Updates of 16 steps: 31.25 in between, which gain 95 and 10."""
+    returns = {0: (100.0, 195.0), 1: (50.0, 60.0)}
+    rows = [
+        ("T16 N2", "{}", "CartPole-v0", seed, step, "return", value)
+        for seed, values in returns.items()
+        for step, value in zip((500, 1_000), values, strict=True)
+    ]
+    figure = runpy.run_path(str(ROOT / "benchmarks" / "rewound_actions.py"))["figure"]
+    line = figure(pd.DataFrame(rows, columns=COLUMNS)).splitlines()[-1]
+    # Of two seeds the interval's ends are those of one.
+    assert line == "| T16 N2 | 2 | 1.00 (1.00 to 1.00) | 1 | 1.68 (0.32 to 3.04) |"

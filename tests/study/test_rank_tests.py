@@ -70,7 +70,7 @@ def test_a_table_in_a_page(tmp_path: Path) -> None:
     ours, others = table("ours", {"dmc/a-v0": [1, 2, 3]}), table("others", {"dmc/a-v0": [4, 5, 6]})
     text = module["markdown"]({step: module["rank_tests"](ours, others, step) for step in (25_000, 50_000)})
     page = tmp_path / "page.md"
-    marks = ["<!-- begin: rank tests: A -->", "<!-- end: rank tests: A -->"]
+    marks = ["<!-- begin: table: A -->", "<!-- end: table: A -->"]
     page.write_text(f"# Before\n\n{marks[0]}\nold\n{marks[1]}\n\nafter\n")
     module["put"](page, "A", text)
     lines = page.read_text().splitlines()
@@ -79,6 +79,6 @@ def test_a_table_in_a_page(tmp_path: Path) -> None:
     assert lines[7] == "| 50,000 | dmc/a-v0 | 3 | 2 (1 to 3) | 3 | 5 (4 to 6) | 0.10 | 0.05 |"
     assert len(lines) == 12 and "old" not in lines
     before = page.read_text()
-    with pytest.raises(ValueError, match="must have a line <!-- begin: rank tests: B -->"):
+    with pytest.raises(ValueError, match="must have a line <!-- begin: table: B -->"):
         module["put"](page, "B", text)
     assert page.read_text() == before
