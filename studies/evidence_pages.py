@@ -12,23 +12,47 @@ program says so.
 """
 
 import argparse
+import functools
 import os
 import runpy
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import pandas as pd
 from evidence import CHECKOUT, plan_file, queue
 from published_grid import read_grid
-from rank_tests import markdown, put, rank_tests
+from rank_tests import markdown, rank_tests
 
 from sb3_sample import study
+from sb3_sample.saving.temporary import becoming
+from sb3_sample.study.reporting.markdown import around
 
 #: The published runs of ``bro_fast`` and ``bro_fast_seeds``, as in these plans.
 GRID = {"agent": "BRO Fast 0.55M", "ratios": [2], "sizes": ["0.55M"]}
+
+
+def ranks(ours: pd.DataFrame, others: pd.DataFrame | None, steps: tuple[int, ...]) -> str:
+    """
+    :param ours: a plan's runs
+    :param others: the published ones
+    :param steps: of the simulator
+    :return: the rank tests of both, in Markdown
+    """
+    assert others is not None
+    return markdown({step: rank_tests(ours, others, step) for step in steps})
+
+
+def figure1(ours: pd.DataFrame, others: pd.DataFrame | None) -> str:
+    """
+    :param ours: runs of ``mbma_figure1_small``
+    :param others: None
+    :return: MBMA's figure 1 of them, in Markdown
+    """
+    return runpy.run_path(str(CHECKOUT / "benchmarks" / "rewound_actions.py"))["figure"](ours)
 
 
 class Page(NamedTuple):
@@ -39,14 +63,14 @@ class Page(NamedTuple):
     :param title: of the report
     :param options: of ``study report``
     :param beside_grid: whether the published runs of ``GRID`` stand beside it
-    :param tested_at: simulator steps at which the rank tests against them are made
+    :param table: makes a further table in Markdown for the page (see ``put``) of our runs and those beside them
     """
 
     page: str
     title: str
     options: tuple[str, ...] = ()
     beside_grid: bool = False
-    tested_at: tuple[int, ...] = ()
+    table: Callable[[pd.DataFrame, pd.DataFrame | None], str] | None = None
 
 
 PAGES = {
@@ -55,13 +79,17 @@ PAGES = {
         "BRO Fast, 0.55M, two tasks",
         ("--groups", "all", "--steps", "50k", "--curves", "none"),
         beside_grid=True,
-        tested_at=(25_000, 50_000),
+        table=functools.partial(ranks, steps=(25_000, 50_000)),
     ),
     "bro_fast": Page(
-        "results.md", "BRO Fast, 0.55M, 14 tasks", ("--curves", "none"), beside_grid=True, tested_at=(50_000, 100_000)
+        "results.md",
+        "BRO Fast, 0.55M, 14 tasks",
+        ("--curves", "none"),
+        beside_grid=True,
+        table=functools.partial(ranks, steps=(50_000, 100_000)),
     ),
     "sac_dac_vpl": Page("results.md", "SAC, DAC and VPL-SAC", ("--groups", "all")),
-    "mbma_figure1_small": Page("many_actions.md", "CartPole, rewound", ("--score", "CartPole-v0=200")),
+    "mbma_figure1_small": Page("many_actions.md", "CartPole, rewound", ("--score", "CartPole-v0=200"), table=figure1),
     "published_agents": Page(
         "after_bro.md", "SimBa, XQC and DR.Q", ("--groups", "all", "--curves", "SimBa (RR=2)", "XQC", "DR.Q")
     ),
@@ -110,11 +138,12 @@ def write(plan: str, docs: Path, path: Path | None) -> str | None:
     :return: why there is nothing to write; None if it is written
     :raises CalledProcessError: the report cannot be made, which it has said
     """
-    table, page = docs / "evidence" / f"{plan}.csv", PAGES[plan]
-    if not table.exists():
+    results, page = docs / "evidence" / f"{plan}.csv", PAGES[plan]
+    if not results.exists():
         return "no run has ended"
     if page.beside_grid and path is None:
         return "bro_grid.npz is not here: --grid FILE"
+    others = published(plan, path) if page.beside_grid and path is not None else None
     with tempfile.TemporaryDirectory() as folder:
         # The report names files as they are given: as in the checkout, wherever this runs.
         here = Path(folder)
@@ -123,18 +152,30 @@ def write(plan: str, docs: Path, path: Path | None) -> str | None:
         command = ["study", "report", f"docs/evidence/{plan}.csv"]
         command += ["--plan", str(plan_file(plan).relative_to(CHECKOUT)), "--title", page.title, *page.options]
         command += ["--markdown", f"docs/{page.page}", "--pictures", f"docs/evidence/{plan}"]
-        if page.beside_grid:
-            others = published(plan, path)
+        if others is not None:
             study.write(others, here / "published.csv")
             command += ["--published", "published.csv"]
         subprocess.run([sys.executable, "-m", "sb3_sample.cli", *command], cwd=here, check=True)
-    ours = study.load(table)
-    if page.tested_at:
-        put(docs / page.page, page.title, markdown({step: rank_tests(ours, others, step) for step in page.tested_at}))
-    if plan == "mbma_figure1_small":
-        figure = runpy.run_path(str(CHECKOUT / "benchmarks" / "rewound_actions.py"))["figure"]
-        put(docs / page.page, page.title, figure(ours))
+    if page.table is not None:
+        put(docs / page.page, page.title, page.table(study.load(results), others))
     return None
+
+
+def put(page: Path, title: str, text: str) -> None:
+    """
+    Put a table into a page, between its lines ``<!-- begin: table: TITLE -->`` and ``<!-- end: table: TITLE -->``.
+
+    :param page: file with these lines
+    :param title: of the report that the table belongs to
+    :param text: what is to stand there
+    :raises ValueError: the file does not have each of these lines once, in this order
+    """
+    begin, end = (f"<!-- {side}: table: {title} -->" for side in ("begin", "end"))
+    parts = around(page.read_text(encoding="utf-8"), begin, end)
+    if parts is None:
+        raise ValueError(f"{page} must have a line {begin} and one {end} after it")
+    with becoming(page) as file:
+        file.write(f"{parts[0]}\n{text}\n{parts[1]}".encode())
 
 
 def main(given: list[str] | None = None) -> None:

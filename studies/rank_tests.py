@@ -77,23 +77,6 @@ def markdown(found: dict[int, pd.DataFrame]) -> str:
     return "\n".join(lines)
 
 
-def put(page: Path, title: str, text: str) -> None:
-    """
-    Put a table into a page, between its lines ``<!-- begin: table: TITLE -->`` and ``<!-- end: table: TITLE -->``.
-
-    :param page: file with these lines
-    :param title: of the report that the table belongs to
-    :param text: what is to stand there
-    :raises ValueError: the file does not have these lines, in this order
-    """
-    begin, end = (f"<!-- {side}: table: {title} -->" for side in ("begin", "end"))
-    before, found, rest = page.read_text(encoding="utf-8").partition(f"{begin}\n")
-    _, ended, after = rest.partition(end)
-    if not found or not ended:
-        raise ValueError(f"{page} must have a line {begin} and one {end} after it")
-    page.write_text(f"{before}{found}{text}\n{ended}{after}", encoding="utf-8")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("ours", type=Path)

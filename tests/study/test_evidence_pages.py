@@ -91,6 +91,19 @@ def test_results_are_put_into_their_page(module: Any, tmp_path: Path) -> None:
     assert f"of docs/evidence/{plan}.csv, published.csv;" in text and str(tmp_path) not in text
 
 
+def test_a_table_in_a_page(module: Any, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    marks = ["<!-- begin: table: A -->", "<!-- end: table: A -->"]
+    page.write_text(f"# Before\n\n{marks[0]}\nold\n{marks[1]}\n\nafter\n")
+    for _ in range(2):
+        module.put(page, "A", "| a |\n| --- |")
+        assert page.read_text().splitlines() == ["# Before", "", marks[0], "| a |", "| --- |", marks[1], "", "after"]
+    before = page.read_text()
+    with pytest.raises(ValueError, match="must have a line <!-- begin: table: B -->"):
+        module.put(page, "B", "| b |")
+    assert page.read_text() == before
+
+
 def test_unknown_plan_and_missing_grid_are_refused(module: Any, capsys: pytest.CaptureFixture[str]) -> None:
     for given, said in ((["bro_fats"], "no page for bro_fats"), (["--grid", "nowhere.npz"], "no file nowhere.npz")):
         with pytest.raises(SystemExit):

@@ -27,14 +27,13 @@ def write(report: Report, path: Path, pictures: Path | None = None) -> None:
     """
     name = re.sub(r"-{2,}|[<>\n\r]", "-", report.title)
     begin, end = BEGIN.format(name), END.format(name)
-    before = path.read_text(encoding="utf-8") if path.exists() else f"{begin}\n{end}\n"
-    if before.count(begin) != 1 or before.count(end) != 1 or before.index(begin) > before.index(end):
+    parts = around(path.read_text(encoding="utf-8") if path.exists() else f"{begin}\n{end}\n", begin, end)
+    if parts is None:
         raise ValueError(
             f"markdown must name a new file, or one with the lines {begin} and {end}, between which the report stands; "
             f"{path} has not both of them once"
         )
     pictures = path.with_name(f"{path.stem}_files") if pictures is None else pictures
-    head, _, rest = before.partition(begin)
     drawn = {part.name: part for section in report.sections for part in section.parts if isinstance(part, Figure)}
     images = {f"{name}.png": figures.png(figure) for name, figure in drawn.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -44,9 +43,22 @@ def write(report: Report, path: Path, pictures: Path | None = None) -> None:
         with becoming(pictures / file) as out:
             out.write(data)
     folder = Path(os.path.relpath(pictures, path.parent)).as_posix()
-    text = f"{head}{begin}\n{markdown(report, folder)}{end}{rest.partition(end)[2]}"
+    head, tail = parts
     with becoming(path) as out:
-        out.write(text.encode())
+        out.write(f"{head}\n{markdown(report, folder)}{tail}".encode())
+
+
+def around(page: str, begin: str, end: str) -> tuple[str, str] | None:
+    """
+    :param page: a text
+    :param begin: a line of it
+    :param end: another one
+    :return: the text up to the first line and from the second one on, both with it; None if it does not have each of
+        them once, in this order
+    """
+    if page.count(begin) != 1 or page.count(end) != 1 or page.index(begin) > page.index(end):
+        return None
+    return page[: page.index(begin) + len(begin)], page[page.index(end) :]
 
 
 def markdown(report: Report, pictures: str) -> str:
