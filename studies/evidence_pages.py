@@ -1,6 +1,7 @@
 """
 Write a report of each plan of studies/evidence/QUEUE that has finished runs into its page of ``docs``, between the two
-marker lines with the report's title (``sb3-sample study report --markdown``).
+marker lines with the report's title (``sb3-sample study report --markdown``); and of results whose page says by what
+program they are made.
 
     make evidence-pages
     python studies/evidence_pages.py [PLAN ...] [--grid bro_grid.npz]
@@ -55,6 +56,25 @@ def figure1(ours: pd.DataFrame, others: pd.DataFrame | None) -> str:
     return runpy.run_path(str(CHECKOUT / "benchmarks" / "rewound_actions.py"))["figure"](ours)
 
 
+def by_task(ours: pd.DataFrame, others: pd.DataFrame | None) -> str:
+    """
+    :param ours: runs of one agent on Meta-World
+    :param others: None
+    :return: return and success of each task at each evaluation, means over the seeds, in Markdown
+    """
+    means = ours.pivot_table(index="task", columns=["metric", "step"], values="value")
+    means.loc["mean"] = means.mean()
+    columns = [(metric, step) for metric in ("return", "success_rate") for step in means["return"].columns]
+    lines = [
+        "| task | " + " | ".join(f"{metric.removesuffix('_rate')}, {step:,}" for metric, step in columns) + " |",
+        "| --- |" + " ---: |" * len(columns),
+    ]
+    for task, values in means.iterrows():
+        cells = [f"{values[column]:,.{2 if column[0] == 'success_rate' else 0}f}" for column in columns]
+        lines.append(f"| {task} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
 class Page(NamedTuple):
     """
     Where a plan's report stands.
@@ -103,7 +123,10 @@ PAGES = {
     "drqv2": Page("drq.md", "DrQ-v2", ("--groups", "all", "--curves", "none")),
     "srspr": Page("srspr.md", "SR-SPR on Breakout", ("--groups", "all", "--curves", "none")),
     "offline": Page("offline_study.md", "Figure 11 on data of our own"),
+    "brc_mt10": Page("multi_task.md", "BRC on MT10", ("--groups", "metaworld", "--curves", "none"), table=by_task),
 }
+#: Results without a plan.
+BY_PROGRAM = ["brc_mt10"]
 #: Plans whose page takes more than a report, and where it says so.
 ELSEWHERE = {"scaling": "docs/scaling.md has the commands, which fit its laws first"}
 
@@ -149,8 +172,9 @@ def write(plan: str, docs: Path, path: Path | None) -> str | None:
         here = Path(folder)
         (here / "docs").symlink_to(docs.resolve())
         (here / "studies").symlink_to(CHECKOUT / "studies")
-        command = ["study", "report", f"docs/evidence/{plan}.csv"]
-        command += ["--plan", str(plan_file(plan).relative_to(CHECKOUT)), "--title", page.title, *page.options]
+        command = ["study", "report", f"docs/evidence/{plan}.csv", "--title", page.title, *page.options]
+        if plan not in BY_PROGRAM:
+            command += ["--plan", str(plan_file(plan).relative_to(CHECKOUT))]
         command += ["--markdown", f"docs/{page.page}", "--pictures", f"docs/evidence/{plan}"]
         if others is not None:
             study.write(others, here / "published.csv")
@@ -192,7 +216,7 @@ def main(given: list[str] | None = None) -> None:
     if options.grid is not None and not options.grid.exists():
         parser.error(f"--grid: no file {options.grid}")
     failed = False
-    for plan in options.plans or dict.fromkeys(name for name, _ in queue()):
+    for plan in options.plans or [*dict.fromkeys(name for name, _ in queue()), *BY_PROGRAM]:
         try:
             reason = ELSEWHERE.get(plan) or write(plan, CHECKOUT / "docs", options.grid or grid())
         except (ValueError, subprocess.CalledProcessError) as error:

@@ -58,7 +58,8 @@ def grid(path: Path) -> None:
 
 def test_every_plan_of_the_queue_has_its_place(module: Any) -> None:
     queued = {name for name, _ in module.queue()}
-    assert queued == module.PAGES.keys() | module.ELSEWHERE.keys()
+    assert queued.isdisjoint(module.BY_PROGRAM)
+    assert queued.union(module.BY_PROGRAM) == module.PAGES.keys() | module.ELSEWHERE.keys()
     for page in module.PAGES.values():
         text = (ROOT / "docs" / page.page).read_text(encoding="utf-8")
         assert text.count(mark("begin", page.title)) == text.count(mark("end", page.title)) == 1
@@ -89,6 +90,30 @@ def test_results_are_put_into_their_page(module: Any, tmp_path: Path) -> None:
     assert (tmp_path / "evidence" / plan / "tasks.png").exists()
     # Files are named as in the checkout.
     assert f"of docs/evidence/{plan}.csv, published.csv;" in text and str(tmp_path) not in text
+
+
+def test_return_and_success_by_task(module: Any) -> None:
+    rows = [
+        ("BRC", "{}", task, seed, step, metric, value * (seed + 1))
+        for seed in (0, 1)
+        for task, metric, step, value in (
+            ("metaworld/push-v3", "return", 0, 2.0),
+            ("metaworld/push-v3", "return", 5_000, 1_000.0),
+            ("metaworld/push-v3", "success_rate", 0, 0.0),
+            ("metaworld/push-v3", "success_rate", 5_000, 0.25),
+            ("metaworld/reach-v3", "return", 0, 4.0),
+            ("metaworld/reach-v3", "return", 5_000, 1_200.0),
+            ("metaworld/reach-v3", "success_rate", 0, 0.0),
+            ("metaworld/reach-v3", "success_rate", 5_000, 0.5),
+        )
+    ]
+    assert module.by_task(pd.DataFrame(rows, columns=COLUMNS), None).splitlines() == [
+        "| task | return, 0 | return, 5,000 | success, 0 | success, 5,000 |",
+        "| --- | ---: | ---: | ---: | ---: |",
+        "| metaworld/push-v3 | 3 | 1,500 | 0.00 | 0.38 |",
+        "| metaworld/reach-v3 | 6 | 1,800 | 0.00 | 0.75 |",
+        "| mean | 4 | 1,650 | 0.00 | 0.56 |",
+    ]
 
 
 def test_a_table_in_a_page(module: Any, tmp_path: Path) -> None:
