@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import yaml
+from gymnasium import spaces
 
 from sb3_sample.envs.registration import is_atari_id, register_atari
 from sb3_sample.envs.suites import SUITES
@@ -176,7 +177,7 @@ class _Reader:
             )
             for seed in seeds
             for task in tasks
-            for agent, arguments, point in variants
+            for agent, arguments, point, _ in variants
             if _has_data_on(agent.data, task)
         )
         for agent in agents:
@@ -353,8 +354,11 @@ class _Reader:
 
     def _variants(
         self, agents: list[_Agent], grid: dict[str, list[Any]]
-    ) -> Iterator[tuple[_Agent, dict[str, Any], dict[str, Any]]]:
-        """Agents with each point of the grid, each of which can be made, and is there once."""
+    ) -> Iterator[tuple[_Agent, dict[str, Any], dict[str, Any], "spaces.Space[Any]"]]:
+        """
+        Agents with each point of the grid, each of which can be made, and is there once; and the action space on which
+        it was made.
+        """
         seen: dict[str, _Agent] = {}
         for agent in agents:
             for values in itertools.product(*grid.values()):
@@ -369,31 +373,30 @@ class _Reader:
                         f"agent {agent.name!r} is agent {first.name!r} of line {line} once more: an agent can be there "
                         "once",
                     )
-                self._check_made(agent, arguments, point)
-                yield agent, arguments, point
+                yield agent, arguments, point, self._made_on(agent, arguments, point)
 
-    def _check_made(self, agent: _Agent, arguments: dict[str, Any], point: dict[str, Any]) -> None:
+    def _made_on(self, agent: _Agent, arguments: dict[str, Any], point: dict[str, Any]) -> "spaces.Space[Any]":
         try:
-            make(agent.algo, _without_data(agent, arguments))
+            return make(agent.algo, _without_data(agent, arguments))
         except (ValueError, TypeError, AssertionError) as error:
             where = f" with {', '.join(f'{k}={v!r}' for k, v in point.items())} of grid" if point else ""
             raise self._fail(agent.node, f"agent {agent.name!r}{where} cannot be made: {error}") from error
 
     def _check_actions(
         self,
-        variants: list[tuple[_Agent, dict[str, Any], dict[str, Any]]],
+        variants: list[tuple[_Agent, dict[str, Any], dict[str, Any], "spaces.Space[Any]"]],
         tasks: list[str],
         env_kwargs: dict[str, Any],
     ) -> None:
         """Check that each agent takes the actions of its tasks."""
         of_tasks = {task: action_space(task, env_kwargs) for task in tasks}
-        for agent, arguments, _ in variants:
+        for agent, arguments, _, made_on in variants:
             tried = set()
             for task, actions in of_tasks.items():
                 if actions is None or repr(actions) in tried or not _has_data_on(agent.data, task):
                     continue
                 tried.add(repr(actions))
-                if why := why_not_acting(agent.algo, _without_data(agent, arguments), actions):
+                if why := why_not_acting(agent.algo, _without_data(agent, arguments), actions, made_on):
                     raise self._fail(agent.node, f"agent {agent.name!r} cannot act in task {task!r}: {why}")
 
     def _check_measured(self, name: str, node: yaml.Node, agents: list[_Agent]) -> None:

@@ -8,8 +8,8 @@ import gymnasium as gym
 import numpy as np
 import yaml
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_sample.envs.no_environment import NoEnvironment
 from sb3_sample.warn import warn
 
 #: Arguments of the constructors that are the run's, not the agent's; ``frame_stack`` is the zoo's VecFrameStack.
@@ -46,14 +46,15 @@ def constructor_value(name: str, value: Any) -> Any:
     return BUFFERS.get(value, value) if name == "replay_buffer_class" and isinstance(value, str) else value
 
 
-def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | None" = None) -> None:
+def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | None" = None) -> "spaces.Space[Any]":
     """
     Make an agent, on a small task and with the settings of ``hyperparams/<algo>.yml``, to have its arguments checked
     together.
 
     :param algo: its algorithm
     :param arguments: its arguments; the observations of the task are those that ``policy`` is for
-    :param actions: action space of the task; None: one that the algorithm is for
+    :param actions: action space of the task; None: one that the agent is for
+    :return: action space of the agent that was made
     :raises ValueError: they do not go together, or one is out of range; a ``TypeError`` where they are of another kind
     """
     from rl_zoo3.exp_manager import ExperimentManager
@@ -68,26 +69,42 @@ def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | Non
     policy = settings.setdefault("policy", "MlpPolicy" if "MlpPolicy" in algorithm.policy_aliases else "CnnPolicy")
     if policy == "CnnPolicy" and "buffer_size" in known:
         settings["buffer_size"] = 1_000  # pictures, of which hardly anything is stored here
-    envs: list[Any] = ["Pendulum-v1", "CartPole-v1"]
-    if policy != "MlpPolicy" or actions is not None:
-        envs = [NoEnvironment(_observations(algo, policy), usual_actions(algo) if actions is None else actions)]
+    observations = _observations(algo, policy)
     errors: list[Exception] = []
-    for env in envs:
+    for space in _USUAL_ACTIONS if actions is None else [actions]:
+        env = DummyVecEnv([functools.partial(_TrialEnv, observations, space)])
         try:
             algorithm(**{"device": "cpu", **settings, "env": env})
-            return
+            return space
         except (ValueError, TypeError, AssertionError) as error:
             errors.append(error)
     # All actions of a discrete space, say, are only there where actions are discrete.
-    raise errors[0]
+    raise errors[-1 if _is_for_games(algo) else 0]
 
 
-def usual_actions(algo: str) -> "spaces.Space[Any]":
+class _TrialEnv(gym.Env[Any, Any]):
     """
-    :param algo: name of an algorithm
-    :return: a small action space that it is for
+    Environment of given spaces in which nothing happens. One that can be reset, copied and restored: ``RewoundPPO``
+    tries that when it is made.
+
+    :param observation_space: observation space
+    :param action_space: action space
     """
-    return spaces.Discrete(3) if _is_for_games(algo) else spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, observation_space: "spaces.Space[Any]", action_space: "spaces.Space[Any]"):
+        self.observation_space, self.action_space = observation_space, action_space
+        self._observation = observation_space.sample()
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self._observation, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return self._observation, 0.0, False, False, {}
+
+
+#: Small action spaces, for one of which each algorithm is.
+_USUAL_ACTIONS: "list[spaces.Space[Any]]" = [spaces.Box(-1, 1, (1,), np.float32), spaces.Discrete(3)]
 
 
 def _is_for_games(algo: str) -> bool:
@@ -123,25 +140,24 @@ def action_space(task: str, env_kwargs: dict[str, Any]) -> "spaces.Space[Any] | 
     return env.action_space
 
 
-def why_not_acting(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any]") -> str | None:
+def why_not_acting(
+    algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any]", made_on: "spaces.Space[Any]"
+) -> str | None:
     """
-    Find why an agent does not take an action space. One that resets its environment when it is made (``RewoundPPO``)
-    cannot be judged so, nor can one that cannot be made on the space that its algorithm is for.
+    Find why an agent does not take an action space.
 
     :param algo: its algorithm
     :param arguments: its arguments
     :param actions: action space of the task
-    :return: the reason; None if it takes them or cannot be judged
+    :param made_on: one on which it could be made
+    :return: the reason; None if it takes them
     """
-    usual = usual_actions(algo)
-    if isinstance(actions, type(usual)) and _is_plain(actions):
+    if isinstance(actions, type(made_on)) and _is_plain(actions):
         return None
     try:
         make(algo, arguments, actions)
     except (ValueError, TypeError, AssertionError) as error:
-        with contextlib.suppress(Exception):
-            make(algo, arguments, usual)
-            return str(error)
+        return str(error)
     return None
 
 

@@ -5,7 +5,9 @@ import shutil
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import pytest
 
 pytest.importorskip("rl_zoo3")
@@ -422,6 +424,13 @@ def test_a_run_that_was_taken_out_of_the_plan_is_not_forgotten(tmp_path: Path) -
         ("algo: bro, policy: MultiInputPolicy", "CartPole-v1", "bounded Box"),
         ("algo: srspr", "Pendulum-v1", "Discrete"),
         ("algo: srspr", "dmc/cheetah-run-v0", "Discrete"),
+        ("algo: rewound_ppo, sample_actions: all", "Pendulum-v1", "every action of a Discrete space"),
+        ("algo: rewound_ppo, sample_actions: all", "dmc/cheetah-run-v0", "every action of a Discrete space"),
+        (
+            "algo: rewound_ppo, policy: CnnPolicy, sample_actions: all",
+            "Pendulum-v1",
+            "every action of a Discrete space",
+        ),
     ],
 )
 def test_an_agent_that_cannot_act_in_a_task_is_refused(plan_of, agent: str, task: str, words: str) -> None:
@@ -439,7 +448,12 @@ def test_the_actions_are_those_of_the_task_with_its_arguments(plan_of) -> None:
 
 def test_an_agent_that_can_act_in_a_task_is_not_made_again(plan_of, monkeypatch: pytest.MonkeyPatch) -> None:
     made = []
-    monkeypatch.setattr(plan_file, "make", lambda *given: made.append(given))
+
+    def make(*given: Any) -> gym.Space[Any]:
+        made.append(given)
+        return gym.spaces.Box(-1, 1, (1,))
+
+    monkeypatch.setattr(plan_file, "make", make)
     monkeypatch.setattr(trial_agents, "make", lambda *_: pytest.fail("made"))
     plan_of(
         "agents: {A: {algo: mbma_ppo}, B: {algo: sac_sample}}\ntasks: [Pendulum-v1, dmc/cheetah-run-v0]\nseeds: 2\n"
@@ -448,7 +462,14 @@ def test_an_agent_that_can_act_in_a_task_is_not_made_again(plan_of, monkeypatch:
     assert len(made) == 2
 
 
-@pytest.mark.parametrize("agent", ["algo: mbma_ppo", "algo: rewound_ppo, sample_actions: all"])
+@pytest.mark.parametrize(
+    "agent",
+    [
+        "algo: mbma_ppo",
+        "algo: rewound_ppo, sample_actions: all",
+        "algo: rewound_ppo, sample_actions: all, policy: CnnPolicy",
+    ],
+)
 def test_discrete_actions_of_an_agent_that_takes_them(plan_of, agent: str) -> None:
     plan = plan_of(f"agents: {{A: {{{agent}}}}}\ntasks: [CartPole-v1]\nseeds: 1\nsteps: 30_000\n")
     assert len(plan.runs) == 1
