@@ -1,5 +1,5 @@
 """
-What each agent costs beside SAC, all in one run.
+Cost of each agent beside SAC, all in one run.
 
     python benchmarks/agent_cost.py [--threads 2] [--rounds 7]
 

@@ -5,7 +5,7 @@ Arithmetic of each agent of a plan: GFLOP of a gradient step and of a step of th
 
 Multiplications and additions of matrix products, forward and backward, counted by ``torch.utils.flop_counter`` over six
 gradient steps (of DR.Q over a block of six steps of its encoder too), on cheetah-run's sizes: 17 observations, 6
-actions. What acting costs is left out: it is one row, where a gradient step has a batch.
+actions. Acting is left out: it is one row, where a gradient step has a batch.
 """
 
 import argparse

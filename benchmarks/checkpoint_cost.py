@@ -1,5 +1,5 @@
 """
-What a checkpoint costs: its seconds, its bytes, and its share of the training, as the replay buffer fills.
+Cost of a checkpoint: its seconds, its bytes, and its share of the training, as the replay buffer fills.
 
     python benchmarks/checkpoint_cost.py [--agent BROFast] [--sizes 100000 500000 1000000] [--folder /tmp/cost]
 

@@ -77,7 +77,7 @@ AGENTS: dict[str, tuple[type[SAC], dict[str, Any]]] = {
     "bro-drawn": (BROFast, {"model_size": "4.92M", **DRAWN}),
     "vpl-drawn": (VPLSAC, DRAWN),
 }
-#: What is measured, in this order: label, number of learners, whether compiled.
+#: Measurements in their order: label, number of learners, whether compiled.
 PARTS: dict[str, tuple[str, int, bool]] = {
     "bro": ("bro", 1, True),
     "sac": ("sac", 1, True),
@@ -201,7 +201,7 @@ def inputs_of(model: Any) -> tuple[Any, ...]:
 
 
 def captured_by(owner: Any) -> Any:
-    """What has captured the steps of a learner or a group; None if they are run as they are."""
+    """Graphs of the steps of a learner or a group; None if they are run as they are."""
     return (owner._drawing or owner._execution)._captured
 
 
@@ -367,7 +367,7 @@ def training(device: str, turn: Turn) -> Iterator[str]:
         yield row(f"SAC, {updates} updates in {seconds:.0f} s with warm-up", updates / seconds)
 
 
-#: What is measured after the agents, in this order.
+#: Measurements after those of the agents, in their order.
 OTHERS: dict[str, Callable[[str, Turn], Iterator[str]]] = {
     "mbma-ppo": partial(mbma, None),
     "mbma-ppo-cpu": partial(mbma, "cpu"),

@@ -1,5 +1,5 @@
 """
-What an update from pixels costs beside its multiplications, and beside Stable-Baselines3's, all in one run.
+Cost of an update from pixels beside its multiplications, and beside Stable-Baselines3's, all in one run.
 
     python benchmarks/pixel_cost.py [--threads 2] [--batch-size 64] [--pixels 84] [--steps 2] [--rounds 3]
 

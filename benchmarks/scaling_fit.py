@@ -1,5 +1,5 @@
 """
-What fitting the scaling laws costs: 40 tasks, 25 configurations each, ten seeds, with bootstrap intervals.
+Cost of fitting the scaling laws: 40 tasks, 25 configurations each, ten seeds, with bootstrap intervals.
 
     python benchmarks/scaling_fit.py [--tasks 40] [--seeds 10] [--evaluations 40] [--reps 100]
 

@@ -1,5 +1,5 @@
 """
-What a study costs beside its runs: 1,000 runs of an agent that does nothing on a task that does nothing.
+Cost of a study beside its runs: 1,000 runs of an agent that does nothing on a task that does nothing.
 
     python benchmarks/study_cost.py [--runs 1000] [--workers 1] [--folder DIR]
 

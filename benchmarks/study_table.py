@@ -1,5 +1,5 @@
 """
-What a table of many runs costs: reading their folders, and the averages over tasks and seeds with intervals.
+Cost of a table of many runs: reading their folders, and the averages over tasks and seeds with intervals.
 
     python benchmarks/study_table.py [--runs 1000] [--evaluations 100] [--folder /tmp/study_table]
 

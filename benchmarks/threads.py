@@ -1,5 +1,5 @@
 """
-What threads do to a gradient step, on an idle machine and beside a busy process.
+Threads and the time of a gradient step, on an idle machine and beside a busy process.
 
     python benchmarks/threads.py [--threads 1 2] [--agent SAC] [--seconds 3]
 

@@ -72,7 +72,7 @@ AGENTS: dict[str, dict[str, tuple[str, dict[str, Any], int | None]]] = {
         **{name: (name, {}, None) for name in ("SimBa", "SimbaV2", "XQC", "CrossQ", "FlashSAC", "DebiasedRQ")},
     },
 }
-#: What was aimed at: label, numerator, denominator (None: the step's matrix multiplications), ratio.
+#: Aims: label, numerator, denominator (None: the step's matrix multiplications), ratio.
 AIMS = [
     ("BRO 4.92M / its matmul", "BRO 4.92M, compiled", None, 1 / 0.7),
     ("BRO 0.55M / its matmul", "BRO 0.55M, compiled", None, 2.0),

@@ -1,5 +1,5 @@
 """
-What goes wrong during a training: numbers that are finite no more, and callbacks that raise.
+Faults during a training: numbers that are finite no more, and callbacks that raise.
 
 Environments that die are the business of ``envs/workers.py``.
 """

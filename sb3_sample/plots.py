@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 DATA = Path(__file__).parent / "data" / "published_curves.csv.gz"
 #: The published algorithms that are drawn unless others are asked for.
 PUBLISHED = ("BRO", "BRO Fast", "SAC")
-#: What a table of a curve has, by simulator step, over the seeds. The standard deviation is the sample's (n - 1).
+#: Columns of the table of a curve, by simulator step, over the seeds. The standard deviation is the sample's (n - 1).
 COLUMNS = ["env_step", "n_seeds", "mean", "std", "min", "max", "iqm"]
 #: The zoo's name of our algorithm, where it is not the published one's.
 ZOO_NAMES = {"flashsac": "flash_sac", "sac": "sac_sample"}

@@ -1,5 +1,5 @@
 """
-What a run has logged, read for the plots and to go on with it: ``evaluations.npz`` of ``EvalCallback`` and the files of
+Logs of a run, read for the plots and to go on with it: ``evaluations.npz`` of ``EvalCallback`` and the files of
 ``Monitor``. A run's folder may come from anybody: what is no such log is refused before it takes time or memory.
 """
 
@@ -171,8 +171,8 @@ def _head(file: IO[bytes], path: str | Path) -> dict[str, Any]:
 
 def read_monitors(folder: str | Path) -> pd.DataFrame:
     """
-    The episodes of all Monitor files in a folder, as Stable-Baselines3's ``load_results`` gives them. What a run that
-    was killed has left of its last line is left out.
+    The episodes of all Monitor files in a folder, as Stable-Baselines3's ``load_results`` gives them. An incomplete
+    last line, of a run that was killed, is left out.
 
     :param folder: the run's folder
     :return: columns "r", the return, "l", the length in steps, "t", seconds since the run began, by which they are

@@ -1,7 +1,7 @@
 """
-What a run is of, by its files of settings: ``run.json`` of ``sb3-sample train --run-dir``, ``args.yml`` and
-``config.yml`` of the zoo, or the head of a Monitor file. A run's folder may come from anybody: nothing in it is
-imported or called.
+Algorithm, environment and arguments of a run, by its files of settings: ``run.json`` of ``sb3-sample train --run-dir``,
+``args.yml`` and ``config.yml`` of the zoo, or the head of a Monitor file. A run's folder may come from anybody: nothing
+in it is imported or called.
 """
 
 import ast

@@ -1,7 +1,7 @@
 """
 Tracing of a gradient step: a run that records tensor operations as a graph, gradients and optimizers' steps included.
 
-What is traced is compiled. Code that is quick as it stands and slow in a compiled graph, or the reverse, asks
+Traced code is compiled. Code that is quick as it stands and slow in a compiled graph, or the reverse, asks
 :func:`is_tracing` which of two equal forms is wanted.
 """
 

@@ -6,9 +6,9 @@ QUEUE of the first.
 
 A run that is begun is made from the last commit, in a git worktree and an environment of its own, never from the files
 of the checkout; one that was interrupted goes on under the commit that it began with. All this lies in
-``~/.cache/sb3_sample/evidence``, which may be removed: what has not ended then begins anew. What has ended is written
-to ``docs/evidence`` of the checkout: evaluations as a table (``<plan>.csv``, as ``sb3-sample study table`` has it), and
-settings, commit, versions and machine of each run (``<plan>.json``).
+``~/.cache/sb3_sample/evidence``, which may be removed: runs that have not ended then begin anew. Those that have are
+written to ``docs/evidence`` of the checkout: evaluations as a table (``<plan>.csv``, as ``sb3-sample study table`` has
+it), and settings, commit, versions and machine of each run (``<plan>.json``).
 
 A program of a plan's name, ``<plan>.py`` beside it, makes what its runs read, such as data sets; it is called before
 each of them, and makes what is not there.

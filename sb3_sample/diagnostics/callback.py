@@ -46,7 +46,7 @@ class DiagnosticsCallback(PeriodicMeasurement):
     buffer. Hence the start pair is a visited state and action of the rollout itself: that of a step which is drawn
     before the rollout begins, uniformly from the first half of ``rollout_length`` (of the time limit, if episodes were
     seen to be cut earlier), and counted over the ends of episodes. So how long an episode happens to last says nothing
-    about which of its states is taken. What the episode did from there on is the reference: it is unbiased also where
+    about which of its states is taken. The rest of the episode is the reference: it is unbiased also where
     episodes end at random. ``overestimation`` compares with the discounted return (Overestimation, Overfitting and
     Plasticity); ``overestimation_soft`` with VPL's equation 22, which also counts the entropy that a soft critic
     contains. The paper writes the entropy target for the policy's entropy; here it is the one measured in the rollout,

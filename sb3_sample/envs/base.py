@@ -19,7 +19,7 @@ def import_library(module: str, extra: str, then: str = "") -> ModuleType:
 
     :param module: Name of the module, e.g. ``"dm_control.suite"``.
     :param extra: The extra of this package that installs it, e.g. ``"dmc"``.
-    :param then: What is to be typed after that, if the extra alone is not enough.
+    :param then: A command to be typed after that, if the extra alone is not enough.
     :return: The module.
     :raises ImportError: The library, or something that it needs, is not installed.
     """

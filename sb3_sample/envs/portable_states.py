@@ -2,7 +2,7 @@
 The state of an environment as plain values: arrays, numbers, strings, random generators and containers of them, which
 can be written to a file and restored in another process, in an environment that was made in the same way.
 
-MuJoCo's data is not written as it lies in memory. What decides the future is its integration state
+MuJoCo's data is not written as it lies in memory. The future follows from its integration state
 (``mjSTATE_INTEGRATION``); all other numbers follow from it or are left over from the last step, and the latter are read
 by some tasks before they are computed anew, so that they are written too.
 """

@@ -2,8 +2,8 @@
 The ids, listed so that registering them imports none of the libraries, and ``make_env``.
 
 Gymnasium has no registry that outlives a process (its plugin entry points went with 1.0), so a worker of
-``SubprocVecEnv`` started by ``spawn`` or ``forkserver`` knows only Gymnasium's own ids. What a parent sends to such a
-worker is SB3's ``CloudpickleWrapper``; :func:`register_in_workers` has multiprocessing pickle it in a way that
+``SubprocVecEnv`` started by ``spawn`` or ``forkserver`` knows only Gymnasium's own ids. A parent sends to such a
+worker SB3's ``CloudpickleWrapper``; :func:`register_in_workers` has multiprocessing pickle it in a way that
 registers the ids before the environment is made.
 """
 

@@ -29,7 +29,7 @@ _CONSTANTS = (type(None), bool, int, float, complex, str, bytes, np.generic)
 #: Attributes of these types are part of the state, with what they contain.
 _CONTAINERS = (list, tuple, dict, set, collections.deque)
 _GENERATORS = (np.random.Generator, np.random.RandomState)
-#: What describes an environment or its interface: never a part of the state.
+#: Descriptions of an environment or its interface: never a part of the state.
 _NOT_STATE = (
     gym.Env, gym.Space, gym.envs.registration.EnvSpec, io.IOBase, type, types.ModuleType, types.FunctionType
 )  # fmt: skip

@@ -129,7 +129,7 @@ class WatchedConnection:
         """
         :param question: for the worker
         """
-        # What is left over where the answer of another raised an error, and what this raises, is told at the answer.
+        # Answers left over where another raised an error; an error here is told at the answer.
         with contextlib.suppress(EnvironmentDied):
             while self._asked:
                 self.recv()
@@ -316,7 +316,7 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
     environment is made anew, with a seed of its own that follows from the one that ``seed`` was given, and its episode
     ends as one that a time limit ends does: reward 0, ``TimeLimit.truncated``, the last observation that it gave as
     ``terminal_observation``, and ``info["worker_died"]`` with the reason, which is also a warning. ``Monitor`` does not
-    count the episode. What was set by ``set_attr`` or ``env_method`` in the old one is lost.
+    count the episode. Values set by ``set_attr`` or ``env_method`` in the old one are lost.
 
     :param env_fns: make the environments, each in a process of its own
     :param start_method: how processes are started, as there

@@ -53,7 +53,7 @@ class Windows(NamedTuple):
 
     ``observations`` is that of the first step, (B, O) or a dict of such; ``actions``, in [-1, 1], (B, H, A);
     ``next_observations`` (B, H, O) or a dict of such; ``dones``, 1 where the episode terminated (a time limit is 0),
-    and ``rewards``, (B, H). What follows a termination is of another episode, and means nothing. ``columns`` are those
+    and ``rewards``, (B, H). Rows after a termination are of another episode, and mean nothing. ``columns`` are those
     of the first step.
     """
 
@@ -240,8 +240,8 @@ class StoreSource:
 class Noise(NamedTuple):
     """
     Everything random of one gradient step: standard normal noise of its sampled actions, (B, A) each, and the critics
-    that make the TD target, (n,), if they are drawn. What is None is drawn by :meth:`completed`; what the batch
-    transforms need, one each, before.
+    that make the TD target, (n,), if they are drawn. Entries that are None are drawn by :meth:`completed`, after
+    those of the batch transforms, one each.
     """
 
     critic: torch.Tensor | None = None

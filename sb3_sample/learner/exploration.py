@@ -201,7 +201,7 @@ class ScheduledNoise(Exploration):
         self._set(learner)
 
 
-#: What may be meant by the spread of the critics.
+#: Kinds of spread of the critics.
 UNCERTAINTIES = ("epistemic", "aleatoric", "both")
 
 

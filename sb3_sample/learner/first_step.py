@@ -1,8 +1,8 @@
 """
 Checks before the first gradient step: a part of one's own whose shapes are wrong broadcasts, and trains nonsense.
 
-They run once, eagerly and before anything is compiled. What a gradient step would ask of networks, value head and rule
-of pessimism is asked once more, of a few of its transitions, so many that the batch has a size that nothing else has.
+They run once, eagerly and before anything is compiled. Networks, value head and rule of pessimism are called as in a
+gradient step, on a few of its transitions, so many that the batch has a size that nothing else has.
 Nothing is left of it: no random numbers, no statistics, no attributes.
 """
 

@@ -7,7 +7,7 @@ from torch import nn
 class CReLU(nn.Module):
     """
     Concatenated ReLU: a neuron's positive and negative part, so that no neuron can die (Shang et al. 2016; against
-    the loss of plasticity, Abbas et al. 2023). What reads it is ``width_factor`` times as wide.
+    the loss of plasticity, Abbas et al. 2023). The layer after it is ``width_factor`` times as wide.
     """
 
     width_factor = 2

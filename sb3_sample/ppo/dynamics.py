@@ -152,7 +152,7 @@ class Standardizer(nn.Module):
         """
         self.mean.copy_(x.mean(dim=0))
         std = x.std(dim=0, correction=0)
-        # What never changes is only shifted.
+        # Columns that never change are only shifted.
         self.std.copy_(torch.where(std > 1e-6, std, torch.ones_like(std)))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:

@@ -127,7 +127,7 @@ class CompactReplay(HasColumns):
         self.__dict__.update(state)
         if self.memory_map is None:
             return
-        # What is copied or unpickled is in the memory.
+        # A copied or unpickled buffer is in memory.
         self.memory_map = files.check_folder(self.memory_map, sum(array.nbytes for array in self.stored().values()))
         frames = self._frames
         if frames is not None:

@@ -97,7 +97,7 @@ class RegularizedSAC(SAC):
     def _check_arguments(self) -> None:
         network = _check_group("network_regularization", self.network_regularization, NETWORK_REGULARIZATIONS)
         chosen = _check_group("plasticity_regularization", self.plasticity_regularization, PLASTICITY_REGULARIZATIONS)
-        # What the constructor made of the groups; load may have changed one of the two.
+        # The groups as the constructor read them; load may have changed one of the two.
         in_force = {
             "critic_regularization": self.pessimism == _pessimism(self.critic_regularization),
             "network_regularization": (self.weight_decay is not None) == ("weight_decay" in network),

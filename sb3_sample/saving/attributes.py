@@ -2,7 +2,7 @@
 Attributes of objects as trees of plain values, and back into objects that were made in the same way.
 
 No object is ever made from a tree: what a class is stays the business of the program, only the values of the attributes
-come from the tree. What is shared between attributes, as a random generator often is, is shared again afterwards.
+come from the tree. An object that attributes share, often a random generator, is shared again afterwards.
 """
 
 import collections
@@ -38,7 +38,7 @@ from sb3_sample.saving.shared_memory import as_array, block_of, group, view_at
 _CONSTANTS = (type(None), bool, int, float, complex, str, bytes, np.generic, np.dtype, torch.dtype, torch.device)
 _GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
 _CONTAINERS = (list, tuple, dict, set, frozenset, collections.deque, np.ndarray)
-#: What describes and does not change; what a program is made of.
+#: Descriptions that do not change; parts of a program.
 _INERT = (gym.envs.registration.EnvSpec, types.ModuleType, pathlib.PurePath, *FUNCTIONS)
 #: The generators of a process, which are saved with it.
 _GLOBAL = (random._inst, np.random.mtrand._rand, torch.default_generator)  # type: ignore[attr-defined]
@@ -56,18 +56,18 @@ _LIBRARIES = (
     "builtins", "abc", "typing", "collections", "enum", "numpy", "torch", "gymnasium", "stable_baselines3",
     "sb3_contrib", "sb3_sample", "mujoco", "dm_control", "dm_env", "metaworld", "myosuite",
 )  # fmt: skip
-#: What is no plain value, but can be told to have stayed the same.
+#: Kinds that are no plain values, but can be told to have stayed the same.
 _IMMUTABLE = (
     range, slice, re.Pattern, datetime.date, datetime.time, datetime.timedelta, datetime.tzinfo, decimal.Decimal,
     fractions.Fraction, uuid.UUID,
 )  # fmt: skip
-#: What classes have besides data.
+#: Attributes of classes besides data.
 _OF_CLASSES = (type, types.FunctionType, classmethod, staticmethod, property)
 _POINTER = struct.calcsize("P")
 
 Node = dict[str, Any]
 
-#: What the attributes of a class were when they were first looked at in this process, by name.
+#: Attributes of a class as they were first seen in this process, by name.
 _FIRST: weakref.WeakKeyDictionary[type, dict[str, Node]] = weakref.WeakKeyDictionary()
 
 
@@ -266,7 +266,7 @@ class Describer:
                 described[name] = self.describe(value)
             except (Opaque, RecursionError) as error:
                 opaque.append(f"{name} ({error})")
-                # What was described half way is not there to be referred to.
+                # Objects that were described half way are not there to be referred to.
                 for key in list(self._seen)[known:]:
                     del self._seen[key]
                 del self._arrays[n_arrays:]
@@ -287,7 +287,7 @@ class Describer:
         """
         described: dict[str, dict[str, Node]] = {}
         opaque: list[str] = []
-        # What they hold may have further classes.
+        # Their values may have further classes.
         while self._n_classes < len(self._classes):
             cls = list(self._classes)[self._n_classes]
             self._n_classes += 1
@@ -655,7 +655,7 @@ class Restorer:
         holds = held(function)
         if described.keys() != holds.keys():
             raise DoesNotFit(f"{name} holds {sorted(holds)}, but held {sorted(described)}")
-        # What names files stays as it is.
+        # Names of files stay as they are.
         values = {**holds, **dict(self._restored(described, holds, name))}
         try:
             return holding(function, values)

@@ -10,7 +10,7 @@ from torch.utils._pytree import tree_leaves
 
 from sb3_sample.saving.container import BadFile
 
-#: What building the algorithms of this package takes is 4 to 8 times the bytes of their parameters (initial values are
+#: Building the algorithms of this package takes 4 to 8 times the bytes of their parameters (initial values are
 #: drawn, made orthogonal and copied), and up to 13 operations a tensor.
 BYTES, BYTES_PER_BYTE = 128 * 2**20, 20
 OPERATIONS, OPERATIONS_PER_TENSOR = 5000, 50

@@ -28,7 +28,7 @@ from sb3_sample.saving.classes import may_be_set
 from sb3_sample.saving.places import brings_text
 from sb3_sample.warn import warn
 
-#: What every callback has and that is not its own.
+#: Attributes that every callback has and that are not its own.
 _NOT_OWN = ("model", "parent", "locals", "globals", "verbose")
 #: Names of the attributes that this process's trainings have changed. The checkpoints of a second training of the same
 #: callback hold what only the first one has changed too.
@@ -104,7 +104,7 @@ class CallbackStates:
         self._before = {path: self._attributes(each)[0] for path, each in self._callbacks.items()}
         # Paths of the callbacks of which it was warned that something is lost.
         self._told: set[str] = set()
-        # What an earlier part of the run has changed belongs to the state as well.
+        # Attributes that an earlier part of the run has changed belong to the state as well.
         self._changed = {path: _CHANGED.setdefault(each, set()) for path, each in self._callbacks.items()}
 
     def _attributes(self, callback: BaseCallback) -> tuple[dict[str, Node], list[str]]:

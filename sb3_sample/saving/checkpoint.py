@@ -112,7 +112,7 @@ class Checkpointer:
         self._folder: RunFolder | None = None
         #: Its place among trainings in lockstep, if it has one.
         self._seat = seat_of(model)
-        #: What was read of the checkpoint that the run goes on from.
+        #: Manifest and state of the checkpoint that the run goes on from.
         self._resumed: dict[str, Any] | None = None
         self._manifest: dict[str, Any] = {"segments": {}}
         self._saved_at: int | None = None
@@ -422,7 +422,8 @@ class Checkpointer:
 
     def finish(self) -> None:
         """
-        Let the callback hear that the training ends. What it raises does not cost the turns since the last checkpoint.
+        Let the callback hear that the training ends. An error that it raises does not cost the turns since the last
+        checkpoint.
 
         :raises Exception: what it raises, or what it raised during a turn that it ended
         """
@@ -510,7 +511,7 @@ class Checkpointer:
         return bool(reasons)
 
     def _save_rows(self, name: str, ring: Ring, known: dict[str, Any]) -> dict[str, Any]:
-        """Write the rows that the files lack. What the manifest says of all that are needed then."""
+        """Write the rows that the files lack, and return the manifest's entry of all that are needed then."""
         assert self._folder is not None
         first, last = ring.advance()
         oldest = last - ring.size()

@@ -44,7 +44,7 @@ _COUNTS = (
 )  # fmt: skip
 _MAX_COUNT = 2**53
 _NUMBER = (int, float, np.integer, np.floating)
-#: What belongs to the program in which a model is, and to no file.
+#: Attributes that belong to the program in which a model is, and to no file.
 NEVER = (
     "policy", "env", "replay_buffer", "rollout_buffer", "_vec_normalize_env", "_logger", "_custom_logger",
     "_trusted_modules", "_told",
@@ -122,7 +122,7 @@ def check_sizes(model: Any, name: str, given: Collection[str]) -> None:
     for key, limit in MOST.items():
         value = getattr(model, key, None)
         number = value.frequency if isinstance(value, TrainFreq) else value
-        # What is no number is refused by the algorithm.
+        # Anything but a number is refused by the algorithm.
         if key not in given and isinstance(number, _NUMBER) and number > limit:
             raise BadFile(f"{name}: {key} must be at most {limit}, not {number!r:.100}: pass {key}= to load")
 

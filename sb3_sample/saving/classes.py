@@ -29,7 +29,8 @@ SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary,
 PACKAGES = ("torch.nn", "torch.optim", "stable_baselines3", "sb3_contrib", "sb3_sample")
 #: Of these, what reading a file imports. Modules of the others must be there already: some write files when they are.
 IMPORTED = ("sb3_contrib", "stable_baselines3.common.sb2_compat")
-#: What can be an argument of an algorithm: networks, policies, features extractors, activations; optimizers; buffers.
+#: Classes that can be arguments of an algorithm: networks, policies, features extractors and activations;
+#: optimizers; buffers.
 KINDS = (nn.Module, torch.optim.Optimizer, BaseBuffer)
 
 

@@ -366,7 +366,7 @@ def _json(text: str, name: str) -> Any:
         return value if math.isfinite(value) else refuse(text)
 
     collecting = gc.isenabled()
-    # What is read has no cycles, and looking for them again and again takes ten times as long as reading.
+    # The data read have no cycles, and looking for them again and again takes ten times as long as reading.
     gc.disable()
     try:
         return json.loads(text, parse_constant=refuse, parse_float=finite)

@@ -37,7 +37,7 @@ from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.generators import check_python_state, numpy_generator
 from sb3_sample.saving.hashes import distinct_hashes, part_name
 
-#: What the library's constructors raise where a file holds nonsense.
+#: Errors of the library's constructors where a file holds nonsense.
 _NONSENSE = (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError, AssertionError, RuntimeError)
 
 
@@ -56,8 +56,8 @@ class NotTrusted(BadFile):
 
 def decode(tree: Any, tensors: dict[str, torch.Tensor], name: str, trusted: Sequence[str] = ()) -> Any:
     """
-    The value that ``encode`` was given. What it refers to is taken out of ``tensors``, so that nothing is there
-    twice and what nobody refers to is left.
+    The value that ``encode`` was given. Tensors that it refers to are taken out of ``tensors``, so that none is there
+    twice and those that nobody refers to are left.
 
     :param tree: the tree
     :param tensors: its arrays and tensors; the value keeps their memory
@@ -336,7 +336,7 @@ _READERS: dict[str, Callable[[_Decoder, Any, Any, str, int], Any]] = {
     "random": _Decoder._random,
     "torch_generator": _Decoder._torch_generator,
 }
-#: What stands beside a tag.
+#: Entries beside a tag.
 _FURTHER: dict[str, tuple[str, ...]] = {
     "deque": ("maxlen",),
     "raw_array": ("dtype", "shape"),

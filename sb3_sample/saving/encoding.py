@@ -57,11 +57,11 @@ __all__ = ["Encoder", "Lenient", "NotPortable", "decode", "encode", "is_left_out
 LEFT_OUT = "left_out"
 #: Lists of numbers that are longer are arrays in the file.
 LONG = 16
-#: What trains, or is trained in, is more than its attributes.
+#: Objects that train, or are trained in, which are more than their attributes.
 _OF_TRAINING = (BaseAlgorithm, BaseBuffer, BaseCallback, VecEnv, gym.Env, gym.Space)
-#: What draws, and is written by its state.
+#: Random generators, which are written by their state.
 GENERATORS = (np.random.Generator, np.random.RandomState, random.Random, torch.Generator)
-#: What is written by its name.
+#: Objects that are written by their names.
 NAMED = (type, types.FunctionType, types.BuiltinFunctionType)
 
 
@@ -349,7 +349,7 @@ class Lenient(Encoder):
 
     def __init__(self, tensors: dict[str, torch.Tensor]):
         super().__init__(tensors)
-        #: What is left out, by its name, with the reason.
+        #: Values that are left out, by name, with the reason.
         self.left_out: dict[str, str] = {}
 
     def attempt(self, value: Any, name: str, schedule: bool = False) -> Any:

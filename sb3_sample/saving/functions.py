@@ -1,6 +1,6 @@
 """
-What functions keep from one call to the next: what they are bound to, the arguments of a ``partial``, the variables
-that a closure closes over, defaults and attributes.
+State that functions keep from one call to the next: what they are bound to, the arguments of a ``partial``, the
+variables that a closure closes over, defaults and attributes.
 """
 
 import functools
@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-#: What is called, and does what the program says.
+#: Callables, which do what the program says.
 FUNCTIONS = (
     type, types.FunctionType, types.BuiltinFunctionType, types.MethodType, functools.partial,
     functools._lru_cache_wrapper, np.ufunc,
 )  # fmt: skip
-#: What a function of a library in C is bound to if it is no method of an object.
+#: Kinds of ``__self__`` of a function of a library in C that is no method of an object.
 _UNBOUND = (type(None), type, types.ModuleType)
 _CONSTANTS = (type(None), bool, int, float, complex, str, bytes)
 

@@ -37,7 +37,7 @@ _STATES: dict[str, tuple[dict[str, _Check], dict[str, _Check]]] = {
         {"buffer": _words(4, np.uint64), "buffer_pos": _whole(4), **_REST},
     ),
 }
-#: What a ``RandomState`` has besides.
+#: Further state of a ``RandomState``.
 _LEGACY: dict[str, _Check] = {"has_gauss": _BIT, "gauss": _is_float}
 BIT_GENERATORS = tuple(_STATES)
 

@@ -6,7 +6,7 @@ import enum
 class Kept(enum.Flag):
     """
     Where an attribute is kept by itself. An algorithm declares it in the class attribute ``_kept``, by name, for its
-    own attributes. What is not declared is kept everywhere, but arguments of the constructor only in a model's file:
+    own attributes. Others are kept everywhere, but arguments of the constructor only in a model's file:
     the program that goes on from a checkpoint gives them anew.
     """
 

@@ -60,7 +60,7 @@ class SafeFiles(BaseAlgorithm):
     policy_base: ClassVar[type] = BasePolicy
     #: Modules that whoever loaded the model vouches for. A file never says so.
     _trusted_modules: tuple[str, ...] = ()
-    #: What was said of the model's files.
+    #: Warnings given about the model's files.
     _told: frozenset[str] = frozenset()
 
     def _excluded_save_params(self) -> list[str]:
@@ -77,11 +77,11 @@ class SafeFiles(BaseAlgorithm):
         trusted_modules: Sequence[str] = (),
     ) -> None:
         """
-        Save the model, as in Stable-Baselines3, but to a file that runs no code when it is loaded. What is there is
-        replaced at once, and only when the new file is complete.
+        Save the model, as in Stable-Baselines3, but to a file that runs no code when it is loaded. A file that
+        is there is replaced at once, and only when the new one is complete.
 
-        Classes and functions are written by their names, and a schedule that has none as a table. What no file can hold
-        is left out, with one warning for a model (``learn`` gives it when the training starts).
+        Classes and functions are written by their names, and a schedule that has none as a table. Attributes that no
+        file can hold are left out, with one warning for a model (``learn`` gives it when the training starts).
 
         :param path: path, to which ".zip" is added if it has no suffix, or a binary file open for writing
         :param exclude: attributes to leave out, besides those that always are
@@ -131,8 +131,9 @@ class SafeFiles(BaseAlgorithm):
         :param trusted_modules: modules, or packages of modules, whose classes and functions the file, and what the
             model reads later, may name
         :param kwargs: arguments of the constructor that take the place of the file's, which is not asked for them:
-            ``policy`` (a class), ``policy_kwargs``, ``action_noise``, ``learning_rate``, ... What a learned number
-            starts from (``initial_...``, ``ent_coef="auto_..."``) counts from the next reset on: the file has its value
+            ``policy`` (a class), ``policy_kwargs``, ``action_noise``, ``learning_rate``, ... The initial value of
+            a learned number (``initial_...``, ``ent_coef="auto_..."``) counts from the next reset on: the file has its
+            value
         :return: the model
         :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, of another class, or names what is
             not trusted; or lacks what must be given

@@ -32,7 +32,7 @@ from sb3_sample.saving.moments import check_moments
 from sb3_sample.saving.training_state import argument_names
 
 KIND = "model"
-#: What follows from the rest, or says who loads.
+#: Attributes that follow from the rest, or say who loads.
 _NOT_READ = ("device", "lr_schedule")
 _SECTIONS = ("classes", "attributes", "parameters", "metadata")
 
@@ -113,10 +113,10 @@ class Description:
             "classes": [path_of(cls) for cls in type(model).__mro__ if issubclass(cls, family)],
             "attributes": self.attributes,
             "parameters": {name: self._state(state, name) for name, state in parameters.items()},
-            # What torch's modules know of the version of their own parameters.
+            # Versions that torch's modules have of their own parameters.
             "metadata": {name: self.encoder.attempt(value, name) for name, value in metadata.items()},
         }
-        # What a subclass has besides: files of this package's own classes have no such section.
+        # Attributes of a subclass besides: files of this package's own classes have no such section.
         return tree | ({"own": {name: self.encoder.attempt(state, name) for name, state in own.items()}} if own else {})
 
     def _state(self, state: Any, name: str) -> Any:
@@ -153,7 +153,7 @@ class Content:
         if not all(isinstance(tree.get(key, {}), dict) for key in ("attributes", "parameters", "metadata", "own")):
             raise BadFile(f"{self.name} is damaged: it does not hold what a model consists of")
         self._check_class([path_of(base) for base in cls.__mro__ if issubclass(base, family)])
-        #: What the file was written without, and nobody has given, with the reason.
+        #: Attributes that the file was written without, and nobody has given, with the reason.
         self.left_out: dict[str, str] = {}
         self._parameters: dict[str, Any] | None = None
 

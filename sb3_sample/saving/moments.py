@@ -6,7 +6,7 @@ import torch
 
 from sb3_sample.saving.untrusted import BadFile
 
-#: What the common optimizers keep of each parameter, in its shape. torch's fused kernels do not check it.
+#: State that the common optimizers keep of each parameter, in its shape. torch's fused kernels do not check it.
 _MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq", "momentum_buffer", "square_avg", "grad_avg")
 
 

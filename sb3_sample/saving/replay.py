@@ -23,7 +23,7 @@ from sb3_sample.saving.rings import check_episodes, check_values
 from sb3_sample.saving.untrusted import MAX_MESSAGE
 
 KIND = "replay buffer"
-#: What is added to a path that is written, and what else may have been, by those who expect a pickle.
+#: Suffix added to a path that is written, and the one that those who expect a pickle may have added.
 SUFFIX, PICKLES_SUFFIX = "buffer.zip", "pkl"
 #: The suffixes of a name that stays as it is.
 OWN_SUFFIXES = ("zip", PICKLES_SUFFIX)
@@ -57,7 +57,7 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
     ) -> None:
         """
         Save the replay buffer, as in Stable-Baselines3, but to a file that runs no code when it is loaded. The rows
-        that were never filled take no space. What no file can hold is left out, with a warning.
+        that were never filled take no space. Attributes that no file can hold are left out, with a warning.
 
         :param path: path, to which ".buffer.zip" is added unless it ends in ".zip" or ".pkl", or a binary file open for
             writing
@@ -128,7 +128,7 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
         self.replay_buffer = buffer
         last: Any = self._last_obs if self.get_vec_normalize_env() is None else self._last_original_obs
         if truncate_last_traj and last is not None and not leads_to(buffer, last):
-            # What is under way is another episode than the buffer's last: the next ``learn`` resets the environment.
+            # The episode under way is not the buffer's last: the next ``learn`` resets the environment.
             self._last_obs = None
 
     def _pickled_buffer(self, path: Any, name: str, truncate_last_traj: bool) -> ReplayBuffer:

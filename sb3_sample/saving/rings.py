@@ -20,7 +20,7 @@ from sb3_sample.saving.untrusted import BadFile
 
 #: Attributes that hindsight keeps of each row besides the columns.
 _OF_HINDSIGHT = ("ep_start",)
-#: What changes in rows that are there already, or is no row; written anew each time.
+#: Attributes that change in rows that are there already, or are no rows; written anew each time.
 _SMALL = ("ep_length", "_current_ep_start")
 #: Never used (infos, without copy_info_dict), or never changes; and what follows from the rows.
 _DERIVED = (
@@ -49,7 +49,7 @@ def check_values(columns: Mapping[str, Any], name: str, buffer: Any) -> None:
         elif declared is None or values.size == 0:
             continue
         elif not declared.is_flag and values.dtype.kind == "f":
-            # What is not finite is the smallest or the largest of them, without a copy.
+            # A number that is not finite is the smallest or the largest of them: no copy is made.
             low, high = values.min(), values.max()
             if not (np.isfinite(low) and np.isfinite(high)):
                 bad = low if not np.isfinite(low) else high

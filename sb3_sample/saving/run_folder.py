@@ -38,13 +38,13 @@ _HIDDEN = re.compile(rf"({re.escape(_WRITING)}|{re.escape(_REMOVED)})-[0-9a-f]{{
 _SEGMENT = re.compile(r"[^\W\d]\w*-\d{12,}-\d{12,}\.zip")
 #: Files that are made to be renamed.
 _HIDDEN_FILE = re.compile(rf"\.({_SEGMENT.pattern}|{re.escape(LOG)}|{re.escape(_LOCK)})\.[0-9a-f]{{12}}")
-#: What is used here, and must be no link; and names that only a run of ours may have for what is not empty.
+#: Names used here, which must be no links; and names that only a run of ours may have for what is not empty.
 _USED = re.compile(rf"{SEGMENTS}|{re.escape(LOG)}|{re.escape(_LOCK)}|{_CHECKPOINT.pattern}|{_HIDDEN.pattern}")
 _CLAIMED = re.compile(
     rf"{SEGMENTS}|{re.escape(LOG)}|{re.escape(_LOCK)}|checkpoint-.*|({re.escape(_WRITING)}|{re.escape(_REMOVED)})(-.*)?",
     re.DOTALL,
 )
-#: What the first file of a run says, by which its folder is known before it has a checkpoint.
+#: Content of the first file of a run, by which its folder is known before it has a checkpoint.
 _MARK = b"The folder of one run of sb3_sample, made by learn(checkpoint=...). See docs/saving.md.\n"
 #: Complete checkpoints that are kept.
 KEPT = 2
@@ -103,7 +103,7 @@ class RunFolder:
         #: Tells the folders of runs that go on from the same step as this one, so that a checkpoint is kept until all
         #: of them have a newer one.
         self.beside: Callable[[], Sequence[Path]] = tuple
-        #: What was warned of.
+        #: Warnings given.
         self._told: set[str] = set()
         self._lock: Lock | None = None
         with Folder.at(self.path) as root:
@@ -308,8 +308,8 @@ class RunFolder:
         self, steps: int, files: dict[str, Callable[[IO[bytes]], Any]], segments: dict[str, Any], about: dict[str, Any]
     ) -> Path:
         """
-        Write a checkpoint, and remove what is not needed any more when it is whole. What cannot be removed is a
-        warning.
+        Write a checkpoint, and remove what is not needed any more when it is whole. Files that cannot be removed are
+        named in a warning.
 
         :param steps: environment steps, by which it is named
         :param files: by name, what writes it to a file

@@ -26,7 +26,7 @@ def _is_keys(value: Any) -> bool:
     return value is None or (isinstance(value, (list, tuple)) and all(isinstance(key, str) for key in value))
 
 
-#: What each argument can be, and in words.
+#: Check of each argument, and the allowed values in words.
 _ALLOWED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "training": (_is_bool, "True or False"),
     "norm_obs": (_is_bool, "True or False"),

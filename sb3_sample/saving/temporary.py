@@ -45,7 +45,7 @@ def becoming(path: Path) -> Iterator[IO[bytes]]:
                     file.close()  # Windows renames no open file
                 os.replace(temporary, path)
             except BaseException:
-                # What is left in its buffer may fail once more.
+                # Writing the rest of its buffer may fail once more.
                 with contextlib.suppress(OSError):
                     file.close()
                 temporary.unlink(missing_ok=True)
@@ -74,7 +74,7 @@ def lock(descriptor: int, shared: bool = False) -> bool | None:
 
 def remove_abandoned(folder: Path) -> None:
     """
-    Remove the temporary files of this user in a folder whose writers are gone. What cannot be removed stays.
+    Remove the temporary files of this user in a folder whose writers are gone. Those that cannot be removed stay.
 
     :param folder: the folder
     """

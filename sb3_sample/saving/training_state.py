@@ -1,5 +1,5 @@
 """
-What a training run consists of besides parameters, replay buffer, environments and callbacks: the algorithm's counters,
+State of a training run besides parameters, replay buffer, environments and callbacks: the algorithm's counters,
 random generators and logger; and what tells one run from another.
 """
 

@@ -197,7 +197,7 @@ def save(venv: VecEnv) -> tuple[dict[str, Any], list[str]]:
         "seeds": list(innermost._seeds),
         "options": list(innermost._options),
         "environments": None,
-        # What a worker's episode is cut off with, should it die.
+        # Observations with which a worker's episode is cut off, should it die.
         "last": innermost.last_observations if isinstance(innermost, SupervisedSubprocVecEnv) else None,
     }
     packed, opaque = _pack(innermost)
@@ -292,8 +292,8 @@ def _for_the_next_reset(state: dict[str, Any], n_envs: int) -> tuple[list[Any], 
 
 def set_sigint_ignored(venv: VecEnv, ignored: bool) -> None:
     """
-    Whether the workers of a vectorised environment ignore SIGINT. What has no workers, or cannot be reached, stays as
-    it is.
+    Whether the workers of a vectorised environment ignore SIGINT. One without workers, or that cannot be reached,
+    stays as it is.
 
     :param venv: a vectorised environment
     :param ignored: whether they do

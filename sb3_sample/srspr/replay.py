@@ -26,8 +26,8 @@ class StateWindows(NamedTuple):
     """
     Windows of consecutive states.
 
-    :param states: s_t, ..., s_{t+K} and s_{t+n}, uint8, (K + 2, B, C, height, width). What lies behind an episode's end
-        is anything
+    :param states: s_t, ..., s_{t+K} and s_{t+n}, uint8, (K + 2, B, C, height, width). Those behind an episode's end
+        are anything
     :param actions: a_t, ..., a_{t+K-1}, their numbers, (B, K)
     :param rewards: r_t, ..., r_{t+L-1}, L being the larger of n and K, (B, L)
     :param terminated: 1 where a step ended the episode, (B, L)

@@ -49,7 +49,7 @@ VARIABLES = (
 )
 #: Patterns of the variables that its regressions take as they are; the logarithm of the others is taken.
 LINEAR = ("*dormant*",)
-#: What an argument is that a run was not given.
+#: Value of an argument that a run was not given.
 DEFAULT = "default"
 
 

@@ -1,7 +1,7 @@
 """
 Plans of studies as YAML files.
 
-A plan has agents (an algorithm and arguments), tasks, seeds, steps, an evaluation and a grid of arguments. What it says
+A plan has agents (an algorithm and arguments), tasks, seeds, steps, an evaluation and a grid of arguments. All of it
 is checked before anything runs, and an error names file, line and what is allowed.
 """
 

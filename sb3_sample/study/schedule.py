@@ -62,8 +62,8 @@ def run(
     worker: Sequence[str] = WORKER,
 ) -> Status:
     """
-    Make all runs of a plan, or go on with them. What is done is not made again, what was interrupted goes on from its
-    last checkpoint, and what has failed is tried again. Runs that other processes make in the folder are waited for.
+    Make all runs of a plan, or go on with them. Finished ones are not made again, interrupted ones go on from
+    their last checkpoint, and failed ones are tried again. Runs that other processes make in the folder are waited for.
 
     :param plan: a plan or its file
     :param folder: the study's; ``runs/<name of the plan>`` if None

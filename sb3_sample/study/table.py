@@ -32,7 +32,7 @@ RUN = ["agent", "arguments", "task", "seed"]
 METRICS = ("return", "success_rate", "hours", "diagnostics/*")
 #: Every seed of the authors' runs of BRO and BRO Fast on their 40 tasks.
 SEEDS = DATA.parent / "published_seeds.npz"
-#: What a published curve is made of, as the metrics ``return/mean``, ... of the table.
+#: Statistics of a published curve, as the metrics ``return/mean``, ... of the table.
 STATISTICS = ("mean", "std", "min", "max", "iqm", "n_seeds")
 
 _EVALUATED = {"return": "results", "success_rate": "successes", "episode_length": "ep_lengths"}
@@ -302,7 +302,7 @@ def _hours(logged: np.ndarray, seconds: np.ndarray, steps: np.ndarray) -> tuple[
 
 
 def _logged(path: Path, repeat: int, metrics: Sequence[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """What the lines of a log hold, by name, and ``_SECONDS``. A last line that is not whole is left out."""
+    """Values of the lines of a log, by name, and ``_SECONDS``. A last line that is not whole is left out."""
     values: dict[str, dict[int, float]] = {}
     try:
         data = read_regular(path, _MAX_LOG)

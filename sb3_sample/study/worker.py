@@ -2,9 +2,9 @@
 The process that makes runs, started by the scheduler with the study's folder as its argument.
 
 It takes one order after the other, as lines of JSON on its standard input, and answers each with a line on its standard
-output. An order is of one run, or of several that are made together. What a run prints goes to a file of its own. When
-the input ends, because the scheduler has nothing more or is gone, it stops: a training under way finishes its turn and
-writes a checkpoint, as after SIGTERM.
+output. An order is of one run, or of several that are made together. The output of a run goes to a file of its own.
+When the input ends, because the scheduler has nothing more or is gone, it stops: a training under way finishes its turn
+and writes a checkpoint, as after SIGTERM.
 """
 
 import contextlib
@@ -88,8 +88,8 @@ def serve(make: Train = train) -> None:
         n_made = 0
         while (order := orders.get()) is not None:
             if n_made < 2:
-                # What was imported stays, the zoo too, which the first run imports: looking through all of it after
-                # each run would take a quarter of a second.
+                # Imported modules stay, those of the zoo too, which the first run imports: looking through all of it
+                # after each run would take a quarter of a second.
                 gc.collect()
                 gc.freeze()
             n_made += 1

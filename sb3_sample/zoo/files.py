@@ -125,7 +125,7 @@ def _rows(table: dict[str, Any]) -> list[Any]:
 
 
 def _are_words(value: Any) -> bool:
-    # What is not printable could tell a terminal what to do.
+    # Characters that are not printable could control a terminal.
     return isinstance(value, list) and all(isinstance(word, str) and word.isprintable() for word in value)
 
 

@@ -136,7 +136,7 @@ def _are_texts(value: Any) -> bool:
     return isinstance(value, dict) and all(isinstance(text, str) for text in value.values())
 
 
-#: What the entries of a record may be.
+#: Checks of the entries of a record.
 _RECORDED: dict[str, Callable[[Any], bool]] = {
     "algo": _is_id,
     "env": _is_id,
@@ -325,7 +325,7 @@ def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
         return Start(list(arguments), freq or CHECKPOINT_FREQ, folder)
     record = Record.read(folder)
     check_monitor_files(folder)
-    # What the command line says besides replaces these.
+    # Further arguments of the command line replace these.
     command = ["--seed", str(record.seed), "-n", str(record.n_timesteps), *arguments]
     return Start(command, freq or record.checkpoint_freq, folder, record)
 
@@ -496,7 +496,7 @@ class Manager(ExperimentManager):
     :raises RunError: if the run cannot learn from such data
     """
 
-    #: What is said of an interrupted run.
+    #: Message for an interrupted run.
     _interrupted = "interrupted; the model was saved as it was"
 
     def __init__(self, data: Data, args: argparse.Namespace, *positional: Any, **named: Any):

@@ -18,7 +18,7 @@ from sb3_sample.zoo.files import PlottedRuns, RunError
 ZOO_REFERENCES = frozenset({"LunarLanderContinuous", "BipedalWalker"})
 #: Parts of names that it normalises by the scores of PyBullet's tasks, whosever runs they are.
 PYBULLET = frozenset({"Half", "Ant", "Hopper", "Walker"})
-#: What averages other tasks.
+#: Command that averages other tasks.
 _OURS = "sb3-sample study aggregate averages runs of any tasks (--score TASK=HIGH)"
 
 

@@ -55,7 +55,7 @@ HER_SPACE: Space = {
     "n_sampled_goal": _int(1, 5),
     "goal_selection_strategy": _choice("final", "episode", "future"),
 }
-#: What every off-policy algorithm has.
+#: Settings of every off-policy algorithm.
 OFF_POLICY_SPACE: Space = {
     "learning_rate": _float(1e-5, 2e-3, log=True),
     "one_minus_gamma": _float(1e-4, 0.03, log=True),
@@ -216,7 +216,7 @@ REWOUND_SPACE: Space = {
     **{name: suggest for name, suggest in ON_POLICY_SPACE.items() if name != "n_simulated"},
     "n_actions": _int(2, 9, log=True),
 }
-#: What each setting of a regularization belongs to, by its argument: the group, the regularization, and the range.
+#: Each setting of a regularization, by its argument: the group, the regularization, and the range.
 REGULARIZATION_SETTINGS: dict[str, tuple[str, str, Suggest]] = {
     "weight_decay": ("network_regularization", "weight_decay", _float(1e-5, 1e-1, log=True)),
     "sam_radius": ("plasticity_regularization", "sam", _float(5e-3, 0.5, log=True)),
@@ -283,7 +283,7 @@ def sampler(space: Space, convert: Converter = decode) -> Sampler:
         uses_her = additional_args["using_her_replay_buffer"]
         whole = {**space, **(HER_SPACE if uses_her else {})}
         params = {name: suggest(trial, name) for name, suggest in whole.items()}
-        # What waits in a storage to be tried is not held to the space by Optuna.
+        # A trial that waits in a storage is not held to the space by Optuna.
         check_params(params, whole, f"trial {trial.number}")
         arguments = convert(params)
         for name in arguments.keys() - params.keys() - {"replay_buffer_kwargs"}:

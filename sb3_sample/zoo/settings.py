@@ -28,7 +28,7 @@ from sb3_sample.shallow_yaml import ShallowLoader
 #: Bytes of a file, and values in it, where an alias counts as what it stands for: some hundred times what the zoo
 #: writes, and what is read in a moment.
 MAX_BYTES, MAX_VALUES = 2**15, 5000
-#: What a run's file may count up to: frames that are stacked, steps that an action is repeated, ...
+#: Largest count in a run's file: frames that are stacked, steps that an action is repeated, ...
 MAX_COUNT = 1000
 #: The largest whole number among the arguments of an environment that a file gives.
 MAX_NUMBER = 10_000
@@ -36,7 +36,7 @@ MAX_NUMBER = 10_000
 _MAX_TEXT = 1000
 _YAML = "tag:yaml.org,2002:"
 _NAME, _ORDERED = f"{_YAML}python/name:", f"{_YAML}python/object/apply:collections.OrderedDict"
-#: What the zoo's settings consist of.
+#: Tags of the zoo's settings.
 _TAGS = {_ORDERED, *(_YAML + kind for kind in ("map", "seq", "str", "int", "float", "bool", "null", "python/tuple"))}
 _UNSAFE = "which can run code: --allow-pickle reads it nevertheless"
 #: A text that is no path of a file.
@@ -176,8 +176,8 @@ def _is_nothing(value: Any) -> bool:
 Arguments = Mapping[str, Check]
 _SKIP: Arguments = {"skip": _is_count}
 _EXTREMES: Arguments = {"noop_max": _is_count, "frame_skip": _is_count, "terminal_on_life_loss": _is_flag}
-#: The wrappers that a run's file may name, and their arguments: those that compute only. What writes files, opens
-#: windows, calls functions or collects without end is not among them.
+#: The wrappers that a run's file may name, and their arguments: those that compute only. Those that write files,
+#: open windows, call functions or collect without end are not among them.
 WRAPPERS: dict[type, Arguments] = {
     wrappers.AddRenderObservation: {"render_only": _is_flag, "render_key": _is_word, "obs_key": _is_word},
     wrappers.AtariPreprocessing: {

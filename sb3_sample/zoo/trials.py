@@ -21,7 +21,7 @@ from sb3_sample.saving.untrusted import BadFile, open_regular
 
 #: Bytes of a line of a journal.
 MAX_LINE = 2**20
-#: What a table of Optuna's is not: one that computes something when it is read.
+#: Words in the definition of a table that computes something when it is read, as none of Optuna's does.
 _COMPUTES = re.compile(r"\b(virtual|generated|as)\b", re.IGNORECASE)
 
 

@@ -103,7 +103,7 @@ class _Watch:
 
     def find(self, exp_id: int, folder: str, algo: str, env_name: Any, *which: Any) -> tuple[str, str, str]:
         """
-        As ``get_model_path``. What the zoo has parsed is what it is about to read.
+        As ``get_model_path``. The zoo has parsed the path that it is about to read.
 
         :raises Refused: if the run is refused, which is no ``ValueError`` that the zoo answers by a download
         """

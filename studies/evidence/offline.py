@@ -4,8 +4,8 @@ episodes of the trained agent.
 
     python studies/evidence/offline.py [--folder DIR]
 
-About half an hour on one core. What was interrupted goes on; what is there is left. ``make evidence`` calls it before
-the plan's first run. ``datasets.json`` says of what agents the data are, by seeds and returns.
+About half an hour on one core. Interrupted trainings go on; data sets that are there are left. ``make evidence`` calls
+it before the plan's first run. ``datasets.json`` says of what agents the data are, by seeds and returns.
 """
 
 import argparse

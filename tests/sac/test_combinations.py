@@ -302,7 +302,7 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
 
 def rows() -> list[str]:
     """First cells of the table."""
-    section = DOCS.read_text().split("\n## What does not go together\n")[1].split("\n## ")[0]
+    section = DOCS.read_text().split("\n## Combinations refused\n")[1].split("\n## ")[0]
     cells = [line.split(" | ")[0].removeprefix("| ") for line in section.splitlines() if line.startswith("| ")]
     return cells[2:]  # below the heading
 

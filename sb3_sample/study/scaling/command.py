@@ -154,7 +154,7 @@ def _run_plan(options: argparse.Namespace) -> None:
     except ValueError:
         options.output.unlink()
         raise
-    print(f"{len(runs)} runs of {runs[0].steps:,} steps in {options.output}. What they cost:")
+    print(f"{len(runs)} runs of {runs[0].steps:,} steps in {options.output}. Their cost:")
     print(f"  sb3-sample study run {options.output} --dry-run")
 
 

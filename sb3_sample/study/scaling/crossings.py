@@ -108,7 +108,7 @@ def kept_evaluations(steps: np.ndarray, curves: np.ndarray, resets: Sequence[flo
         if first == 0:
             continue
         end = len(steps) if i + 1 == len(resets) else int(np.searchsorted(steps, resets[i + 1], side="right"))
-        # What is before this reset may itself be on the way back from the one before.
+        # The curve before this reset may itself be on the way back from the one before.
         before = np.where(kept[..., :first], np.arange(first), -1).max(axis=-1)
         value = np.take_along_axis(curves, np.maximum(before, 0)[..., None], axis=-1)
         back = np.maximum.accumulate(curves[..., first:end] >= value, axis=-1)
