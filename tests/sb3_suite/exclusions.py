@@ -48,7 +48,7 @@ REASONS = (
     "Schedules in files",
     "`tau=0`",
     "Weight decay",
-    "What can be simulated",
+    "Simulation",
     "Advantages",
     "The test",
 )
@@ -122,7 +122,7 @@ if importlib.util.find_spec("pygame") is None:
     _PPO += _excluded("The test", "pygame is not installed", "test_vec_envs::test_video_recorder")
 _MBMA = (
     *_excluded(
-        "What can be simulated",
+        "Simulation",
         "pass n_simulated=0",
         "test_cnn::test_cnn[*]",
         "test_dict_env::test_dict_spaces[*]",
