@@ -12,19 +12,20 @@ from sb3_sample.learner.transforms import BatchTransform
 
 class RandomShift(BatchTransform):
     """
-    Random shift of images (DrQ, Kostrikov et al. 2021): replicate-padded by ``pad`` pixels and cropped back to their
-    size, at one of (2 * pad + 1)² offsets, each as likely as any other. An image has one offset for all its channels;
-    those of observations and next observations, and of several copies, are drawn apart. Images keep their type.
+    Random shift of images (DrQ, Kostrikov et al. 2021): images are replicate-padded by ``pad`` pixels and cropped back
+    to their size at one of (2 * pad + 1)² equally likely offsets. All channels of an image share one offset; offsets of
+    observations, of next observations and of their copies are drawn independently. Images keep their type.
 
     DrQ regularises its critics by several copies of a transition: their target is the mean over ``target_copies``
-    shifts of the next observation, K in the paper, each with an action of its own, and their loss is the sum over
-    ``online_copies`` shifts of the observation, M there. Actors, explorers and rules of pessimism learn from the first.
+    shifts of the next observation (K in the paper), each with its own action, and their loss is the sum over
+    ``online_copies`` shifts of the observation (M in the paper). Actors, explorers and rules of pessimism learn from
+    the first copy.
 
     :param learner: the learner
     :param pad: largest shift in pixels, at least 0; 0 leaves images as they are
     :param target_copies: K, at least 1
     :param online_copies: M, at least 1
-    :raises ValueError: if an argument is out of range, or observations are no images
+    :raises ValueError: if an argument is out of range, or observations are not images
     """
 
     has_state = False
@@ -74,7 +75,7 @@ def shifted(images: torch.Tensor, offsets: torch.Tensor, pad: int) -> torch.Tens
     device = images.device
     rows = (torch.arange(height, device=device) + (offsets[:, :1] - pad)).clamp_(0, height - 1)
     columns = (torch.arange(width, device=device) + (offsets[:, 1:] - pad)).clamp_(0, width - 1)
-    # The same pixels of all channels: three to six times as fast as crops of a padded image.
+    # Gathers the same pixels of all channels: three to six times as fast as crops of a padded image.
     pixels = (rows.unsqueeze(2) * width + columns.unsqueeze(1)).view(n, 1, -1).expand(-1, channels, -1)
     return images.reshape(n, channels, -1).gather(2, pixels).view_as(images)
 

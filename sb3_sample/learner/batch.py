@@ -13,9 +13,9 @@ class Batch(NamedTuple):
     """
     One gradient step's transitions.
 
-    ``observations`` and ``next_observations`` are (B, O) or dicts of tensors; ``actions``, in [-1, 1], (B, A);
-    ``dones``, 1 where the episode terminated (a time limit is 0), and ``rewards``, (B, 1); ``discounts`` a
-    number or (B, 1), None for the learner's own; ``columns`` what the source has besides, by name, (B, ...) each.
+    ``observations`` and ``next_observations`` are (B, O) or dicts of tensors; ``actions``, in [-1, 1], are (B, A);
+    ``dones``, 1 where the episode terminated (a time limit is 0), and ``rewards`` are (B, 1); ``discounts`` is a
+    number or (B, 1), None for the learner's own; ``columns`` are further columns of the source by name, (B, ...) each.
     """
 
     observations: Any
@@ -32,7 +32,7 @@ class Batch(NamedTuple):
         Convert samples of a Stable-Baselines3 buffer to a batch.
 
         :param samples: transitions as Stable-Baselines3's buffers give them
-        :param gamma: discount factor, where they have none of their own
+        :param gamma: discount factor of samples that have none of their own
         :return: the same as a batch
         """
         discounts = getattr(samples, "discounts", None)
@@ -49,12 +49,12 @@ class Batch(NamedTuple):
 
 class Windows(NamedTuple):
     """
-    Consecutive steps of one environment each, H of them.
+    Windows of H consecutive steps, each window from one environment.
 
-    ``observations`` is that of the first step, (B, O) or a dict of such; ``actions``, in [-1, 1], (B, H, A);
-    ``next_observations`` (B, H, O) or a dict of such; ``dones``, 1 where the episode terminated (a time limit is 0),
-    and ``rewards``, (B, H). Rows after a termination are of another episode, and mean nothing. ``columns`` are those
-    of the first step.
+    ``observations`` are those of the first steps, (B, O) or a dict of such; ``actions``, in [-1, 1], are (B, H, A);
+    ``next_observations`` are (B, H, O) or a dict of such; ``dones``, 1 where the episode terminated (a time limit is
+    0), and ``rewards`` are (B, H). Steps after a termination belong to another episode and have no meaning.
+    ``columns`` are those of the first steps.
     """
 
     observations: Any
@@ -88,8 +88,8 @@ class Windows(NamedTuple):
 
 class Encoded(NamedTuple):
     """
-    Observations in the form of the features that a shared encoder made of them, which actors and critics take in the
-    place of observations: ``features`` is (B, F), with a gradient to the encoder in the critics' own step only.
+    Features that a shared encoder computed from observations. Actors and critics take them in place of observations:
+    ``features`` is (B, F), with a gradient to the encoder in the critics' own step only.
     """
 
     features: torch.Tensor
@@ -97,7 +97,7 @@ class Encoded(NamedTuple):
 
 def for_each(function: Callable[[Any], Any], values: Any) -> Any:
     """
-    Apply a function to a tensor or array, or to each of a dict of them, as observations are.
+    Apply a function to observations: a tensor or array, or each value of a dict of them.
 
     :param function: the function
     :param values: the tensor or array, or the dict
@@ -113,8 +113,8 @@ def widened(batch: Batch, target_copies: int, online_copies: int) -> Batch:
     :param batch: B transitions
     :param target_copies: K
     :param online_copies: M
-    :return: observations and actions M times, (M * B, ...), what makes the TD target K times, (K * B, ...); columns
-        stay as they are
+    :return: observations and actions M times, (M * B, ...), inputs of the TD target K times, (K * B, ...), columns
+        unchanged
     """
 
     def repeated(values: Any, n: int) -> Any:
@@ -182,11 +182,11 @@ class Source(Protocol):
 
 
 class Store(Protocol):
-    """Interface of a replay buffer on the learner's device, of which the gradient step itself draws its batches."""
+    """Interface of a replay buffer on the learner's device, from which the gradient step itself draws its batches."""
 
     def draw(self, n: int) -> Any:
         """
-        Draw transitions to train on, with operations on tensors alone, by torch's generator of the device.
+        Draw transitions to train on by tensor operations alone, with torch's generator of the device.
 
         :param n: how many
         :return: transitions as Stable-Baselines3's buffers give them
@@ -202,7 +202,7 @@ class Store(Protocol):
 
     def newest(self, n_steps: int) -> tuple[Any, torch.Tensor]:
         """
-        Gather the newest transitions, with operations on tensors alone.
+        Gather the newest transitions by tensor operations alone.
 
         :param n_steps: T
         :return: the latest T steps of every environment, the oldest first, as Stable-Baselines3's buffers give them;
@@ -212,11 +212,11 @@ class Store(Protocol):
 
 class StoreSource:
     """
-    Source of a gradient step that draws of a store itself: there are as many transitions as it asks for.
+    Source for a gradient step that itself draws from a store, which always has as many transitions as are drawn.
 
     :param store: the store
     :param n: transitions of the validation side that :meth:`held_out` draws
-    :param gamma: discount factor, where the transitions have none of their own
+    :param gamma: discount factor of transitions that have none of their own
     """
 
     def __init__(self, store: Store, n: int, gamma: float):
@@ -239,9 +239,9 @@ class StoreSource:
 
 class Noise(NamedTuple):
     """
-    Everything random of one gradient step: standard normal noise of its sampled actions, (B, A) each, and the critics
-    that make the TD target, (n,), if they are drawn. Entries that are None are drawn by :meth:`completed`, after
-    those of the batch transforms, one each.
+    All random numbers of one gradient step: standard normal noise of its sampled actions, (B, A) each; the indices of
+    the critics that make the TD target, (n,), if they are drawn; and one entry for each batch transform. Entries that
+    are None are drawn by :meth:`completed`, after those of the batch transforms.
     """
 
     critic: torch.Tensor | None = None
@@ -258,8 +258,8 @@ class Noise(NamedTuple):
         Draw what is missing.
 
         :param batch: the step's transitions
-        :param extra: those that the rule of pessimism learns from besides, if any
-        :param subset: how many critics are drawn for the TD target, and from how many; None: no drawing
+        :param extra: further transitions that the rule of pessimism learns from, if any
+        :param subset: how many critics are drawn for the TD target, and from how many; None: none are drawn
         :param copies: copies of the transitions in the TD target, K, and in the critics' loss, M (:func:`widened`). The
             critics' noise is then (K * B, A)
         :return: the same noise, with what was None drawn
@@ -282,12 +282,12 @@ class Noise(NamedTuple):
 
 class CriticStep(NamedTuple):
     """
-    Results of the critics' step, from before the critics changed, for a rule of pessimism that learns from the same
-    transitions. Without gradient.
+    Results of the critics' step, computed before the critics changed, for a rule of pessimism that learns from the
+    same transitions. Without gradient.
 
-    ``q`` is (E, B, K), the critics' predictions; ``next_q`` (E, B, K), the target critics' of the next state and the
-    actor's action there (of the drawn subset, if one is drawn); ``entropy_bonus``, ``-alpha * log pi`` of that
-    action, (B, 1); ``subset``, the critics that make the step's TD target, (n,), None for all.
+    ``q`` are the critics' predictions, (E, B, K); ``next_q`` those of the target critics for the next state and the
+    actor's action there (of the drawn subset, if one is drawn), (E, B, K); ``entropy_bonus`` is ``-alpha * log pi`` of
+    that action, (B, 1); ``subset`` the critics that make the step's TD target, (n,), None for all.
     """
 
     q: torch.Tensor

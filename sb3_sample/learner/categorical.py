@@ -16,11 +16,11 @@ class CategoricalHead(ValueHead):
     Head of critics that classify the return: K logits over atoms spaced evenly in [v_min, v_max], trained by the
     cross-entropy with the projected target (C51, Bellemare et al. 2017). The value is the expectation.
 
-    The E target critics become one distribution whose expectation is the value by the rule of pessimism: a mixture of
-    the mean of their probabilities and of all probabilities of the critic with the smallest value, per sample. So
-    pessimism 0 takes the mean of the probabilities (BRC), and the minimum of two critics (pessimism 1) the whole
-    distribution of the smaller one (SimbaV2, XQC, FlashSAC). A value below the smallest critic's has that critic's
-    atoms shifted by the difference.
+    The E target critics become one distribution whose expectation is the value by the rule of pessimism: per sample, a
+    mixture of the mean of their distributions and the distribution of the critic with the smallest value. Pessimism 0
+    thus takes the mean distribution (BRC), and the minimum of two critics (pessimism 1) the distribution of the smaller
+    one (SimbaV2, XQC, FlashSAC). If the value is below the smallest critic's, the atoms of that critic are shifted by
+    the difference.
 
     Each atom z moves to ``r + discount * (1 - done) * (z + entropy bonus)``, clipped to the support; its probability is
     shared linearly between the two neighbouring atoms.
@@ -104,7 +104,7 @@ class CategoricalHead(ValueHead):
         Move probabilities back to the atoms.
 
         :param probabilities: (B, K)
-        :param positions: where they lie, (B, K); clipped to the support
+        :param positions: positions of these probabilities, (B, K); clipped to the support
         :return: probabilities of the atoms, (B, K)
         """
         clipped = positions.clamp(self.v_min, self.v_max)
@@ -116,7 +116,7 @@ class CategoricalHead(ValueHead):
 
     def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """
-        Compute the cross-entropy: mean over the batch, summed over the critics, or their mean.
+        Compute the cross-entropy: mean over the batch, sum or mean over the critics.
 
         :param q: logits of the critics, (E, B, K)
         :param target: probabilities of the atoms, (B, K), without gradient
@@ -128,8 +128,8 @@ class CategoricalHead(ValueHead):
 
 class HLGaussHead(CategoricalHead):
     """
-    The same with the target of HL-Gauss (Imani and White 2018; Farebrother et al. 2024): the probabilities of a
-    Gaussian around the TD target, which is one number, in the bins around the atoms, relative to those of all bins.
+    Categorical head with the target of HL-Gauss (Imani and White 2018; Farebrother et al. 2024): the probabilities of a
+    Gaussian around the TD target, a single number, in the bins around the atoms, normalised over all bins.
 
     :param n_atoms: K, at least 2
     :param v_min: centre of the first bin

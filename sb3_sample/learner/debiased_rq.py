@@ -1,4 +1,4 @@
-"""Learner of DR.Q: TD3's step on embeddings that do not move, and blocks of steps of the embeddings in between."""
+"""Learner of DR.Q: TD3's gradient step on fixed embeddings, with blocks of encoder steps in between."""
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -13,9 +13,9 @@ from sb3_sample.learner.learner import Learner, check_is_batch
 
 class EmbeddingLoss(NamedTuple):
     """
-    Loss of the embeddings, the sum over a window's steps of three terms: weights of the squared error of the predicted
-    next embedding, of the reward's cross-entropy and of InfoNCE; InfoNCE's temperature; and the atoms of the reward,
-    from symexp of the first to symexp of the second of ``reward_range``.
+    Settings of the embeddings' loss, the sum of three terms over a window's steps: weights of the squared error of the
+    predicted next embedding, of the reward's cross-entropy and of InfoNCE; the temperature of InfoNCE; and the range of
+    the reward's atoms, from symexp of the first to symexp of the second number in ``reward_range``.
     """
 
     dynamics_weight: float = 1.0
@@ -30,14 +30,14 @@ class DebiasedRQLearner(Learner):
     Learner of DR.Q ("Debiased model-based Representations for Q-learning", https://arxiv.org/abs/2605.11711), built
     from a specification of the update.
 
-    The gradient step of values and policy is the family's, on networks that read embeddings and give the encoder no
-    gradient. Before every ``target_update_interval``-th of them, and the first from the start and from each reset, all
-    targets become copies of their networks, and the encoder takes as many steps on windows, towards the embeddings of
-    the target encoder just copied. Nothing else moves encoder and targets.
+    The gradient step of values and policy is the family's; its networks read embeddings and pass no gradient to the
+    encoder. Before every ``target_update_interval``-th of these steps, and before the first one after the start and
+    after each reset, all targets become copies of their networks, and the encoder takes as many steps on windows,
+    towards the embeddings of the target encoder just copied. Nothing else changes encoder and targets.
 
-    :param args: as of :class:`Learner`
-    :param embedding_loss: the encoder's loss
-    :param kwargs: as of :class:`Learner`
+    :param args: as in :class:`Learner`
+    :param embedding_loss: settings of the encoder's loss
+    :param kwargs: as in :class:`Learner`
     """
 
     def __init__(self, *args: Any, embedding_loss: EmbeddingLoss | None = None, **kwargs: Any):
@@ -97,9 +97,9 @@ class DebiasedRQLearner(Learner):
 
     @property
     def n_encoder_steps_due(self) -> int:
-        """How many steps of the encoder, on a batch of windows each, come before the next gradient step."""
+        """Number of encoder steps, on a batch of windows each, that are due before the next gradient step."""
         period = self.target_update_interval or self.policy_delay
-        # A reset leaves an encoder that has learned nothing.
+        # After a reset the encoder has learned nothing.
         is_due = self.n_updates % period == 0 or self.n_updates == self._counts._began_at
         return period if is_due else 0
 
@@ -111,14 +111,14 @@ class DebiasedRQLearner(Learner):
         windows: Iterable[Windows] | None = None,
     ) -> dict[str, torch.Tensor]:
         """
-        Take a gradient step, after the steps of the encoder where they are due.
+        Take a gradient step, preceded by the encoder's steps if they are due.
 
         :param batch: transitions
-        :param noise: all that is random; drawn where it is None
+        :param noise: random numbers of the step; drawn where it is None
         :param extra: without meaning here
         :param windows: ``n_encoder_steps_due`` batches of windows, if that is not 0
         :return: what to log, by name, scalars on the learner's device
-        :raises ValueError: if the batch is none, or there are not as many batches of windows
+        :raises ValueError: if ``batch`` is not a batch, or the number of batches of windows is another
         """
         check_is_batch(batch)
         given, due = list(windows or ()), self.n_encoder_steps_due
@@ -158,7 +158,7 @@ class DebiasedRQLearner(Learner):
 
     @torch.no_grad()
     def copy_targets(self) -> None:
-        """Make policy, values and encoder their targets."""
+        """Copy policy, values and encoder to their targets."""
         networks = self.networks
         for target, online in (
             (networks.actor_target, networks.actor),
@@ -180,7 +180,7 @@ class DebiasedRQLearner(Learner):
         with torch.no_grad():
             following = for_each(lambda part: part.flatten(0, 1), batch.next_observations)
             targets = networks.embedded(following, target=True).unflatten(0, (n, horizon))
-            # The steps up to a termination count, its own included.
+            # Steps count up to and including a termination.
             alive = (1 - batch.dones).cumprod(dim=1)
             masks = torch.cat((torch.ones_like(alive[:, :1]), alive[:, :-1]), dim=1).to(targets.dtype)
             atoms = symexp_atoms(*settings.reward_range, encoder.n_reward_atoms, like=targets)
@@ -196,7 +196,7 @@ class DebiasedRQLearner(Learner):
                     (
                         (mask * error).mean(),
                         (mask * reward_cross_entropy(logits, codes[:, t])).mean(),
-                        # As published: the mean over the whole batch, by the share of windows that have not ended.
+                        # As published: the mean over the whole batch times the share of windows that have not ended.
                         infonce(embedding, targets[:, t], settings.infonce_temperature).mean() * mask.mean(),
                     )
                 )

@@ -12,7 +12,7 @@ from sb3_sample.tracing import is_tracing
 
 def minimize(optimizer: Optimizer, loss: torch.Tensor) -> None:
     """
-    Take one step of an optimizer. Only its own parameters get a gradient, also where the loss depends on others.
+    Take one step of an optimizer. Only its own parameters get a gradient, even if the loss depends on others.
 
     :param optimizer: the optimizer
     :param loss: scalar
@@ -25,9 +25,9 @@ def follow(target: Any, online: Any, tau: float) -> None:
     Take one step of Polyak averaging of the parameters.
 
     :param target: network that follows
-    :param online: network that is followed; what it has at its beginning and the target has not is left out, the
-        encoder of critics whose targets have none
-    :param tau: weight of the latter
+    :param online: network that is followed; leading parameters that the target lacks are left out, such as the encoder
+        of critics whose targets have none
+    :param tau: weight of the online network
     """
     ours, theirs = list(target.parameters()), list(online.parameters())
     with torch.no_grad():
@@ -49,7 +49,7 @@ def descend(optimizer: Optimizer, gradients: Sequence[torch.Tensor | None]) -> N
     Take one step of an optimizer with given gradients.
 
     :param optimizer: the optimizer
-    :param gradients: in the order of its parameters; None leaves one alone
+    :param gradients: in the order of its parameters; None leaves a parameter alone
     """
     if is_tracing():
         assert isinstance(optimizer, AdamW)
@@ -62,8 +62,8 @@ def descend(optimizer: Optimizer, gradients: Sequence[torch.Tensor | None]) -> N
 
 class _Minimize(torch.autograd.Function):
     """
-    Step of an optimizer of S learners inside of ``torch.vmap``, where the losses of all are at hand: their sum has each
-    learner's gradient, as nothing couples the learners.
+    Optimizer step of S learners inside ``torch.vmap``, where the losses of all learners are available: the gradient of
+    their sum holds each learner's own, as nothing couples the learners.
     """
 
     @staticmethod
@@ -83,10 +83,10 @@ class _Minimize(torch.autograd.Function):
 
 class StackedDescent:
     """
-    Steps of S learners' optimizers and targets, inside of ``torch.vmap`` over the learners.
+    Steps of S learners' optimizers and targets, inside ``torch.vmap`` over the learners.
 
-    :param optimizers: by identity of one learner's optimizer, the optimizer of the stacked parameters
-    :param parameters: by identity of one learner's network, its stacked parameters, (S, ...) each
+    :param optimizers: optimizers of the stacked parameters, by the ``id`` of one learner's optimizer
+    :param parameters: stacked parameters, (S, ...) each, by the ``id`` of one learner's network
     """
 
     def __init__(self, optimizers: Mapping[int, AdamW], parameters: Mapping[int, list[torch.Tensor]]):
@@ -98,7 +98,7 @@ class StackedDescent:
         """
         Take one step of each learner's optimizer.
 
-        :param optimizer: that of the learner by whose networks the loss was computed
+        :param optimizer: optimizer of the learner whose networks computed the loss
         :param loss: scalar
         """
         _Minimize.apply(loss, self._optimizers[id(optimizer)])
@@ -107,9 +107,9 @@ class StackedDescent:
         """
         Take one step of each learner's Polyak averaging.
 
-        :param target: network that follows, of the learner by whose networks the losses are computed
+        :param target: network that follows, of the learner whose networks compute the losses
         :param online: network that is followed
-        :param tau: without meaning here, see :attr:`tau`
+        :param tau: ignored, see :attr:`tau`
         """
         ours, theirs = self._parameters[id(target)], self._parameters[id(online)]
         theirs = theirs[len(theirs) - len(ours) :]

@@ -11,13 +11,13 @@ import torch.nn.functional as F
 
 def symexp_atoms(low: float, high: float, n: int, like: torch.Tensor) -> torch.Tensor:
     """
-    Rewards that the reward model distinguishes, ``sign(x) * (exp(|x|) - 1)`` for x evenly between two numbers.
+    Rewards that the reward model distinguishes, ``sign(x) * (exp(|x|) - 1)`` for x spaced evenly between two numbers.
 
-    :param low: of x
-    :param high: of x
+    :param low: smallest x
+    :param high: largest x
     :param n: K, at least 2
-    :param like: a tensor of the type and on the device that they shall have
-    :return: rising, (K,)
+    :param like: tensor whose type and device the result has
+    :return: atoms, ascending, (K,)
     """
     x = torch.linspace(low, high, n, dtype=like.dtype, device=like.device)
     return x.sign() * x.abs().expm1()
@@ -25,11 +25,11 @@ def symexp_atoms(low: float, high: float, n: int, like: torch.Tensor) -> torch.T
 
 def two_hot(rewards: torch.Tensor, atoms: torch.Tensor) -> torch.Tensor:
     """
-    Distribution over the atoms whose mean a reward is: between two atoms, each has its share by the distance to the
-    other. A reward beyond the outermost atom is that atom.
+    Distribution over the atoms with the reward as its mean: a reward between two atoms is shared between them
+    linearly. A reward beyond the outermost atom counts as that atom.
 
     :param rewards: (B,)
-    :param atoms: rising, (K,)
+    :param atoms: ascending, (K,)
     :return: (B, K)
     """
     rewards = rewards.clamp(atoms[0], atoms[-1])
@@ -54,8 +54,8 @@ def reward_cross_entropy(logits: torch.Tensor, code: torch.Tensor) -> torch.Tens
 
 def infonce(predicted: torch.Tensor, target: torch.Tensor, temperature: float) -> torch.Tensor:
     """
-    InfoNCE of predicted embeddings: each must be told from the whole batch's targets as its own target's, by the
-    cosines. Not symmetric.
+    InfoNCE of predicted embeddings: each must be matched with its own target among those of the whole batch, by
+    cosine. Not symmetric.
 
     :param predicted: (B, D)
     :param target: (B, D), without gradient

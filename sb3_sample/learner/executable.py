@@ -8,8 +8,8 @@ from sb3_sample.learner.execution import Execution
 
 class Executable:
     """
-    Base of a learner. It has ``gradient_step``, ``identities``, ``step_modules`` and ``optimizers``, ``compile``,
-    ``device`` and ``verbose``.
+    Base class of a learner, which has ``gradient_step``, ``identities``, ``step_modules`` and ``optimizers``,
+    ``compile``, ``device`` and ``verbose``.
 
     :param counts: object that holds ``compiled``, whether the gradient step is compiled, beside the learner's counts
     """
@@ -22,7 +22,7 @@ class Executable:
 
     @property
     def compiled(self) -> bool | None:
-        """Whether the gradient step is compiled; None while that is not decided."""
+        """Whether the gradient step is compiled; None while undecided."""
         return self._counts.compiled  # type: ignore[no-any-return]
 
     @compiled.setter
@@ -31,7 +31,7 @@ class Executable:
 
     def exchangeable(self) -> dict[str, Any]:
         """
-        List what may be of a class from outside of this package.
+        List the parts and networks whose classes may come from outside of this package.
 
         :return: parts and networks of the gradient step, by the argument that names their class
         """

@@ -22,15 +22,15 @@ from sb3_sample.optim import AdamW
 from sb3_sample.tracing import compile_graph, trace, undone
 from sb3_sample.warn import warn
 
-#: With ``compile="auto"``, gradient steps in one ``learn`` from which on compiling pays: it takes the time of some
-#: thousand steps (docs/performance.md). A number of steps, not a measurement, so that a seed fixes the whole run.
+#: With ``compile="auto"``, gradient steps in one ``learn`` from which compiling pays: compiling takes the time of some
+#: thousand steps (docs/performance.md). A fixed number, not a measurement, so that a seed determines the whole run.
 PAYS_FROM = 20_000
-#: The first torch that a gradient step is compiled with.
+#: The oldest torch with which a gradient step is compiled.
 COMPILES_FROM = (2, 11)
 
 Metrics = dict[str, torch.Tensor]
-#: Runs a function without its effects taking place, and gives back what repeats them, and its result, whose tensors
-#: each repetition fills anew.
+#: Runs a function without its effects taking place. Returns a function that repeats it with its effects, and its
+#: result, whose tensors each repetition fills anew.
 Recorder = Callable[[Callable[[], Metrics]], tuple[Callable[[], None], Metrics]]
 
 
@@ -46,14 +46,14 @@ def old_torch() -> str | None:
     return f"that needs torch {needed} or newer, and this is {torch.__version__}. It is run eagerly, on a GPU captured"
 
 
-#: Ways to ask for compiling (values of ``compile``) that have been answered with a torch that is too old.
+#: Values of ``compile`` for which a warning of a torch that is too old has been given.
 _told: set[bool | str] = set()
 
 
 def warn_not_compiled(learner: Any, reason: str) -> None:
     """
-    Warn that the gradient step is not compiled. A torch that is too old is warned of once for each value of ``compile``
-    in a process, since it concerns every model.
+    Warn that the gradient step is not compiled. The warning of a torch that is too old comes once for each value of
+    ``compile`` in a process, since it concerns every model.
 
     :param learner: the learner
     :param reason: what keeps it from being compiled
@@ -101,12 +101,12 @@ def why_not_compiled(learner: Any) -> str | None:
 
 def foreign_parts(learner: Any) -> list[str]:
     """
-    Look for code from outside of this package that may not be fit to be compiled.
+    Look for code from outside of this package that may be unfit for compiling.
 
     :param learner: the learner
     :return: its parts, networks and gradient step from outside of this package without the declaration ``compilable =
-        True``, as "argument=class": a number that changes at every step, for example, causes a compilation at every
-        step
+        True``, as "argument=class": a number in them that changes at every step, for example, causes a compilation at
+        every step
     """
     objects = learner.exchangeable()
     if not _is_ours(type(learner).gradient_step):
@@ -136,8 +136,8 @@ class Execution:
 
     :param learner: the learner, its networks and parts built
     :param compiled: whether to compile
-    :param fall_back: whether what cannot be compiled is run uncompiled, with a warning, instead of an error
-    :param recorder: what captures; a CUDA graph on a GPU, None elsewhere: no capture
+    :param fall_back: whether a step that cannot be compiled runs uncompiled, with a warning, instead of raising
+    :param recorder: captures the step, as a CUDA graph on a GPU; None, elsewhere: no capture
     :param method: name of the learner's method that is run
     """
 
@@ -194,7 +194,7 @@ class Execution:
 
     @property
     def leaves_gradients(self) -> bool:
-        """Whether a gradient step that is not asked to be eager leaves its gradients in ``.grad``."""
+        """Whether a gradient step that is run without ``eager`` leaves its gradients in ``.grad``."""
         return not self.compiled and self._captured is None
 
     def prepare(self, learner: Any) -> None:
@@ -217,7 +217,7 @@ class Execution:
 
         :param learner: the learner
         :param inputs: the arguments of ``Learner.gradient_step``
-        :param eager: neither compiled nor captured this time, which leaves the gradients in ``.grad``
+        :param eager: run this step neither compiled nor captured, which leaves the gradients in ``.grad``
         :return: its result; that of a captured step is valid until the next one
         """
         if eager:
@@ -232,7 +232,7 @@ class Execution:
         try:
             return self._compiled(self._step, learner, inputs)
         except CannotCompile as error:
-            # Raised before anything of the step has taken effect.
+            # Raised before any effect of the step.
             if not self.fall_back:
                 raise RuntimeError(
                     f"compile=True, but the gradient step cannot be compiled: {error}. Pass compile=False, or 'auto'"
@@ -251,8 +251,8 @@ def acting_of(learner: Any) -> Acting | None:
     Choose how actions of the training are computed.
 
     :param learner: the learner
-    :return: what captures them; None where they are computed as they are: on a CPU, and for an explorer with an ``act``
-        of its own
+    :return: captured computation of the actions; None where they are computed without capture: on a CPU, and for an
+        explorer that overrides ``act``
     """
     if type(learner.explorer).act is not Exploration.act or not captures(learner):
         return None
@@ -261,11 +261,11 @@ def acting_of(learner: Any) -> Acting | None:
 
 def captures(learner: Any, of: Any = None) -> bool:
     """
-    Decide whether what a learner computes is captured.
+    Decide whether the computations of a learner are captured.
 
-    :param learner: the learner, or a group of some
-    :param of: learner whose parts count; None: its own
-    :return: whether it is: on a GPU, unless that is declined, or parts of one's own may look at values on the host
+    :param learner: the learner, or a group of learners
+    :param of: learner whose parts count; None: ``learner`` itself
+    :return: True on a GPU, unless capture is declined or custom parts may read values on the host
     """
     if learner.device.type != "cuda":
         return False
@@ -279,7 +279,7 @@ class CannotCompile(Exception):
 class _Program(NamedTuple):
     """A compiled gradient step, for one kind of inputs."""
 
-    #: Words of the trace, and the tensors beside the state that it reads.
+    #: Code of the trace, and the tensors that it reads besides the state.
     code: str
     further: list[torch.Tensor]
     function: Callable[..., Sequence[torch.Tensor]]
@@ -291,20 +291,20 @@ class Compiled:
     """
     Compiled gradient steps of a learner, one for each kind of inputs.
 
-    A compiled step holds all numbers and words that it read when it was traced. If one of those that it may have read
-    changes, it is traced anew, in about a second, and compiled anew if what was traced differs. Parameters, moments,
-    counts of steps and learning rates are tensors, which it is given.
+    A compiled step contains all numbers and strings that it read when it was traced, as constants. If one that it may
+    have read changes, the step is traced again, in about a second, and compiled again if the trace differs. Parameters,
+    moments, counts of steps and learning rates are tensors, which are passed to it.
 
     :param learner: the learner
     """
 
-    #: Programs that are made before it is taken that a setting changes all the time.
+    #: Largest number of programs; more mean that a setting changes all the time.
     MAX_PROGRAMS = 8
 
     def __init__(self, learner: Any):
         #: Seconds spent on tracing and compiling.
         self.seconds = 0.0
-        #: Number of changes of settings that were found.
+        #: Number of changes of settings found so far.
         self.version = 0
         self._programs: dict[Any, tuple[int, _Program]] = {}
         self._n_made = 0
@@ -313,7 +313,7 @@ class Compiled:
 
     def prepare(self, learner: Any) -> None:
         """
-        Look for other settings and other tensors.
+        Look for changed settings and new tensors.
 
         :param learner: the learner
         """
@@ -346,7 +346,7 @@ class Compiled:
     def _made(
         self, step: Callable[..., Metrics], learner: Any, inputs: tuple[Any, ...], old: _Program | None
     ) -> _Program:
-        """A program for the inputs: the old one if it would come out the same."""
+        """A program for the inputs: the old one if a new one would be the same."""
         start = time.perf_counter()
         own = inputs_like(inputs, lambda x: x.clone(memory_format=torch.contiguous_format))
         names: list[str] = []
@@ -360,12 +360,12 @@ class Compiled:
         further: list[torch.Tensor] = []
         try:
             graph = trace(run, self._tensors.all, tensors_of(own))
-            # Tensors that are neither state nor input: as inputs, so that their values are those of the day.
+            # Tensors that are neither state nor input become inputs, so that their current values are read.
             further = [getattr(graph, str(node.target)) for node in graph.graph.nodes if node.op == "get_attr"]
             if further:
                 graph = trace(run, [*self._tensors.all, *further], tensors_of(own))
         except Exception as error:
-            # An error of the step itself is raised as it is, from its place.
+            # An error of the step itself is raised unchanged, from where it occurs.
             with undone(self._tensors.all, learner.device):
                 step(learner, *inputs)
             raise CannotCompile(str(error).strip().splitlines()[0]) from error
@@ -407,7 +407,7 @@ def tensors_of(inputs: Any) -> list[torch.Tensor]:
 
 
 def _kind(inputs: Any) -> Any:
-    """Structure and contents of nested tuples and dicts but the tensors' values; hashable."""
+    """Structure and contents of nested tuples and dicts, without the tensors' values; hashable."""
     if isinstance(inputs, torch.Tensor):
         return tuple(inputs.shape), inputs.dtype, inputs.device
     if isinstance(inputs, dict):
@@ -420,8 +420,8 @@ def inputs_like(inputs: Any, make: Callable[[torch.Tensor], torch.Tensor]) -> An
     Copy nested tuples and dicts with other tensors.
 
     :param inputs: the tuples and dicts
-    :param make: makes a tensor of each, in the order of :func:`tensors_of`
-    :return: the same with what was made
+    :param make: makes the new tensor from each, in the order of :func:`tensors_of`
+    :return: the same with the new tensors
     """
     if isinstance(inputs, torch.Tensor):
         return make(inputs)
@@ -433,7 +433,7 @@ def inputs_like(inputs: Any, make: Callable[[torch.Tensor], torch.Tensor]) -> An
     return inputs
 
 
-#: Held during a capture, in which no other thread may use the GPU, and by whoever does so beside a training.
+#: Held during a capture, when no other thread may use the GPU, and by any thread that uses the GPU beside a training.
 CAPTURING = threading.Lock()
 
 
@@ -441,7 +441,7 @@ def cuda_graph(run: Callable[[], Metrics]) -> tuple[Callable[[], None], Metrics]
     """
     Capture as a CUDA graph.
 
-    :param run: what to capture, of the current device
+    :param run: function to capture, on the current device
     :return: function that repeats it, and its result
     """
     graph = torch.cuda.CUDAGraph()
@@ -452,12 +452,12 @@ def cuda_graph(run: Callable[[], Metrics]) -> tuple[Callable[[], None], Metrics]
 
 @functools.cache
 def _capture_stream(device: int) -> torch.cuda.Stream:
-    """The stream of a GPU's captures. torch's own is of the GPU on which the first of a process was made."""
+    """Stream of a GPU's captures. torch's own capture stream belongs to the GPU of the process's first capture."""
     return torch.cuda.Stream(device)
 
 
 def _current(device: torch.device) -> AbstractContextManager[Any]:
-    """Have a GPU be the current one, of which streams and captures are: a capture of another one is empty."""
+    """Make a GPU the current one, to which streams and captures belong: a capture of another GPU's work is empty."""
     return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
 
 
@@ -465,17 +465,17 @@ class Captured:
     """
     Gradient steps captured once and then repeated: one launch instead of some thousand.
 
-    A captured step reads and writes fixed places in memory. Its inputs are copied to theirs before each repetition;
-    parameters, moments, step counts and learning rates are changed in place by all that changes them, resets included.
-    If one of them moves to another place (loading, a reinitialised optimizer), or a number outside of tensors changes,
-    :meth:`forget_if_stale` drops the captured steps, and they are captured anew.
+    A captured step reads and writes fixed places in memory. Its inputs are copied there before each repetition;
+    parameters, moments, step counts and learning rates always change in place, in resets too. If one of them moves to
+    another place (loading, a reinitialised optimizer), or a number outside of tensors changes, :meth:`forget_if_stale`
+    drops the captured steps, and they are captured anew.
 
     :param learner: the learner
-    :param recorder: what captures
-    :param optimizers: whether what is captured reads the optimizers' tensors
+    :param recorder: captures a step
+    :param optimizers: whether the captured function reads the optimizers' tensors
     """
 
-    #: Steps of each kind that are run as they are before one is captured, as CUDA's libraries set themselves up.
+    #: Steps of each kind that run uncaptured before one is captured, while CUDA's libraries initialise.
     WARM_UP = 3
 
     def __init__(self, learner: Any, recorder: Recorder, optimizers: bool = True):
@@ -491,13 +491,13 @@ class Captured:
         Drop the captured steps if the model has other tensors or other settings than at their capture.
 
         :param learner: the learner
-        :param program: number of the compiled steps that are captured, if they are
+        :param program: version of the compiled steps that are captured, if they are compiled
         """
         self._tensors.renew()
         now = [program, *(t.data_ptr() for t in self._tensors.all)]
         if self._settings.have_changed() or now != self._held:
             if self._held is not None and self._held[0] != program:
-                # The next steps are traced and compiled, which is not done within a capture.
+                # The next steps are traced and compiled, which is never done within a capture.
                 self._runs.clear()
             self._recorded.clear()
             self._held = now
@@ -526,12 +526,12 @@ class Captured:
         if given := tensors_of(inputs):
             torch._foreach_copy_(tensors_of(own), given)
         repeat()
-        # The caller adds to what it is given.
+        # The caller adds entries to the dict.
         return dict(metrics)
 
 
 def _aside(run: Callable[[], Metrics]) -> Metrics:
-    """Run on a stream of its own, as CUDA requires of the last steps before a capture."""
+    """Run on a separate stream, as CUDA requires of the last steps before a capture."""
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
@@ -542,11 +542,11 @@ def _aside(run: Callable[[], Metrics]) -> Metrics:
 
 class CapturedActing:
     """
-    Actions captured as gradient steps are.
+    Computation of actions, captured like gradient steps.
 
-    :param learner: the learner, or a group of some
-    :param method: name of its method that computes them
-    :param recorder: what captures
+    :param learner: the learner, or a group of learners
+    :param method: name of the method that computes the actions
+    :param recorder: captures a step
     """
 
     def __init__(self, learner: Any, method: str, recorder: Recorder):
@@ -570,7 +570,7 @@ class _Tensors:
     of steps and learning rates.
 
     :param learner: the learner
-    :param optimizers: whether those of its optimizers are among them
+    :param optimizers: whether its optimizers' tensors are included
     """
 
     def __init__(self, learner: Any, optimizers: bool = True):
@@ -590,7 +590,7 @@ class _Tensors:
         self._versions = [versions, rates]
         self.all = list(self._of_modules)
         for optimizer in self._optimizers:
-            # Counts of steps are places in one vector, which comes after them.
+            # An AdamW's counts of steps are elements of one vector, which is added after them.
             own = isinstance(optimizer, AdamW)
             for state in optimizer.state.values():
                 tensors = {k: t for k, t in state.items() if isinstance(t, torch.Tensor) and not (own and k == "step")}
@@ -599,17 +599,18 @@ class _Tensors:
                 self.all += optimizer.read_tensors()
 
 
-#: Public numbers of a part or of the learner that are no settings: they move with the run, and the gradient step does
-#: not read them.
+#: Public numbers of a part or of the learner that are not settings: they change during the run, and the gradient step
+#: does not read them.
 NO_SETTINGS = {"arm", "training", "gradients_are_stale"}
 
 
 class Settings:
     """
-    Numbers and words that a gradient step may read: the learner's own, its modules' and its optimizers'.
+    Numbers and strings that a gradient step may read: the learner's own, its modules' and its optimizers'.
 
     :param learner: the learner
-    :param private: whether private ones count in classes from outside of this package, whose own have public names
+    :param private: whether private attributes of classes from outside of this package count too; settings of this
+        package's own classes have public names
     """
 
     def __init__(self, learner: Any, private: bool):
@@ -626,13 +627,13 @@ class Settings:
         for optimizer in learner.optimizers().values():
             for group in optimizer.param_groups:
                 self.held += [(group, name, value) for name, value in group.items() if name not in ("params", "lr")]
-        #: Places of those that changed, and changed nothing in the step.
+        #: Indices of settings whose change left the step the same.
         self._unread: set[int] = set()
         self._changed: set[int] = set()
 
     def have_changed(self) -> bool:
         """
-        :return: whether one has another value than at the last call
+        :return: whether a setting that the step may read has another value than at the last call
         """
         changed = [
             (i, values[name])
@@ -645,10 +646,10 @@ class Settings:
         return any(i not in self._unread for i, _ in changed)
 
     def changed_the_step(self) -> None:
-        """Take note that the changes so far made another step."""
+        """Record that the changes so far made another step."""
         self._changed, self._unread = set(), set()
 
     def did_not_change_the_step(self) -> None:
-        """Take note that the changes since the last call of :meth:`changed_the_step` made no other step."""
+        """Record that the changes since the last call of :meth:`changed_the_step` left the step the same."""
         self._unread |= self._changed
         self._changed = set()

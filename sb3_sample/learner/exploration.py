@@ -1,4 +1,4 @@
-"""Exploration: choice of the actions in training. ``predict`` and evaluation are the pessimistic actor's alone."""
+"""Exploration: choice of the actions in training. ``predict`` and evaluation use the pessimistic actor alone."""
 
 import math
 from abc import abstractmethod
@@ -23,7 +23,7 @@ from sb3_sample.warn import warn
 
 class Exploration(Part):
     """
-    Exploration by the actor itself, sampled or, if it is deterministic, with noise added; base class of the others.
+    Exploration by the actor itself, sampled or, if it is deterministic, with added noise; base class of the others.
 
     :param learner: the learner, whose networks exist already
     """
@@ -36,8 +36,8 @@ class Exploration(Part):
 
     def act(self, learner: Learning, observations: Any) -> torch.Tensor:
         """
-        Sample the actions of the training. An explorer that leaves this as it is, and has its own :meth:`sampled`, is
-        captured on a GPU.
+        Sample the actions of the training. An explorer that overrides :meth:`sampled` and not this method is captured
+        on a GPU.
 
         :param learner: the learner
         :param observations: tensors on the device of the model, (B, O) or a dict of them
@@ -102,8 +102,8 @@ class ScaledNoise(Exploration):
 class HeldNoise(Exploration):
     """
     FlashSAC's exploration: the actor's noise is held for some steps, ``tanh(mean + std * held)`` with mean and standard
-    deviation of each step. How many, n, is drawn with a probability proportional to ``n ** -exponent``, for all
-    environments at once. A noise outlives the end of an episode.
+    deviation of each step. The number of steps n is drawn with a probability proportional to ``n ** -exponent``, for
+    all environments at once. Noise is held across the end of an episode.
 
     :param learner: the learner, whose networks exist already
     :param exponent: of the distribution of n, at least 0
@@ -129,7 +129,7 @@ class HeldNoise(Exploration):
         Take one step.
 
         :param fresh: standard normal noise, (n_envs, A), used if none is held any longer
-        :param uniform: number in [0, 1), from which it then follows how long the new one is held
+        :param uniform: number in [0, 1) that then determines how long the new noise is held
         :return: the noise of the step, (n_envs, A)
         """
         held = self._held
@@ -167,8 +167,8 @@ class ScheduledNoise(Exploration):
     actor's ``noise_std``, which the TD target and the actor's loss read too.
 
     :param learner: the learner, whose networks exist already
-    :param schedule: first and last standard deviation, in actions of [-1, 1], and the transitions in between
-    :raises ValueError: if the schedule is none, or the actor's noise cannot be moved
+    :param schedule: first and last standard deviation, in units of actions in [-1, 1], and the transitions in between
+    :raises ValueError: if ``schedule`` is not a schedule, or the actor's noise cannot be changed
     """
 
     has_state = False
@@ -227,11 +227,11 @@ def spread(q: torch.Tensor, uncertainty: str) -> torch.Tensor:
 
 def check_uncertainty(uncertainty: str, learner: Learning) -> None:
     """
-    Check what is meant by the spread of the critics.
+    Check the kind of the critics' spread.
 
     :param uncertainty: the argument
-    :param learner: the learner, whose critics it is of
-    :raises ValueError: if it is unknown, or one of quantiles that they have not
+    :param learner: the learner with the critics
+    :raises ValueError: if it is unknown, or needs quantiles that the critics do not have
     """
     if uncertainty not in UNCERTAINTIES:
         raise ValueError(f"uncertainty must be one of {UNCERTAINTIES}, not {uncertainty!r}")
@@ -241,7 +241,7 @@ def check_uncertainty(uncertainty: str, learner: Learning) -> None:
             f"not n_quantiles={learner.head.n_quantiles}"
         )
     if uncertainty == "epistemic" and learner.critic.n_critics == 1:
-        # No error: models that were trained so are to be loaded.
+        # No error, so that models trained this way can be loaded.
         warn(
             "uncertainty='epistemic' of an optimistic actor is the critics' spread, which is 0 with n_critics=1: it "
             "follows their mean. Pass n_critics of at least 2, n_quantiles with uncertainty='aleatoric', or "
@@ -257,7 +257,7 @@ class OptimisticExploration(Exploration):
 
     :param learner: the learner, whose networks exist already
     :param kl_target: KL divergence per action dimension to be met, above 0
-    :param std_multiplier: factor on the standard deviation while exploring, above 0; taken out before the divergence
+    :param std_multiplier: factor on the standard deviation while exploring, above 0; left out of the divergence
     :param uncertainty: what Q_std is: "epistemic", "aleatoric" or "both"; see :func:`spread`
     :param adjustment_learning_rate: of optimism and weight, by Adam with beta1 = 0.5
     :raises ValueError: if an argument is out of range or contradicts another
@@ -294,7 +294,7 @@ class OptimisticExploration(Exploration):
         """
         self.actor_optimizer = learner.make_optimizer(actor)
         common = self._adjustment_learning_rate
-        # Their learning rates are their own, whatever the schedule of the others.
+        # Their learning rates do not follow the schedule of the others.
         groups = [
             {"params": list(parameters), "lr": common if rate is None else rate, "scheduled": False}
             for parameters, rate in scalars
@@ -354,7 +354,7 @@ class OptimisticExploration(Exploration):
     def update(self, learner: Learning, batch: Batch, noise: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         observations = learner.encoded(batch.observations)
         with torch.no_grad():
-            # As it acts: its running statistics are moved by its own step alone.
+            # In the mode in which it acts: only its own step moves its running statistics.
             pessimistic = at_rest(learner.actor)
             features = pessimistic.features(observations)
             mean, log_std = pessimistic.gaussian(features)
@@ -406,9 +406,9 @@ class OptimisticShift(OptimisticExploration):
     :param initial_kl_weight: weight of the divergence at the start and after a reset
     :param adjustment_learning_rate: of optimism and weight, by Adam with beta1 = 0.5
     :param network: trunk of the shift network, one of ``NETWORKS``
-    :param network_kwargs: its arguments, those that are not given one block, 256 wide, for "bronet", the network's own
+    :param network_kwargs: its arguments; the defaults are one block, 256 wide, for "bronet", and the network's own
         otherwise
-    :param width_factor: by which its hidden layers are wider than that
+    :param width_factor: factor on the widths of its hidden layers
     :raises ValueError: if an argument is out of range
     """
 
@@ -470,8 +470,8 @@ class OptimisticShift(OptimisticExploration):
 
 class OptimisticActor(OptimisticExploration):
     """
-    DAC's optimistic actor (algorithm 1, lines 8, 10, 11; eq. 11, 14, 15): a policy of its own, with the networks of
-    the pessimistic one, that samples with its standard deviation times ``std_multiplier``.
+    DAC's optimistic actor (algorithm 1, lines 8, 10, 11; eq. 11, 14, 15): a separate policy, with networks like the
+    pessimistic one's, that samples with its own standard deviation times ``std_multiplier``.
 
     Optimism is kept above minus the pessimism in force: ``optimism = exp(p) - beta``, so that at worst both actors
     maximise the same value. A barrier ends its decline 0.001 above that bound.
@@ -479,10 +479,10 @@ class OptimisticActor(OptimisticExploration):
     Where text and published code differ, the code is followed: the divergence goes from the optimistic to the
     pessimistic Gaussian (eq. 11 writes the other order, ``kl_direction="pessimistic_to_optimistic"``), with the
     multiplier taken out of the sampled distribution (the text's "m-times smaller"; algorithm 1 writes ``m *
-    sigma``); its weight enters the loss as at most 20; the actor starts from weights of its own, not from the
-    pessimistic actor's; and it starts anew, with optimism, weight and their optimizers, every 25,000 environment
-    steps, which the text does not mention (``reinitialize_every=None`` turns it off). At a full reset it starts anew
-    as everything does.
+    sigma``); the weight of the divergence enters the loss as at most 20; the actor starts from its own weights, not
+    from the pessimistic actor's; and it starts anew, with optimism, weight and their optimizers, every 25,000
+    environment steps, which the text does not mention (``reinitialize_every=None`` turns it off). At a full reset it
+    starts anew like everything else.
 
     :param learner: the learner, whose networks exist already
     :param kl_target: KL divergence per action dimension to be met, above 0
@@ -491,13 +491,13 @@ class OptimisticActor(OptimisticExploration):
     :param initial_optimism: optimism at the start, above minus the pessimism; None: 0.5 above it
     :param initial_kl_weight: weight of the divergence at the start; at 0 it stays 0, while optimism is still adjusted
     :param adjustment_learning_rate: of optimism and weight, by Adam with beta1 = 0.5
-    :param optimism_learning_rate: of optimism; None: ``adjustment_learning_rate``; 0: it stays at its start
-    :param kl_weight_learning_rate: the same of the weight
+    :param optimism_learning_rate: of optimism; None: ``adjustment_learning_rate``; 0: optimism stays at its start
+    :param kl_weight_learning_rate: the same for the weight
     :param deterministic: whether it acts and learns by its mean; its standard deviation in the divergence is then the
         pessimistic actor's
     :param kl_direction: "optimistic_to_pessimistic" or "pessimistic_to_optimistic"
-    :param reinitialize_every: environment steps, counted in transitions over the model's life, of each task where there
-        are several, after which it starts anew; None for never
+    :param reinitialize_every: environment steps after which it starts anew, counted in transitions over the model's
+        life, for each task if there are several; None for never
     :raises ValueError: if an argument is out of range
     """
 
@@ -524,7 +524,7 @@ class OptimisticActor(OptimisticExploration):
         beta = float(learner.pessimism_rule.beta())
         distance = 0.5 if initial_optimism is None else initial_optimism + beta
         if learner.num_transitions > 0:
-            # A start in the midst of training, when a pessimism that moves may have come below initial_optimism.
+            # Starts in the midst of training: a pessimism that moves may have fallen to minus initial_optimism or below.
             distance = max(distance, self.BARRIER)
         if not 0 < distance < math.inf:
             raise ValueError(f"initial_optimism must be above minus the pessimism, {-beta}, not {initial_optimism}")
@@ -640,7 +640,7 @@ class OptimisticGradient(Exploration):
         with torch.no_grad():
             mean, log_std = learner.actor.gaussian(learner.actor.features(observations))
         std = log_std.exp()
-        # Acting runs in inference mode, which knows no gradients.
+        # Acting runs in inference mode, which has no gradients.
         with torch.inference_mode(False), torch.enable_grad():
             at = mean.clone().requires_grad_()
             q = values(learner, learner.critic, for_each(torch.clone, observations), torch.tanh(at))

@@ -1,9 +1,9 @@
 """
-Checks before the first gradient step: a part of one's own whose shapes are wrong broadcasts, and trains nonsense.
+Checks before the first gradient step: wrong shapes of a custom part would broadcast, and train nonsense.
 
 They run once, eagerly and before anything is compiled. Networks, value head and rule of pessimism are called as in a
-gradient step, on a few of its transitions, so many that the batch has a size that nothing else has.
-Nothing is left of it: no random numbers, no statistics, no attributes.
+gradient step, on a few of its transitions, as many as give the batch a size that nothing else has. The checks leave no
+trace: random numbers, statistics and attributes are as before.
 """
 
 import math
@@ -29,10 +29,10 @@ def check_batch(who: str, batch: Any, like: Batch | None = None) -> None:
     """
     Check the shapes of a batch.
 
-    :param who: whose it is, for the error
+    :param who: origin of the batch, for the error
     :param batch: transitions
-    :param like: the batch that it was made of, whose shapes it must have; None: any of a batch
-    :raises ValueError: if it is no batch, or one of its entries has another shape
+    :param like: the batch from which it was made, whose shapes it must have; None: any shapes of a batch
+    :raises ValueError: if it is not a batch, or one of its entries has another shape
     """
     if not isinstance(batch, Batch):
         raise ValueError(f"{who} must be a Batch, not {_shown(batch)}: batch._replace(...) makes one")
@@ -42,7 +42,7 @@ def check_batch(who: str, batch: Any, like: Batch | None = None) -> None:
         like = batch
     for name in ("observations", "next_observations"):
         stored, found = getattr(like, name), getattr(batch, name)
-        # Of several copies of each transition there may be others in the TD target than elsewhere.
+        # The TD target may have another number of copies of each transition than the rest.
         n = len(like.actions) if like is batch or name == "observations" else len(like.rewards)
         if isinstance(stored, dict):
             if not isinstance(found, dict) or found.keys() != stored.keys():
@@ -65,8 +65,8 @@ def check_actions(learner: Any, observations: Any, actions: Any) -> None:
     Check an explorer's actions.
 
     :param learner: the learner
-    :param observations: for which they are, (B, O), or a dict of them
-    :param actions: the explorer's
+    :param observations: observations that the actions are for, (B, O), or a dict of them
+    :param actions: the explorer's actions
     :raises ValueError: if they are not (B, A) in [-1, 1]; or not finite, though the learner's actor is
     """
     first = next(iter(observations.values())) if isinstance(observations, dict) else observations
@@ -84,12 +84,12 @@ def check_actions(learner: Any, observations: Any, actions: Any) -> None:
 
 def check(learner: Any, batch: Batch, extra: Extra | None) -> None:
     """
-    Check what a gradient step asks of networks, value head and rule of pessimism.
+    Check networks, value head and rule of pessimism against the needs of a gradient step.
 
     :param learner: the learner, before its first gradient step
     :param batch: the step's transitions, checked
     :param extra: further transitions for the rule of pessimism
-    :raises ValueError: if something has another shape than it must have; the message names class and method
+    :raises ValueError: if a result has a wrong shape; the message names class and method
     """
     if extra is not None:
         check_batch("extra.batch", extra.batch)
@@ -102,7 +102,7 @@ def check(learner: Any, batch: Batch, extra: Extra | None) -> None:
 def _try(learner: Any, batch: Batch) -> None:
     head, rule, critic, n = learner.head, learner.pessimism_rule, learner.critic, len(batch.actions)
     n_critics = critic.n_critics
-    # Networks: whatever they return is read by a dense layer, which takes one output for all copies as well.
+    # Networks: a dense layer reads their outputs, and would also accept one output for all copies.
     trunk, inputs = critic.trunk, critic.inputs(batch.observations, batch.actions)
     # A network without weights, such as an MLP without hidden layers, is the same for all critics.
     has_copies = any(True for _ in trunk.parameters())
@@ -139,7 +139,7 @@ def _try(learner: Any, batch: Batch) -> None:
     if not _is_tensor(target) or n not in target.shape[:2]:
         raise ValueError(f"{_name(head)}.target must return a target with B = {n} rows, not {_shown(target)}")
     if type(head).loss is ValueHead.loss:
-        # A squared error takes whatever broadcasts.
+        # A squared error accepts any shape that broadcasts.
         _check(head, "target", target, "a target", (n, q.shape[2]), "(B, n_outputs)")
     loss = _called(head, "loss", q, target, letters="q (E, B, n_outputs), target (B, n_outputs)")
     _check(head, "loss", loss, "a loss", (), "()")
@@ -148,7 +148,7 @@ def _try(learner: Any, batch: Batch) -> None:
 
 
 def _called(part: Any, method: str, *arguments: Any, letters: str = "") -> Any:
-    """Call a method; an error that it raises has a note of where, and of the shapes that it was called with."""
+    """Call a method; add a note to its errors: where they occurred, and the shapes that it was called with."""
     try:
         return part(*arguments) if method == "forward" else getattr(part, method)(*arguments)
     except Exception as error:
@@ -168,7 +168,7 @@ def _new_size(roots: Iterable[nn.Module], batch: Batch) -> int:
 
 
 def _rows(batch: Batch, n: int) -> Batch:
-    """As many transitions of a batch, again from the first on if there are fewer."""
+    """The first n transitions of a batch, repeated from the first on if there are fewer."""
     rows = torch.arange(n, device=batch.actions.device) % len(batch.actions)
 
     def take(value: Any) -> Any:
@@ -179,7 +179,7 @@ def _rows(batch: Batch, n: int) -> Batch:
 
 @contextmanager
 def _untouched(modules: list[nn.Module]) -> Iterator[None]:
-    """Have modules in evaluation mode, without the hooks that others have put on them, and as they were afterwards."""
+    """Put modules in evaluation mode, without the hooks that others have registered, and restore them afterwards."""
     scripts = {module: module.training for module in modules if isinstance(module, torch.jit.ScriptModule)}
     plain = [module for module in modules if not isinstance(module, torch.jit.ScriptModule)]
     attributes = [(module, dict(vars(module)), dict(module._buffers)) for module in plain]
@@ -231,7 +231,7 @@ def _check_entry(who: str, name: str, got: Any, shape: tuple[int, ...], otherwis
 
 
 def _replace(content: dict[str, Any], earlier: dict[str, Any]) -> None:
-    """Give a dict its earlier content. It is never without what both have: another thread may act meanwhile."""
+    """Restore a dict's earlier content. Keys of both contents are never missing: another thread may act meanwhile."""
     content.update(earlier)
     for name in content.keys() - earlier.keys():
         del content[name]

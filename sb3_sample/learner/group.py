@@ -33,13 +33,13 @@ from sb3_sample.warn import warn
 
 #: Numbers of a learner that its gradient step does not read, or reads from its inputs.
 _NOT_READ = {"learning_starts", "verbose", "compile", "learning_rate"}
-#: Parts that a learner has or has not (None), and uses around its gradient step by itself.
+#: Optional parts of a learner (None if absent), which each learner uses by itself, around its gradient step.
 _AROUND = {"redo", "reward_scaler", "schedule"}
 
 
 class _Networks(nn.Module):
     """
-    All that one learner's gradient step reads and writes, as one module, which runs that or another method of it.
+    One module of all that a learner's gradient step reads and writes; it runs that step or another of its methods.
 
     :param learner: the learner
     """
@@ -61,7 +61,7 @@ class _Networks(nn.Module):
 
 
 class _Stacks(nn.Module):
-    """Parameters and buffers of S learners, (S, ...) each, by the names that they have in each."""
+    """Parameters and buffers of S learners, (S, ...) each, by the names that they have in each learner."""
 
     def __init__(self, tensors: dict[str, Sequence[torch.Tensor]]):
         super().__init__()
@@ -82,11 +82,11 @@ class _Stacks(nn.Module):
 
 class LearnerGroup:
     """
-    Gradient steps, and actions, of S learners that are one. Each learner's tensors become its rows of the stacks, so
-    that whatever acts on a learner alone (acting, resets, saving, loading in place) goes on as it is.
+    S learners whose gradient steps and actions are computed as one. Each learner's tensors become its rows of the
+    stacks, so that operations on a single learner (acting, resets, saving, loading in place) work as before.
 
     :param learners: learners of the same networks, parts and settings; learning rates and other numbers may differ
-    :raises ValueError: if they differ in more, or cannot be stacked, by name
+    :raises ValueError: if they differ in more, or cannot be stacked; the message names the reason
     """
 
     def __init__(self, learners: Sequence[Learner]):
@@ -98,7 +98,7 @@ class LearnerGroup:
         _check_alike(self.learners)
         self._networks = [_Networks(learner) for learner in self.learners]
         self._stacks = _Stacks(_by_name([networks.tensors() for networks in self._networks]))
-        #: By the optimizers' names, those of the stacked parameters, and each learner's.
+        #: Optimizers of the stacked parameters, and those of each learner, by the optimizers' names.
         self._optimizers = self._stacked_optimizers()
         self._of_each: dict[str, list[Any]] = {
             path: [learner.optimizers()[path] for learner in self.learners] for path in self._optimizers
@@ -111,13 +111,13 @@ class LearnerGroup:
         self._discounts: float | torch.Tensor = 0.0
         #: Numbers that differ between learners: object of the first learner, attribute, (S,).
         self._differing: list[tuple[dict[str, Any], str, torch.Tensor]] = []
-        # Numbers that differ between the inputs are mostly the same as before, and a GPU waits for those of the host.
+        # Cached, as numbers that differ between the inputs mostly stay the same, and a GPU waits for those of the host.
         self._row = functools.lru_cache(maxsize=8)(self._made_row)
         self._settings = [_settings_of(learner) for learner in self.learners]
         self._versions: list[int] = []
         #: Whether the learners' optimizers have taken different numbers of steps, as after a reset of one.
         self.counts_differ = False
-        # Each learner's gradient steps at the last one that was taken here.
+        # Each learner's count of gradient steps at the last one taken here.
         self._n_updates: list[int] = []
         self._execution: Execution | None = None
         self._drawing: Execution | None = None
@@ -142,7 +142,7 @@ class LearnerGroup:
         """
         Identify what the gradient step is made for.
 
-        :return: the same of each learner, one after the other
+        :return: the identities of each learner, one after the other
         """
         return tuple(number for learner in self.learners for number in learner.identities())
 
@@ -189,7 +189,7 @@ class LearnerGroup:
         if self._acting is None:
             of_group = CapturedActing(self, "mapped_actions", cuda_graph) if captures(self, self._first) else None
             self._acting = of_group or (lambda group, stacked: group.mapped_actions(*stacked))
-        # Whose thread this is may be another's than those that act.
+        # This may run in another thread than those that act.
         with torch.inference_mode():
             return self._of_each_learner(self._acting(self, _stacked(inputs, self._row)))
 
@@ -198,24 +198,24 @@ class LearnerGroup:
         return [{name: of[s] for name, of in rows.items()} for s in range(len(self.learners))]
 
     def release(self) -> None:
-        """Give each learner tensors of its own again. The group cannot be used any more."""
+        """Give each learner its own tensors again. The group cannot be used any more."""
         for learner, networks in zip(self.learners, self._networks, strict=True):
             for tensor in networks.tensors().values():
                 tensor.data = tensor.data.clone()
             for optimizer in learner.optimizers().values():
                 for state in optimizer.state.values():
                     state.update({name: value.clone() for name, value in state.items()})
-                # Made anew from them.
+                # Its vectors are made anew from the state.
                 optimizer.__setstate__(optimizer.__dict__)
 
     def _made_row(self, values: tuple[float, ...]) -> torch.Tensor:
-        """A number of each learner as a tensor, (S,)."""
+        """One number for each learner, as a tensor, (S,)."""
         # Actions are computed in inference mode, whose tensors no gradient step can read.
         with torch.inference_mode(False):
             return torch.tensor(values, dtype=torch.float32, device=self.device)
 
     def _prepare(self) -> None:
-        """Bring the stacks up to date with what has happened to the learners since the last step."""
+        """Update the stacks with the changes of the learners since the last step."""
         optimizers = [optimizer for of_each in self._of_each.values() for optimizer in of_each]
         for optimizer in optimizers:
             optimizer.prepare()
@@ -229,14 +229,14 @@ class LearnerGroup:
             self._versions = versions
             is_next = False
         if not is_next:
-            # One has stepped alone. Only then, as it waits for a GPU.
+            # A learner has stepped alone. Only then, as the comparison waits for a GPU.
             self._compare_counts()
         self._take_rates()
         self._take_changes()
 
     def _take_changes(self) -> None:
-        """Take over what was set in the learners."""
-        # Each looks at its own.
+        """Take over settings that were changed in the learners."""
+        # Every learner is checked, even after a change was found: each check updates the values that it holds.
         changed = [settings.have_changed() for settings in self._settings]
         if any(changed):
             self._take_settings()
@@ -264,10 +264,10 @@ class LearnerGroup:
         """
         Draw batches and compute the gradient step of all learners: this function is compiled or captured.
 
-        :param batch_size: B, of each
-        :param n_further: as of ``drawn_step``, of each
-        :param moves_targets: as of ``gradient_step``
-        :param moves_actor: as of ``gradient_step``
+        :param batch_size: B, for each learner
+        :param n_further: as in ``drawn_step``, for each learner
+        :param moves_targets: as in ``gradient_step``
+        :param moves_actor: as in ``gradient_step``
         :return: each learner's result, by name, (S, ...)
         """
         inputs = []
@@ -305,7 +305,7 @@ class LearnerGroup:
 
     @contextmanager
     def _in_force(self, numbers: Sequence[torch.Tensor]) -> Iterator[None]:
-        """Have the first learner's step be that of all."""
+        """Make the first learner's step that of all learners."""
         before = [(values, name, values[name]) for values, name, _ in self._differing]
         first = vars(self._first)
         first.update(minimize=self._descent.minimize, follow=self._descent.follow)
@@ -338,7 +338,7 @@ class LearnerGroup:
         return {id(module): [stacks[names[id(p)]] for p in module.parameters()] for module in modules}
 
     def _take_moments(self) -> None:
-        """Have each learner's moments and counts of steps be rows of stacks."""
+        """Make each learner's moments and counts of steps rows of stacks."""
         for path, stacked in self._optimizers.items():
             theirs = self._of_each[path]
             stacked.state.clear()
@@ -363,7 +363,7 @@ class LearnerGroup:
             stacked.version += 1
 
     def _compare_counts(self) -> None:
-        """Look whether the learners have taken as many steps of each parameter, of which Adam's step is quicker."""
+        """Check whether the learners have equal counts of steps for each parameter, as Adam's step is then quicker."""
         counts = [steps for stacked in self._optimizers.values() for steps in stacked._steps]
         self.counts_differ = any(not torch.equal(steps, steps[:1].expand_as(steps)) for steps in counts)
         for stacked in self._optimizers.values():
@@ -385,7 +385,7 @@ class LearnerGroup:
         """
         self._differing = []
         self._descent.tau = self._first.tau
-        # Of batches that a step draws itself, where no tensor can come from the host.
+        # For batches that a step draws itself, where no tensor can come from the host.
         gammas = [learner.gamma for learner in self.learners]
         same = all(gamma == gammas[0] for gamma in gammas)
         self._discounts = gammas[0] if same else self._made_row(tuple(gammas))

@@ -16,9 +16,9 @@ class ValueHead(nn.Module):
     """
     Head of scalar critics, trained by the squared error; base class of other heads.
 
-    A head is a module: what it keeps in buffers moves with the learner's device and is saved. ``n_outputs`` is the
-    number of outputs a critic; ``n_quantiles`` the same if they are quantiles, else None. A head from outside of this
-    package that does not branch on a tensor's value may declare ``compilable = True``.
+    A head is a module: its buffers move with the learner's device and are saved. ``n_outputs`` is the number of outputs
+    per critic; ``n_quantiles`` the same if they are quantiles, else None. A head from outside of this package that does
+    not branch on a tensor's value may declare ``compilable = True``.
     """
 
     compilable: ClassVar[bool] = True
@@ -31,7 +31,7 @@ class ValueHead(nn.Module):
         Convert outputs to values.
 
         :param outputs: of critics, (E, B, n_outputs)
-        :return: input of the rules of pessimism and of the actors, (E, B, K): values, or quantiles of one
+        :return: input of the rules of pessimism and of the actors, (E, B, K): values, or quantiles of a value
         """
         return outputs
 

@@ -54,7 +54,7 @@ from sb3_sample.networks.projected import Projected
 from sb3_sample.networks.unit_norm import project_weights
 from sb3_sample.optim import AdamW, sharpness_aware_gradients
 
-#: Among a gradient step's results, the TD errors that are no metric.
+#: Name of the TD errors among a gradient step's results, which are not a metric.
 _TD_ERRORS = "td_errors"
 
 
@@ -63,14 +63,14 @@ def check_is_batch(batch: Any) -> None:
     Check that something is a batch.
 
     :param batch: anything
-    :raises ValueError: if it is none
+    :raises ValueError: if it is not
     """
     if not isinstance(batch, Batch):
         raise ValueError(f"batch must be a Batch, not {batch!r:.100}: data.sample(n) of a Dataset gives one")
 
 
 def _chosen(trunk: Network) -> Network:
-    """The network that was chosen for a trunk, which stands behind a projection where there is one."""
+    """The network that was chosen for a trunk: the one behind the projection, if the trunk has one."""
     return trunk.network if isinstance(trunk, Projected) else trunk
 
 
@@ -84,50 +84,51 @@ class Counts:
         self._began_at = 0
         #: Transitions reported by :meth:`Learner.on_step`.
         self.num_transitions = 0
-        #: The same of each task, where several take a step together.
+        #: The same for each task, if several tasks take a step together.
         self.num_task_steps = 0
-        #: Whether the gradient step is compiled; None while that is not decided.
+        #: Whether the gradient step is compiled; None while undecided.
         self.compiled: bool | None = None
-        #: Gradient steps planned, for the schedule of the learning rate; None while they are not known.
+        #: Gradient steps planned, for the schedule of the learning rate; None while unknown.
         self.planned_updates: int | None = None
 
 
 class Learner(Executable):
     """
-    Soft actor-critic with exchangeable parts, without an environment, a file or a replay buffer around it.
+    Soft actor-critic with exchangeable parts, independent of environments, files and replay buffers.
 
     :param make_networks: makes freshly initialised networks
-    :param head: what the critics' outputs mean
+    :param head: value head, the meaning of the critics' outputs
     :param make_temperature: makes a freshly initialised temperature
     :param make_pessimism: makes a freshly initialised rule of pessimism for the learner
     :param make_explorer: makes a freshly initialised explorer for the learner
     :param plasticity: resets of networks, optimizers and learned numbers
     :param redo: recycling of dormant neurons; None for none
     :param make_transforms: each makes a batch transform for the learner, applied in this order
-    :param make_reward_scaler: makes the rule that scales rewards for the learner, applied before them; None for none
+    :param make_reward_scaler: makes the rule that scales rewards for the learner, applied before the transforms; None
+        for none
     :param make_objective: makes a freshly initialised objective for the learner; None for that of soft actor-critic
     :param learning_rate: of actor, critics and temperature, at the start
-    :param schedule: learning rates over the planned gradient steps; None: as :meth:`set_learning_rate` says
+    :param schedule: learning rates over the planned gradient steps; None: as set by :meth:`set_learning_rate`
     :param temperature_beta1: beta1 of the temperature's Adam
     :param gamma: discount factor of batches that have none of their own
     :param tau: weight of the new critics in the Polyak average of the targets
-    :param target_entropy: entropy that the learned temperature aims at; one for each task where each has a temperature
-        of its own, or the same for all; None: -|A|/2
-    :param n_tasks: tasks that the observations tell apart
+    :param target_entropy: target entropy of the learned temperature; one for each task if tasks have their own
+        temperatures, or the same for all; None: -|A|/2
+    :param n_tasks: number of tasks that the observations distinguish
     :param target_update_interval: gradient steps between two updates of the targets; None: ``policy_delay``
-    :param policy_delay: gradient steps between two of the actors' and of the temperature
-    :param actor_at_once: whether the first of ``policy_delay`` gradient steps is the actors', and not the last
-    :param actor_first: whether actors and temperature learn before the critics, whose target is then of the new ones
+    :param policy_delay: gradient steps between two updates of actors and temperature
+    :param actor_at_once: whether the actors learn in the first of ``policy_delay`` gradient steps, not in the last
+    :param actor_first: whether actors and temperature learn before the critics, whose target then uses the new ones
     :param target_subset: how many critics, drawn at random, make the TD target; None: all
     :param actor_pessimism: a weight of pessimism for the actor's objective alone; None: the rule's
     :param sam_radius: radius of sharpness-aware minimisation of the critics' loss; None for none
     :param learning_starts: number of transitions at the beginning whose actions are random
-    :param compile: whether the gradient step is compiled; "auto": as ``counts.compiled`` says, else not
+    :param compile: whether the gradient step is compiled; "auto": as set in ``counts.compiled``, else not
     :param device: where the learner computes
     :param verbose: 0 nothing, 1 info
-    :param networks: the first networks; made if None
+    :param networks: the initial networks; made if None
     :param counts: object that holds the learner's counts, with the attributes of :class:`Counts`; made if None
-    :param generators: generators of everything random in the learner; None: torch's global ones
+    :param generators: random generators of the learner; None: torch's global ones
     """
 
     #: Arguments that may be set between two gradient steps, with effect from the next one on.
@@ -192,7 +193,7 @@ class Learner(Executable):
             self.networks = make_networks().to(self.device) if networks is None else networks
             plasticity.starts["networks"] = self.networks.drawn_from
             for critics in (self.critic, self.critic_target):
-                # Past nn.Module's own setattr, which would register it.
+                # Bypasses nn.Module's own setattr, which would register it.
                 vars(critics)["value_head"] = self.head
             self.target_entropy: float | torch.Tensor = 0.0
             self.set_target_entropy(-self.actor.action_dim / 2 if target_entropy is None else target_entropy)
@@ -202,7 +203,7 @@ class Learner(Executable):
             self.reward_scaler = None if make_reward_scaler is None else make_reward_scaler(self).to(self.device)
             made: list[Any] = [make(self).to(self.device) for make in make_transforms]
             self.transforms: Any = nn.ModuleList(made)
-            #: Copies of each transition in the TD target and in the critics' loss, by the transforms.
+            #: Copies of each transition in the TD target and in the critics' loss, as the transforms require.
             self.target_copies = math.prod(each.target_copies for each in made)
             self.online_copies = math.prod(each.online_copies for each in made)
             self.objective = plasticity.first("objective", lambda: self._make_objective(self))
@@ -214,14 +215,14 @@ class Learner(Executable):
             betas = (temperature_beta1, 0.999)
             self.temperature_optimizer = AdamW(self.temperature.parameters(), lr=learning_rate, betas=betas)
         self._parts_mode = ModeSwitch(*self.parts().values())
-        # Where :meth:`drawn_step` draws its batches from; None: it cannot be taken.
+        # Store from which :meth:`drawn_step` draws its batches; None: such steps are not possible.
         self._store: Store | None = None
         self._drawing: Execution | None = None
         #: Chooses how the explorer's actions are computed.
         self.make_acting: Callable[[Any], Acting | None] = acting_of
         # The explorer, and what computes its actions; None for its own ``act``.
         self._acting: tuple[Exploration, Acting | None] | None = None
-        #: Whether ``.grad`` holds the gradients of another gradient step than the last, as a compiled one leaves none.
+        #: Whether ``.grad`` holds gradients of an earlier gradient step than the last, as a compiled step leaves none.
         self.gradients_are_stale = False
         # Whether the shapes of a gradient step, and those of the explorer's actions, were checked.
         self._checked_step = self._checked_actions = False
@@ -234,11 +235,11 @@ class Learner(Executable):
     def _random(self) -> AbstractContextManager[None]:
         return nullcontext() if self._generators is None else self._generators.in_force()
 
-    # ---------------------------------------------------------------- what it consists of
+    # ---------------------------------------------------------------- components
 
     @property
     def actor(self) -> Any:
-        """Actor of the evaluation, which is learned from the pessimistic value."""
+        """Actor of the evaluation, which learns from the pessimistic value."""
         return self.networks.actor
 
     @property
@@ -268,17 +269,17 @@ class Learner(Executable):
 
     @property
     def environment_steps(self) -> int:
-        """The same of each task, where several take a step together."""
+        """Transitions of each task, if several tasks take a step together; else :attr:`num_transitions`."""
         return self.num_transitions if self.n_tasks == 1 else int(self._counts.num_task_steps)
 
     @property
     def n_envs(self) -> int:
-        """Environments of the latest step that it was told of; 1 before."""
+        """Environments of the latest reported step; 1 before."""
         return self._n_envs
 
     @property
     def planned_updates(self) -> int | None:
-        """Gradient steps planned, for the schedule of the learning rate; None while they are not known."""
+        """Gradient steps planned, for the schedule of the learning rate; None while unknown."""
         return self._counts.planned_updates  # type: ignore[no-any-return]
 
     @planned_updates.setter
@@ -288,8 +289,8 @@ class Learner(Executable):
     @property
     def td_errors(self) -> torch.Tensor | None:
         """
-        TD errors of the last gradient step, for the priorities of its transitions: absolute, the largest of any
-        critic's, from before the step, (B,). None if the batch came without the column ``slots``.
+        TD errors of the last gradient step, for the priorities of its transitions: the largest absolute error of any
+        critic, from before the step, (B,). None if the batch came without the column ``slots``.
         """
         return self._td_errors
 
@@ -313,7 +314,7 @@ class Learner(Executable):
         """
         Make an actor.
 
-        :return: an actor like the learner's, with parameters of its own
+        :return: an actor like the learner's, with its own parameters
         """
         return self.networks.make_actor()
 
@@ -321,7 +322,7 @@ class Learner(Executable):
         """
         Make a value network.
 
-        :return: a network of the critics' kind that judges observations alone, (B, O) to (B, 1)
+        :return: a network of the critics' kind that evaluates observations alone, (B, O) to (B, 1)
         """
         return self.networks.make_value()
 
@@ -346,11 +347,11 @@ class Learner(Executable):
 
     def encoded(self, observations: Any) -> Any:
         """
-        Encode observations once for actors and critics, where they share an encoder.
+        Encode observations once for actors and critics, if they share an encoder.
 
         :param observations: (B, O), or a dict of them
-        :return: what actors and critics take in their place, without gradient to the encoder; the observations
-            themselves if nothing is shared
+        :return: input of actors and critics in place of the observations, without gradient to the encoder; the
+            observations themselves if nothing is shared
         """
         return self.networks.encoded(observations)
 
@@ -397,14 +398,14 @@ class Learner(Executable):
 
     def set_target_entropy(self, value: float | Sequence[float]) -> None:
         """
-        Set the entropy that the learned temperature aims at.
+        Set the target entropy of the learned temperature.
 
         :param value: a number, or one for each task
         """
         if isinstance(value, Sequence):
             targets = torch.tensor(value, dtype=torch.float32, device=self.device)
             if isinstance(self.target_entropy, torch.Tensor):
-                # In place, where a captured gradient step reads it.
+                # In place, as a captured gradient step reads it there.
                 self.target_entropy.copy_(targets)
             else:
                 self.target_entropy = targets
@@ -425,7 +426,7 @@ class Learner(Executable):
         """
         Set the learning rate.
 
-        :param rate: of every optimizer that has none of its own
+        :param rate: of every optimizer that does not have its own
         """
         for optimizer in self.optimizers().values():
             for group in optimizer.param_groups:
@@ -438,10 +439,10 @@ class Learner(Executable):
         return None if self.schedule is None else self.schedule.rate(self.n_updates, self.planned_updates)
 
     def _set_scheduled_rates(self, schedule: LearningRateSchedule) -> None:
-        """Set the rates of the step that is counted already; each optimizer goes by the steps that it took itself."""
+        """Set the rates of the step just counted, for each optimizer by the number of its own steps."""
         before = self.n_updates - 1
         of_critics = schedule.rate(before, self.planned_updates)
-        # One ahead, at a start and after every delay, where the first of the steps is theirs.
+        # One step ahead, at the start and after every delay, if the first of the steps is the actors'.
         ahead = self.policy_delay - 1 if self.actor_at_once else 0
         of_actors = schedule.rate((before + ahead) // self.policy_delay, self.planned_updates)
         for optimizer in self.optimizers().values():
@@ -451,11 +452,11 @@ class Learner(Executable):
             if isinstance(optimizer, AdamW):
                 optimizer.prepare_rates()
 
-    # ---------------------------------------------------------------- what it is told
+    # ---------------------------------------------------------------- events of the environment
 
     def on_observations(self, observations: Any) -> None:
         """
-        Tell the parts of the observations that are acted on, before the actions of a step are chosen in training.
+        Pass the observations that are acted on to the parts, before the actions of a training step are chosen.
 
         :param observations: arrays or tensors, (n_envs, O), or a dict of them
         """
@@ -480,7 +481,7 @@ class Learner(Executable):
                     part.on_episode_end(self, int(index), infos[index]["episode"]["r"])
 
     def on_environment_reset(self) -> None:
-        """Tell the parts that the environments were reset in the midst of their episodes."""
+        """Notify the parts that the environments were reset in mid-episode."""
         for part in self.parts().values():
             part.on_environment_reset(self)
 
@@ -551,14 +552,14 @@ class Learner(Executable):
 
     def update(self, batch: Batch, noise: Noise | None = None, extra: Extra | None = None) -> dict[str, torch.Tensor]:
         """
-        Take one gradient step, after what is due before it: resets, and the parts' work after environment steps.
+        Take one gradient step, after the work that is due: resets, and the parts' work after environment steps.
 
         :param batch: transitions, on the learner's device
-        :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly, unless
-            transforms draw for the transitions of ``extra``, which is done by torch's generator each time
+        :param noise: random numbers of the step; drawn where it is None. A given noise reproduces a step exactly,
+            unless transforms draw for the transitions of ``extra``, always by torch's generator
         :param extra: further transitions for a rule of pessimism that learns from some, from its ``draw``
         :return: what to log, by name, scalars on the learner's device
-        :raises ValueError: if the batch is none
+        :raises ValueError: if ``batch`` is not a batch
         """
         check_is_batch(batch)
         with self._updating():
@@ -566,12 +567,12 @@ class Learner(Executable):
 
     @contextmanager
     def _updating(self) -> Iterator[None]:
-        """Count, transform, draw and check around a gradient step, for :meth:`update`."""
+        """Prepare a gradient step of :meth:`update`: parts, resets, execution and training mode, which ends after it."""
         with self._random():
             if self._heard:
                 self.before_updates()
             self.plasticity.before_gradient_steps(self, 1)
-            # A compiled or captured step is told of rates, settings and moments that were set since the last one.
+            # A compiled or captured step receives the rates, settings and moments set since the last one.
             self.prepared_execution()
             self.set_training_mode(True)
             try:
@@ -584,7 +585,7 @@ class Learner(Executable):
         Choose actions.
 
         :param observations: tensors, or NumPy's arrays, (B, O) or a single one (O,); or a dict of either
-        :param deterministic: the actor's mean action, as in evaluation, instead of the explorer's sample
+        :param deterministic: whether to take the actor's mean action, as in evaluation, not the explorer's sample
         :return: actions in [-1, 1], (B, A), or (A,) for a single observation: a tensor on the learner's device for
             tensors, an array for arrays
         :raises ValueError: if the observations have other keys or shapes than the observation space
@@ -597,11 +598,11 @@ class Learner(Executable):
 
     def explore(self, observations: Any) -> torch.Tensor:
         """
-        Have the explorer act.
+        Compute the explorer's actions.
 
         :param observations: tensors on the learner's device, (B, O), or a dict of them
         :return: actions in [-1, 1], (B, A)
-        :raises ValueError: if the explorer's first actions are something else
+        :raises ValueError: if the explorer's first actions are not of this form
         """
         actions = self._actions(observations)
         if not self._checked_actions:
@@ -634,13 +635,13 @@ class Learner(Executable):
         self, batch: Batch, noise: Noise | None = None, extra: Extra | None = None, eager: bool = False
     ) -> dict[str, torch.Tensor]:
         """
-        Draw the noise, take one gradient step, and count it; without what :meth:`update` does before it.
+        Draw the noise, take one gradient step, and count it; without the work that :meth:`update` does before it.
 
         :param batch: transitions
-        :param noise: all that is random; drawn where it is None. A given noise reproduces a step exactly, unless
-            transforms draw for the transitions of ``extra``, which is done by torch's generator each time
+        :param noise: random numbers of the step; drawn where it is None. A given noise reproduces a step exactly,
+            unless transforms draw for the transitions of ``extra``, always by torch's generator
         :param extra: further transitions for the rule of pessimism
-        :param eager: neither compiled nor captured this time, which leaves the gradients in ``.grad``
+        :param eager: run this step neither compiled nor captured, which leaves the gradients in ``.grad``
         :return: what to log, by name, scalars on the learner's device, computed with the parameters from before
             the update of the module in question
         """
@@ -661,11 +662,11 @@ class Learner(Executable):
         drawing included.
 
         :param batch_size: B
-        :param n_further: by the rule of pessimism's ``n_further``
-        :return: as of :meth:`step`
+        :param n_further: from the rule of pessimism's ``n_further``
+        :return: as in :meth:`step`
         """
         if not self._checked_step:
-            # A batch apart, so that a training that goes on draws what it would have drawn.
+            # A separate batch, so that a continued training draws the same numbers as an uninterrupted one.
             with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
                 batch, _, extra = self.drawn_inputs(batch_size, n_further)
             first_step.check_batch("batch", batch)
@@ -680,10 +681,10 @@ class Learner(Executable):
 
     def drawn_inputs(self, batch_size: int, n_further: int = 0) -> tuple[Batch, Noise, Extra | None]:
         """
-        Draw what a gradient step takes, with operations on tensors alone.
+        Draw the inputs of a gradient step by tensor operations alone.
 
         :param batch_size: B
-        :param n_further: by the rule of pessimism's ``n_further``
+        :param n_further: from the rule of pessimism's ``n_further``
         :return: transitions, noise, and further transitions for the rule of pessimism, None for ``n_further=0``
         """
         assert self._store is not None
@@ -700,10 +701,10 @@ class Learner(Executable):
         Draw a batch and compute its gradient step: this function is compiled or captured.
 
         :param batch_size: B
-        :param n_further: by the rule of pessimism's ``n_further``
-        :param moves_targets: as of :meth:`gradient_step`
-        :param moves_actor: as of :meth:`gradient_step`
-        :return: as of :meth:`gradient_step`
+        :param n_further: from the rule of pessimism's ``n_further``
+        :param moves_targets: as in :meth:`gradient_step`
+        :param moves_actor: as in :meth:`gradient_step`
+        :return: as in :meth:`gradient_step`
         """
         batch, noise, extra = self.drawn_inputs(batch_size, n_further)
         return self.gradient_step(batch, noise, extra, moves_targets, moves_actor)
@@ -747,7 +748,7 @@ class Learner(Executable):
         return batch, noise, extra
 
     def _what_moves(self) -> tuple[bool, bool]:
-        """Whether the targets, and whether actors and temperature move in the gradient step that was just counted."""
+        """Whether the targets, and whether actors and temperature, are updated in the gradient step just counted."""
         moves_targets = self.n_updates % (self.target_update_interval or self.policy_delay) == 0
         return moves_targets, (self.n_updates - self.actor_at_once) % self.policy_delay == 0
 
@@ -774,11 +775,11 @@ class Learner(Executable):
         return self.target_copies > 1 or self.online_copies > 1
 
     def _first_copy(self, batch: Batch) -> Batch:
-        """The transitions in the place of their copies."""
+        """The first copy of each transition."""
         return first_copy(batch, len(batch.actions) // self.online_copies) if self._has_copies else batch
 
     def _encoded_once(self, batch: Batch) -> Batch:
-        """The batch with features in the place of observations that several networks read of the online encoder."""
+        """The batch with features in place of observations that several networks read through the online encoder."""
         networks = self.networks
         if networks.encodes_once:
             batch = batch._replace(observations=Encoded(networks.features(batch.observations)))
@@ -794,7 +795,7 @@ class Learner(Executable):
         Compute the gradient step (BRO, algorithm 2), on tensors only: this function is compiled or captured.
 
         :param batch: transitions, or several copies of each
-        :param noise: all that is random
+        :param noise: all random numbers of the step
         :param extra: further transitions for the rule of pessimism
         :param moves_targets: whether the target critics are updated in this step
         :param moves_actor: whether actors and temperature learn in this step
@@ -834,8 +835,9 @@ class Learner(Executable):
         prepared: Prepared,
     ) -> tuple[CriticStep | None, dict[str, torch.Tensor]]:
         """
-        Take the critics' step on all copies of the transitions, and that of their targets; None for what the rule of
-        pessimism judges, if nothing. ``observations`` are those of the copies before they were encoded.
+        Take the critics' step on all copies of the transitions, and the step of their targets. Returns the results for
+        the rule of pessimism, None if there are none, and the metrics. ``observations`` are those of the copies before
+        they were encoded.
         """
         # Critics, towards the targets' value of the actor's next action, unless the objective has another target.
         step: CriticStep | None = None
@@ -848,13 +850,13 @@ class Learner(Executable):
             q, target = evaluate(self.critic, copies.observations, copies.actions), prepared.target
         if self._has_copies:
             n = len(batch.actions)
-            # The mean over the copies, for each of them.
+            # Each copy gets the mean over the copies.
             target = target.reshape(-1, n, target.shape[-1]).mean(dim=0).repeat(self.online_copies, 1)
         critic_loss = self._critic_loss(q, target)
         if self.sam_radius is None:
             self.minimize(self.critic.optimizer, critic_loss)
         else:
-            # Uphill, features are others too.
+            # Uphill, the features differ too.
             self._sharpness_aware_step(critic_loss, copies._replace(observations=observations), next_actions, target)
         self.critic.project()
         q = self.head.values(q)
@@ -874,7 +876,7 @@ class Learner(Executable):
         return step, metrics
 
     def _critic_loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """The critics' loss, the sum over copies of transitions, if there are several."""
+        """The critics' loss, summed over the copies of transitions, if there are several."""
         loss: torch.Tensor = self.head.loss(q, target)
         return loss if self.online_copies == 1 else loss * self.online_copies
 
@@ -913,7 +915,7 @@ class Learner(Executable):
 
     @torch.no_grad()
     def _errors(self, batch: Batch, q: torch.Tensor, step: CriticStep | None, prepared: Prepared) -> torch.Tensor:
-        """The largest absolute TD error of any critic, of the means over quantiles, (B,)."""
+        """The largest absolute TD error of any critic, between means over quantiles, (B,)."""
         target = prepared.target
         if target is None:
             assert step is not None
@@ -937,7 +939,7 @@ class Learner(Executable):
         """Take one step of Polyak averaging; with ``tau=1`` the target is the online network."""
         self.follow(target, online, self.tau)
         with torch.no_grad():
-            # Running statistics, as in Stable-Baselines3; a target without an encoder of its own has none of it.
+            # Running statistics, as in Stable-Baselines3; a target without its own encoder lacks the encoder's.
             ours, theirs = target.statistics(), online.statistics()
             for own, other in zip(ours, theirs[len(theirs) - len(ours) :], strict=True):
                 own.copy_(other)
@@ -959,7 +961,7 @@ class Learner(Executable):
             [len(p) if id(p) in copied else None for p in parameters],
         )
         with torch.no_grad():
-            # They are of the critics as they are, whose own pass has moved them, and not of those uphill.
+            # The statistics are those after the critics' own pass; the pass uphill must not move them.
             for each, value in zip(statistics, before, strict=True):
                 each.copy_(value)
         descend(self.critic.optimizer, gradients)
@@ -967,26 +969,26 @@ class Learner(Executable):
     @staticmethod
     def follow(target: Any, online: Any, tau: float) -> None:
         """
-        Take one step of Polyak averaging of the parameters. A group has its own in this place, as of :meth:`minimize`.
+        Take one step of Polyak averaging of the parameters. A group replaces this method, like :meth:`minimize`.
 
         :param target: network that follows
         :param online: network that is followed
-        :param tau: weight of the latter
+        :param tau: weight of the online network
         """
         follow(target, online, tau)
 
     @staticmethod
     def minimize(optimizer: Optimizer, loss: torch.Tensor) -> None:
         """
-        Take one step of an optimizer. Only its own parameters get a gradient, also where the loss depends on others.
-        A group puts its own in this place while it takes the step of all its learners.
+        Take one step of an optimizer. Only its own parameters get a gradient, even if the loss depends on others.
+        A group replaces this method while it takes the step of all its learners.
 
         :param optimizer: the optimizer
         :param loss: scalar
         """
         minimize(optimizer, loss)
 
-    # ---------------------------------------------------------------- its state
+    # ---------------------------------------------------------------- state
 
     def state_dict(self) -> dict[str, Any]:
         """
@@ -1021,7 +1023,7 @@ class Learner(Executable):
         counts = state["counts"]
         self._counts._n_updates, self._counts.num_transitions = counts["n_updates"], counts["num_transitions"]
         self._counts.num_task_steps = counts["num_task_steps"]
-        # States of before have none.
+        # Older states have none.
         self._counts._began_at = counts.get("began_at", 0)
         self.planned_updates, self._heard = counts["planned_updates"], counts["heard"]
         if self._generators is not None:
@@ -1048,8 +1050,8 @@ class Learner(Executable):
         Start every network, optimizer and learned number anew, in place.
 
         :param shrink: share of the old parameters that stays
-        :param keep: what stays as it is: "encoder" for the critics' encoder, that of their targets, and their moments
-            and counts of steps in the optimizer
+        :param keep: what stays as it is: "encoder" for the critics' encoder and their targets' encoder, with their
+            moments and counts of steps in the optimizer
         :param to: "fresh" for new parameters, "start" for the run's own first ones
         :raises ValueError: if ``to`` is neither
         """
@@ -1062,7 +1064,7 @@ class Learner(Executable):
             for own, other in zip(encoders, fresh.encoders(), strict=True):
                 other.load_state_dict(own.state_dict())
         if self.observation_norm is not None:
-            # They describe the replay, which stays.
+            # Its statistics describe the replay, which stays.
             fresh.observation_norm.load_state_dict(self.observation_norm.state_dict())
         self.restart(self.networks, fresh, shrink)
         self.restart(self.temperature, again("temperature", lambda: self._make_temperature(self)), shrink)
@@ -1089,7 +1091,7 @@ class Learner(Executable):
         if shrink > 0:
             for name, parameter in module.named_parameters():
                 state[name] = torch.lerp(state[name].to(parameter.device), parameter.detach(), shrink)
-            # Fresh moments would be those of no network, neither the old one nor the mixed.
+            # Fresh moments would fit neither the old network nor the mixed one.
             state.update({name: moment for name, moment in running_moments(module) if name in state})
         module.load_state_dict(state)
         if shrink > 0:

@@ -110,7 +110,7 @@ def _huber_sorted(q: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, 
     n_critics, n_rows, n_quantiles = q.shape
     n_targets = target.shape[1]
     y = target.sort(dim=1).values
-    # Distances to the sample's middle target: the same differences of smaller numbers.
+    # Distances to the sample's middle target: the differences stay the same, of smaller numbers.
     centre = y[:, n_targets // 2, None]
     y = y - centre
     x = (q - centre).transpose(0, 1).reshape(n_rows, -1)
@@ -125,7 +125,7 @@ def _huber_sorted(q: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, 
     n_near_below, n_near_above = n_below - n_far_below, n_not_far_above - n_below
     s_near_below, s_near_above = s_below - s_far_below, s_not_far_above - s_below
     n_far_above, s_far_above = n_targets - n_not_far_above, sums[:, -1:] - s_not_far_above
-    # Sums of x - y over the near intervals, of which the sums of their squares are made.
+    # Sums of x - y over the near intervals, from which the sums of their squares are computed.
     d_near_below, d_near_above = n_near_below * x - s_near_below, n_near_above * x - s_near_above
 
     t = ((torch.arange(n_quantiles, device=q.device, dtype=y.dtype) + 0.5) / n_quantiles).repeat(n_critics)
@@ -163,7 +163,7 @@ def quantile_huber(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     :return: scalar
     """
     if isinstance(q, QValues):
-        q = q.tensor  # An autograd Function would not take it for a tensor: no gradient.
+        q = q.tensor  # An autograd Function would not treat it as a tensor: no gradient.
     compute = _huber_pairs if is_tracing() else _huber_sorted
     loss: torch.Tensor = _KnownGradient.apply(q, target, compute, 1)[0]
     return loss.squeeze(0)
@@ -199,7 +199,7 @@ def expectile_loss(difference: torch.Tensor, expectile: float) -> torch.Tensor:
     Squared error whose minimum is an expectile, ``mean(|tau - 1(u < 0)| u^2)`` (Kostrikov et al. 2021, eq. 5); half the
     squared error at 0.5.
 
-    :param difference: u, target less prediction, any shape
+    :param difference: u, target minus prediction, any shape
     :param expectile: tau, in (0, 1)
     :return: scalar
     """
@@ -221,13 +221,13 @@ def advantage_weights(advantage: torch.Tensor, inverse_temperature: float, most:
 
 def cloned_value_loss(value: torch.Tensor, actions: torch.Tensor, cloned: torch.Tensor, weight: float) -> torch.Tensor:
     """
-    Loss of an actor near given actions, ``mean((a - a*)^2) - lambda * mean(Q)`` with ``lambda = weight / mean(|Q|)``
-    without gradient (Fujimoto and Gu 2021, eqs. 3 and 5).
+    Loss of an actor that stays near given actions, ``mean((a - a*)^2) - lambda * mean(Q)`` with ``lambda = weight /
+    mean(|Q|)`` without gradient (Fujimoto and Gu 2021, eqs. 3 and 5).
 
     :param value: Q, value of the actor's actions, (B,)
-    :param actions: the actor's, (B, A)
-    :param cloned: a*, those to stay near to, (B, A)
-    :param weight: of the value
+    :param actions: a, the actor's actions, (B, A)
+    :param cloned: a*, the actions to stay near, (B, A)
+    :param weight: weight of the value
     :return: scalar
     """
     scale = weight / value.detach().abs().mean()

@@ -1,4 +1,4 @@
-"""Objectives: what actor and critics learn from a batch, where that is not soft actor-critic's."""
+"""Objectives of actor and critics on a batch: soft actor-critic's and others."""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -18,8 +18,8 @@ MAX_WEIGHT = 100.0
 
 class Prepared(NamedTuple):
     """
-    What an objective computes before the critics' step, without gradient: the critics' ``target``, (B, 1), None for the
-    TD target of the actor's next action; and the ``weights`` of the batch's actions for the actor, (B, 1).
+    Results that an objective computes before the critics' step, without gradient: the critics' ``target``, (B, 1), None
+    for the TD target of the actor's next action; and the ``weights`` of the batch's actions for the actor, (B, 1).
     """
 
     target: torch.Tensor | None = None
@@ -30,16 +30,16 @@ class Objective(Part):
     """Objective of soft actor-critic and TD3: the value of the actor's own actions; base class of the others."""
 
     has_state: ClassVar[bool] = False
-    #: Whether there are critics to learn.
+    #: Whether the critics learn.
     learns_critics: ClassVar[bool] = True
 
     def prepare(self, learner: Learning, batch: Batch) -> tuple[dict[str, torch.Tensor], Prepared]:
         """
-        Learn what comes before the critics' step.
+        Take the learning steps that precede the critics' step.
 
         :param learner: the learner
         :param batch: transitions
-        :return: what to log, by name, scalars; and what the later steps need of it
+        :return: what to log, by name, scalars; and the results that the later steps need
         """
         return {}, Prepared()
 
@@ -57,7 +57,7 @@ class Objective(Part):
 
         :param learner: the learner, after its critics' step, or before it with ``actor_first``
         :param batch: transitions
-        :param observations: the batch's for the actor, encoded once if there is a shared encoder
+        :param observations: the batch's observations for the actor, encoded once if there is a shared encoder
         :param alpha: temperature, a scalar, or (B, 1) where tasks have their own
         :param noise: standard normal noise of the sampled actions, (B, A)
         :param prepared: from :meth:`prepare`
@@ -73,11 +73,11 @@ def sampled(
     learner: Learning, batch: Batch, observations: Any, noise: torch.Tensor | None
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """
-    Sample the actor's own actions, in a forward pass with the next rows where its network asks for them.
+    Sample the actor's own actions, in one forward pass with the next rows if its network requires them.
 
     :param learner: the learner
     :param batch: transitions
-    :param observations: the batch's for the actor
+    :param observations: the batch's observations for the actor
     :param noise: standard normal noise, (B, A)
     :return: actions in [-1, 1], (B, A), and their log-probability, (B, 1)
     """
@@ -90,7 +90,7 @@ class OptimisticValue(Objective):
     """
     Objective of one optimistic actor alone (DAC, table 1): it maximises ``Q_mean + optimism * Q_std`` of its actions.
 
-    :param optimism: weight of the critics' spread, which stays as it is
+    :param optimism: constant weight of the critics' spread
     :param uncertainty: what Q_std is; see :func:`~sb3_sample.learner.exploration.spread`
     :param entropy: whether the entropy is rewarded too
     """
@@ -166,13 +166,13 @@ class ImplicitQ(Objective):
     """
     Objective of implicit Q-learning (Kostrikov et al. 2021): a value network learns an expectile of the target critics'
     values of the batch's actions, the critics learn from its value of the next state, and the actor repeats the
-    batch's actions, weighted by their advantage. No action is ever judged that is not in the data.
+    batch's actions, weighted by their advantage. Actions outside of the data are never evaluated.
 
     The order is that of the published update: value network, weights by the new one and the old targets, and then the
     critics, whose targets move last.
 
     :param learner: the learner, whose networks exist already
-    :param expectile: that the value network learns, in (0, 1); 0.5 is the mean
+    :param expectile: expectile that the value network learns, in (0, 1); 0.5 is the mean
     :param inverse_temperature: weight of the advantage in the exponent of an action's weight
     """
 

@@ -11,15 +11,15 @@ from sb3_sample.learner.parts import Learning, Part
 
 class ObservationStatistics(Part):
     """
-    Feeds the networks' running normalisation (``observation_norm``, whose statistics are the networks') with the
-    observations that are acted on while training, random actions included. The first observation after the
-    environments were reset by ``learn`` and the last one of an episode are not among them, as in SimbaV2's published
-    code, and a batch drawn after a step does not see that step yet. At a reset of the networks the statistics stay.
+    Feeds the networks' running normalisation (``observation_norm``, whose statistics belong to the networks) with the
+    observations that are acted on in training, those with random actions included. The first observation after the
+    environments were reset by ``learn`` and the last one of an episode are excluded, as in SimbaV2's published code,
+    and a batch drawn after a step does not see that step yet. At a reset of the networks the statistics stay.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        # Whether a step was taken before the observations that come.
+        # Whether a step was taken before the next observations.
         self._stepped = False
 
     def on_step(self, learner: Learning, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:

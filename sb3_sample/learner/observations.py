@@ -1,4 +1,4 @@
-"""Observations in the kinds in which callers have them: tensors or arrays, one or a batch, alone or in a dict."""
+"""Observations in the forms that callers pass: tensors or arrays, one or a batch, alone or in a dict."""
 
 from typing import Any
 
@@ -8,11 +8,11 @@ import torch
 
 class Observations:
     """
-    Observations as a batch of tensors, and the way back for the actions that are chosen for them.
+    Observations as a batch of tensors, and the conversion of the chosen actions back to the caller's form.
 
     :param given: tensors or arrays, (B, O) or (O,), or a dict of either
-    :param space: observation space, Gymnasium's
-    :param device: of the tensors that are made of arrays
+    :param space: Gymnasium's observation space
+    :param device: of the tensors
     :raises ValueError: if they have other keys or shapes than the space
     """
 

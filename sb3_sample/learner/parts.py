@@ -3,8 +3,8 @@ Exchangeable parts of an off-policy learner, and the learner's interface to them
 
 A part is a ``torch.nn.Module``, so that its networks, learned numbers and buffers move with the learner's device and
 are saved with it (``state_dict``; numbers that are not tensors go into ``get_extra_state``). The learner
-calls the methods of :class:`Part` at the steps of the environment and at the gradient steps, and those of its own base
-class (``Pessimism.update``, ``Exploration.update``).
+calls the methods of :class:`Part` at the steps of the environment and at the gradient steps, and those of the part's
+own base class (``Pessimism.update``, ``Exploration.update``).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -42,12 +42,12 @@ class Learning(Protocol):
     Interface of the learner to its parts.
 
     ``actor``, ``critic`` and ``critic_target`` are the networks, ``temperature()`` the entropy's weight, a scalar, or
-    (n_tasks,) where each task has its own, ``temperature_of(batch)`` that of transitions,
-    ``head`` gives the meaning of the critics' outputs, ``gamma`` is the discount factor, ``target_entropy`` what the
-    temperature aims at, ``observation_norm`` the networks' running normalisation, None for none. ``n_updates`` counts
-    gradient steps; ``num_transitions`` counts the environments' transitions over the learner's life, of which the first
-    ``learning_starts`` have random actions; ``environment_steps`` the same of each task, where several take a step
-    together.
+    (n_tasks,) where each task has its own, ``temperature_of(batch)`` the temperature of transitions,
+    ``head`` gives the meaning of the critics' outputs, ``gamma`` is the discount factor, ``target_entropy`` the target
+    of the learned temperature, ``observation_norm`` the networks' running normalisation, None for none. ``n_updates``
+    counts gradient steps; ``num_transitions`` counts the environments' transitions over the learner's life, of which
+    the first ``learning_starts`` have random actions; ``environment_steps`` counts the same for each task, if several
+    tasks take a step together.
     """
 
     @property
@@ -117,25 +117,25 @@ class Learning(Protocol):
 
     def encoded(self, observations: Any) -> Any:
         """
-        Encode observations once for actors and critics, where they share an encoder.
+        Encode observations once for actors and critics, if they share an encoder.
 
         :param observations: (B, O), or a dict of them
-        :return: what actors and critics take in their place, without gradient to the encoder; the observations
-            themselves if nothing is shared
+        :return: input of actors and critics in place of the observations, without gradient to the encoder; the
+            observations themselves if nothing is shared
         """
 
     def make_actor(self) -> Any:
         """
         Make an actor.
 
-        :return: an actor like the learner's, with parameters of its own
+        :return: an actor like the learner's, with its own parameters
         """
 
     def make_value(self) -> Any:
         """
         Make a value network.
 
-        :return: a network of the critics' kind that judges observations alone, (B, O) to (B, 1)
+        :return: a network of the critics' kind that evaluates observations alone, (B, O) to (B, 1)
         """
 
     def actor_value(self, q: torch.Tensor) -> torch.Tensor:
@@ -156,7 +156,7 @@ class Learning(Protocol):
 
     def minimize(self, optimizer: Optimizer, loss: torch.Tensor) -> None:
         """
-        Take one step of an optimizer. Only its own parameters get a gradient, also where the loss depends on others.
+        Take one step of an optimizer. Only its own parameters get a gradient, even if the loss depends on others.
 
         :param optimizer: the optimizer
         :param loss: scalar
@@ -183,20 +183,20 @@ class Learning(Protocol):
         Start every network, optimizer and learned number anew, in place.
 
         :param shrink: share of the old parameters that stays
-        :param keep: what stays as it is, "encoder" for the critics' encoder and that of their targets
+        :param keep: what stays as it is: "encoder" for the critics' encoder and their targets' encoder
         :param to: "fresh" for new parameters, "start" for the first ones
         """
 
 
 def logged(part: nn.Module, method: str, metrics: Any) -> dict[str, torch.Tensor]:
     """
-    Check what a part gives to be logged.
+    Check the metrics of a part.
 
     :param part: the part
-    :param method: its method that gave it
-    :param metrics: what it gave
-    :return: the same
-    :raises ValueError: if it is no dict of scalar tensors
+    :param method: its method that returned them
+    :param metrics: the returned metrics
+    :return: the same metrics
+    :raises ValueError: if they are not a dict of scalar tensors
     """
     if not isinstance(metrics, dict):
         raise ValueError(f"{type(part).__name__}.{method} must return a dict of what to log, not {metrics!r}")
@@ -211,10 +211,10 @@ class Networks(Protocol):
     """
     Actor, critics and their targets, an ``nn.Module``.
 
-    ``actor.optimizer`` and ``critic.optimizer`` are theirs; ``actor_target`` is the actor of the TD targets if it is
-    not the actor itself. ``encodes_once`` and ``encodes_next_once`` say whether observations and next observations are
-    encoded once for the whole gradient step, by ``features``. ``drawn_from`` is the state of torch's generator from
-    which the parameters were drawn.
+    ``actor.optimizer`` and ``critic.optimizer`` are their optimizers; ``actor_target`` is the actor of the TD targets
+    if it is not the actor itself. ``encodes_once`` and ``encodes_next_once`` say whether observations and next
+    observations are encoded once for the whole gradient step, by ``features``. ``drawn_from`` is the state of torch's
+    generator from which the parameters were drawn.
     """
 
     drawn_from: torch.Tensor
@@ -283,17 +283,17 @@ class Part(nn.Module):
 
     def on_environment_reset(self, learner: Learning) -> None:
         """
-        Called when the environments were reset, whose episodes so far have no end in the replay buffer.
+        Called when the environments were reset; their episodes so far have no end in the replay buffer.
 
         :param learner: the learner
         """
 
     def on_observations(self, learner: Learning, observations: Any) -> None:
         """
-        Called before the actions of a step are chosen while training, also where they are random.
+        Called before the actions of a training step are chosen, random actions included.
 
         :param learner: the learner
-        :param observations: that are acted on, arrays or tensors, (n_envs, O), or a dict of them
+        :param observations: observations that are acted on, arrays or tensors, (n_envs, O), or a dict of them
         """
 
     def on_step(self, learner: Learning, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
@@ -311,6 +311,6 @@ class Part(nn.Module):
         Called when an episode ended, after ``on_step``.
 
         :param learner: the learner
-        :param env_index: which environment's episode
+        :param env_index: the environment whose episode ended
         :param episode_return: undiscounted, unnormalised return
         """

@@ -97,7 +97,7 @@ class Pessimism(Part):
 
     def n_further(self, n_held_out: int, n_steps: int) -> int:
         """
-        Count what :meth:`draw` draws, for gradient steps that draw themselves.
+        Count the further transitions of :meth:`draw`, for gradient steps that draw their own batches.
 
         :param n_held_out: transitions of the validation side that a step may draw, 0 while there are fewer
         :param n_steps: steps of every environment in the replay buffer
@@ -114,7 +114,7 @@ class Pessimism(Part):
         extra: Extra | None = None,
     ) -> dict[str, torch.Tensor]:
         """
-        Move the weight; called last in every gradient step, and compiled with it.
+        Update the weight; called last in every gradient step, and compiled with it.
 
         :param learner: the learner, its networks already updated
         :param batch: the step's batch
@@ -132,7 +132,7 @@ class LearnedPessimism(Pessimism):
     VPL are choices of ``loss`` and ``source``, and so are the variants of the VPL paper
     (https://arxiv.org/abs/2403.01014, figures 8 and 9).
 
-    With the lower bound's TD error ``e = Q_mean(s, a) - r - gamma * (V_lb(s'))``, where ``V_lb`` holds beta:
+    With the lower bound's TD error ``e = Q_mean(s, a) - r - gamma * (V_lb(s'))``, where ``V_lb`` contains beta:
 
     - ``loss="squared"`` is VPL's ``mean(e^2)`` (VPL, eq. 12); the gradient goes through the beta of ``V_lb``;
     - ``loss="dual"`` is ``beta * mean(e)`` with the error as a constant (VPL, eq. 6): beta rises where the target
@@ -141,16 +141,16 @@ class LearnedPessimism(Pessimism):
 
     - ``source="replay"`` takes the gradient step's own batch (GPL), and the critics' step's results for it;
     - ``source="validation"`` takes transitions that are held out of training (VPL), ``round(validation_proportion *
-      batch_size)`` of them, at least 1; there is no step before as many are held out;
+      batch_size)`` of them, at least 1; beta takes no step before as many are held out;
     - ``source="recent"`` takes the latest 8 steps of every environment;
     - ``source="on_policy"`` (OPL) takes the latest 8 steps too and replaces the estimate ``Q_mean`` by the
       TD(0.95) return of the recorded steps; see :meth:`lambda_returns`.
 
-    Left open by the papers and decided here: the bootstrap ``V_lb`` is that of the TD target, of the target critics and
-    a fresh action of the actor, with its entropy bonus, since beta corrects the bias of that value; with
-    ``target_subset`` it is that of the critics of the step's own target, for every source. ``Q_mean(s, a)`` is of all
-    online critics, which are trained towards it. The error on the batch of replay is that of the values from before the
-    step, which need no further computation. Quantiles are averaged after the spread over critics is taken.
+    Left open by the papers and decided here: the bootstrap ``V_lb`` is the TD target's, from the target critics and a
+    fresh action of the actor, with its entropy bonus, since beta corrects the bias of that value; with
+    ``target_subset`` it comes from the critics of the step's own target, for every source. ``Q_mean(s, a)`` is the mean
+    of all online critics, which are trained towards that target. The error on the batch of replay uses the values from
+    before the step, which need no further computation. Quantiles are averaged after the spread over critics is taken.
 
     At a reset beta and its optimizer start anew, as every learned number does.
 
@@ -192,9 +192,9 @@ class LearnedPessimism(Pessimism):
         self.loss, self.source = loss, source
         self.segment_length, self.td_lambda = segment_length, td_lambda
         self.weight = nn.Parameter(torch.tensor(float(initial_pessimism)))
-        # Its learning rate is its own, whatever the schedule of the others.
+        # Its learning rate does not follow the schedule of the others.
         self.optimizer = AdamW([{"params": [self.weight], "scheduled": False}], lr=learning_rate)
-        # Steps of every environment since the actor acts (and since a reset made it a new one).
+        # Steps of every environment since the actor began to act (or since a reset renewed it).
         self._n_steps = 0
 
     def optimizers(self) -> dict[str, Optimizer]:
@@ -235,7 +235,7 @@ class LearnedPessimism(Pessimism):
 
     def n_further(self, n_held_out: int, n_steps: int) -> int:
         """
-        Count what :meth:`draw` draws, for gradient steps that draw themselves.
+        Count the further transitions of :meth:`draw`, for gradient steps that draw their own batches.
 
         :param n_held_out: transitions of the validation side that a step may draw, 0 while there are fewer
         :param n_steps: steps of every environment in the replay buffer
@@ -278,7 +278,7 @@ class LearnedPessimism(Pessimism):
         :return: error of the lower bound on transitions other than the step's, (B,), its gradient through beta
         """
         batch = extra.batch
-        # The spread of the critics that beta is applied to: that of a few of them is not that of all.
+        # The spread is that of the critics to which beta is applied: a subset's differs from that of all critics.
         judged = self._judge(learner, batch, noise, subset)
         if self.source != "on_policy":
             return self._td_error(batch, judged)
@@ -299,7 +299,7 @@ class LearnedPessimism(Pessimism):
     def _judge(
         learner: Learning, batch: Batch, noise: torch.Tensor | None, subset: torch.Tensor | None = None
     ) -> CriticStep:
-        """Compute what the critics' step computes, on other transitions."""
+        """Compute the results of the critics' step on other transitions."""
         with torch.no_grad():
             next_q, entropy_bonus = bootstrap(learner, batch, learner.temperature_of(batch), noise, subset)
             q = values(learner, learner.critic, batch.observations, batch.actions)
@@ -362,8 +362,8 @@ class TOP(Pessimism):
     has none. One arm is in force for all environments. Once each of them has ended an episode under it, the bandit
     learns and draws anew; a second episode of a fast environment counts as well.
 
-    The papers' learning rate is for raw returns, up to 1000 an episode, with which the bandit decides quickly. Where
-    returns are larger, make it smaller.
+    The papers' learning rate is for raw returns, up to 1000 an episode, with which the bandit decides quickly. Lower it
+    for larger returns.
 
     At a reset the bandit starts anew too, so that the drop of the return does not count against the arm in force.
 
@@ -373,7 +373,7 @@ class TOP(Pessimism):
     :raises ValueError: if an argument is out of range
     """
 
-    #: Least probability that an arm's feedback is divided by.
+    #: Smallest probability by which an arm's feedback is divided.
     MIN_PROBABILITY = 1e-3
 
     weight: torch.Tensor
@@ -388,7 +388,7 @@ class TOP(Pessimism):
         super().__init__(arms[0])
         self.arms = tuple(float(beta) for beta in arms)
         self.learning_rate = learning_rate
-        #: The bandit, on the host, where it lives.
+        #: The bandit's weights, kept on the host.
         self.log_weights = [0.0] * len(self.arms)
         self.arm = 0
         self.register_buffer("weight", torch.tensor(0.0), persistent=False)
@@ -401,7 +401,7 @@ class TOP(Pessimism):
         """
         Compute the bandit's distribution.
 
-        :return: each arm's probability to be drawn
+        :return: each arm's probability of being drawn
         """
         top = max(self.log_weights)
         weights = [math.exp(w - top) for w in self.log_weights]
@@ -418,7 +418,7 @@ class TOP(Pessimism):
 
     def on_step(self, learner: Learning, rewards: Any, dones: Any, infos: list[dict[str, Any]]) -> None:
         for index in np.flatnonzero(dones):
-            # That of a worker that has died is none.
+            # An episode whose worker has died has no return.
             if "episode" not in infos[index] and "worker_died" not in infos[index]:
                 raise ValueError(
                     f"TOP learns from episodic returns, and environment {index} reports none: wrap it in "

@@ -30,18 +30,18 @@ class Resets(Part):
     parameter becomes ``shrink * old + (1 - shrink) * fresh``, target networks and learned numbers (on the scale on
     which they are learned, that of the logarithm for a temperature) included; the optimizers start anew.
 
-    A step counts transitions over the model's life, of each task where several take a step together, warm-up included
-    and independent of ``num_timesteps``, which ``learn`` zeroes; the reset happens at the first update at or after it.
-    The step reached is saved with the model, so that a loaded one does not reset again.
+    Steps are counted in transitions over the model's life (for each task, if several tasks take a step together), with
+    the warm-up and independently of ``num_timesteps``, which ``learn`` sets to zero; the reset happens at the first
+    update at or after the step. The step reached is saved with the model, so that a loaded one does not reset again.
 
     With ``gradient_steps`` the resets are counted in gradient steps instead, over the model's life too (D'Oro et al.
-    2022: every 2,560,000). After each such number of them the reset comes before the next one is taken, so that
+    2022: every 2,560,000). The reset comes just before the gradient step that follows each such number of them, so that
     networks that have learned nothing neither act nor are saved.
 
-    New parameters are drawn, or with ``to="start"``, as in BRO's published code, the run's first ones again, from the
-    states of torch's generator that they came from, which are saved with the model.
+    New parameters are drawn; with ``to="start"``, as in BRO's published code, the run's first parameters are drawn
+    again, from the states of torch's generator that they came from, which are saved with the model.
 
-    :param steps: transitions at which to reset, above 0, strictly ascending; an integer for every so many; none by
+    :param steps: transitions at which to reset, above 0, strictly ascending; an integer: a reset every so many; none by
         default
     :param shrink: share of the old parameters that stays, in [0, 1)
     :param gradient_steps: gradient steps between two resets; None for none
@@ -69,8 +69,8 @@ class Resets(Part):
                 f"{gradient_steps!r}"
             )
         self.shrink, self.gradient_steps, self.keep, self.returns_to = shrink, gradient_steps, tuple(keep), to
-        #: By the part of the learner, the state of torch's generator from which it was first drawn; None if it draws
-        #: nothing.
+        #: State of torch's generator from which each part of the learner was first drawn, by the part's name; None if
+        #: it draws nothing.
         self.starts: dict[str, torch.Tensor | None] = {}
         self.period: int | None = None
         self.steps: tuple[int, ...] = ()
@@ -102,7 +102,7 @@ class Resets(Part):
 
     def before_gradient_steps(self, learner: Learning, n: int) -> int:
         """
-        Reset now, if one is due by the gradient steps taken.
+        Reset now, if a reset is due after the gradient steps taken so far.
 
         :param learner: the learner
         :param n: gradient steps that are to be taken, at least 1
@@ -117,7 +117,7 @@ class Resets(Part):
 
     def first(self, name: str, make: Callable[[], T]) -> T:
         """
-        :param name: of a part of the learner
+        :param name: name of a part of the learner
         :param make: makes it
         :return: the part that the run begins with
         """
@@ -128,7 +128,7 @@ class Resets(Part):
 
     def again(self, name: str, make: Callable[[], T], to: str) -> T:
         """
-        :param name: of a part of the learner
+        :param name: name of a part of the learner
         :param make: makes it
         :param to: "fresh" or "start"
         :return: the part that a reset begins with
@@ -165,7 +165,7 @@ class ReDo(Part):
     """
     Recycling of dormant neurons (Sokar et al. 2023, algorithm 1) in the critics: every ``period`` gradient steps,
     hidden neurons whose score on a batch is at most ``threshold`` get fresh incoming and zero outgoing weights. The
-    score is the mean absolute activation over that of the layer's average neuron, each critic by itself.
+    score is the mean absolute activation divided by that of the layer's average neuron, for each critic separately.
 
     The targets keep their weights and follow by Polyak averaging, as after any other step.
 
@@ -189,7 +189,7 @@ class ReDo(Part):
         Check that there is something to recycle.
 
         :param learner: the learner, its networks built
-        :raises ValueError: if the critics' network names no neurons that can be
+        :raises ValueError: if the critics' network lists no neurons that can be recycled
         """
         trunk = learner.critic.trunk
         if all(units.outgoing is None for units in trunk.hidden_units(learner.critic.head)):

@@ -49,8 +49,8 @@ class QValues(tuple[torch.Tensor, ...]):
 
 def evaluate(critics: Callable[..., Any], observations: Any, actions: torch.Tensor) -> torch.Tensor:
     """
-    Values of critics as one tensor, from :class:`QValues` as from a tensor: stand-ins, hooks on the module and networks
-    from outside of this package are called like any other.
+    Values of critics as one tensor, whether they return :class:`QValues` or a tensor: stand-ins, modules with hooks and
+    networks from outside of this package are called like any other.
 
     :param critics: (B, O) and (B, A) to values
     :param observations: (B, O), or a dict of them

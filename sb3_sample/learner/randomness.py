@@ -10,17 +10,17 @@ import torch
 
 def checked_state(state: Any, name: str) -> torch.Tensor:
     """
-    :param state: of torch's generator on the CPU, from a file
-    :param name: whose it is, for the message
-    :return: the same on the CPU
-    :raises ValueError: if it is no such state
+    :param state: state of torch's generator on the CPU, from a file
+    :param name: name of the state, for the message
+    :return: the same state, on the CPU
+    :raises ValueError: if it is not such a state
     """
     try:
         state = state.cpu()
         torch.Generator().set_state(state)
     except (AttributeError, TypeError, RuntimeError) as error:
         raise ValueError(f"{name} cannot be {state!r:.200}: it is no state of torch's generator") from error
-    # Numbers left of those made ahead, and the place of the next one: torch reads past their end if the two disagree.
+    # Count of pre-generated numbers left, and place of the next one: torch reads past their end if the two disagree.
     left, following = state.numpy()[8:12].view(np.int32)[0], state.numpy()[16:24].view(np.int64)[0]
     if following < 0 or left + following > 625:
         raise ValueError(f"{name} is no state of torch's generator: {left} numbers left from place {following} on")

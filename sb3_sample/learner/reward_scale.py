@@ -1,4 +1,4 @@
-"""Rewards divided by a running measure of the return's size: the published rules; and a fixed scale."""
+"""Scaling of rewards: published rules, which divide by a running measure of the return's size, and a fixed scale."""
 
 from abc import abstractmethod
 from typing import Any, ClassVar
@@ -23,21 +23,21 @@ class RewardScale(BatchTransform):
     :param learner: the learner
     """
 
-    #: Whether the scale follows from steps in an environment, so that there is none without them.
+    #: Whether the scale is computed from steps in an environment, and does not exist without them.
     needs_steps: ClassVar[bool] = True
     #: Added to the rewards after the division.
     shift: float = 0.0
 
     @property
     def waits_for_data(self) -> bool:
-        """Whether the scale is still to follow from a data set."""
+        """Whether the scale is yet to be computed from a data set."""
         return False
 
     def on_dataset(self, return_range: float) -> None:
         """
         Called when learning from a data set begins, if the rule waits for one.
 
-        :param return_range: largest less smallest return of its episodes
+        :param return_range: largest minus smallest return of its episodes
         """
 
     @abstractmethod
@@ -45,7 +45,7 @@ class RewardScale(BatchTransform):
         """
         Look up the divisor.
 
-        :param task: tasks of transitions by their numbers, (B, 1); None where there is one
+        :param task: task numbers of transitions, (B, 1); None if there is one task
         :return: the divisor of their rewards, (B, 1) or a scalar
         """
         raise NotImplementedError
@@ -57,10 +57,10 @@ class RewardScale(BatchTransform):
 
 def task_of(batch: Batch) -> torch.Tensor | None:
     """
-    Look up the tasks of transitions: the column "task", or that of dict observations.
+    Look up the tasks of transitions: the column "task", or the key "task" of dict observations.
 
     :param batch: transitions
-    :return: numbers of tasks, (B, 1); None if they tell none
+    :return: task numbers, (B, 1); None if the transitions have none
     """
     dicts = batch.observations if isinstance(batch.observations, dict) else {}
     task = batch.columns.get("task", dicts.get("task"))
@@ -69,8 +69,8 @@ def task_of(batch: Batch) -> torch.Tensor | None:
 
 class ReturnScale(RewardScale):
     """
-    Base class of the rules by the return so far, ``G <- gamma * (1 - done) * G + r`` of each environment, where
-    ``done`` is a termination or truncation by this very step: the last reward of an episode begins the next one's
+    Base class of the rules that use the return so far, ``G <- gamma * (1 - done) * G + r`` of each environment, where
+    ``done`` is a termination or truncation at this very step: the last reward of an episode begins the next one's
     return, as in the published code. Statistics are of G over steps and environments.
 
     :param learner: the learner
@@ -93,7 +93,7 @@ class ReturnScale(RewardScale):
 
     def feed(self, rewards: np.ndarray, dones: np.ndarray, gamma: float) -> None:
         """
-        Take one step of all environments into the statistics.
+        Add one step of all environments to the statistics.
 
         :param rewards: (n_envs,)
         :param dones: whether each environment's episode ended with this step, (n_envs,)
@@ -123,7 +123,7 @@ class ReturnScale(RewardScale):
 class StdScale(ReturnScale):
     """
     XQC's rule (Palenicek et al. 2026): the divisor is the standard deviation of G plus ``eps``, from population
-    statistics in float64 without start values. Before the first step the rewards are as they are.
+    statistics in float64 without start values. Before the first step the rewards are unchanged.
 
     :param learner: the learner
     :param eps: added to the standard deviation
@@ -143,7 +143,7 @@ class StdOrMaxScale(ReturnScale):
     SimbaV2's rule (Lee et al. 2025): the divisor is the standard deviation of G, or the largest ``|G|`` so far divided
     by ``max_return``, whichever is larger. Statistics in float64; the start values (variance 1) count as 1e-4 samples.
 
-    A step is taken in when the next actions are chosen, so that a batch drawn after it does not see it yet.
+    A step enters the statistics when the next actions are chosen, so that a batch drawn after it does not see it yet.
 
     :param learner: the learner
     :param max_return: bound of the scaled return; None: the largest ``|atom|`` of a categorical head, 5 without one
@@ -152,7 +152,7 @@ class StdOrMaxScale(ReturnScale):
     def __init__(self, learner: Learning, max_return: float | None = None):
         super().__init__(learner, 1e-4, torch.float64)
         self.max_return = _bound(learner, max_return, 5.0)
-        # The latest step's rewards and ends, while they wait.
+        # The latest step's rewards and ends, until they enter the statistics.
         self._waiting: tuple[list[float], list[bool]] | None = None
 
     def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
@@ -182,7 +182,8 @@ class StdOrMaxScale(ReturnScale):
 class Float32Scale(ReturnScale):
     """
     FlashSAC's rule: SimbaV2's with statistics in float32, without start values, and 1e-4 added to the count where it
-    weighs the old variance (1 at the start). G is in float64, its discount in float32. A step is taken in at once.
+    weights the old variance (1 at the start). G is in float64, its discount in float32. A step enters the statistics at
+    once.
 
     :param learner: the learner
     :param max_return: bound of the scaled return; None: the largest ``|atom|`` of a categorical head, 5 without one
@@ -205,17 +206,17 @@ class Float32Scale(ReturnScale):
 class TaskScale(RewardScale):
     """
     BRC's rule (Nauman et al. 2025), by task. The returns of finished episodes, ``G_t = r_t + gamma * G_{t+1}``, are
-    formed backwards; after the last reward of a truncated one (also if it terminated) stands ``mean reward / (1 -
-    gamma)``. With the largest and smallest return of a task ever seen (in float32) the divisor is::
+    computed backwards; the return after the last reward of a truncated episode (even if it terminated) is ``mean reward
+    / (1 - gamma)``. With the largest and smallest return of a task ever seen (in float32) the divisor is::
 
         (max(largest, |smallest|) - alpha * min(target_entropy, 0) / (2 * (1 - gamma))) / max_return
 
-    and at least 1e-8, the temperature alpha being read before the gradient steps that follow an environment step. It is
-    infinite, and the rewards are 0, until the task has finished an episode; learning that begins before that is warned
-    of, once.
+    and at least 1e-8. The temperature alpha is read before the gradient steps that follow an environment step. The
+    divisor is infinite, and the rewards are 0, until the task has finished an episode; a warning comes, once, if
+    learning begins before that.
 
-    The task of an environment's step is that of the dict observation that was acted on, key "task", or its info's
-    "task"; that of a transition the same key, or the batch's column "task". Without either it is 0.
+    The task of an environment's step is read from the key "task" of the dict observation that was acted on, or of the
+    info; the task of a transition from the same key, or from the batch's column "task". Without either it is 0.
 
     :param learner: the learner
     :param n_tasks: number of tasks
@@ -237,7 +238,7 @@ class TaskScale(RewardScale):
         self.register_buffer("smallest", torch.full((n_tasks,), torch.inf))
         self.register_buffer("largest", torch.full((n_tasks,), -torch.inf))
         self.register_buffer("divisors", torch.full((n_tasks,), torch.inf, dtype=torch.float64))
-        # Rewards of each environment's episode so far, and the tasks that their observations told.
+        # Rewards of each environment's episode so far, and the tasks read from their observations.
         self._episodes: list[list[float]] = []
         self._tasks: list[int] = []
         self._has_looked = False
@@ -257,7 +258,7 @@ class TaskScale(RewardScale):
                 episode.clear()
 
     def _take(self, rewards: list[float], truncated: bool, task: int, gamma: float) -> None:
-        """Take in a finished episode."""
+        """Add a finished episode to the statistics."""
         n_tasks = len(self.largest)
         if not 0 <= task < n_tasks:
             raise ValueError(f"the task of an environment must lie in [0, {n_tasks - 1}], by n_tasks, not be {task}")
@@ -273,7 +274,7 @@ class TaskScale(RewardScale):
         self._episodes = []
 
     def before_updates(self, learner: Learning) -> None:
-        if not self._has_looked:  # once: on a GPU the look waits for the device
+        if not self._has_looked:  # once: on a GPU the check waits for the device
             self._has_looked = True
             if n_without := int(self.largest.isinf().sum()):
                 n_tasks = len(self.largest)
@@ -286,7 +287,7 @@ class TaskScale(RewardScale):
             alpha = learner.temperature().double()
         size = torch.maximum(self.largest, self.smallest.abs()).double()
         entropy = alpha * learner.target_entropy / (2 * (1 - learner.gamma))
-        # Only a bonus widens the range of the values: a positive target would turn the sign of small returns.
+        # Only a bonus widens the range of the values: a positive target would flip the sign of small returns.
         entropy = torch.as_tensor(entropy).clamp(max=0)
         self.divisors.copy_(((size - entropy) / self.max_return).clamp(min=1e-8))
 
@@ -301,24 +302,24 @@ class TaskScale(RewardScale):
 
 
 def _bound(learner: Learning, max_return: float | None, otherwise: float) -> float:
-    """Bound of the scaled return: the atoms' largest size unless it is given, a number without atoms."""
+    """Bound of the scaled return: as given, else the largest absolute atom, or ``otherwise`` without atoms."""
     if max_return is not None:
         return float(check_value("max_return", max_return, ABOVE_0))
     head: Any = learner.head
-    # Of costs the support may end at 0 or below.
+    # For costs the support may end at 0 or below.
     return float(max(abs(head.v_min), abs(head.v_max))) if hasattr(head, "v_max") else otherwise
 
 
 class LinearScale(RewardScale):
     """
-    Rewards of offline learning: times a factor, plus a number. Implicit Q-learning (Kostrikov et al. 2021) has -1 added
-    on AntMaze, and on MuJoCo a factor that makes the returns of the data set span 1,000.
+    Linear scale of rewards in offline learning: times a factor, plus a shift. Implicit Q-learning (Kostrikov et al.
+    2021) adds -1 on AntMaze, and on MuJoCo uses a factor that makes the returns of the data set span 1,000.
 
     :param learner: the learner
     :param factor: of the rewards
     :param shift: added to the product
-    :param return_range: largest less smallest return of the data set after scaling, from which the factor follows when
-        the first data set is learned from; None: ``factor``
+    :param return_range: largest minus smallest return of the data set after scaling, which determines the factor when
+        learning from the first data set begins; None: ``factor``
     :raises ValueError: if an argument is out of range, or both ``factor`` and ``return_range`` are given
     """
 
@@ -338,7 +339,7 @@ class LinearScale(RewardScale):
 
     @property
     def waits_for_data(self) -> bool:
-        """Whether the factor is still to follow from a data set."""
+        """Whether the factor is yet to be computed from a data set."""
         return self.return_range is not None and not self.factor.item()
 
     def on_dataset(self, return_range: float) -> None:
@@ -357,7 +358,7 @@ class LinearScale(RewardScale):
         return batch._replace(rewards=batch.rewards * self.factor + self.shift)
 
 
-#: Rules by the name that ``reward_scale`` takes, that of the method which has published it, but for a fixed scale.
+#: Rules by the name that ``reward_scale`` takes: the name of the method that published the rule, or "linear".
 REWARD_SCALES: dict[str, type[RewardScale]] = {
     "brc": TaskScale,
     "flashsac": Float32Scale,

@@ -1,4 +1,4 @@
-"""TD target of the gradient step, of the rules of pessimism and of the diagnostics: the only place where it is made."""
+"""TD target of the gradient step, the rules of pessimism and the diagnostics: the only place where it is computed."""
 
 from typing import Any
 
@@ -38,7 +38,7 @@ def outputs(critics: Any, observations: Any, actions: torch.Tensor) -> torch.Ten
 
 def at_rest(network: Any) -> Any:
     """
-    Take an actor or critics as they are evaluated outside of their own step.
+    Return an actor or critics in the mode in which they are evaluated outside of their own step.
 
     :param network: the actor, or the critics
     :return: their view in evaluation mode, if the modes differ

@@ -10,17 +10,17 @@ from sb3_sample.learner.parts import Learning, Part
 
 class BatchTransform(Part):
     """
-    Base class of transforms. A transform is told of the environment's steps as every part is, holds its
-    statistics in buffers, and is applied before the step to its batch and to the further transitions of a rule of
+    Base class of transforms. Like every part, a transform receives the environment's steps; it holds its statistics in
+    buffers, and is applied before the gradient step to the step's batch and to the further transitions of a rule of
     pessimism.
 
     :param learner: the learner, whose networks exist already
     """
 
-    #: Copies of each transition that it asks for in the TD target, whose mean the target is.
+    #: Copies of each transition that it requires in the TD target, which is the mean over them.
     target_copies: int = 1
-    #: Copies that it asks for in the critics' loss, whose sum the loss is. The critics' step has the copies beneath
-    #: each other (``batch.widened``); all other steps take the first.
+    #: Copies that it requires in the critics' loss, which is the sum over them. In the critics' step the copies lie one
+    #: after the other (``batch.widened``); all other steps take the first.
     online_copies: int = 1
 
     def __init__(self, learner: Learning):

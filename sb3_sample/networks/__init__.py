@@ -1,4 +1,4 @@
-"""Networks that know nothing of reinforcement learning."""
+"""Networks, independent of reinforcement learning."""
 
 from sb3_sample.networks.activations import CReLU
 from sb3_sample.networks.batch_norm import BatchNorm, BatchRenorm

@@ -15,15 +15,15 @@ MOMENTUM = Kind("lie in (0, 1]", lambda value: is_number(value) and 0 < value <=
 class BatchNorm(nn.Module):
     """
     Batch norm over the rows: ``(x - mean) / sqrt(var + eps) * weight + bias``, in training mode with the moments of the
-    batch, through which the gradient goes, in evaluation mode with running ones. A training pass moves those:
-    ``running += momentum * (of the batch - running)``. Each copy of a stack has its own.
+    batch, through which the gradient goes, in evaluation mode with running moments. A training pass updates these:
+    ``running += momentum * (of the batch - running)``. Each copy of a stack has its own moments.
 
     :param n_features: number of features
     :param n_copies: E for E independent ones, None for one
     :param eps: added to the variance
     :param momentum: share of the batch in the running moments, in (0, 1]
-    :param unbiased: whether the batch is normalised by the unbiased variance (over n - 1 of n rows) and not by that
-        over n
+    :param unbiased: whether the batch is normalised by the unbiased variance (divided by n - 1 for n rows) and not by
+        the biased one
     :param running_unbiased: whether the unbiased variance enters the running one; None: as ``unbiased``
     """
 
@@ -84,7 +84,7 @@ class BatchNorm(nn.Module):
             var = var * (n / (n - 1))
         elif self.unbiased and not self.running_unbiased:
             var = var * ((n - 1) / n)
-        # Not in place: torch.vmap, by which many learners are one, has a rule for this form.
+        # Not in place: torch.vmap, which maps the step over many learners, has a rule for this form.
         for running, now in ((self.running_mean, mean), (self.running_var, var)):
             running.copy_(running.lerp(now.detach().to(running.dtype), self.momentum))
 
@@ -94,16 +94,17 @@ class BatchNorm(nn.Module):
 
 class BatchRenorm(BatchNorm):
     """
-    Batch renormalisation (Ioffe 2017) as CrossQ has it: after ``warm_up`` training passes, in which it is batch norm,
-    the batch is normalised so that the result is that of the running moments, as far as these lie within a factor of 3
-    of the batch's standard deviation and 5 standard deviations of its mean. The correction is constant to the gradient.
+    Batch renormalisation (Ioffe 2017) as in CrossQ: batch norm in the first ``warm_up`` training passes; after them the
+    batch is normalised so that the result is that of the running moments, as far as these lie within a factor of 3 of
+    the batch's standard deviation and 5 standard deviations of its mean. The gradient treats the correction as
+    constant.
 
     :param n_features: number of features
     :param n_copies: E for E independent ones, None for one
     :param eps: added to the variance
     :param momentum: share of the batch in the running moments, in (0, 1]
     :param unbiased: whether variances are unbiased
-    :param warm_up: training passes before
+    :param warm_up: number of initial training passes with batch norm
     """
 
     #: Bounds of the ratio of standard deviations (and its inverse), and of the distance of means.
@@ -134,7 +135,7 @@ class BatchRenorm(BatchNorm):
             distance = torch.where(is_warm, distance, 0.0)
             self.n_passes.add_(1)
         self._follow(mean, var, x.shape[-2])
-        # Where a feature is the same in all rows, as of a silent neuron, the root would have an infinite gradient.
+        # Where a feature is the same in all rows, as for a silent neuron, the root would have an infinite gradient.
         is_flat = var == 0
         std = torch.where(is_flat, 0.0, torch.where(is_flat, 1.0, var).sqrt())
         return mean - distance * std / ratio, var / ratio.square()
@@ -144,7 +145,7 @@ def running_moments(module: nn.Module) -> Iterator[tuple[str, torch.Tensor]]:
     """
     Find the buffers of batch norms, torch's own among them: running moments and counts of passes.
 
-    :param module: a network, or whatever has some
+    :param module: a network, or any module that contains batch norms
     :return: the buffers, with the names that they have in the module's state
     """
     for prefix, layer in module.named_modules():

@@ -52,10 +52,10 @@ class BatchNormedMLP(Network):
 
     def hidden_units(self, head: Dense | None) -> list[HiddenUnits]:
         """
-        The neurons are listed to be looked at, not to be recycled: a batch norm stands between them and their readers
-        or, with weights of unit norm, ReDo's fresh ones have another length.
+        The neurons are listed for inspection, not for recycling: a batch norm stands between them and their readers or,
+        with weights of unit norm, ReDo's fresh weights have another length.
 
-        :param head: the layer that reads the network's output; it plays no part here
+        :param head: the layer that reads the network's output; not used here
         :return: every hidden layer, in the order of the forward pass
         """
         layers = zip(self.dense, self.activations, strict=True)
@@ -74,16 +74,16 @@ class CrossQNet(BatchNormedMLP):
     """
     CrossQ's trunk (Bhatt et al. 2024): batch (re)norm of the input, then Dense, activation, batch (re)norm.
 
-    With ``weight_norm`` it is that of CrossQ+WN: weights and bias of each hidden unit have length 1 together, and so
-    have the weights of the units of the output layer; its critics have targets, and the actor's running moments move in
-    gradient steps too in which it does not learn.
+    With ``weight_norm`` it is the trunk of CrossQ+WN: weights and bias of each hidden unit together have length 1, and
+    so do the weights of each unit of the output layer; critics have targets, and the actor's running moments move even
+    in gradient steps in which it does not learn.
 
     :param in_features: width of the input
     :param hidden_sizes: widths of the hidden layers
     :param activation_fn: activation after each hidden layer
     :param weight_norm: whether units have weights of length 1
-    :param renorm_warm_up: training passes of batch norm before it is batch renormalisation; None: batch norm for ever
-    :param unbiased: whether variances are unbiased, as in sb3_contrib, and not over all rows, as in the published code
+    :param renorm_warm_up: training passes of batch norm before batch renormalisation; None: batch norm throughout
+    :param unbiased: whether variances are unbiased, as in sb3_contrib, and not biased, as in the published code
     :param eps: added to the variance
     :param momentum: share of the batch in the running moments, in (0, 1]
     :param n_copies: E for E independent networks, None for one
@@ -132,9 +132,9 @@ class CrossQNet(BatchNormedMLP):
 class XQCNet(BatchNormedMLP):
     """
     XQC's trunk (Palenicek et al. 2026): batch norm of the input, then Dense without bias, batch norm, activation. The
-    units of all dense layers, of the output layer too, have input weights of length 1, which :meth:`project` restores
-    after each step of the optimizer. Critics have targets, in training mode; the actor's running moments move in
-    gradient steps too in which it does not learn.
+    units of all dense layers, the output layer included, have input weights of length 1, which :meth:`project` restores
+    after each step of the optimizer. Critics have targets, in training mode; the actor's running moments move even in
+    gradient steps in which it does not learn.
 
     :param in_features: width of the input
     :param hidden_sizes: widths of the hidden layers

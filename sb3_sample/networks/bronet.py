@@ -32,7 +32,7 @@ class ResidualBlock(nn.Module):
 class BroNet(Network):
     """
     The trunk of BRO's critics and actors: Dense, LayerNorm, ReLU, then residual blocks. The output layer
-    (quantiles, mean, log standard deviation) belongs to whoever uses the trunk.
+    (quantiles, mean, log standard deviation) belongs to the trunk's owner.
 
     :param in_features: width of the input
     :param width: width of every layer
@@ -74,11 +74,11 @@ class BroNet(Network):
 
     def hidden_units(self, head: Dense | None) -> list[HiddenUnits]:
         """
-        The first layer opens the residual stream, which every block and the head read: its neurons are listed to be
-        looked at, not to be recycled (``outgoing`` is None). Those inside a block are read by its second layer alone.
-        The stream after a block is no activation and is not listed.
+        The first layer opens the residual stream, which every block and the head read: its neurons are listed for
+        inspection, not for recycling (``outgoing`` is None). Neurons inside a block are read by its second layer alone.
+        The stream after a block is not an activation and is not listed.
 
-        :param head: the layer that reads the network's output; it plays no part here
+        :param head: the layer that reads the network's output; not used here
         :return: the first layer, then the hidden layer of each block
         """
         units = [HiddenUnits("dense", self.dense, self.norm, self.activation, None)]

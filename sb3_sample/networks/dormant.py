@@ -16,9 +16,9 @@ from sb3_sample.networks.spectral_norm import SpectralNorm
 @torch.no_grad()
 def neuron_scores(trunk: Network, head: Dense | None, x: torch.Tensor) -> dict[str, torch.Tensor]:
     """
-    How active each hidden neuron is (Sokar et al. 2023, equation 1): the mean over the batch of its absolute
-    activation, divided by the mean of that over the neurons of its layer. A neuron is τ-dormant if its score is at
-    most τ. The scores of a layer average 1, or are all 0 if the whole layer is silent. The two halves of a CReLU
+    Score of each hidden neuron's activity (Sokar et al. 2023, equation 1): the mean over the batch of its absolute
+    activation, divided by the average of these means over the neurons of its layer. A neuron is τ-dormant if its score
+    is at most τ. The scores of a layer average 1, or are all 0 if the whole layer is silent. The two halves of a CReLU
     neuron are added up. Dropout is off.
 
     :param trunk: the network
@@ -43,7 +43,7 @@ def neuron_scores(trunk: Network, head: Dense | None, x: torch.Tensor) -> dict[s
 
 
 class _Measure:
-    """A forward hook that writes down the scores of a layer."""
+    """A forward hook that records the scores of a layer."""
 
     def __init__(self, scores: dict[str, torch.Tensor], name: str):
         self.scores, self.name = scores, name
@@ -68,9 +68,9 @@ def recycle(
     again. Each copy has its own dormant neurons.
 
     The incoming weights are columns of a kernel drawn as at initialisation (``HiddenUnits.draw``); the bias is 0, scale
-    and shift of a layer norm 1 and 0. All layers are judged first, and a weight between two dormant neurons ends at 0,
-    as in the published code. The output does move where a layer norm follows, which sees the new neuron among the
-    others, and where a spectral norm is that of a kernel which has changed.
+    and shift of a layer norm 1 and 0. All layers are scored first, and a weight between two dormant neurons ends at 0,
+    as in the published code. The output does change where a layer norm follows, which reads the new neuron with the
+    others, and where the kernel of a spectral norm has changed.
 
     Nothing is copied to the host.
 

@@ -1,7 +1,7 @@
 """
 Layers of which several independent copies are evaluated at once.
 
-The copies are the leading axis E of every parameter, so that E networks cost one batched matmul a layer
+The copies are the leading axis E of every parameter, so that E networks cost one batched matmul per layer
 instead of a Python loop. Nothing couples the copies: copy e of the output depends on copy e of the
 parameters alone.
 """

@@ -11,11 +11,11 @@ from sb3_sample.networks.unit_norm_blocks import UnitNormBlocks
 
 
 class UnitBatchNorm(UnitNorm, BatchNorm):
-    """Batch norm of which scale and shift of all features have the root mean square 1 of one number a feature."""
+    """Batch norm whose scales and shifts together have root mean square 1, counted as one number per feature."""
 
     @torch.no_grad()
     def project(self) -> None:
-        """Bring scale and shift, together, back to the length of as many ones as there are features, in place."""
+        """Bring scale and shift, together, back to the length of a vector of ones, one per feature, in place."""
         square = (self.weight.square() + self.bias.square()).sum(dim=-1, keepdim=True)
         factor = (self.n_features / (square + 1e-8)).sqrt()
         self.weight.mul_(factor)
@@ -45,13 +45,13 @@ class UnitRMSNorm(UnitNorm):
 
     @torch.no_grad()
     def project(self) -> None:
-        """Bring the scale back to the length of as many ones, in place."""
+        """Bring the scale back to the length of a vector of ones, in place."""
         square = self.weight.square().sum(dim=-1, keepdim=True)
         self.weight.mul_((self.n_features / (square + 1e-8)).sqrt())
 
 
 def _norm(width: int, n_copies: int | None) -> UnitBatchNorm:
-    # Normalised by the variance over all rows, while the unbiased one is remembered, as torch's own does.
+    # Normalises by the biased variance, while the running variance is unbiased, as in torch's own batch norm.
     return UnitBatchNorm(width, n_copies, eps=1e-5, momentum=0.01, running_unbiased=True)
 
 
@@ -85,10 +85,10 @@ class FlashBlock(nn.Module):
 class FlashNet(UnitNormBlocks):
     """
     FlashSAC's trunk (Holiday Robot 2026): batch norm of the input, a dense layer, residual blocks with inverted
-    bottlenecks and batch norm, and an RMS norm. No biases but the head's. The units of all dense layers, of the head
-    too, have input weights of length 1, scale and shift of each norm a fixed length; :meth:`project` restores both
-    after each step of the optimizer. Critics have targets, in training mode; actors learn with current and next rows
-    stacked, as critics do.
+    bottlenecks and batch norm, and an RMS norm. No biases but the head's. The units of all dense layers, the head
+    included, have input weights of length 1, and scale and shift of each norm have a fixed length; :meth:`project`
+    restores both after each step of the optimizer. Critics have targets, in training mode; actors learn with current
+    and next rows stacked, as critics do.
 
     :param in_features: width of the input
     :param width: width of the stream

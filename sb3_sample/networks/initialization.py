@@ -45,10 +45,10 @@ def init_orthogonal(layer: Dense, gain: float = DEFAULT_GAIN) -> None:
 
 def draw_he_normal(weight: torch.Tensor, fan_in: int) -> torch.Tensor:
     """
-    Draw kernels from a normal distribution of variance 2 / fan-in, truncated at two standard deviations (of which the
-    variance is what is left), in place.
+    Draw kernels from a normal distribution truncated at two standard deviations, whose variance after truncation is
+    2 / fan-in, in place.
 
-    :param weight: kernel, or a stack of some
+    :param weight: kernel, or a stack of kernels
     :param fan_in: inputs of the layer
     :return: the same tensor
     """
@@ -88,7 +88,8 @@ def linear(
     :param bias: whether the layer has a bias
     :param gain: factor on the orthogonal kernel
     :param spectral_norm: whether the kernel is divided by its largest singular value, which undoes the gain
-    :param unit_norm: whether each unit's input weights have length 1, which ``project`` restores; not with the former
+    :param unit_norm: whether each unit's input weights have length 1, which ``project`` restores; not with
+        ``spectral_norm``
     :param he_normal: whether the kernel is He-normal instead, without the gain
     """
     layer: Dense

@@ -15,8 +15,8 @@ from sb3_sample.networks.network import HiddenUnits, Network
 
 class MLP(Network):
     """
-    Hidden layers of an MLP; the output layer belongs to whoever uses them. A hidden layer is Dense, dropout, layer
-    norm, activation; the last kernel may have spectral norm 1 (regularization study, 2403.00514, appendix B).
+    Hidden layers of an MLP; the output layer belongs to their owner. A hidden layer is Dense, dropout, layer norm,
+    activation; the last kernel may have spectral norm 1 (regularization study, 2403.00514, appendix B).
 
     :param in_features: width of the input
     :param hidden_sizes: widths of the hidden layers

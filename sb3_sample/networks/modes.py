@@ -9,11 +9,11 @@ from torch import nn
 def evaluated(module: nn.Module) -> Any:
     """
     Make a view of a module that stays in evaluation mode, whatever the mode of the module: running statistics are read
-    and not moved, dropout is off. Parameters and buffers are the module's own, also after it was moved to a device,
+    but not updated, dropout is off. Parameters and buffers are the module's own, even after it was moved to a device,
     loaded or copied together with its view. A scripted module, which has one mode, is its own view.
 
     :param module: the module
-    :return: a module of the same class; to be held where it is not registered
+    :return: a module of the same class; hold it where it is not registered as a submodule
     """
     views: dict[int, nn.Module] = {}
 
@@ -33,15 +33,15 @@ def evaluated(module: nn.Module) -> Any:
 
 class ModeSwitch:
     """
-    Training and evaluation mode of modules and all that is in them, without the detours of
+    Switch of modules and all their submodules between training and evaluation mode, without the overhead of
     ``nn.Module.train``, which takes as long as a small network's forward pass.
 
-    :param roots: the modules; what they hold must not change afterwards
+    :param roots: the modules; their submodules must not change afterwards
     """
 
     def __init__(self, *roots: nn.Module):
-        # A module with a train of its own is asked (one that keeps its batch norm in evaluation mode, say), and so is
-        # one whose attributes are not Python's.
+        # ``train`` is called on a module that overrides it (to keep its batch norm in evaluation mode, say), and on one
+        # whose attributes are not Python's.
         def is_special(m: nn.Module) -> bool:
             return type(m).train is not nn.Module.train or isinstance(m, torch.jit.ScriptModule)
 
@@ -53,7 +53,7 @@ class ModeSwitch:
         :param mode: training (True) or evaluation mode
         """
         for module in self._plain:
-            # The effect of nn.Module's own setattr on this attribute, without its search for much else.
+            # Same effect as nn.Module's own setattr on this attribute, without its lookups.
             module.__dict__["training"] = mode
         for root in self._own:
             root.train(mode)

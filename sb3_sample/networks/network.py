@@ -32,28 +32,28 @@ class HiddenUnits(NamedTuple):
 
 class Network(nn.Module):
     """
-    Base class of trunks, the networks of actors and critics up to the output layer, which belongs to whoever uses them.
+    Base class of trunks, the networks of actors and critics up to the output layer, which belongs to the trunk's owner.
 
     A trunk is made as ``Trunk(in_features, n_copies=E, **kwargs)``: for E independent critics it takes (B, in_features)
-    and gives (E, B, out_features), for an actor (``n_copies=None``) it gives (B, out_features).
+    and returns (E, B, out_features), for an actor (``n_copies=None``) it returns (B, out_features).
     """
 
     #: Width of the last layer.
     out_features: int
-    #: Whether it can be compiled. A class from outside of this package says so itself.
+    #: Whether it can be compiled. A class from outside of this package declares it itself.
     compilable: ClassVar[bool] = True
-    #: Whether the copy of it in the target critics is in training mode during gradient steps, as dropout needs (DroQ).
-    #: Batch norm is not: False has the targets use the running statistics.
+    #: Whether its copy in the target critics is in training mode during gradient steps, as dropout needs (DroQ). Batch
+    #: norm does not need it: with False the targets use the running statistics.
     trains_in_target: bool = True
     #: Whether the critics' step stacks the current and the next rows for one forward pass of 2B rows, so that batch
-    #: statistics are of both: "online" takes the next values from that pass (CrossQ, Bhatt et al. 2024, which has no
-    #: targets), "target" from the target critics' own pass over the same rows; None: a pass each. Where rows are
-    #: stacked, everything else (actors' objectives, rules of pessimism, TD targets' actions) sees the network in
+    #: statistics cover both: "online" takes the next values from that pass (CrossQ, Bhatt et al. 2024, which has no
+    #: targets), "target" from the target critics' own pass over the same rows; None: separate passes. Where rows are
+    #: stacked, everything else (actors' objectives, rules of pessimism, TD targets' actions) uses the network in
     #: evaluation mode, so that running statistics are those of the stacked rows alone.
     stacks_rows: str | None = None
-    #: Whether an actor's own step stacks the current and the next rows too, of which the current ones are learned from.
+    #: Whether an actor's own step stacks the current and the next rows too; it learns from the current ones alone.
     stacks_actor_rows: bool = False
-    #: Whether an actor's running statistics move in every gradient step, also where ``policy_delay`` has it not learn.
+    #: Whether an actor's running statistics move in every gradient step, even if it does not learn by ``policy_delay``.
     statistics_every_step: bool = False
 
     #: Gain of the output layer's kernel, unless its owner asks for another.
@@ -87,26 +87,26 @@ class Network(nn.Module):
 
     def project(self) -> None:
         """
-        Called after every step of the optimizer: bring weights back to where they belong, in place. Dense layers of
-        unit norm in the head are projected by its owner.
+        Project the weights back onto their constraints, in place; called after every step of the optimizer. Dense
+        layers of unit norm in the head are projected by its owner.
         """
 
     def refresh(self) -> None:
-        """Called after weights were overwritten, as at a shrink and perturb: compute anew what follows from them."""
+        """Recompute what is derived from the weights; called after they were overwritten, as by shrink and perturb."""
         for layer in self.modules():
             if isinstance(layer, SpectralNorm):
                 layer.find_direction()
 
     def copied_parameters(self) -> list[nn.Parameter]:
         """
-        :return: the parameters that each copy has of its own, (E, ...) each; here all
+        :return: the parameters that are separate for each copy, (E, ...) each; here all
         """
         return list(self.parameters())
 
     def follow_directions(self) -> None:
         """
-        Have the directions of spectral norms follow the weights by one power iteration, where no forward pass does: in
-        a target that is never in training mode.
+        Update the directions of spectral norms by one power iteration where no forward pass does so: in a target that
+        is never in training mode.
         """
         for layer in self.modules():
             if isinstance(layer, SpectralNorm) and not layer.training:
@@ -114,7 +114,7 @@ class Network(nn.Module):
 
     def statistics(self) -> list[torch.Tensor]:
         """
-        :return: running statistics that a target takes over whole; here all buffers but the directions of spectral
+        :return: running statistics that a target copies unchanged; here all buffers but the directions of spectral
             norms, which follow the target's own weights
         """
         layers = [layer for layer in self.modules() if not isinstance(layer, SpectralNorm)]
@@ -123,13 +123,13 @@ class Network(nn.Module):
 
 def widened(network: type[Network], kwargs: Mapping[str, Any], factor: int) -> dict[str, Any]:
     """
-    Arguments of a network that is wider.
+    Compute the arguments of a wider network.
 
     :param network: its class, whose width is its argument "width" or "hidden_sizes"
     :param kwargs: its arguments
-    :param factor: by which every hidden layer is wider
+    :param factor: factor on the width of every hidden layer
     :return: the same arguments with other widths
-    :raises ValueError: if it has neither of the two
+    :raises ValueError: if it has neither of the two arguments
     """
     if factor == 1:
         return dict(kwargs)

@@ -1,4 +1,4 @@
-"""Running mean and variance of what a network reads."""
+"""Running mean and variance of a network's inputs."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from torch import nn
 
 class RunningMoments(nn.Module):
     """
-    Running mean and population variance, by the parallel formula (Chan et al. 1979) from batches.
+    Running mean and population variance, updated from batches by the parallel formula (Chan et al. 1979).
 
     :param shape: of one value
     :param count: weight of the start values, in samples
@@ -30,8 +30,8 @@ class RunningMoments(nn.Module):
         """
         Add samples.
 
-        :param values: (n, ...), n of them
-        :param more_count: added to the count where it weighs the old variance
+        :param values: n samples, (n, ...)
+        :param more_count: added to the count where it weights the old variance
         """
         values = values.to(self.mean.dtype)
         n, count = len(values), self.count
@@ -45,7 +45,7 @@ class RunningMoments(nn.Module):
 
 class RunningNorm(RunningMoments):
     """
-    Observation less its running mean, divided by the root of its running variance, not clipped (SimbaV2's published
+    Observation minus its running mean, divided by the root of its running variance, not clipped (SimbaV2's published
     code; statistics in float64, whose start values, mean 0 and variance 1, count as 1e-4 samples).
 
     :param shape: of an observation

@@ -1,4 +1,4 @@
-"""Multi-layer perceptron of MR.Q and DR.Q, whose layer norms have nothing to learn."""
+"""Multi-layer perceptron of MR.Q and DR.Q, whose layer norms have no parameters."""
 
 import functools
 import itertools
@@ -18,7 +18,7 @@ def draw_xavier(weight: torch.Tensor, fans: int) -> torch.Tensor:
     """
     Draw kernels from Xavier's uniform distribution, gain √2, in place.
 
-    :param weight: kernel, or a stack of some
+    :param weight: kernel, or a stack of kernels
     :param fans: inputs and outputs of the layer together
     :return: the same tensor
     """
@@ -47,8 +47,7 @@ def xavier_linear(in_features: int, out_features: int, n_copies: int | None = No
 
 class NormedMLP(Network):
     """
-    Hidden layers, each Dense, layer norm without scale and shift, activation; the output layer belongs to whoever uses
-    them.
+    Hidden layers, each Dense, layer norm without scale and shift, activation; the output layer belongs to their owner.
 
     :param in_features: width of the input
     :param hidden_sizes: widths of the hidden layers

@@ -14,12 +14,12 @@ from sb3_sample.networks.network import HiddenUnits, Network
 class Projected(Network):
     """
     Dense layer, layer norm and tanh on the features of an encoder (DrQ; SAC-AE, Yarats et al. 2021), and a network on
-    their result and whatever comes beside the features. The projection is one for all copies of the network.
+    their result and the inputs beside the features. All copies of the network share one projection.
 
-    :param in_features: F and what comes beside the features
-    :param n_features: F, the first of the inputs
+    :param in_features: F plus the number of inputs beside the features
+    :param n_features: F, number of features, which come first among the inputs
     :param width: of the projection
-    :param network: class of the network behind it
+    :param network: class of the network behind the projection
     :param network_kwargs: its arguments
     :param gain: of the projection's orthogonal kernel
     :param n_copies: E for E copies of the network, None for one
@@ -42,7 +42,7 @@ class Projected(Network):
         self.projection = nn.Sequential(linear(n_features, width, None, gain=gain), nn.LayerNorm(width), nn.Tanh())
         self.network = network(in_features - n_features + width, n_copies=n_copies, **network_kwargs)
         self.out_features = self.network.out_features
-        # Requests of the network to its owner.
+        # What the network requires of its owner.
         self.trains_in_target = self.network.trains_in_target
         self.stacks_rows, self.stacks_actor_rows = self.network.stacks_rows, self.network.stacks_actor_rows
         self.statistics_every_step = self.network.statistics_every_step
@@ -75,12 +75,12 @@ class Projected(Network):
 
     def statistics(self) -> list[torch.Tensor]:
         """
-        :return: those of the network
+        :return: the statistics of the network
         """
         return self.network.statistics()
 
     def copied_parameters(self) -> list[nn.Parameter]:
         """
-        :return: the parameters that each copy has of its own
+        :return: the parameters that are separate for each copy
         """
         return self.network.copied_parameters()

@@ -32,9 +32,8 @@ class SimbaBlock(nn.Module):
 
 class SimbaNet(Network):
     """
-    SimBa's trunk: Dense, residual blocks with the layer norm at their beginning and an inverted bottleneck, and a layer
-    norm at the end. The output layer belongs to whoever uses the trunk; its kernel and that of the first layer are
-    orthogonal of gain 1.
+    SimBa's trunk: Dense, residual blocks with a leading layer norm and an inverted bottleneck, and a final layer norm.
+    The output layer belongs to the trunk's owner; its kernel and the first layer's are orthogonal of gain 1.
 
     :param in_features: width of the input
     :param width: width of the residual stream
@@ -72,7 +71,7 @@ class SimbaNet(Network):
 
     def hidden_units(self, head: Dense | None) -> list[HiddenUnits]:
         """
-        :param head: the layer that reads the network's output; it plays no part here
+        :param head: the layer that reads the network's output; not used here
         :return: the hidden layer of each block, which its second layer alone reads
         """
         units = []

@@ -48,8 +48,8 @@ def _dense(in_features: int, out_features: int, n_copies: int | None, bias: bool
 
 class HyperBlock(nn.Module):
     """
-    ``h`` on the sphere from an inverted bottleneck of ``x``, and the interpolation ``x + alpha * (h - x)`` of both on
-    the sphere.
+    Inverted bottleneck of ``x``, projected onto the sphere as ``h``, and the interpolation ``x + alpha * (h - x)``,
+    projected onto the sphere.
 
     :param width: width of input and output
     :param expansion: hidden neurons per input
@@ -67,7 +67,7 @@ class HyperBlock(nn.Module):
         self.alpha = Scaler(width, 1 / (n_blocks + 1), 1 / math.sqrt(width), n_copies)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        # The small number gives a unit that is off on the whole batch a gradient, as in the published code.
+        # The small constant gives a gradient to a unit that is off on the whole batch, as in the published code.
         h = on_sphere(self.dense2(self.activation(self.scaler(self.dense1(x))) + 1e-8))
         return on_sphere(x + self.alpha(h - x))
 
@@ -93,9 +93,10 @@ class HyperHead(nn.Module):
 
 class SimbaV2Net(UnitNormBlocks):
     """
-    SimbaV2's trunk: the input with a constant appended, on the sphere; a dense layer and a scaler, on the sphere;
-    blocks that move on it. The units of every dense layer have input weights of length 1, which :meth:`project`
-    restores after each step of the optimizer; those of the network's own head too. No biases but the head's.
+    SimbaV2's trunk: the input with an appended constant, projected onto the sphere; a dense layer and a scaler,
+    projected onto the sphere; blocks that move on it. The units of every dense layer, the network's own head included,
+    have input weights of length 1, which :meth:`project` restores after each step of the optimizer. No biases but the
+    head's.
 
     :param in_features: width of the input
     :param width: width of the stream

@@ -30,7 +30,7 @@ class SpectralBlock(nn.Module):
 class SpectralNet(Network):
     """
     "Spectral" of the BRO paper, figure 14 and table 1, the design of Bjorck et al. (2021): Dense, ReLU, then residual
-    blocks with the layer norm at their beginning and spectral norms inside.
+    blocks with a leading layer norm and spectral norms inside.
 
     The paper does not say what follows the first Dense. There is a ReLU and no norm here, since the paper gets its "BRO
     wo first LN" from this network by replacing the spectral norms "in the residual blocks": outside of the blocks the
@@ -67,7 +67,7 @@ class SpectralNet(Network):
         As in BroNet: the first layer's neurons are listed but cannot be recycled (``outgoing`` is None), since the
         residual stream that they open has many readers.
 
-        :param head: the layer that reads the network's output; it plays no part here
+        :param head: the layer that reads the network's output; not used here
         :return: the first layer, then the hidden layer of each block
         """
         units = [HiddenUnits("dense", self.dense, None, self.activation, None)]

@@ -13,8 +13,8 @@ class SpectralNorm(nn.Module):
 
     The largest singular value is ``sigma = u' weight v``. Its vectors u and v follow the kernel by one power iteration
     at each forward pass in training mode; in evaluation mode they stay. They are buffers, saved with the layer, and
-    constants to the gradient. A network whose weights follow another's (a target) follows with its own vectors: those
-    that are in training mode in their forward passes, others by ``Network.follow_directions``.
+    constants to the gradient. A network whose weights follow another's (a target) updates its own vectors: in its
+    forward passes if it is in training mode, else by ``Network.follow_directions``.
     """
 
     weight: torch.Tensor
@@ -30,7 +30,7 @@ class SpectralNorm(nn.Module):
     @torch.no_grad()
     def find_direction(self, n_iterations: int = 15) -> None:
         """
-        Power iterations, after the kernel has been changed at once.
+        Run power iterations, after an abrupt change of the kernel.
 
         :param n_iterations: how many
         """
@@ -43,7 +43,7 @@ class SpectralNorm(nn.Module):
 
     def normalized_weight(self) -> torch.Tensor:
         """
-        :return: the kernel of spectral norm 1, of the weight's shape; a kernel of zeros stays one
+        :return: the kernel of spectral norm 1, of the weight's shape; a kernel of zeros stays zero
         """
         if self.training:
             self.find_direction(1)
@@ -55,7 +55,7 @@ class SpectralNorm(nn.Module):
 
 
 def _direction(x: torch.Tensor, otherwise: torch.Tensor) -> torch.Tensor:
-    """Vectors of length 1; one of length 0 gives way to the other, since it would never leave 0."""
+    """Vectors of length 1; ``otherwise`` in place of a vector of length 0, which would stay 0 for ever."""
     length = torch.linalg.vector_norm(x, dim=-1, keepdim=True)
     return torch.where(length > 0, x / length, otherwise)
 

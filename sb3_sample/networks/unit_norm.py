@@ -8,8 +8,8 @@ from sb3_sample.networks.ensemble import EnsembleLinear
 
 class UnitNorm(nn.Module):
     """
-    Addition to a dense layer: :meth:`project` divides the input weights of each unit by their length, per copy. Forward
-    passes do not, so that whoever changes the weights has to project them.
+    Mixin of a dense layer: :meth:`project` divides the input weights of each unit by their length, per copy. Forward
+    passes do not, so that code which changes the weights must project them.
     """
 
     weight: torch.Tensor

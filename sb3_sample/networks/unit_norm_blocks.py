@@ -8,7 +8,7 @@ from sb3_sample.networks.unit_norm import project_weights
 
 
 class UnitNormBlocks(Network):
-    """Base class: ``blocks``, each with a hidden layer ``dense1`` and its ``activation``, of layers of unit norm."""
+    """Base class: ``blocks`` of unit-norm layers, each with a hidden layer ``dense1`` and its ``activation``."""
 
     blocks: Any
 
@@ -17,9 +17,9 @@ class UnitNormBlocks(Network):
 
     def hidden_units(self, head: Dense | None) -> list[HiddenUnits]:
         """
-        List the neurons to be looked at, not to be recycled: fresh weights of ReDo's have another length.
+        List the neurons for inspection, not for recycling: ReDo's fresh weights have another length.
 
-        :param head: the layer that reads the network's output; it plays no part here
+        :param head: the layer that reads the network's output; not used here
         :return: the hidden layer of each block
         """
         return [

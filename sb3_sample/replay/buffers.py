@@ -37,8 +37,8 @@ class ValidationSplit(HasColumns):
 
     Nothing is stored twice: the split is a mask, and a list of the places that it marks.
 
-    :param args: as of the buffer that it is mixed into, which calls ``_replacing`` and ``_restored``
-    :param kwargs: as of that buffer
+    :param args: as in the buffer that it is mixed into, which calls ``_replacing`` and ``_restored``
+    :param kwargs: as in that buffer
     :param validation_proportion: probability of the validation side, in (0, 1)
     """
 
@@ -100,7 +100,7 @@ class ValidationSplit(HasColumns):
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
         """
-        Training transitions, uniformly with replacement.
+        Draw training transitions, uniformly with replacement.
 
         :param batch_size: how many
         :param env: normalises observations and rewards
@@ -133,7 +133,7 @@ class ValidationSplit(HasColumns):
 
     def sample_validation(self, batch_size: int, env: VecNormalize | None = None) -> Any:
         """
-        Transitions held out, uniformly with replacement.
+        Draw held-out transitions, uniformly with replacement.
 
         :param batch_size: how many
         :param env: normalises observations and rewards
@@ -183,12 +183,13 @@ class DeviceReplayBuffer(HasColumns, ReplayBuffer):
     Replay buffer in the memory of the model's device: each transition is moved once, when it is stored, and batches
     are gathered where they are needed. For a GPU; on a CPU it is the plain buffer with other arrays.
 
-    Pass ``replay_buffer_class=DeviceReplayBuffer``. For one observation, not a dict of them. It draws the same
+    Pass ``replay_buffer_class=DeviceReplayBuffer``. It takes single observations, not dicts of them. It draws the same
     transitions as ``ReplayBuffer`` with the same seed, unless the gradient step draws its batch itself.
 
     :param args: as in Stable-Baselines3
-    :param sampling: who draws the batches of gradient steps: "host", NumPy's generator, or "device", the gradient step
-        itself, by torch's generator of the device, so that on a GPU a step with its drawing is one launch
+    :param sampling: where the batches of gradient steps are drawn: "host", by NumPy's generator, or "device", by the
+        gradient step itself with torch's generator of the device, so that on a GPU a step with its drawing is one
+        launch
     :param kwargs: as in Stable-Baselines3; ``optimize_memory_usage`` and ``VecNormalize`` are refused by the algorithm
     :raises ValueError: if ``sampling`` is something else
     """
@@ -243,33 +244,33 @@ class DeviceReplayBuffer(HasColumns, ReplayBuffer):
 
     def draw(self, n: int) -> Any:
         """
-        Draw transitions uniformly with replacement, with operations on tensors alone, by torch's generator of the
-        device, from as many as there were at the last :meth:`prepare_draws`.
+        Draw transitions uniformly with replacement, by tensor operations alone and torch's generator of the device,
+        from those that were stored at the last :meth:`prepare_draws`.
 
         :param n: how many
         :return: the transitions
         """
-        # Uniform in [0, 1), to 53 digits, so that the product stays below.
+        # Uniform in [0, 1), to 53 binary digits, so that the product stays below the number of places.
         uniform = torch.rand(n, dtype=torch.float64, device=self.device)
         return self._taken((uniform * self._drawable).long())
 
     def draw_held_out(self, n: int) -> Any:
         """
-        Draw transitions of the validation side, as :meth:`draw` does those to train on.
+        Draw transitions of the validation side, as :meth:`draw` draws training transitions.
 
         :param n: how many
         :return: the transitions
-        :raises ValueError: if the buffer holds none out, as this one
+        :raises ValueError: if the buffer holds none out, like this one
         """
         raise ValueError(f"{type(self).__name__} holds no transition out: pass validation_proportion to the algorithm")
 
     def newest(self, n_steps: int) -> tuple[Any, torch.Tensor]:
         """
-        Gather the latest steps of every environment, with operations on tensors alone, as of the last
+        Gather the latest steps of every environment, by tensor operations alone, as stored at the last
         :meth:`prepare_draws`.
 
         :param n_steps: T, at most as many as are stored
-        :return: as of :func:`latest`
+        :return: as in :func:`latest`
         """
         rows = (self._next_row - n_steps + torch.arange(n_steps, device=self.device)) % self.buffer_size
         places = rows.unsqueeze(1) * self.n_envs + torch.arange(self.n_envs, device=self.device)
@@ -277,7 +278,7 @@ class DeviceReplayBuffer(HasColumns, ReplayBuffer):
         return self._taken(places.flatten()), ends.index_select(0, rows)
 
     def prepare_draws(self) -> None:
-        """Have :meth:`draw`, :meth:`draw_held_out` and :meth:`newest` draw from all that is stored now."""
+        """Make :meth:`draw`, :meth:`draw_held_out` and :meth:`newest` draw from all that is stored now."""
         self._drawable.fill_(self.size() * self.n_envs)
         self._next_row.fill_(self.pos)
 
@@ -295,7 +296,7 @@ class DeviceReplayBuffer(HasColumns, ReplayBuffer):
         Move an array to the device.
 
         :param array: rows of the buffer, or an array of the host
-        :param copy: whether the result has memory of its own
+        :param copy: whether the result has its own memory
         :return: the same as a tensor on the device
         """
         if isinstance(array, torch.Tensor):
@@ -305,7 +306,7 @@ class DeviceReplayBuffer(HasColumns, ReplayBuffer):
 
 class _Places:
     """
-    Places of a buffer on its device, oldest first: a ring, of which a gradient step draws itself.
+    Places of a buffer on its device, oldest first: a ring, from which a gradient step itself draws.
 
     :param capacity: largest number of places
     :param device: the device
@@ -313,7 +314,8 @@ class _Places:
 
     def __init__(self, capacity: int, device: torch.device):
         self._ring = torch.zeros(capacity, dtype=torch.int64, device=device)
-        # The first of the ring, and one after its last, neither ever reduced; and what a captured step reads of them.
+        # Counts of the ring's first place, and of one after its last, never reduced; and the tensors of them that a
+        # captured step reads.
         self._first = self._last = 0
         self._start = torch.zeros((), dtype=torch.int64, device=device)
         self._drawable = torch.zeros((), dtype=torch.float64, device=device)
@@ -323,7 +325,7 @@ class _Places:
         Drop the oldest places and add new ones.
 
         :param n_gone: how many are dropped
-        :param new: what is added
+        :param new: the new places
         """
         self._first += n_gone
         if len(new) == 0:
@@ -336,19 +338,19 @@ class _Places:
         """
         Hold other places, in the same memory.
 
-        :param places: they, oldest first
+        :param places: the new places, oldest first
         """
         self._first = self._last = 0
         self.replace(0, places)
 
     def prepare(self) -> None:
-        """Have :meth:`draw` draw from all places there are now."""
+        """Make :meth:`draw` draw from all current places."""
         self._start.fill_(self._first % len(self._ring))
         self._drawable.fill_(self._last - self._first)
 
     def draw(self, n: int) -> torch.Tensor:
         """
-        Draw places uniformly with replacement; at least one must be there.
+        Draw places uniformly with replacement; there must be at least one.
 
         :param n: how many
         :return: (n,)
@@ -363,13 +365,13 @@ class DeviceValidationReplayBuffer(ValidationSplit, DeviceReplayBuffer):
     Replay buffer in the memory of the model's device that holds transitions out. Both sides are overwritten in the
     order in which they came, so that the places of each are a ring.
 
-    :param args: as of ``DeviceReplayBuffer``
-    :param kwargs: as of ``DeviceReplayBuffer``
+    :param args: as in ``DeviceReplayBuffer``
+    :param kwargs: as in ``DeviceReplayBuffer``
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        # On the host, where it is asked for.
+        # On the host, where it is read.
         self.held_out = np.zeros((self.buffer_size, self.n_envs), dtype=bool)
         self._make_sides()
 
@@ -420,7 +422,7 @@ class DeviceValidationReplayBuffer(ValidationSplit, DeviceReplayBuffer):
 
     def draw(self, n: int) -> Any:
         """
-        Draw transitions to train on uniformly with replacement, as ``DeviceReplayBuffer`` draws of all.
+        Draw training transitions uniformly with replacement, as ``DeviceReplayBuffer`` draws from all transitions.
 
         :param n: how many
         :return: the transitions
@@ -429,7 +431,7 @@ class DeviceValidationReplayBuffer(ValidationSplit, DeviceReplayBuffer):
 
     def draw_held_out(self, n: int) -> Any:
         """
-        Draw transitions of the validation side, as :meth:`draw` does those to train on.
+        Draw transitions of the validation side, as :meth:`draw` draws training transitions.
 
         :param n: how many
         :return: the transitions
@@ -438,7 +440,7 @@ class DeviceValidationReplayBuffer(ValidationSplit, DeviceReplayBuffer):
 
     def prepare_draws(self) -> None:
         """
-        Have :meth:`draw`, :meth:`draw_held_out` and :meth:`newest` draw from all that is stored now.
+        Make :meth:`draw`, :meth:`draw_held_out` and :meth:`newest` draw from all that is stored now.
 
         :raises ValueError: if there is none to train on
         """
@@ -464,7 +466,7 @@ def store_float_actions(buffer: ReplayBuffer) -> None:
         buffer.actions = np.zeros(buffer.actions.shape, dtype)
 
 
-#: Buffers that hold one transition a place, each of which can be drawn by itself.
+#: Buffers that hold one transition per place, each of which can be drawn by itself.
 PLAIN_BUFFERS = (
     CompactReplayBuffer,
     CompactDictReplayBuffer,
@@ -476,7 +478,7 @@ PLAIN_BUFFERS = (
     DictReplayBuffer,
 )
 #: Buffers whose every transition is drawn independently, so that one large draw can be cut into batches. Others compose
-#: each batch (HerReplayBuffer: so many real, so many relabelled transitions) and are asked once a gradient step.
+#: each batch (HerReplayBuffer: so many real, so many relabelled transitions) and are sampled once per gradient step.
 INDEPENDENT_BUFFERS = (
     *PLAIN_BUFFERS,
     NStepReplayBuffer,
@@ -494,15 +496,15 @@ def samples_as_its_class(buffer: ReplayBuffer) -> bool:
     Check that a buffer's draws are independent.
 
     :param buffer: a replay buffer
-    :return: whether it is one of ``INDEPENDENT_BUFFERS``, or adds columns to one, its sampling replaced neither in the
-        class nor in the object
+    :return: whether it is one of ``INDEPENDENT_BUFFERS``, or adds columns to one, and neither the class nor the object
+        replaces its sampling
     """
     present = [getattr(type(buffer), name, None) for name in _SAMPLING]
     return _OWN_SAMPLING.get(_without_columns(buffer)) == present and vars(buffer).keys().isdisjoint(_SAMPLING)
 
 
 def _without_columns(buffer: ReplayBuffer) -> Any:
-    """The class of a buffer; of one that declares columns of its own the one that it adds them to."""
+    """The class of a buffer; if it declares its own columns, the class to which it adds them."""
     cls = type(buffer)
     while "more_columns" in vars(cls) and cls not in _OWN_SAMPLING:
         cls = cls.__bases__[0]
@@ -511,8 +513,8 @@ def _without_columns(buffer: ReplayBuffer) -> Any:
 
 class BatchMemory:
     """
-    Memory that the transitions of gradient steps are gathered into, used again and again, and from which they are moved
-    to the device at once. On a CPU the gathered transitions are valid until the next call of :meth:`gather`.
+    Reused memory into which the transitions of gradient steps are gathered, and from which they are moved to the device
+    at once. On a CPU the gathered transitions are valid until the next call of :meth:`gather`.
     """
 
     def __init__(self) -> None:
@@ -525,7 +527,7 @@ class BatchMemory:
         Check that transitions can be gathered without the buffer's own ``sample``.
 
         :param buffer: replay buffer
-        :param vec_normalize: what normalises the samples
+        :param vec_normalize: normalises the samples
         :return: whether they can
         """
         is_plain = _without_columns(buffer) in PLAIN_BUFFERS and samples_as_its_class(buffer)

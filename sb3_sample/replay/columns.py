@@ -1,7 +1,7 @@
 """
-Columns of a transition, declared once: what replay buffers store, what batches have and what files hold follows.
+Columns of a transition, declared once: they determine what replay buffers store, batches have and files hold.
 
-A buffer of one's own adds a column by naming it: ``more_columns = (Column("task", lambda step: ...),)``.
+A custom buffer adds a column by declaring it: ``more_columns = (Column("task", lambda step: ...),)``.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ from sb3_sample.replay.rows import action_dtype, as_actions, as_observation, as_
 
 
 class Step(NamedTuple):
-    """One step of all environments, as ``add`` of a replay buffer is given it."""
+    """One step of all environments, as passed to ``add`` of a replay buffer."""
 
     observation: Any
     next_observation: Any
@@ -42,7 +42,7 @@ class Column:
     batch has it in ``columns[name]``, (B, ...), or (B, 1) if it is one number.
 
     :param name: its name
-    :param read: gives the values of a step, one for each environment; None if the buffer itself writes it
+    :param read: returns the values of a step, one for each environment; None if the buffer itself writes them
     :param shape: of one environment's value
     :param dtype: of the values; a float must be finite
     :param is_flag: whether it is 0 or 1
@@ -72,11 +72,11 @@ class Column:
 
     def writer(self, buffer: Any) -> Callable[[Given], Any]:
         """
-        Make what turns a step into a row.
+        Make the function that turns a step into a row.
 
-        :param buffer: the buffer, which the result does not hold
-        :return: from a step to its values in the form in which they are stored, (n_envs, ...). It raises a ValueError
-            if they have another shape, are a single value, or not finite
+        :param buffer: the buffer, to which the function keeps no reference
+        :return: function from a step to its values in the form in which they are stored, (n_envs, ...). It raises a
+            ValueError if they have another shape, are a single value, or not finite
         """
         name, read, shape, dtype = self.name, self.read, (buffer.n_envs, *self.shape), np.dtype(self.dtype)
         assert read is not None
@@ -99,7 +99,7 @@ class Column:
         return write
 
 
-# Those of every buffer, whose place in a step is known: each transition passes through them.
+# Columns of every buffer, whose place in a step is known: each transition passes through them.
 class _Observations(Column):
     def layout(self, buffer: Any) -> dict[str, tuple[tuple[int, ...], Any]]:
         space = buffer.observation_space
@@ -131,7 +131,7 @@ class _Actions(Column):
 
 class _Number(Column):
     def writer(self, buffer: Any) -> Callable[[Given], np.ndarray]:
-        # Whether it is finite is looked at where it comes from the environment.
+        # Whether it is finite is checked where it comes from the environment.
         label, place, shape = self.label, Step._fields.index(self.label), (buffer.n_envs,)
         return lambda given: as_row(label, given[place], shape)
 
@@ -146,30 +146,30 @@ OBSERVATIONS = _Observations("observations", lambda step: step.observation)
 NEXT_OBSERVATIONS = _Observations("next_observations", lambda step: step.next_observation)
 ACTIONS = _Actions("actions", lambda step: step.action)
 REWARDS = _Number("rewards", lambda step: step.reward)
-#: Ends of episodes, and which of them are time limits. A batch's ``dones`` are those that are none.
+#: Ends of episodes, and which of them are time limits. A batch's ``dones`` are the ends that are not.
 DONES = _Number("dones", lambda step: step.done, is_flag=True)
 TIMEOUTS = _Timeouts("timeouts", lambda step: step.infos, is_flag=True)
 #: Transitions of the validation side.
 HELD_OUT = Column("held_out", None, dtype=bool, is_flag=True, in_batch=False)
 
-#: Of every replay buffer, in the order in which a step is looked at: Stable-Baselines3's attributes.
+#: Columns of every replay buffer, in the order in which a step is checked: Stable-Baselines3's attributes.
 OF_EVERY_BUFFER = (OBSERVATIONS, NEXT_OBSERVATIONS, ACTIONS, REWARDS, DONES, TIMEOUTS)
 #: Of these, all but the observations.
 _PLAIN = OF_EVERY_BUFFER[2:]
 
 
 class HasColumns:
-    """Base of replay buffers that may store columns of their own."""
+    """Base of replay buffers that may store further columns."""
 
-    # Beside the attributes, since it can neither be copied nor saved, and follows from them.
+    # A slot besides the attributes, since it can neither be copied nor saved, and is derived from them.
     __slots__ = ("_writers",)
     _writers: tuple[tuple[str, Callable[[Given], Any]], ...]
 
     #: Columns besides those of every replay buffer and of the base classes.
     more_columns: ClassVar[tuple[Column, ...]] = ()
-    #: Columns but the observations, base classes' included.
+    #: All columns except the observations, those of base classes included.
     plain_columns: ClassVar[tuple[Column, ...]] = _PLAIN
-    #: Whether batches have some of those that not every buffer has.
+    #: Whether batches have columns that not every buffer has.
     more_in_batch: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -189,9 +189,9 @@ class HasColumns:
 
     def writers(self) -> tuple[tuple[str, Callable[[Given], Any]], ...]:
         """
-        The functions that turn a step into rows.
+        Return the functions that turn a step into rows.
 
-        :return: by the name of a column, those of the observations first: from the arguments of ``add`` to its row
+        :return: pairs of a column's name, observations first, and the function from the arguments of ``add`` to its row
         """
         try:
             return self._writers
@@ -244,17 +244,17 @@ class Samples(NamedTuple):
 
 def samples_of(buffer: Any, take: Callable[..., Any]) -> Any:
     """
-    Put transitions together, the only place where it is said which column becomes what.
+    Assemble transitions: the only place that maps columns to entries of the samples.
 
     :param buffer: replay buffer
-    :param take: called with a column and the buffer's array of it (or dict of arrays) gives tensors of the rows wanted,
-        (B, ...), (B, 1) if it is one number; 0 where its keyword argument ``but``, another array, is 1
+    :param take: function of a column and the buffer's array of it (or dict of arrays) that returns tensors of the
+        wanted rows, (B, ...), (B, 1) if it is one number; 0 where its keyword argument ``but``, another array, is 1
     :return: the transitions, in the form of the buffer's ``sample``
     """
     samples = (
         take(OBSERVATIONS, buffer.observations),
         take(ACTIONS, buffer.actions),
-        # Stable-Baselines3's variant has them in the observations' next rows.
+        # Stable-Baselines3's memory-saving layout has them in the observations' next rows.
         take(NEXT_OBSERVATIONS, getattr(buffer, "next_observations", None)),
         # A time limit does not end the bootstrap.
         take(DONES, buffer.dones, but=buffer.timeouts),
@@ -270,8 +270,8 @@ def samples_at(
     buffer: ReplayBuffer, positions: np.ndarray, env_indices: np.ndarray, vec_normalize: VecNormalize | None = None
 ) -> Any:
     """
-    Transitions of a replay buffer at given places, each one step, without the changes that the buffer's own ``sample``
-    makes (n-step returns, relabelled goals).
+    Gather transitions of a replay buffer at given places, each one step, without the changes that the buffer's own
+    ``sample`` makes (n-step returns, relabelled goals).
 
     :param buffer: Stable-Baselines3's replay buffer or a subclass
     :param positions: places in the buffer, (N,)

@@ -1,6 +1,6 @@
 """
-Replay buffers that store one observation a step: the next observation of a step is, nearly always, the observation of
-the step after it.
+Replay buffers that store one observation per step: the next observation of a step is, nearly always, the observation
+of the step after it.
 """
 
 import functools
@@ -26,7 +26,7 @@ except ImportError:
     psutil = None
 
 
-#: In files, before the names of what changes in rows that are there already; no column's name has it.
+#: Prefix in files of the names of state that changes in rows already stored; no column's name has it.
 _CHANGING = "changing/"
 
 
@@ -36,26 +36,27 @@ def _file_name(column: str, key: str) -> str:
 
 class CompactReplay(HasColumns):
     """
-    Replay buffer that stores one observation a step.
+    Replay buffer that stores one observation per step.
 
     The next observation of row t is the observation of row t + 1, except where the two differ in a bit: at the end of
     an episode, where ``learn`` reset the environment, or where the sequence broke otherwise. The two are compared when
-    row t + 1 is stored, and a next observation that differs is kept aside. So every transition is that of
+    row t + 1 is stored, and a next observation that differs is kept aside. So every transition equals that of
     Stable-Baselines3's buffer, time limits included, and none is lost when the buffer is full.
 
     :param buffer_size: capacity in transitions
     :param observation_space: of the environment
     :param action_space: of the environment
-    :param device: where samples go
+    :param device: device of the samples
     :param n_envs: number of environments
-    :param optimize_memory_usage: either value: the buffer always stores one observation a step
-    :param handle_timeout_termination: whether a time limit is no termination
-    :param memory_map: a folder, made if it is not there, whose files hold the buffer instead of the memory. They have
-        no names and go with the buffer: runs cannot meet in them, and nothing is left to delete. None for the memory
-    :param frame_stack: frames that an observation consists of along its first axis, the newest last. Each is then
-        stored once, and they are stacked when they are read. 1 or None: observations are stored as they are
-    :raises ValueError: if ``memory_map`` cannot be written to or has not the space, or observations do not consist of
-        so many frames
+    :param optimize_memory_usage: has no effect: the buffer always stores one observation per step
+    :param handle_timeout_termination: whether a time limit is not a termination
+    :param memory_map: a folder, made if it is missing, whose files hold the buffer instead of the memory. The files
+        have no names and vanish with the buffer: runs cannot share them, and nothing is left to delete. None for the
+        memory
+    :param frame_stack: number of frames in an observation along its first axis, the newest last. Each frame is then
+        stored once, and frames are stacked when they are read. 1 or None: observations are stored as they are
+    :raises ValueError: if ``memory_map`` cannot be written to or lacks the space, or observations do not consist of so
+        many frames
     """
 
     buffer_size: int
@@ -82,7 +83,7 @@ class CompactReplay(HasColumns):
         frame_stack: int | None = None,
     ):
         assert isinstance(self, ReplayBuffer)
-        # The constructors in between make arrays for two observations a step.
+        # The constructors in between make arrays for two observations per step.
         super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs=n_envs)
         self.buffer_size = max(buffer_size // n_envs, 1)
         # True means the layout that overwrites the last next observation of an episode.
@@ -216,7 +217,7 @@ class CompactReplay(HasColumns):
         for key, array in pending.items():
             a, b = (np.ascontiguousarray(x).reshape(self.n_envs, -1).view(np.uint8) for x in (array, now[key]))
             differs |= (a != b).any(axis=1)
-        # A disk may be found to be full here: nothing has changed yet.
+        # The disk may turn out to be full here: nothing has changed yet.
         slots = self.aside.put({key: array[differs] for key, array in pending.items()})
         self.slot[row] = NEXT_ROW
         self.slot[row, differs] = slots
@@ -232,7 +233,7 @@ class CompactReplay(HasColumns):
     def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> Any:
         if not self.more_in_batch:
             return super()._get_samples(batch_inds, env)  # type: ignore[misc]  # the buffer's
-        # The environments are drawn as there.
+        # The environments are drawn as in the base class.
         env_indices = np.random.randint(0, high=self.n_envs, size=len(batch_inds))  # noqa: NPY002
         return samples_at(self, batch_inds, env_indices, env)  # type: ignore[arg-type]
 
@@ -242,8 +243,8 @@ class CompactReplay(HasColumns):
         """
         List the arrays of the rows.
 
-        :return: the columns of a row but its next observation, by name, (buffer_size, n_envs, ...) each; the
-            observations are ``observations``, or ``observations/<key>``; of stacked frames the newest ones
+        :return: the columns of a row except its next observation, by name, (buffer_size, n_envs, ...) each; the
+            observations are ``observations``, or ``observations/<key>``; for stacked frames the newest ones
         """
         assert isinstance(self, ReplayBuffer)
         frames = self._frames
@@ -267,8 +268,8 @@ class CompactReplay(HasColumns):
         :param n: how many
         :return: copies of the :meth:`columns`, oldest step first, (n, n_envs, ...) each; ``next_index``, (M,), the
             places (step * n_envs + environment) whose next observation is not the observation of the next step, among
-            them the whole last step; ``next_observations`` (or ``next_observations/<key>``), (M, O), what it is there;
-            of stacked frames also what ``StackedFrames.described`` gives
+            them the whole last step; ``next_observations`` (or ``next_observations/<key>``), (M, O), the next
+            observations of these places; for stacked frames also the result of ``StackedFrames.described``
         :raises ValueError: if the buffer holds fewer
         """
         assert isinstance(self, ReplayBuffer)
@@ -285,7 +286,7 @@ class CompactReplay(HasColumns):
         Restore the buffer that :meth:`new_rows` was called on, row for row; its own content is dropped.
 
         :param pieces: the number of the first step, counted over the run such that step i lies in row
-            i % ``buffer_size``; and the steps from there on. A piece goes on where the one before ended, or replaces
+            i % ``buffer_size``; and the steps from there on. A piece continues where the one before ended, or replaces
             its last steps
         :raises ValueError: if they are of another buffer, or a piece is missing
         """
@@ -316,7 +317,7 @@ class CompactReplay(HasColumns):
         """
         before = (rows[0] - 1) % self.buffer_size
         if keeps_before:
-            # For now it is the newest: where its next observation is may change.
+            # For now the row before is the newest: the place of its next observation may change.
             following = self._following(before * self.n_envs + np.arange(self.n_envs))
             self.aside.free(self.slot[before])
             self._set_newest(before, following)
@@ -325,7 +326,7 @@ class CompactReplay(HasColumns):
         self._put(rows, piece, len(rows) - 1)
 
     def _first_of(self, piece: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Observations of the first step from a file, whose older frames are none of other steps of the file."""
+        """Observations of the first step from a file, whose older frames come from no other step of the file."""
         newest = {key: piece[_file_name(OBSERVATIONS.name, key)][0] for key in self.stored()}
         frames = self._frames
         if frames is None:
@@ -362,9 +363,9 @@ class CompactReplay(HasColumns):
         Check rows from a file.
 
         :param piece: rows from a file
-        :param n: how many they must be
+        :param n: number of rows that they must be
         :param newest: which of them is the newest
-        :raises ValueError: if they are no rows of this buffer
+        :raises ValueError: if they are not rows of this buffer
         """
         shapes = {name: ((n, *array.shape[1:]), array.dtype) for name, array in self.columns().items()}
         index = piece.get("next_index", np.zeros(0, np.int64))
@@ -398,8 +399,8 @@ class CompactReplay(HasColumns):
         """
         Collect the buffer's state.
 
-        :return: the numbers ``pos``, ``full``, ``buffer_size`` and ``n_envs``, and arrays: what is filled of each of
-            the :meth:`columns`, not copied, and the next observations in the form of :meth:`new_rows`, its
+        :return: the numbers ``pos``, ``full``, ``buffer_size`` and ``n_envs``, and arrays: the filled part of each of
+            the :meth:`columns`, not copied, and the next observations in the form of :meth:`new_rows`, with
             ``next_index`` naming places of the buffer
         """
         assert isinstance(self, ReplayBuffer)
@@ -412,7 +413,7 @@ class CompactReplay(HasColumns):
 
     def changing_state(self) -> dict[str, Any]:
         """
-        Collect what changes in rows that are there already.
+        Collect the state that changes in rows already stored.
 
         :return: numbers and arrays by name; nothing here
         """
@@ -420,7 +421,7 @@ class CompactReplay(HasColumns):
 
     def load_changing_state(self, state: dict[str, Any]) -> None:
         """
-        Restore what changes in rows that are there already, after the rows.
+        Restore the state that changes in rows already stored, after the rows.
 
         :param state: from :meth:`changing_state` of a buffer of the same sizes
         :raises ValueError: if it is of another buffer
@@ -474,15 +475,15 @@ class CompactReplayBuffer(CompactReplay, ReplayBuffer):  # type: ignore[misc, ov
 
 
 class CompactDictReplayBuffer(CompactReplay, DictReplayBuffer):  # type: ignore[misc, override]  # next_observations is a view
-    """Replay buffer for dict observations that stores one observation a step."""
+    """Replay buffer for dict observations that stores one observation per step."""
 
 
 class CompactNStepReplayBuffer(CompactReplay, NStepReplayBuffer):  # type: ignore[misc, override]  # next_observations is a view
     """
-    Replay buffer for n-step returns, as Stable-Baselines3's, that stores one observation a step.
+    Replay buffer for n-step returns, like Stable-Baselines3's, that stores one observation per step.
 
-    :param args: as of ``CompactReplayBuffer``
-    :param kwargs: as of ``CompactReplayBuffer``
+    :param args: as in ``CompactReplayBuffer``
+    :param kwargs: as in ``CompactReplayBuffer``
     :param n_steps: steps whose rewards are summed
     :param gamma: discount factor
     """

@@ -30,14 +30,14 @@ Arrays = np.ndarray | dict[str, np.ndarray]
 
 class Dataset:
     """
-    Fixed set of transitions, from which batches are drawn uniformly with replacement. It is made by one of the
-    functions ``from_...``.
+    Fixed set of transitions, from which batches are drawn uniformly with replacement. It is made by one of the class
+    methods ``from_...``.
 
     :param steps: the steps, in the types of their spaces, floats of observations and rewards as float32
     :param observation_space: of the observations
     :param action_space: of the actions as an environment takes them
     :param seed: of the generator that :meth:`sample` draws from
-    :param n_left_out: steps that the source had besides, whose next observation is not known
+    :param n_left_out: number of further steps of the source, left out because their next observation is unknown
     """
 
     def __init__(
@@ -80,8 +80,8 @@ class Dataset:
         """
         Make a data set of N steps in the order in which they were taken, episode after episode.
 
-        Without ``next_observations`` a step's next observation is the following step's. A truncated step, and the
-        last one, have none then and are left out with a warning, unless the episode terminated there.
+        Without ``next_observations`` a step's next observation is the following step's observation. Truncated steps,
+        and the last one, then have none and are left out with a warning, unless the episode terminated there.
 
         Observations and actions are held in the types of their spaces, floats of observations as float32.
 
@@ -89,8 +89,8 @@ class Dataset:
         :param actions: (N, A), in the environment's units, within the bounds of ``action_space``
         :param rewards: (N,)
         :param terminations: whether the episode terminated with the step, (N,)
-        :param truncations: whether it was cut off there, by a time limit for example, (N,)
-        :param next_observations: as the observations
+        :param truncations: whether the episode was cut off there, by a time limit for example, (N,)
+        :param next_observations: like the observations
         :param observation_space: of the observations; None: unbounded, of their shape
         :param action_space: of the actions; None: [-1, 1]
         :param seed: of the generator that the batches are drawn from
@@ -98,8 +98,8 @@ class Dataset:
         :param memory_map: folder whose disk holds the observations and actions, if they are larger than the memory; the
             files are unnamed and vanish with the data set. None: memory
         :return: the data set
-        :raises ValueError: if the arrays are not of one length, not of the spaces, or not finite, or a space of
-            integers has not their numbers
+        :raises ValueError: if the arrays differ in length, do not match the spaces or are not finite, or a space of
+            integers cannot hold their numbers
         """
         observations, actions = _arrays("observations", observations, 2), _arrays("actions", actions, 1)
         if len(actions.shape) < 2:
@@ -160,7 +160,7 @@ class Dataset:
                     "the two are not of the same numbers"
                 )
         else:
-            # Those of a step that terminated are not bootstrapped from, whatever they are: its own observation.
+            # The target of a terminated step does not use its next observation: its own observation stands in for it.
             cut_off = truncated | (steps.at == n - 1)
             kept = np.flatnonzero(~cut_off | terminated)
             n_left_out = n - len(kept)
@@ -183,13 +183,13 @@ class Dataset:
         cls, id_or_path: str | os.PathLike[str], *, seed: int = 0, memory_map: str | os.PathLike[str] | None = None
     ) -> "Dataset":
         """
-        Read a data set of Minari's from this computer; nothing is downloaded. Needs the extra ``[offline]``.
+        Read one of Minari's data sets from this computer; nothing is downloaded. Needs the extra ``[offline]``.
 
         :param id_or_path: its folder, or its id among Minari's local data sets
         :param seed: of the generator that the batches are drawn from
         :param memory_map: as in :meth:`from_arrays`
         :return: the data set
-        :raises ValueError: if there is none, its spaces are not supported, or its content is not what it must be
+        :raises ValueError: if there is none, its spaces are not supported, or its content is invalid
         """
         return cls(*read_minari(id_or_path, memory_map), seed)
 
@@ -213,7 +213,7 @@ class Dataset:
         :param seed: of the generator that the batches are drawn from
         :param memory_map: as in :meth:`from_arrays`
         :return: the data set
-        :raises ValueError: if it is no such file, or its content is not what it must be
+        :raises ValueError: if it is not such a file, or its content is invalid
         """
         with opened_hdf5(path) as given:
             return cls.from_arrays(
@@ -240,7 +240,7 @@ class Dataset:
         """
         size, first = buffer.size(), int(buffer.pos) if buffer.full else 0
         if buffer.full and getattr(buffer, "optimize_memory_usage", False):
-            # The row's observation has made way for the newest next observation.
+            # The observation of the oldest row was overwritten by the newest next observation.
             size, first = size - 1, first + 1
         if size < 1:
             raise ValueError("buffer must have at least one transition, not 0")
@@ -270,13 +270,14 @@ class Dataset:
 
     def to_minari(self, id_or_path: str | os.PathLike[str], **metadata: Any) -> Path:
         """
-        Write a data set of Minari's, uncompressed. An end of an episode that is no termination is a truncation there;
-        further columns are left out with a warning. Needs the extra ``[offline]``.
+        Write the data set in Minari's format, uncompressed. An end of an episode that is not a termination becomes a
+        truncation; further columns are left out with a warning. Needs the extra ``[offline]``.
 
         :param id_or_path: a new folder, or an id (``cartpole/swingup-v0``) among Minari's local data sets
-        :param metadata: what Minari keeps besides: ``author``, ``algorithm_name``, ``description``, ...
+        :param metadata: further entries that Minari keeps: ``author``, ``algorithm_name``, ``description``, ...
         :return: the folder that it is in
-        :raises ValueError: if there is one already, or an id is the path of a folder here too: ``./`` makes it one
+        :raises ValueError: if the target exists already, or an id is also the path of a folder here; a leading ``./``
+            makes it a path
         """
         return write_minari(self, id_or_path, metadata)
 
@@ -299,10 +300,10 @@ class Dataset:
     @property
     def return_range(self) -> float:
         """
-        Largest less smallest undiscounted return of the episodes, those that are cut off included. Where a next
-        observation is the following observation but for rounding, the episode goes on.
+        Largest minus smallest undiscounted return of the episodes, those that are cut off included. Where a next
+        observation equals the following observation except for rounding, the episode continues.
 
-        :raises ValueError: if most steps are episodes of their own that did not terminate, as of shuffled data
+        :raises ValueError: if most steps are episodes of one step that did not terminate, as in shuffled data
         """
         rewards, last = _numpy(self._steps.rewards).astype(np.float64), -1
         returns, n_alone = [], 0
@@ -318,7 +319,7 @@ class Dataset:
         return float(max(returns) - min(returns))
 
     def _last_steps(self) -> np.ndarray:
-        """Last steps of the episodes, one where a next observation is the following one but for rounding left out."""
+        """Last steps of the episodes, except where a next observation equals the following one but for rounding."""
         steps, terminated = self._steps, _numpy(self._steps.terminations)
         ends = np.flatnonzero(terminated | _numpy(steps.truncations))
         goes_on = np.zeros(len(self), bool)
@@ -326,13 +327,13 @@ class Dataset:
         for first in range(0, len(cut_off), CHUNK):
             rows = cut_off[first : first + CHUNK]
             following, then = _take(steps.observations, steps.at[rows + 1]), self._next_observations(rows)
-            # Where they are the same, it is the data set that says so.
+            # Where they are equal, the end of the episode is the data set's own.
             goes_on[rows] = _rows_agree(then, following, np.isclose) & ~_rows_agree(then, following, np.equal)
         return ends[~goes_on[ends]]
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of the transitions, whatever the data set was made of; of their numbers, not of the spaces."""
+        """SHA-256 of the transitions, independent of the data set's source; of their numbers, not of the spaces."""
         if not self._fingerprint:
             digest = sha256()
             for first in range(0, len(self), CHUNK):
@@ -374,7 +375,7 @@ class Dataset:
 
     def episodes(self) -> Iterator[slice]:
         """
-        Go through the episodes.
+        Iterate over the episodes.
 
         :return: the rows of each
         """
@@ -458,7 +459,7 @@ def _parts(arrays: Any) -> list[Any]:
 
 
 def _arrays(name: str, values: Any, least_axes: int) -> Any:
-    """Arrays, or what is read like them in pieces; nothing is copied."""
+    """Arrays, or objects that are read like arrays in pieces; nothing is copied."""
     if isinstance(values, Mapping):
         return {key: _arrays(f"{name}[{key!r}]", value, least_axes) for key, value in values.items()}
     array = values if hasattr(values, "shape") and hasattr(values, "dtype") else np.asarray(values)
@@ -478,7 +479,7 @@ def _copied(name: str, values: Any, dtype: Any, folder: str | None) -> Any:
 
 
 def _folder(memory_map: Any, held: list[tuple[Any, Any]]) -> str | None:
-    """The folder, if there is room for arrays that are held in a type each, both by the keys of a dict."""
+    """The folder, if it has room for arrays, each given with the type in which it is held (or dicts of both)."""
     if memory_map is None:
         return None
 
@@ -491,7 +492,7 @@ def _folder(memory_map: Any, held: list[tuple[Any, Any]]) -> str | None:
 
 
 def _breaks(steps: Steps) -> np.ndarray:
-    """Steps after which the data do not go on where they have ended, (N,)."""
+    """Steps whose next observation is not the observation of the following step, (N,)."""
     n = len(steps.actions)
     breaks = np.ones(n, bool)
     for first in range(0, n - 1, CHUNK):
@@ -509,7 +510,7 @@ def _rows_agree(then: Any, now: Any, agree: Callable[..., np.ndarray]) -> np.nda
 
 
 def _column(name: str, values: Any) -> np.ndarray:
-    with np.errstate(over="ignore"):  # what float32 does not hold is refused below
+    with np.errstate(over="ignore"):  # numbers beyond float32 are refused below
         array = np.array(values).astype(np.float32)
     if array.ndim == 2 and array.shape[1] == 1:
         array = array[:, 0]

@@ -16,7 +16,7 @@ from sb3_sample.replay.memory_map import check_folder, n_bytes, zeros
 from sb3_sample.replay.steps import Steps
 from sb3_sample.warn import warn
 
-#: An id of Minari's: namespaces, a name, a version.
+#: A Minari id: namespaces, a name, a version.
 _ID = re.compile(r"[\w-]+(/[\w-]+)*-v\d+")
 #: D4RL's names, by those of ``Dataset.from_arrays``.
 _D4RL = {
@@ -46,7 +46,7 @@ def opened_hdf5(path: str | os.PathLike[str]) -> Iterator[dict[str, Any]]:
 
     :param path: the file
     :return: the arrays by the names of ``Dataset.from_arrays``, large ones unread
-    :raises ValueError: if it is no such file
+    :raises ValueError: if it is not such a file
     """
     try:
         import h5py
@@ -79,12 +79,12 @@ def _is_id(id_or_path: Any) -> bool:
 
 def read_minari(id_or_path: Any, memory_map: Any) -> tuple[Steps, spaces.Space, spaces.Box]:
     """
-    Read a data set of Minari's.
+    Read one of Minari's data sets.
 
     :param id_or_path: its folder, or its id
     :param memory_map: folder whose disk holds observations and actions; None: memory
     :return: the steps, and the spaces
-    :raises ValueError: if there is none, its spaces are not supported, or its episodes are none
+    :raises ValueError: if there is none, its spaces are not supported, or its episodes are invalid
     """
     minari = _minari()
     folder = _found(id_or_path, minari)
@@ -174,13 +174,13 @@ def _found(id_or_path: Any, minari: Any) -> Path:
 
 def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> Path:
     """
-    Write a data set of Minari's.
+    Write a data set in Minari's format.
 
     :param data: the data set
     :param id_or_path: new folder, or an id
-    :param metadata: what Minari keeps besides
+    :param metadata: further entries that Minari keeps
     :return: the folder
-    :raises ValueError: if there is one already, or an id is the path of a folder here too
+    :raises ValueError: if the target exists already, or an id is also the path of a folder here
     """
     minari = _minari()
     if data.column_names:
@@ -191,14 +191,14 @@ def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> Path:
         name, folder = str(id_or_path), Path(minari.storage.get_dataset_path(id_or_path)) / "data"
         as_path = Path(id_or_path)
         if as_path.exists() or ("/" in name and as_path.parent.exists()):
-            # Reading takes the folder here of this name, if there is one.
+            # Reading prefers a folder of this name here, if there is one.
             raise ValueError(
                 f"id_or_path={name!r} is an id of Minari's, of {folder.parent}, and a path here too, since "
                 f"{as_path if as_path.exists() else as_path.parent} is there: pass './{name}' for a folder, or another "
                 "id"
             )
     else:
-        # Minari looks for its files below a relative folder once more below that folder.
+        # Minari looks for the files of a relative folder below that folder once more.
         folder = Path(id_or_path).expanduser().absolute() / "data"
         name = re.sub(r"[^\w-]", "-", folder.parent.name)
         name = name if _is_id(name) else f"{name}-v0"

@@ -1,4 +1,4 @@
-"""Ends of episodes that the environment has not told of."""
+"""Ends of episodes that the environment did not report."""
 
 import warnings
 from typing import Any
@@ -13,8 +13,8 @@ from sb3_sample.replay.columns import samples_at
 def end_episodes(replay_buffer: ReplayBuffer) -> None:
     """
     End the episodes under way in a replay buffer: nothing that follows belongs to them. The newest transitions of
-    environments in mid-episode end by a time limit, so that the bootstrap goes on; in a buffer that does not know time
-    limits they terminate, as Stable-Baselines3 has it where the following row holds the next observation.
+    environments in mid-episode end by a time limit, so that targets still bootstrap; in a buffer without time limits
+    they terminate, as in Stable-Baselines3 where the following row holds the next observation.
 
     :param replay_buffer: the buffer, which may be empty
     """
@@ -35,10 +35,10 @@ def end_episodes(replay_buffer: ReplayBuffer) -> None:
 
 def leads_to(replay_buffer: ReplayBuffer, observations: Any) -> bool:
     """
-    Check whether an episode goes on where a replay buffer ends.
+    Check whether the environments continue where a replay buffer ends.
 
     :param replay_buffer: the buffer
-    :param observations: present ones of its environments, (n_envs, O) or a dict of them
+    :param observations: current observations of its environments, (n_envs, O) or a dict of them
     :return: whether the newest transition of each environment led to its observation, or ended an episode; for an empty
         buffer True
     """

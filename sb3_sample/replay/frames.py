@@ -8,7 +8,7 @@ import numpy as np
 from sb3_sample.replay import memory_map as files
 from sb3_sample.replay.next_observations import ONLY, SideStore
 
-#: In files, of an older frame: it is all zeros; it is among those that the piece holds apart.
+#: Codes of an older frame in files: all zeros; among those that the piece holds apart.
 _ZEROS, _APART = -1, -2
 #: Entries of files: where the older frames of each observation are, and those that are not of the same piece.
 OLDER, OLDER_FRAMES = "older", "older_frames"
@@ -19,9 +19,9 @@ class StackedFrames:
     Observations of a buffer, each a stack of k frames along its first axis, the newest last. Read like an array of
     (rows, n_envs, k * C, ...): indices of rows and environments come first.
 
-    A row stores its newest frame. Each older one is a frame of the rows before, as found in the row before it; the
-    row's own newest frame, as at an episode's start; all zeros; or, if it is none of these bit by bit, kept aside. So
-    what is read is what was stored, whatever the environment does, and frames of consecutive observations are stored
+    A row stores its newest frame. Each older frame is a frame of an earlier row, as referenced by the row before; the
+    row's own newest frame, as at an episode's start; all zeros; or, if it equals none of these bit by bit, kept aside.
+    So reads return what was stored, whatever the environment does, and frames of consecutive observations are stored
     once.
 
     :param shape: (rows, n_envs, k * C, ...)
@@ -36,7 +36,7 @@ class StackedFrames:
         #: Newest frame of each row, (rows + 1, n_envs, C, ...), and a last row of zeros.
         self.frames = files.zeros(folder, self.layout(shape, n_frames), dtype)
         #: Where the frames of each row are, the oldest first, (rows, n_envs, k): place (row * n_envs + environment) of
-        #: a newest frame or of zeros; below 0, -1 less the slot aside.
+        #: a newest frame or of zeros; below 0, -1 minus the slot aside.
         self.at = np.empty((n_rows, self._n_envs, n_frames), np.int32)
         self.aside = SideStore({ONLY: (self.frames.shape[2:], dtype)}, 0, folder)
         self.clear()
@@ -55,7 +55,7 @@ class StackedFrames:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that it takes."""
+        """Number of bytes used."""
         return int(self.frames.nbytes + self.at.nbytes + self.aside.arrays[ONLY].nbytes)
 
     def __len__(self) -> int:
@@ -89,7 +89,7 @@ class StackedFrames:
         Gather observations.
 
         :param places: row * n_envs + environment of each, (N,)
-        :param out: memory for the result, contiguous, (N, k * C, ...); None for new one
+        :param out: memory for the result, contiguous, (N, k * C, ...); None for new memory
         :return: the observations there
         """
         return self._stacked(self.at.reshape(-1, self.n_frames).take(places, axis=0), out)
@@ -129,7 +129,7 @@ class StackedFrames:
         """
         Store the observations of one step, of all environments.
 
-        :param row: where they go, after the row before it was stored
+        :param row: where they go; the row before must be stored already
         :param values: (n_envs, k * C, ...)
         """
         n_rows, n_envs, flat = self.shape[0], self._n_envs, self._flat
@@ -160,7 +160,7 @@ class StackedFrames:
         return self.aside.put({ONLY: frames.reshape(-1, *self.frames.shape[2:])})
 
     def _make_room(self, rows: np.ndarray) -> None:
-        """Free what rows keep aside, and keep aside what other rows need of them, before they are written to."""
+        """Before rows are overwritten, free the frames that they keep aside, and put aside those that others need."""
         n_rows = self.shape[0]
         if len(rows) == 1:
             # Older frames are of the k - 1 rows before.
@@ -185,8 +185,8 @@ class StackedFrames:
         Describe the older frames of rows, for files that hold the newest ones.
 
         :param rows: the rows, (n,)
-        :return: ``older``, (n, n_envs, k - 1), which of these rows has the frame as its newest, or below 0 that it is
-            zeros or apart; and ``older_frames``, (M, C, ...), those apart, in that order
+        :return: ``older``, (n, n_envs, k - 1), which of these rows has the frame as its newest, or a code below 0 for
+            zeros or apart; and ``older_frames``, (M, C, ...), the frames apart, in that order
         """
         index_of = np.full(self.shape[0] + 1, _APART, np.int32)
         index_of[rows] = np.arange(len(rows))
@@ -199,10 +199,10 @@ class StackedFrames:
 
     def check(self, piece: dict[str, np.ndarray], n: int, newest: int) -> None:
         """
-        Check what a file says of older frames.
+        Check a file's entries of older frames.
 
         :param piece: rows from a file
-        :param n: how many they must be
+        :param n: number of rows that they must be
         :param newest: which of them is the newest
         :raises ValueError: if they are not of these rows
         """

@@ -29,7 +29,7 @@ def check_folder(folder: Any, needed: int) -> str:
     :param folder: folder of the files; made if it is missing
     :param needed: how many bytes they will have
     :return: its path
-    :raises ValueError: if files cannot be written there, or the disk has not the space
+    :raises ValueError: if files cannot be written there, or the disk lacks the space
     """
     if not isinstance(folder, (str, os.PathLike)) or not os.fspath(folder):
         raise ValueError(f"memory_map must be a folder, or None for the memory, not {folder!r}")
@@ -59,7 +59,7 @@ def zeros(folder: str | None, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     :param dtype: its type
     :return: an array of zeros. The file has no name and is freed with the array: no other run can open it, and nothing
         is left of it when the process is killed
-    :raises OSError: if the disk has not the space
+    :raises OSError: if the disk lacks the space
     """
     size = n_bytes(shape, dtype)
     if folder is None or size == 0:
@@ -67,7 +67,7 @@ def zeros(folder: str | None, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             if hasattr(os, "posix_fallocate"):
-                # The space is taken now: a disk found to be full at a later write to the array would kill the process.
+                # The space is allocated now: a disk that is full at a later write to the array would kill the process.
                 os.posix_fallocate(file.fileno(), 0, size)
             else:
                 file.truncate(size)
@@ -76,7 +76,7 @@ def zeros(folder: str | None, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         what = f"{error.strerror}, for {size / 1e9:.3f} GB of a replay buffer with memory_map"
         raise OSError(error.errno, what, folder) from error
     if hasattr(mmap, "MADV_RANDOM"):
-        # Rows are drawn at random: what lies around them is not worth reading.
+        # Rows are drawn at random: their neighbours are not worth reading.
         mapped.madvise(mmap.MADV_RANDOM)
     return np.frombuffer(mapped, dtype=dtype).reshape(shape)
 

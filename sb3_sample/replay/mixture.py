@@ -10,7 +10,7 @@ from sb3_sample.learner.batch import Batch
 
 
 class Samples(Protocol):
-    """Whatever batches are drawn from."""
+    """Interface of a source of batches."""
 
     def sample(self, batch_size: int) -> Batch: ...
 
@@ -20,7 +20,7 @@ class Mixture:
     Batches of several sources, such as a data set and a replay buffer, the rows of the first source first.
 
     :param sources: each with ``sample(batch_size)``
-    :param shares: share of each source in a batch; they add up to 1. The last source has what rounding leaves
+    :param shares: share of each source in a batch; they add up to 1. The last source gets the remainder of rounding
     :raises ValueError: if there are not as many shares as sources, one is negative, or they do not add up to 1
     """
 
@@ -35,7 +35,7 @@ class Mixture:
         """
         :param batch_size: B
         :return: transitions of all sources
-        :raises ValueError: if the batch size is below 1, or the sources have other columns each
+        :raises ValueError: if the batch size is below 1, or the sources differ in their columns
         """
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1, not {batch_size}")
@@ -48,7 +48,7 @@ def mixed(batches: list[Batch]) -> Batch:
     """
     :param batches: of several sources
     :return: their rows, one after the other
-    :raises ValueError: if they have other columns each
+    :raises ValueError: if they differ in their columns
     """
     columns = [sorted(batch.columns) for batch in batches]
     if any(names != columns[0] for names in columns):
@@ -65,11 +65,11 @@ def _joined(columns: list[Any]) -> Any:
 
 
 def _discounts(batches: list[Batch]) -> torch.Tensor | float | None:
-    """One discount factor for all where they agree, or one a row."""
+    """One discount factor for all if they agree, else one per row."""
     given = [batch.discounts for batch in batches]
     numbers = {discount for discount in given if not isinstance(discount, torch.Tensor)} - {None}
     if len(numbers) <= 1 and not any(isinstance(discount, torch.Tensor) for discount in given):
-        # None is the learner's own, which a replay buffer's number is too.
+        # None stands for the learner's own, and so does a replay buffer's number.
         return next(iter(numbers), None)
     rows = []
     for batch, discount in zip(batches, given, strict=True):

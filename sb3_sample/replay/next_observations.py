@@ -1,4 +1,4 @@
-"""Next observations without an array of their own: the observations of the next rows, and a side store."""
+"""Next observations without a separate array: the observations of the next rows, and a side store."""
 
 from typing import Any
 
@@ -6,9 +6,9 @@ import numpy as np
 
 from sb3_sample.replay.memory_map import zeros
 
-#: In ``slot``: the next row's observation is the next observation.
+#: Value of ``slot`` where the next row's observation is the next observation.
 NEXT_ROW = -1
-#: The name of the only observation where it is not a dict.
+#: Key of the only observation, if observations are not dicts.
 ONLY = ""
 
 
@@ -16,9 +16,9 @@ def taken(array: Any, places: np.ndarray, out: np.ndarray | None = None) -> np.n
     """
     Gather rows of one environment each.
 
-    :param array: (rows, n_envs, ...), or what is read like one and has a ``take`` of its own
+    :param array: (rows, n_envs, ...), or an object that is read like an array and has its own ``take``
     :param places: row * n_envs + environment of each, (N,)
-    :param out: memory for the result, (N, ...), (N, 1) if it is one number; None for new one
+    :param out: memory for the result, (N, ...), (N, 1) if it is one number; None for new memory
     :return: the rows
     """
     if isinstance(array, np.ndarray):
@@ -28,8 +28,8 @@ def taken(array: Any, places: np.ndarray, out: np.ndarray | None = None) -> np.n
 
 class SideStore:
     """
-    Store of the next observations that no row holds, by a number, their slot. Slots 0 to ``n_envs - 1`` are those of
-    the newest row, which no row follows yet. It grows on demand.
+    Store of the next observations that no row holds, indexed by a number, their slot. Slots 0 to ``n_envs - 1`` belong
+    to the newest row, which no row follows yet. The store grows on demand.
 
     :param like: shape and type of the observations, by key
     :param n_envs: number of environments
@@ -91,7 +91,7 @@ class SideStore:
         self._free.extend(slots[slots >= self._n_envs].tolist())
 
     def clear(self) -> None:
-        """Free all."""
+        """Free all slots."""
         self._free = list(range(self._capacity() - 1, self._n_envs - 1, -1))
 
 
@@ -101,7 +101,7 @@ class NextObservations:
     stored are undefined.
 
     :param buffer: the buffer
-    :param key: which observation, of a dict of them
+    :param key: key of the observation, in a dict of them
     """
 
     def __init__(self, buffer: Any, key: str = ONLY):
@@ -117,7 +117,7 @@ class NextObservations:
         Gather next observations.
 
         :param places: position * n_envs + environment of each, (N,)
-        :param out: memory for the result, (N, O); None for new one
+        :param out: memory for the result, (N, O); None for new memory
         :return: the next observations there
         """
         n_envs, n = self.shape[1], self.shape[0] * self.shape[1]

@@ -1,4 +1,4 @@
-"""Data sets by name, as commands have them."""
+"""Data sets by name, as commands take them."""
 
 import os
 from pathlib import Path
@@ -22,11 +22,11 @@ def read_dataset(
     Read a data set from this computer. Needs the extra ``[offline]``.
 
     :param source: a folder or an id of Minari's, or an HDF5 file in D4RL's layout
-    :param env_id: of an HDF5 file, which has no spaces: id of the environment whose spaces it has
+    :param env_id: for an HDF5 file, which stores no spaces: id of the environment whose spaces the data have
     :param env_kwargs: arguments of the environment
     :param memory_map: as in ``Dataset.from_arrays``
     :return: the data set
-    :raises ValueError: if there is none, or its content is not what it must be
+    :raises ValueError: if there is none, or its content is invalid
     """
     if Path(source).suffix not in HDF5:
         return Dataset.from_minari(source, memory_map=memory_map)

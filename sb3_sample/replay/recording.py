@@ -21,16 +21,15 @@ def record(
     """
     Record episodes of a policy, as it acts in evaluation.
 
-    :param model: whatever has Stable-Baselines3's ``predict``
-    :param env: environment, vectorised environment or id. Of a ``VecNormalize`` the policy gets normalised
-        observations, by the statistics as they are, and the data set the original ones
-    :param episodes: number of episodes, whole ones; several environments share them evenly, as in
-        ``evaluate_policy``
+    :param model: any object with Stable-Baselines3's ``predict``
+    :param env: environment, vectorised environment or id. With a ``VecNormalize`` the policy gets observations
+        normalised by its current statistics, and the data set the original ones
+    :param episodes: number of whole episodes; several environments share them evenly, as in ``evaluate_policy``
     :param deterministic: whether the policy's mean action is taken instead of a sample
     :param seed: of the environment; None: as it is
     :return: the data set
-    :raises ValueError: if ``episodes`` is no number above 0, or the model is of other spaces than the environment's, or
-        learned from observations that a ``VecNormalize`` normalised, and ``env`` is in none
+    :raises ValueError: if ``episodes`` is not a number above 0, if the model's spaces are not the environment's, or if
+        the model learned from observations that a ``VecNormalize`` normalised and ``env`` is in none
     """
     check_value("episodes", episodes, integer(1))
     made: Any = make_vec_env(env) if isinstance(env, str) else env
@@ -87,7 +86,7 @@ def record(
 
 def _check_not_normalized(model: BaseAlgorithm) -> None:
     """
-    :raises ValueError: it knows normalised observations, and would get the environment's own
+    :raises ValueError: if the model learned from normalised observations, and would get the environment's own
     """
     own = model.get_vec_normalize_env()
     if not (lacks_vec_normalize(model) if own is None else own.norm_obs):
@@ -98,14 +97,14 @@ def _check_not_normalized(model: BaseAlgorithm) -> None:
         "numbers than it knows"
     )
     if own is None and model.env is not None:
-        # It may have been trained on in an environment without one.
+        # It may have been trained further in an environment without one.
         warn(message)
     else:
         raise ValueError(message)
 
 
 def _below(venv: VecEnv, normalize: VecNormalize | None) -> VecEnv:
-    """The environments without a normalisation of theirs, which is their outermost wrapper."""
+    """The environments without their normalisation, which must be their outermost wrapper."""
     if normalize is None:
         return venv
     if venv is not normalize:

@@ -17,7 +17,7 @@ def as_row(name: str, given: Any, shape: tuple[int, ...], dtype: Any = FLOAT32) 
     :param given: one value, or one of each environment
     :param shape: of a row, (n_envs, ...)
     :param dtype: of a row
-    :return: the row, of that shape and type, or what was given if it is one
+    :return: the row, of that shape and type; ``given`` itself if it is one already
     :raises ValueError: if it has another shape
     """
     given = np.asarray(given)
@@ -46,7 +46,7 @@ def as_observation(name: str, given: Any, shape: tuple[int, ...], space: spaces.
     :param name: what it is, for the error
     :param given: one observation, or one of each environment
     :param shape: of a row, (n_envs, O)
-    :param space: of one environment's
+    :param space: of one environment's observations
     :return: the row, (n_envs, O)
     :raises ValueError: if it has another shape
     """
@@ -62,7 +62,7 @@ def as_actions(given: Any, shape: tuple[int, int], space: spaces.Space) -> np.nd
 
     :param given: one action, or one of each environment, with the axes of the space or flat
     :param shape: of a row, (n_envs, A)
-    :param space: of one environment's
+    :param space: of one environment's actions
     :return: the row, (n_envs, A)
     :raises ValueError: if it has another shape
     """
@@ -106,8 +106,8 @@ def action_dtype(space: spaces.Space) -> Any:
     Choose the type of stored actions.
 
     :param space: of the actions
-    :return: the type of the actions that a buffer stores: those of a Box lie in [-1, 1], so that they are floats also
-        where the space is one of integers
+    :return: the type in which a buffer stores actions: those of a Box lie in [-1, 1], so that they are floats even if
+        the space is one of integers
     """
     if space.dtype == np.float64 or (isinstance(space, spaces.Box) and not np.issubdtype(space.dtype, np.floating)):
         return np.float32

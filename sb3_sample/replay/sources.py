@@ -17,10 +17,10 @@ from sb3_sample.replay.mixture import mixed
 class DatasetSource:
     """
     Source of batches from a data set, normalised as a model's environment is. Rows are drawn by NumPy's global
-    generator, as those of replay buffers.
+    generator, like those of replay buffers.
 
     :param model: the algorithm; its ``batch_size`` and normalisation are those in force when something is drawn
-    :param dataset: the data set, of which ``validation_proportion`` of the model are held out, always the same steps
+    :param dataset: the data set; the model's ``validation_proportion`` of its steps are held out, always the same ones
     """
 
     def __init__(self, model: Any, dataset: Dataset):
@@ -45,7 +45,7 @@ class DatasetSource:
         Draw the batches of several gradient steps.
 
         :param n_batches: number of gradient steps
-        :param batch_size: transitions a step
+        :param batch_size: transitions per step
         :return: the batches
         """
         n = len(self.dataset) if self._training is None else len(self._training)
@@ -56,7 +56,7 @@ class DatasetSource:
         """
         Draw transitions of the validation side.
 
-        :return: as many as those of :meth:`ReplaySource.held_out`; None while there are fewer
+        :return: as many transitions as :meth:`ReplaySource.held_out` draws; None while there are fewer
         """
         n = n_held_out(self._model)
         return self.drawn_held_out(n) if len(self._held_out) >= n else None
@@ -75,7 +75,7 @@ class DatasetSource:
 
     def observations(self) -> Iterator[Any]:
         """
-        :return: those of all transitions, the held-out ones included, some thousand at a time, (n, O)
+        :return: observations of all transitions, the held-out ones included, some thousand at a time, (n, O)
         """
         for rows in np.array_split(np.arange(len(self.dataset)), -(-len(self.dataset) // 10_000)):
             yield self._taken(rows).observations
@@ -83,7 +83,7 @@ class DatasetSource:
     def latest(self, n_steps: int) -> Extra | None:
         """
         :param n_steps: T
-        :return: None: no steps are the newest ones
+        :return: None: a data set has no newest steps
         """
         return None
 
@@ -111,8 +111,8 @@ class DatasetSource:
 
 class ReplaySource:
     """
-    Source of batches from a model's replay buffer, normalised as its environment is, and from its prior data, if any:
-    the latter's rows come first.
+    Source of batches from a model's replay buffer, normalised as its environment is, and from its prior data, if any,
+    whose rows come first.
 
     :param model: the algorithm; its ``replay_buffer``, ``gamma``, ``batch_size`` and ``validation_proportion`` are
         those in force when something is drawn
@@ -136,7 +136,7 @@ class ReplaySource:
         Draw the batches of several gradient steps.
 
         :param n_batches: number of gradient steps
-        :param batch_size: transitions a step
+        :param batch_size: transitions per step
         :return: the batches, valid until the next call
         """
         model, n_prior = self._model, 0
@@ -202,8 +202,8 @@ class WindowSource(ReplaySource):
         Draw the batches of several gradient steps.
 
         :param n_batches: number of gradient steps
-        :param batch_size: transitions a step
-        :return: the batches, each drawn by the weights of now
+        :param batch_size: transitions per step
+        :return: the batches, each drawn by the current weights
         """
         model = self._model
         drawn = (self._window(batch_size, model.n_steps) for _ in range(n_batches))
@@ -214,7 +214,7 @@ class WindowSource(ReplaySource):
         Draw the batches of several steps of the encoder, each when it is needed.
 
         :param n_batches: number of steps
-        :param batch_size: windows a step
+        :param batch_size: windows per step
         :return: the batches
         """
         return (self._window(batch_size, self._model.encoder_horizon) for _ in range(n_batches))
@@ -246,10 +246,10 @@ def draw_batches(
 
     :param buffer: replay buffer
     :param n_batches: number of gradient steps
-    :param batch_size: transitions a step
-    :param gamma: discount factor, where the buffer has none of its own
+    :param batch_size: transitions per step
+    :param gamma: discount factor, if the buffer has none of its own
     :param vec_normalize: normalises observations and rewards as they are drawn
-    :param memory: memory that the transitions are gathered into where that is possible
+    :param memory: memory into which the transitions are gathered if possible
     :return: the batches; with ``memory``, valid until it is used again
     """
     if memory is not None and memory.serves(buffer, vec_normalize):

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
-#: Rows that are looked at or copied at once, so that data larger than the memory are never in it as a whole.
+#: Rows that are checked or copied at a time, so that data larger than the memory are never in it as a whole.
 CHUNK = 65_536
 
 
@@ -15,7 +15,7 @@ class Steps(NamedTuple):
     observation and next observation, (N,) each; without ``next_at``, ``next_observations`` has the latter, (N, O).
 
     ``actions`` are in the environment's units, (N, A); ``terminations`` and ``truncations`` say whether the episode
-    ended with the step, (N,), the latter also where the data end or go on elsewhere.
+    ended with the step, (N,), the latter also where the data end or continue elsewhere.
     """
 
     observations: Any
@@ -32,7 +32,7 @@ class Steps(NamedTuple):
 def observation_dtypes(space: Any) -> Any:
     """
     :param space: of observations
-    :return: the type that they are stored in, floats as float32; of a Dict by key
+    :return: the type in which they are stored, floats as float32; for a Dict by key
     """
     if isinstance(space, spaces.Dict):
         return {key: observation_dtypes(part) for key, part in space.spaces.items()}
@@ -43,7 +43,7 @@ def observation_dtypes(space: Any) -> Any:
 def action_dtype(space: spaces.Box) -> Any:
     """
     :param space: of actions
-    :return: the type that they are stored in, which has fractions in any case
+    :return: the type in which they are stored, always a float
     """
     dtype = np.dtype(space.dtype)
     return dtype if dtype.kind == "f" else np.dtype(np.float32)
@@ -51,13 +51,13 @@ def action_dtype(space: spaces.Box) -> Any:
 
 def put(name: str, values: Any, out: np.ndarray) -> None:
     """
-    Convert values to what is stored.
+    Convert values to the type in which they are stored.
 
     :param name: what they are, for the error
-    :param values: an array, or what is read like one
-    :param out: of the same shape, which they are written to
-    :raises ValueError: if they are not finite in its type; of actions :func:`check_actions` says so. If its type is one
-        of integers and has not their numbers
+    :param values: an array, or an object that is read like one
+    :param out: array of the same shape to which they are written
+    :raises ValueError: if they are not finite in the type of ``out`` (for actions :func:`check_actions` raises it), or
+        if that is a type of integers that cannot hold them
     """
     for first in range(0, len(out), CHUNK):
         given = np.asarray(values[first : first + CHUNK])
@@ -75,7 +75,7 @@ def check_action_space(shape: tuple[int, ...], action_space: Any) -> None:
     """
     :param shape: of an action
     :param action_space: the space
-    :raises ValueError: if it is no bounded Box of this shape
+    :raises ValueError: if it is not a bounded Box of this shape
     """
     bounded = isinstance(action_space, spaces.Box) and np.isfinite([action_space.low, action_space.high]).all()
     if not bounded or tuple(shape) != action_space.shape or not (action_space.low < action_space.high).all():
@@ -92,7 +92,7 @@ def check_actions(actions: np.ndarray, action_space: spaces.Box) -> None:
     :raises ValueError: if one lies outside of it
     """
     low, high = (bound.astype(np.float64) for bound in (action_space.low, action_space.high))
-    # float32 rounds a bound that float64 has.
+    # float32 rounds a bound given in float64.
     margin = 1e-5 * (high - low)
     for first in range(0, len(actions), CHUNK):
         piece = actions[first : first + CHUNK]

@@ -23,15 +23,14 @@ _FADE = number("lie in (0, 1]", lambda value: 0 < value <= 1)
 
 class FadedReplay(CompactReplay):
     """
-    Replay buffer whose transitions are drawn the less, the older they are: in proportion to ``max(fade ** age,
-    fade_floor)``, the age being the number of steps stored after a transition's own, 0 of the newest ("Forget and
-    Grow", 2025; DR.Q). The age that belongs to a uniform number is computed in closed form: a draw costs the same
-    whatever the size of the buffer.
+    Replay buffer that draws older transitions less often: in proportion to ``max(fade ** age, fade_floor)``, the age
+    being the number of steps stored after a transition's own, 0 for the newest ("Forget and Grow", 2025; DR.Q). The age
+    that belongs to a uniform number is computed in closed form: a draw costs the same whatever the size of the buffer.
 
-    :param args: as of ``CompactReplayBuffer``
-    :param kwargs: as of ``CompactReplayBuffer``
+    :param args: as in ``CompactReplayBuffer``
+    :param kwargs: as in ``CompactReplayBuffer``
     :param fade: factor on a weight at each step, in (0, 1]
-    :param fade_floor: up to where a weight fades, in [0, 1]
+    :param fade_floor: factor down to which a weight fades, in [0, 1]
     :raises ValueError: if one of them is out of range
     """
 
@@ -92,23 +91,23 @@ class FadedReplayBuffer(FadedReplay, CompactReplayBuffer):  # type: ignore[misc,
 
 
 class FadedDictReplayBuffer(FadedReplay, CompactDictReplayBuffer):  # type: ignore[misc, override]
-    """Replay buffer for dict observations whose transitions are drawn the less, the older they are."""
+    """Replay buffer for dict observations that draws older transitions less often."""
 
 
 class PrioritizedReplay(CompactReplay):
     """
     Replay buffer whose transitions are drawn by priority, ``max(|TD error|, smallest_error) ** priority_exponent``
-    (LAP, Fujimoto et al. 2020; without importance weights), and, with ``fade`` below 1, the less, the older they are.
-    The TD errors of a gradient step, the largest of its critics', renew the priorities of its transitions. New
+    (LAP, Fujimoto et al. 2020; without importance weights), and, with ``fade`` below 1, less often the older they are.
+    The TD errors of a gradient step, the largest over its critics, renew the priorities of its transitions. New
     transitions have the largest priority so far.
 
-    LAP's loss is Huber's, which ``n_quantiles=1`` has; with the squared error of scalar critics large errors count
+    LAP uses the Huber loss, as ``n_quantiles=1`` does; with the squared error of scalar critics large errors count
     twice.
 
-    :param args: as of ``CompactReplayBuffer``
-    :param kwargs: as of ``CompactReplayBuffer``
+    :param args: as in ``CompactReplayBuffer``
+    :param kwargs: as in ``CompactReplayBuffer``
     :param fade: factor on a weight at each transition stored, in (0, 1]; 1 for none
-    :param fade_floor: up to where a weight fades, in [0, 1]
+    :param fade_floor: factor down to which a weight fades, in [0, 1]
     :param priority_exponent: at least 0
     :param smallest_error: at least 0
     :raises ValueError: if one of them is out of range
@@ -131,7 +130,7 @@ class PrioritizedReplay(CompactReplay):
         values = dict(zip(kinds, (fade, fade_floor, priority_exponent, smallest_error), strict=True))
         checked = {name: check_value(f"replay_buffer_kwargs[{name!r}]", values[name], kinds[name]) for name in kinds}
         if fade < 1 and fade_floor == 0:
-            # After enough steps nothing but zeros would be left of weights that are no longer renewed.
+            # Weights that are no longer renewed would all be zero after enough steps.
             raise ValueError(f"replay_buffer_kwargs: fade={fade} needs a fade_floor above 0")
         self.weights = DrawWeights(self.buffer_size * self.n_envs, **checked)
 
@@ -182,7 +181,7 @@ class PrioritizedReplay(CompactReplay):
         """
         Renew the priorities of transitions.
 
-        :param slots: of a batch, its column ``slots``, (B, 1)
+        :param slots: column ``slots`` of a batch, (B, 1)
         :param errors: absolute TD errors, (B,)
         """
         self.weights.renew(slots.reshape(-1).cpu().numpy(), errors.cpu().numpy())
@@ -206,7 +205,7 @@ class PrioritizedReplay(CompactReplay):
 
     def changing_state(self) -> dict[str, Any]:
         """
-        Collect what changes in rows that are there already.
+        Collect the state that changes in rows already stored.
 
         :return: the state of the weights
         """
@@ -214,7 +213,7 @@ class PrioritizedReplay(CompactReplay):
 
     def load_changing_state(self, state: dict[str, Any]) -> None:
         """
-        Restore what changes in rows that are there already, after the rows.
+        Restore the state that changes in rows already stored, after the rows.
 
         :param state: from :meth:`changing_state` of a buffer of the same sizes
         :raises ValueError: if it is of another buffer
@@ -236,16 +235,16 @@ class PrioritizedDictReplayBuffer(PrioritizedReplay, CompactDictReplayBuffer):  
 
 class WindowReplay(PrioritizedReplay):
     """
-    Faded prioritised replay buffer of windows, as many consecutive steps of one episode (DR.Q).
+    Faded prioritised replay buffer of windows of consecutive steps of one episode (DR.Q).
 
     A transition may start a window when ``horizon`` later ones of its episode are stored; after a termination the last
-    ones may too, whose windows run over the end. The last ``horizon`` transitions before a time limit never do. As in
-    the published code, the end of an episode takes a slot, so that the buffer holds as many transitions and ends as it
-    has slots. Unlike there, the next observation of a terminating transition is the episode's last one, also within
+    ones may too, with windows that run past the end. The last ``horizon`` transitions before a time limit never do. As
+    in the published code, the end of an episode takes a slot, so that the buffer holds as many transitions and ends as
+    it has slots. Unlike there, the next observation of a terminating transition is the episode's last one, even within
     windows.
 
-    :param args: as of ``CompactReplayBuffer``
-    :param kwargs: as of ``CompactReplayBuffer``
+    :param args: as in ``CompactReplayBuffer``
+    :param kwargs: as in ``CompactReplayBuffer``
     :param horizon: steps of the longest window
     :param fade: factor on a weight at each transition stored, in (0, 1]; 1 for none
     :raises ValueError: if an argument is out of range, or the buffer cannot hold two windows of each environment
@@ -263,7 +262,7 @@ class WindowReplay(PrioritizedReplay):
 
     def _weigh(self, row: int) -> None:
         slots = self.weights.put(self.n_envs)
-        # A time limit goes before a termination at the same step.
+        # A time limit takes precedence over a termination at the same step.
         truncated = self.timeouts[row] == 1  # type: ignore[attr-defined]
         terminated = (self.dones[row] == 1) & ~truncated  # type: ignore[attr-defined]
         self.weights.set_ready(self._windows.push(slots, terminated))
@@ -279,7 +278,7 @@ class WindowReplay(PrioritizedReplay):
         self._end(self._windows.n_open > 0)
 
     def truncate_last_trajectory(self) -> None:
-        """End the episodes under way as a time limit would, also in the rows."""
+        """End the episodes under way as a time limit would, in the rows too."""
         assert isinstance(self, ReplayBuffer)
         last = (self.pos - 1) % self.buffer_size
         goes_on = self.dones[last] == 0
@@ -340,7 +339,7 @@ class WindowReplay(PrioritizedReplay):
 
     def changing_state(self) -> dict[str, Any]:
         """
-        Collect what changes in rows that are there already.
+        Collect the state that changes in rows already stored.
 
         :return: the state of the weights, and the windows that are not complete yet
         """
@@ -348,7 +347,7 @@ class WindowReplay(PrioritizedReplay):
 
     def load_changing_state(self, state: dict[str, Any]) -> None:
         """
-        Restore what changes in rows that are there already, after the rows.
+        Restore the state that changes in rows already stored, after the rows.
 
         :param state: from :meth:`changing_state` of a buffer of the same sizes
         :raises ValueError: if it is of another buffer
@@ -364,7 +363,7 @@ class WindowReplay(PrioritizedReplay):
 
 class OpenWindows:
     """
-    The latest slots of each environment's episode, which start windows when enough steps follow.
+    The latest slots of each environment's episode, which may start windows once enough steps follow.
 
     :param n_envs: number of environments
     :param horizon: how many later transitions complete a window
@@ -378,7 +377,7 @@ class OpenWindows:
 
     @property
     def n_open(self) -> np.ndarray:
-        """How many slots of each environment wait, (n_envs,)."""
+        """Number of waiting slots of each environment, (n_envs,)."""
         return np.minimum(self._n_pushed, self._horizon)
 
     def push(self, slots: np.ndarray, terminated: np.ndarray) -> np.ndarray:
@@ -386,7 +385,7 @@ class OpenWindows:
         Add the slots of one step.
 
         :param slots: of each environment's transition, (n_envs,)
-        :param terminated: whose episode terminated with it, (n_envs,)
+        :param terminated: whether each environment's episode terminated with it, (n_envs,)
         :return: slots that may be drawn from now on, (n,)
         """
         at = self._n_pushed % self._horizon
@@ -403,7 +402,7 @@ class OpenWindows:
         """
         Forget the slots of episodes that ended.
 
-        :param ended: whose, (n_envs,)
+        :param ended: whether each environment's episode ended, (n_envs,)
         """
         self._n_pushed[ended] = 0
 
@@ -419,9 +418,9 @@ class OpenWindows:
         """
         Restore the state.
 
-        :param state: from :meth:`state_dict` of as many environments and steps
-        :param n_slots: how many slots there are
-        :raises ValueError: if it is of others
+        :param state: from :meth:`state_dict` with the same numbers of environments and steps
+        :param n_slots: number of slots
+        :raises ValueError: if it does not fit these numbers
         """
         for name, own, most in (("open_slots", self._slots, n_slots), ("n_pushed", self._n_pushed, 2**62)):
             value = state[name]

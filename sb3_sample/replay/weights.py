@@ -17,9 +17,9 @@ class DrawWeights:
 
     :param n_slots: capacity, in slots
     :param fade: factor on a weight at each transition stored, in (0, 1]; 1 for none
-    :param fade_floor: up to where a weight fades, in [0, 1]
+    :param fade_floor: factor down to which a weight fades, in [0, 1]
     :param priority_exponent: exponent of the priorities, at least 0
-    :param smallest_error: TD errors below it count as it, at least 0
+    :param smallest_error: smaller TD errors count as this one, at least 0
     """
 
     #: Numbers and arrays that change with what is stored.
@@ -46,7 +46,7 @@ class DrawWeights:
 
     def put(self, n: int) -> np.ndarray:
         """
-        Give slots to new transitions, not ready yet, in the place of the oldest ones.
+        Give slots, not ready yet, to new transitions, in place of the oldest ones.
 
         :param n: how many
         :return: their slots, (n,)
@@ -60,7 +60,7 @@ class DrawWeights:
 
     def skip(self, n: int) -> None:
         """
-        Take slots for nothing.
+        Take slots without a transition.
 
         :param n: how many
         """
@@ -128,10 +128,10 @@ class DrawWeights:
 
     def renew(self, slots: np.ndarray, errors: np.ndarray) -> None:
         """
-        Give slots new priorities. One that is there several times has its last.
+        Give slots new priorities. A slot given several times gets its last one.
 
         :param slots: which, (n,)
-        :param errors: absolute TD errors of their transitions, (n,). One that is not finite, at which a training stops,
+        :param errors: absolute TD errors of their transitions, (n,). A non-finite error, at which training stops,
             changes nothing
         """
         finite = np.isfinite(errors)
@@ -142,7 +142,7 @@ class DrawWeights:
 
     def set_priorities(self, slots: np.ndarray, priorities: np.ndarray) -> None:
         """
-        Set priorities. The largest of all times, which new transitions get, is never lowered.
+        Set priorities. The largest priority so far, which new transitions get, is never lowered.
 
         :param slots: which, (n,)
         :param priorities: their priorities, (n,)
@@ -164,8 +164,8 @@ class DrawWeights:
         """
         Restore the state.
 
-        :param state: from :meth:`state_dict` of as many slots
-        :raises ValueError: if it is of others
+        :param state: from :meth:`state_dict` with the same number of slots
+        :raises ValueError: if it does not fit that number
         """
         if state.keys() != {*self._NUMBERS, *self._ARRAYS}:
             raise ValueError(f"the weights of a replay buffer are {sorted({*self._NUMBERS, *self._ARRAYS})}, not "
