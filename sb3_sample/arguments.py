@@ -24,11 +24,14 @@ from sb3_sample.warn import warn
 
 
 class NotAllowed(ValueError, AssertionError):
-    """Refusal that is an assertion in Stable-Baselines3: a ``ValueError``, as every refusal here, and one of those."""
+    """
+    Refusal that is an assertion in Stable-Baselines3: a ``ValueError``, like every refusal here, and an
+    ``AssertionError``.
+    """
 
 
 class NoPolicy(ValueError):
-    """A policy is none of this family."""
+    """The policy is not one of this family."""
 
 
 #: Entries of ``policy_kwargs`` that Stable-Baselines3's policies and those here have in common.
@@ -43,8 +46,8 @@ _ENVIRONMENT = Kind(
     "be an environment, a vectorised environment or the id of one",
     lambda value: isinstance(value, (str, VecEnv)) or (hasattr(value, "action_space") and hasattr(value, "step")),
 )
-#: Arguments that may be functions of the remaining progress, whose values are numbers of at least 0. The zoo passes one
-#: that is 0 where it loads a model to act.
+#: Arguments that may be functions of the remaining progress, with values of at least 0. The zoo passes a function that
+#: is 0 when it loads a model to act.
 _SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf")
 #: Arguments of ``learn`` in both families.
 _LEARN: dict[str, Kind] = {
@@ -60,11 +63,11 @@ _LEARN: dict[str, Kind] = {
 
 def check_every(agent: Any, needs_spaces: bool = True) -> None:
     """
-    Check every argument that has a kind, and what all policies take. There are spaces unless a model is made without an
-    environment.
+    Check every argument that has a kind, and the arguments that all policies take. There are spaces unless a model is
+    made without an environment.
 
     :param agent: an algorithm whose arguments are stored and whose networks do not exist yet
-    :param needs_spaces: whether it is an error that there are no spaces yet
+    :param needs_spaces: whether missing spaces are an error
     :raises ValueError: if one of them is of another kind, or the policy is not one for the observations, or takes none
         of an entry's name in ``policy_kwargs``
     """
@@ -72,7 +75,8 @@ def check_every(agent: Any, needs_spaces: bool = True) -> None:
         raise ValueError(f"env must {_ENVIRONMENT.words}, not None")
     for name, argument in type(agent).constructor_arguments.items():
         if argument.kind is not None:
-            # Stable-Baselines3 stores some under the argument's name that are declared under another for their type.
+            # Stable-Baselines3 stores some under the argument's name, though they are declared under another for their
+            # type.
             attribute = argument.attribute if argument.attribute in vars(agent) else name
             setattr(agent, attribute, check_value(name, getattr(agent, attribute), argument.kind))
             if name in _SCHEDULED and callable(getattr(agent, attribute)):
@@ -97,7 +101,7 @@ def check_every(agent: Any, needs_spaces: bool = True) -> None:
 
 
 def _check_schedule(name: str, schedule: Callable[[float], Any]) -> None:
-    """Check that a function gives a number at the begin, where Stable-Baselines3 asks it first."""
+    """Check that a function gives a number at the begin, where Stable-Baselines3 first calls it."""
     try:
         first = float(schedule(1.0))
     except Exception as error:
@@ -127,7 +131,7 @@ def _check_names(policy_kwargs: Mapping[str, Any], policy: type) -> None:
 def named_policy(agent: Any) -> str | None:
     """
     :param agent: an algorithm
-    :return: the name of its policy; None for a class of the user's own, which may do with its arguments what it likes
+    :return: the name of its policy; None for a class of the user's own, which may use its arguments as it likes
     """
     return next((name for name, cls in agent.policy_aliases.items() if cls is agent.policy_class), None)
 
@@ -135,7 +139,7 @@ def named_policy(agent: Any) -> str | None:
 def check_net_arch(net_arch: Any, keys: tuple[str, str], both: bool) -> None:
     """
     :param net_arch: the policy's argument
-    :param keys: of a dict, for the actor and the critic
+    :param keys: keys of a dict, for the actor and the critic
     :param both: whether a dict must have both
     :raises ValueError: if it is neither a list of widths nor a dict of such lists with these keys
     """
@@ -183,12 +187,12 @@ def check_device(device: Any) -> None:
     except (RuntimeError, TypeError, ValueError) as error:
         raise ValueError(f"device must be 'auto', 'cpu', 'cuda' or another of torch's, not {device!r}") from error
     if device != "auto" and torch.device(device).type != used.type:
-        # Stable-Baselines3 does the same, without a word.
+        # Stable-Baselines3 does the same silently.
         warn(f"device={str(device)!r}: torch finds no such device here, so {used} is used")
 
 
 def _check_env(env: Any) -> None:
-    """An environment as an argument. Gymnasium is told of Atari's games, which it does not know by itself."""
+    """Check an environment argument. Atari's games are registered: Gymnasium does not know them by itself."""
     check_value("env", env, _ENVIRONMENT.or_none())
     if is_atari_id(env):
         check_game(env)
@@ -196,10 +200,10 @@ def _check_env(env: Any) -> None:
 
 def check_program(cls: type, given: Mapping[str, Any]) -> None:
     """
-    Check what Stable-Baselines3's constructor makes use of.
+    Check the arguments that Stable-Baselines3's constructor uses.
 
     :param cls: class of an algorithm
-    :param given: its arguments by name; env is None where a model is loaded
+    :param given: its arguments by name; env is None when a model is loaded
     :raises ValueError: if one of them is of another kind
     :raises ImportError: if env is the id of an Atari game without ``ale-py``, or without its ROM
     """
@@ -242,9 +246,9 @@ def check_n_envs(agent: Any, env: GymEnv) -> None:
 def names_for_load(cls: type, base: type) -> set[str]:
     """
     :param cls: class of an algorithm
-    :param base: what the algorithms' classes are derived from
+    :param base: base class of the algorithms
     :return: the arguments that ``load`` may change: those of the class and of its bases below ``base``, and
-        ``policy_class``, Stable-Baselines3's name for what the policy is of
+        ``policy_class``, Stable-Baselines3's name for the policy's class
     """
     classes = [c for c in cls.__mro__ if issubclass(c, base) and c is not base]
     names = {name for c in classes for name in inspect.signature(c).parameters}
@@ -254,10 +258,10 @@ def names_for_load(cls: type, base: type) -> set[str]:
 def check_load(cls: type, base: type, env: Any, device: Any, kwargs: dict[str, Any]) -> None:
     """
     :param cls: class of an algorithm
-    :param base: what the algorithms' classes are derived from
-    :param env: with which it is to be loaded
-    :param device: where it is to be loaded
-    :param kwargs: what ``load`` is to change
+    :param base: base class of the algorithms
+    :param env: environment with which it is to be loaded
+    :param device: device to which it is to be loaded
+    :param kwargs: arguments that ``load`` is to change
     :raises ValueError: if one of them is no argument of the class, or of another kind where that is not found later
     :raises ImportError: if env is the id of an Atari game without ``ale-py``, or without its ROM
     """
@@ -273,7 +277,7 @@ def check_load(cls: type, base: type, env: Any, device: Any, kwargs: dict[str, A
 def default_of(cls: type, name: str) -> Any:
     """
     :param cls: class of an algorithm
-    :param name: an argument of its constructor, or of a base's that it hands it on to
+    :param name: an argument of its constructor, or of a base's constructor to which it is passed on
     :return: the argument's default
     """
     signatures = (inspect.signature(c).parameters for c in cls.__mro__)
@@ -283,7 +287,7 @@ def default_of(cls: type, name: str) -> Any:
 @contextmanager
 def naming_changes(kwargs: dict[str, Any]) -> Iterator[None]:
     """
-    Where a file is loaded: that its parameters do not fit is laid to the arguments that are to differ from the file's.
+    While a file is loaded: blame parameters that do not fit on the arguments that are to differ from the file's.
 
     :param kwargs: these arguments
     :raises ValueError: if they are not of the model's networks and parts

@@ -1,5 +1,5 @@
 """
-The command ``sb3-sample``: the zoo's commands with the algorithms of this package in them, ``plot``, ``study``,
+The command ``sb3-sample``: the zoo's commands, extended by the algorithms of this package, and ``plot``, ``study``,
 ``dataset``, ``scaling``, ``advise`` and ``variance``.
 """
 
@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         try:
             sys.stdout.flush()
         except BrokenPipeError:
-            # Whoever reads the output, such as `head`, has gone. Python would try once more at the end.
+            # The reader of the output, such as `head`, is gone. Python would try to write again at the end.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise SystemExit(128 + signal.SIGPIPE) from None
         raise  # another pipe, such as a worker's
@@ -74,7 +74,7 @@ def _usage() -> str:
 
 
 def _zoo_module(name: str) -> ModuleType:
-    """A module of the zoo, with our algorithms and environments in the zoo."""
+    """Import a module of the zoo, with our algorithms and environments registered in the zoo."""
     try:
         from sb3_sample import zoo
     except ImportError as error:
@@ -85,12 +85,12 @@ def _zoo_module(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        # Of the zoo itself all is there; what its plots need is an extra of it.
+        # The zoo itself is complete; its plots need an extra.
         sys.exit(f"sb3-sample: {error}. Install it with: {install('zoo', 'plots')}")
 
 
 def _set_command_line(command: str, arguments: list[str]) -> None:
-    """The zoo's commands read ``sys.argv``; its first entry is the name in their help."""
+    """Set ``sys.argv``, which the zoo's commands read; its first entry is the name in their help."""
     sys.argv = [f"sb3-sample {command}", *arguments]
 
 
@@ -119,7 +119,7 @@ def _enjoy(arguments: list[str]) -> None:
 
 
 def _own_options(parser: argparse.ArgumentParser, arguments: list[str]) -> tuple[argparse.Namespace, list[str]]:
-    """Our options and the zoo's, whose help comes after ours."""
+    """Separate our options from the zoo's, whose help comes after ours."""
     if {"-h", "--help"} & set(arguments):
         print(parser.format_help())
     return parser.parse_known_args(arguments)
@@ -127,7 +127,7 @@ def _own_options(parser: argparse.ArgumentParser, arguments: list[str]) -> tuple
 
 @contextlib.contextmanager
 def _errors(command: str) -> Iterator[None]:
-    """A run or a file that is refused is told of without a traceback."""
+    """Report a refused run or file without a traceback."""
     from sb3_sample.errors import ParametersDoNotFit
     from sb3_sample.saving.container import BadFile, PickledFile
     from sb3_sample.saving.encoding import NotPortable
@@ -162,7 +162,9 @@ def _arguments(command: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _drawing(command: str) -> Iterator[None]:
-    """The zoo's pictures are of whatever numbers a run has logged, and fail in many ways with those of several runs."""
+    """
+    Refuse what the zoo cannot draw: it takes any logged numbers, and fails in many ways with those of several runs.
+    """
     try:
         yield
     except (ValueError, TypeError, LookupError, ArithmeticError, OSError) as error:
@@ -212,7 +214,7 @@ def _zoo_plot(function: str) -> Callable[[list[str]], None]:
 
 
 def _record_video(arguments: list[str]) -> None:
-    # The zoo's other commands have this option, this one has not.
+    # The zoo's other commands have the option --gym-packages, this one does not.
     select_gl_backend()
     utils = _zoo_module("rl_zoo3.utils")
     from sb3_sample.zoo import watch
@@ -241,7 +243,7 @@ def _variance(arguments: list[str]) -> None:
 
 @contextlib.contextmanager
 def _extras() -> Iterator[None]:
-    """An extra that is not installed is told of without a traceback."""
+    """Report an extra that is not installed without a traceback."""
     try:
         yield
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Lines for a terminal, a pipe or a file that may be gone, or full: the training goes on without them."""
+"""Lines for a terminal, a pipe or a file that may be gone or full: the training continues without them."""
 
 import contextlib
 import os
@@ -10,22 +10,22 @@ from sb3_sample.warn import warn
 
 def standard_error() -> int | None:
     """
-    :return: the descriptor of the standard error; None if the program has none (any more), and another file may have
-        got its number
+    :return: the descriptor of the standard error; None if the program has none, or no longer has one, so that its
+        number may be another file's
     :raises OSError: there is no such descriptor
     """
     stream = sys.__stderr__
     if stream is None or stream.closed:
         return None
     descriptor = stream.fileno()
-    # Files that Python opens are not inherited by other programs; what the standard error was given is.
+    # Files that Python opens are not inherited by other programs; the standard error that the program was given is.
     return descriptor if os.get_inheritable(descriptor) else None
 
 
 def tell(text: str) -> None:
     """
-    Write to the standard error from the handler of a signal: nothing is raised, whatever has become of it, since the
-    handler runs in the midst of anything.
+    Write to the standard error from a signal handler. Nothing is raised, whatever the state of the standard error,
+    since the handler can interrupt any code.
 
     :param text: a line
     """
@@ -37,19 +37,19 @@ def tell(text: str) -> None:
 
 def say(text: str) -> None:
     """
-    Print a line in the midst of a turn. It is lost where nobody takes it.
+    Print a line during a turn. It is lost if the output does not accept it.
 
     :param text: the line
     """
-    # The reader of a pipe is gone, the disk is full: no reason to lose the turn.
+    # A pipe without a reader or a full disk is no reason to lose the turn.
     with contextlib.suppress(OSError):
         print(text)
 
 
 class LossyLog:
     """
-    While it is in force, lines of the log that a terminal, a pipe or a file does not take are lost with a warning, and
-    do not end the training in the midst of a turn.
+    While in force, lines of the log that a terminal, a pipe or a file does not accept are lost with a warning, instead
+    of ending the training during a turn.
 
     :param logger: the algorithm's, of Stable-Baselines3
     """

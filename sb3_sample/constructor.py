@@ -3,8 +3,8 @@ Constructors declared as attributes: name, type, default, kind and meaning of an
 class repeats nothing of what it inherits.
 
 Type checkers and editors read the declarations as they stand (``typing.dataclass_transform``): the signature of every
-class is complete without running anything. The string below a declaration is what an editor shows of the argument, and
-``help`` of the class.
+class is complete without running anything. Editors show the string below a declaration for the argument, and ``help``
+shows it for the class.
 """
 
 import ast
@@ -32,11 +32,11 @@ class Argument:
     :param default: default; ``REQUIRED`` for none
     :param kind: the kind of its values; None if that is checked elsewhere
     :param kw_only: whether it is passed by name only
-    :param of_training: whether it says how transitions are collected, stored and drawn, or what is told of it, of which
-        a learner has nothing
+    :param of_training: whether it concerns how transitions are collected, stored and drawn, or the reports of that,
+        none of which applies to a learner
     :param annotation: its type
     :param meaning: the string below its declaration
-    :param keeps_place: whether ``kw_only`` is the inherited one's, if there is one
+    :param keeps_place: whether ``kw_only`` is that of the inherited argument, if there is one
     """
 
     name: str
@@ -59,16 +59,16 @@ def argument(
     alias: str | None = None,
 ) -> Any:
     """
-    Declare an argument of a constructor, as the value of an annotated attribute of the class. In the place of an
-    inherited one only its default and what is given here change.
+    Declare an argument of a constructor, as the value of an annotated attribute of the class. If it replaces an
+    inherited argument, only the default and what is given here change.
 
     :param default: default; none if left out
-    :param kind: the kind of its values, of ``sb3_sample.kinds``; None for that of the inherited one, or no check
-    :param kw_only: whether it is passed by name only; None: as the inherited one, else by name only. Type checkers take
-        None for True
-    :param of_training: whether a learner has nothing of it
-    :param alias: name of the argument, if the declaration needs another: one whose type differs from that of the
-        object's attribute of this name
+    :param kind: the kind of its values, of ``sb3_sample.kinds``; None for the inherited argument's, or no check
+    :param kw_only: whether it is passed by name only; None: as for the inherited argument, else by name only. Type
+        checkers take None for True
+    :param of_training: whether it does not apply to a learner
+    :param alias: name of the argument, if the declaration needs another name, since the argument's type differs from
+        that of the object's attribute of this name
     :return: the declaration
     """
     return Argument(alias or "", "", default, kind, kw_only is not False, of_training, keeps_place=kw_only is None)
@@ -79,7 +79,7 @@ class Given(dict[str, Any]):
     Values of a constructor's arguments, by their names.
 
     :param values: the values
-    :param passed: names of the arguments that were passed, and are not at their defaults for want of a value
+    :param passed: names of the arguments that were passed; the others have their defaults
     """
 
     def __init__(self, values: Mapping[str, Any], passed: Iterable[str]):
@@ -94,14 +94,14 @@ class Constructed:
     derived from one that does, keeps it.
     """
 
-    #: By name, the arguments of the constructor.
+    #: Arguments of the constructor, by name.
     constructor_arguments: ClassVar[dict[str, Argument]] = {}
 
     @classmethod
     def place_of(cls, name: str) -> str:
         """
-        :param name: of what is no argument of the constructor
-        :return: how it is passed otherwise, as the message of the error has it; empty if it is not
+        :param name: name that is not an argument of the constructor
+        :return: how it is passed otherwise, as worded in the error message; empty if it is not
         """
         return ""
 
@@ -125,14 +125,14 @@ class Constructed:
 
 
 def _declared(cls: type) -> dict[str, Argument]:
-    """Merge a class's declarations into what it inherits, and delete them from it: an attribute is the object's."""
+    """Merge a class's declarations into the inherited ones, and delete them from it: an attribute is the object's."""
     arguments: dict[str, Argument] = {}
     for base in reversed(cls.__mro__[1:]):
         arguments |= vars(base).get("constructor_arguments", {})
     names = {known.attribute: name for name, known in arguments.items()}
     annotations, meanings = _annotations(cls), _strings_below(cls)
     for attribute, value in list(vars(cls).items()):
-        # A method or a property of that name is none of the constructor's, unless it is annotated.
+        # A method or a property of that name is not an argument of the constructor, unless it is annotated.
         is_default = attribute in names and (attribute in annotations or not hasattr(type(value), "__get__"))
         if not isinstance(value, Argument) and not is_default:
             continue
@@ -161,7 +161,7 @@ def _declared(cls: type) -> dict[str, Argument]:
 
 
 def _annotations(cls: type) -> dict[str, Any]:
-    """Types of a class's attributes; where Python evaluates them late, a name that is not there yet is no error."""
+    """Types of a class's attributes; where Python evaluates them late, a name not yet defined is no error."""
     if sys.version_info >= (3, 14):
         import annotationlib
 
@@ -171,7 +171,7 @@ def _annotations(cls: type) -> dict[str, Any]:
 
 @functools.cache
 def _classes_of(module: str) -> dict[str, ast.ClassDef]:
-    """Classes of a module's text by their qualified names; none where there is no text."""
+    """Classes in a module's source by their qualified names; none if there is no source."""
     try:
         text = inspect.getsource(sys.modules[module])
     except (KeyError, OSError, TypeError):
@@ -189,7 +189,7 @@ def _classes_of(module: str) -> dict[str, ast.ClassDef]:
 
 
 def _strings_below(cls: type) -> dict[str, str]:
-    """By attribute, the string below it in the class's text."""
+    """Strings below the attributes in the class's source, by attribute."""
     node = _classes_of(cls.__module__).get(cls.__qualname__)
     found: dict[str, str] = {}
     if node is None:
@@ -242,7 +242,7 @@ def _constructor(cls: type[Constructed], signature: inspect.Signature) -> Callab
 
 
 def _meant(cls: type[Constructed], signature: inspect.Signature, kwargs: dict[str, Any]) -> str:
-    """Where an unknown argument belongs, or the argument that was meant, if a name is close to one."""
+    """Hint at where an unknown argument belongs, or at the argument that was meant, if a name is close to one."""
     unknown = [name for name in kwargs if name not in signature.parameters]
     for name in unknown:
         if place := cls.place_of(name):

@@ -1,4 +1,4 @@
-"""``sb3-sample dataset``: data sets recorded, looked at and converted."""
+"""``sb3-sample dataset``: record, show and convert data sets."""
 
 import argparse
 import ast
@@ -80,12 +80,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     Run the command.
 
-    :param argv: its arguments; None for this process's
+    :param argv: the command's arguments; None for this process's
     """
     args = parser().parse_args(argv)
     try:
         with warnings.catch_warnings():
-            # Left out steps are among what is printed.
+            # The output shows the steps left out.
             warnings.filterwarnings("ignore", "[0-9]+ of [0-9]+ steps left out")
             _run(args)
     except PickledFile as error:
@@ -133,7 +133,7 @@ def _read(args: argparse.Namespace) -> Dataset:
 def facts_of(data: Dataset) -> dict[str, Any]:
     """
     :param data: a data set
-    :return: what there is to say of it, plain values by name
+    :return: facts about it, plain values by name
     """
     ends = {"terminated": 0, "truncated": 0}
     returns, lengths = [], []

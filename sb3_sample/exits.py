@@ -3,18 +3,18 @@
 import sys
 from typing import NoReturn
 
-#: The process's exit code, as that of a wrong option.
+#: The process's exit code, the same as after a wrong option.
 CODE = 2
-#: The same after Ctrl-C, as a shell has it: 128 and the number of SIGINT.
+#: The exit code after Ctrl-C, as in shells: 128 plus the number of SIGINT.
 INTERRUPTED = 130
 _MAX = 2000
 
 
 class Refusal(SystemExit):
     """
-    The end of a command that has said why.
+    The end of a command that has printed the reason.
 
-    :param message: what it has said
+    :param message: the printed line
     """
 
     def __init__(self, message: str):
@@ -27,7 +27,7 @@ def refuse(command: str, reason: object) -> NoReturn:
     End the process with one line on stderr and exit code 2.
 
     :param command: name of the command; none if empty
-    :param reason: why; what a file brings into it is not trusted to be one line, short or printable
+    :param reason: the reason; text from a file is not trusted to be one line, short or printable
     :raises Refusal: always
     """
     raise Refusal(_say(command, reason))
@@ -38,7 +38,7 @@ def interrupt(command: str, reason: object) -> NoReturn:
     End the process after Ctrl-C, with one line on stderr and exit code 130.
 
     :param command: name of the command; none if empty
-    :param reason: what there is to say
+    :param reason: the message
     :raises SystemExit: always
     """
     _say(command, reason)

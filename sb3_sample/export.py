@@ -37,7 +37,7 @@ from sb3_sample.warn import warn
 OPSET = 18
 #: The names of input and output; a dict observation's inputs have the names of its keys.
 INPUT, OUTPUT = "observation", "action"
-#: Rows of the observations that the policy is traced with (not 1, which the tracer takes for a constant), and checked.
+#: Rows of observations with which the policy is traced (not 1, which the tracer takes for a constant), and checked.
 _TRACED_ROWS, _CHECKED_ROWS = 2, 3
 
 _FIXED_BATCH = (
@@ -52,13 +52,13 @@ class Exportable:
     def export(self, path: str | os.PathLike[str], vec_normalize: VecNormalize | None = None) -> tuple[Path, Path]:
         """
         Write the deterministic policy as ONNX and as TorchScript, for use without this package. Both take observations
-        as the environment gives them (images with the channels first) and return what
-        ``predict(observation, deterministic=True)`` does. The batch is the first axis, of any length. Needs the extra
-        ``[export]``.
+        as the environment gives them (images with the channels first) and return the same as ``predict(observation,
+        deterministic=True)``. The batch is the first axis, of any length. Needs the extra ``[export]``.
 
         :param path: where to write; ``.onnx`` and ``.pt`` are appended
-        :param vec_normalize: whose normalisation of the observations is put inside; None: that of the model's own
-            environment, if there is one; that it is missing in an environment without one is warned of
+        :param vec_normalize: its normalisation of the observations is included; None: that of the model's own
+            environment, if there is one; a warning is given if the environment lacks the normalisation that the model
+            learned with
         :return: the two files
         :raises ImportError: if the extra is missing, or torch is too old
         :raises TrainingDiverged: if a parameter is not finite
@@ -83,7 +83,7 @@ class Exportable:
             )
             if self.env is None:
                 raise ValueError(message)
-            # It may have been trained on in an environment without one.
+            # It may have been trained further in an environment without one.
             warn(message)
         check_finite_parameters(self)
         path = Path(path)
@@ -104,7 +104,7 @@ class Exportable:
 
 class _RawPolicy(nn.Module):
     """
-    From observations as the environment gives them to actions as it takes them.
+    Map observations as the environment gives them to actions as it takes them.
 
     :param policy: the model's policy
     :param vec_normalize: normalises the observations; None for no normalisation
@@ -127,11 +127,11 @@ class _RawPolicy(nn.Module):
             ) from error
         self.action_space, self.squashed = policy.action_space, policy.squash_output
         if isinstance(self.action_space, spaces.Box):
-            # Of integers, as floats: in the type of the actions that ``predict`` gives.
+            # Bounds of integers as floats, in the type of the actions that ``predict`` gives.
             dtype = _action_dtype(self.action_space)
             self.register_buffer("low", torch.as_tensor(self.action_space.low.astype(dtype)))
             self.register_buffer("high", torch.as_tensor(self.action_space.high.astype(dtype)))
-        #: Which inputs are normalised.
+        #: Names of the inputs that are normalised.
         self.normalized: list[str] = []
         if vec_normalize is not None and vec_normalize.norm_obs:
             self._take_statistics(vec_normalize)
@@ -177,7 +177,7 @@ class _RawPolicy(nn.Module):
             return actions
         actions = actions.reshape(-1, *self.action_space.shape)
         if self.squashed:
-            # As Stable-Baselines3 computes it; and inside the bounds also where that rounds.
+            # As Stable-Baselines3 computes it, and inside the bounds even if that rounds.
             actions = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
         return torch.minimum(torch.maximum(actions, self.low), self.high)
 
@@ -194,7 +194,7 @@ class _RawPolicy(nn.Module):
 
 
 class _Positional(nn.Module):
-    """The same with one argument for each input, as ONNX has it."""
+    """``_RawPolicy`` with one argument for each input, as in ONNX."""
 
     def __init__(self, policy: _RawPolicy):
         super().__init__()
@@ -221,7 +221,7 @@ def _inputs(space: spaces.Space) -> dict[str, spaces.Space]:
 
 
 def _metadata(model: BaseAlgorithm, policy: _RawPolicy) -> dict[str, str]:
-    """Metadata of the files; the values are text, those of several parts JSON."""
+    """Metadata of the files; the values are text, and JSON if they have several parts."""
     action = policy.action_space
     return {
         "exported_by": f"sb3_sample {__version__}",
@@ -243,21 +243,21 @@ def _described(name: str, space: spaces.Space) -> dict[str, Any]:
 
 def _action_dtype(space: spaces.Space) -> Any:
     """
-    Type of the actions that ``predict`` gives: the policy's numbers, whatever the space's, scaled to the bounds of a
-    Box.
+    Type of the actions that ``predict`` gives: that of the policy's numbers, whatever the space's type, scaled to the
+    bounds of a Box.
     """
     if isinstance(space, spaces.Box):
         return np.result_type(np.float32, space.dtype)
-    # Of Bernoulli distributions the mode is a float.
+    # The mode of Bernoulli distributions is a float.
     return np.dtype(np.float32 if isinstance(space, spaces.MultiBinary) else np.int64)
 
 
 def _apart(work: Callable[[], Any]) -> Any:
     """
-    Do something in a process of its own, where one can be forked: torch keeps the types and functions of all that it
-    ever traced, a megabyte for each export. A process that has used a GPU is not forked.
+    Run work in a forked process, if one can be forked: torch keeps the types and functions of everything that it ever
+    traced, a megabyte for each export. A process that has used a GPU is not forked.
 
-    :param work: without effects but for what it returns, which can be pickled as what it raises
+    :param work: function without side effects; its result and its exceptions can be pickled
     :return: what it returns
     :raises Exception: what it raises
     """
@@ -268,7 +268,7 @@ def _apart(work: Callable[[], Any]) -> Any:
     if child == 0:
         try:
             os.close(ours)
-            # The threads of OpenMP are not there after a fork.
+            # OpenMP's threads do not exist after a fork.
             torch.set_num_threads(1)
             with open(theirs, "wb") as file:
                 file.write(_answer(work))
@@ -282,7 +282,7 @@ def _apart(work: Callable[[], Any]) -> Any:
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if not data:
         raise RuntimeError(f"the process that exports has ended without an answer (exit code {status})")
-    # Of this program itself: nobody else has written it.
+    # Safe to unpickle: this program itself has written it.
     value, trace = pickle.loads(data)
     if trace is not None:
         raise value from RuntimeError(f"in the process that exports:\n{trace}")
@@ -329,7 +329,7 @@ def _as_onnx(policy: _RawPolicy, metadata: dict[str, str]) -> bytes:
 
 
 def _as_torchscript(policy: _RawPolicy, metadata: dict[str, str]) -> bytes:
-    # Frozen, the weights are constants: nothing in the file asks for a gradient.
+    # Freezing makes the weights constants: nothing in the file requires a gradient.
     traced = torch.jit.freeze(torch.jit.trace(policy.eval(), (policy.example(_TRACED_ROWS),), check_trace=False))
     more = policy.example(_CHECKED_ROWS)
     try:
@@ -345,7 +345,7 @@ def _as_torchscript(policy: _RawPolicy, metadata: dict[str, str]) -> bytes:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without what the exporters say of themselves: of packages they could use, of their deprecation, of constants."""
+    """Silence the exporters' messages about packages that they could use, their deprecation and constants."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -359,7 +359,7 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _without_checks_of_values() -> Iterator[None]:
-    """Distributions do not look at the values of their arguments, which a tracer does not know."""
+    """Keep distributions from checking the values of their arguments, which a tracer does not know."""
     before = torch.distributions.Distribution._validate_args
     torch.distributions.Distribution.set_default_validate_args(False)
     try:

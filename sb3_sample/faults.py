@@ -1,7 +1,7 @@
 """
-Faults during a training: numbers that are finite no more, and callbacks that raise.
+Faults during a training: numbers that are no longer finite, and callbacks that raise.
 
-Environments that die are the business of ``envs/workers.py``.
+``envs/workers.py`` handles environments that die.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,9 +18,9 @@ from torch import nn
 
 class TrainingDiverged(FloatingPointError, ValueError):
     """
-    A loss, another metric or a parameter is NaN or infinite. Nothing that is learned from here on is worth anything.
+    A loss, another metric or a parameter is NaN or infinite. Everything learned from here on is worthless.
 
-    It is a ``ValueError`` too, since that is what makes the zoo's search for hyperparameters end a trial and go on.
+    It is also a ``ValueError``, at which the zoo's search for hyperparameters ends a trial and continues.
 
     :param values: what is not finite, by name
     :param when: the gradient step, in words
@@ -43,13 +43,13 @@ class TrainingDiverged(FloatingPointError, ValueError):
 
 class MetricWatch:
     """
-    Looks at the metrics of every gradient step without making the host wait for the device: they are kept there, and
-    looked at where the host waits anyway.
+    Check the metrics of every gradient step without making the host wait for the device: they stay on the device, and
+    are checked when the host waits anyway.
 
     :param device: where the metrics are
     """
 
-    #: Gradient steps after which they are looked at in any case, so that what is kept is bounded.
+    #: Gradient steps after which the metrics are checked in any case, so that their number is bounded.
     WINDOW = 1_000
 
     def __init__(self, device: torch.device):
@@ -79,7 +79,7 @@ class MetricWatch:
 
     def check(self) -> None:
         """
-        Look at what was kept since the last time; on a GPU the host waits for it.
+        Check the metrics kept since the last check; on a GPU the host waits for them.
 
         :raises TrainingDiverged: something was not finite; it names the first gradient step at which
         """
@@ -106,8 +106,8 @@ def not_finite(values: Mapping[str, float]) -> dict[str, float]:
 def diverged(model: BaseAlgorithm, values: Mapping[str, float]) -> TrainingDiverged:
     """
     :param model: an algorithm
-    :param values: what of it is not finite, by name
-    :return: the error that says so, and after how many updates
+    :param values: its values that are not finite, by name
+    :return: the error that names them and the number of updates
     """
     # PPO counts passes over its rollouts.
     kind = "gradient step" if isinstance(model, OffPolicyAlgorithm) else "update"
@@ -116,8 +116,8 @@ def diverged(model: BaseAlgorithm, values: Mapping[str, float]) -> TrainingDiver
 
 def check_finite_parameters(model: BaseAlgorithm) -> None:
     """
-    Look at every parameter of a model and at its optimizers' moments, and at the metrics that nobody looked at yet.
-    Called before a checkpoint is written and at the end of ``learn``.
+    Check every parameter of a model, its optimizers' moments, and the metrics not checked yet. Called before a
+    checkpoint is written and at the end of ``learn``.
 
     :param model: an algorithm, of this package or of Stable-Baselines3
     :raises TrainingDiverged: one is not finite
@@ -141,7 +141,7 @@ def check_finite_parameters(model: BaseAlgorithm) -> None:
 def _learned(model: BaseAlgorithm) -> Iterator[tuple[str, torch.Tensor]]:
     """Everything that gradient steps change, by name."""
     for path in model._get_torch_save_params()[0]:
-        # Whoever puts something else in a learned model's place need not give it an optimizer.
+        # A user's replacement for a learned model need not have an optimizer.
         value = recursive_getattr(model, path, None)
         if isinstance(value, nn.Module):
             for name, parameter in value.named_parameters():
@@ -155,12 +155,12 @@ def _learned(model: BaseAlgorithm) -> Iterator[tuple[str, torch.Tensor]]:
 
 class HoldBack(BaseCallback):
     """
-    Calls a callback, and keeps what it raises in the midst of a turn of the training's loop until the turn is over,
-    when everything agrees and can be saved: Stable-Baselines3 calls callbacks between the environment's step and the
-    storing of the transition.
+    Call a callback, and keep an exception that it raises during a turn of the training loop until the turn is over,
+    when the state is consistent and can be saved: Stable-Baselines3 calls callbacks between the environment's step and
+    the storing of the transition.
 
-    The others of a list of callbacks are called all the same, and each goes on being called until the turn ends.
-    ``KeyboardInterrupt`` and the like are no business of it.
+    The other callbacks of a list are still called, and each continues to be called until the turn ends.
+    ``KeyboardInterrupt`` and the like are not kept.
 
     :param callback: the callback, set up
     """
@@ -175,7 +175,7 @@ class HoldBack(BaseCallback):
 
     def _each(self, callback: BaseCallback, call: Callable[[BaseCallback], bool | None]) -> bool:
         if type(callback) is CallbackList:
-            # As it does itself, each on its own.
+            # As CallbackList does itself, but each separately.
             callback.num_timesteps = self.model.num_timesteps
             answers = [self._each(one, call) for one in callback.callbacks]
             return all(answers)
@@ -224,9 +224,7 @@ class HoldBack(BaseCallback):
         return self._raised is not None
 
     def raise_kept(self) -> None:
-        """
-        Raise what was kept, if anything; once.
-        """
+        """Raise the exception kept, if any; only once."""
         error, self._raised = self._raised, None
         if error is not None:
             raise error

@@ -29,7 +29,7 @@ class Kind(NamedTuple):
     Kind of value that an argument takes.
 
     :param words: the kind after "must", for the error
-    :param fits: whether a value is of it
+    :param fits: whether a value is of this kind
     """
 
     words: str
@@ -38,15 +38,15 @@ class Kind(NamedTuple):
     def otherwise(self, words: str, fits: Callable[[Any], bool]) -> "Kind":
         """
         :param words: another kind, after "or"
-        :param fits: whether a value is of that one
-        :return: the kind of what is of either
+        :param fits: whether a value is of that kind
+        :return: the kind of values of either kind
         """
         return Kind(f"{self.words}, or {words}", lambda value: self.fits(value) or fits(value))
 
     def or_none(self, meaning: str = "") -> "Kind":
         """
-        :param meaning: of None, for the error
-        :return: the same, or None
+        :param meaning: meaning of None, for the error
+        :return: this kind, or None
         """
         return self.otherwise(f"None{meaning and ' for '}{meaning}", lambda value: value is None)
 
@@ -91,7 +91,7 @@ def maker(of: type, example: str) -> Kind:
     """
     :param of: a class
     :param example: one derived from it, for the error
-    :return: the kind of whatever can be called for its objects
+    :return: the kind of everything that can be called to make its objects
     """
 
     def fits(value: Any) -> bool:
@@ -116,7 +116,7 @@ def check_value(name: str, value: Any, kind: Kind) -> Any:
     :param name: name of an argument
     :param value: its value
     :param kind: what it must be
-    :return: the value; a number of NumPy's as Python's, since torch, Gymnasium and files do not take them everywhere
+    :return: the value; a NumPy number as Python's, since torch, Gymnasium and files do not accept NumPy's everywhere
     :raises ValueError: if it is something else
     """
     if not kind.fits(value):
@@ -127,7 +127,7 @@ def check_value(name: str, value: Any, kind: Kind) -> Any:
 def one_of(table: Collection[str], base: type | None = None) -> Kind:
     """
     :param table: choices by name, or their names
-    :param base: base class of the choices; None if there are their names only
+    :param base: base class of the choices; None if there are only names
     :return: the kind of their names, and of the classes derived from ``base``
     """
     names = sorted(table)

@@ -1,10 +1,10 @@
 """
-Trainings of one process in lockstep: each in a thread of its own, of which exactly one runs at any time.
+Trainings of one process in lockstep: each in its own thread, of which exactly one runs at any time.
 
-A training runs until it comes to a meeting; when all have come to one, what the meeting is for is done for all of them,
-and they go on one after the other, always in the same order. So callbacks, evaluations, logs and checkpoints are those
-of a training alone, and only what is done together knows that there are several. The generators of the process (torch,
-CUDA, NumPy, Python) are exchanged with the thread, so that each training draws what it draws alone with its seed.
+A training runs until it reaches a meeting. When all have reached one, the meeting's work is done for all of them, and
+they continue one after the other, always in the same order. Callbacks, evaluations, logs and checkpoints are therefore
+those of a training alone; only the work done together involves several trainings. The generators of the process (torch,
+CUDA, NumPy, Python) are exchanged with the thread, so that each training draws the same numbers as alone with its seed.
 """
 
 import copy
@@ -22,7 +22,7 @@ from numpy.random import mtrand
 MADE, BEGIN, ACTIONS, ENVIRONMENTS, GRADIENT_STEP = "made", "begin", "actions", "environments", "gradient step"
 #: Further states of a training.
 _READY, _ENDED = "ready", "ended"
-#: Seconds that trainings have to end by themselves when they are told to leave at once.
+#: Seconds that trainings have to end by themselves when all must leave at once.
 PATIENCE = 30.0
 _HERE = threading.local()
 
@@ -42,29 +42,29 @@ class Joint(Protocol):
         """
         Take one gradient step of each learner.
 
-        :param inputs: the arguments of ``Learner.gradient_step``, a tuple a learner, in their order
-        :return: its result, of each learner
+        :param inputs: the arguments of ``Learner.gradient_step``, a tuple per learner, in their order
+        :return: the result of each learner
         """
 
     def act(self, inputs: Sequence[tuple[Any, ...]]) -> list[dict[str, torch.Tensor]]:
         """
         Compute the actions of each learner.
 
-        :param inputs: the arguments of ``Learner.action_step``, a tuple a learner, in their order
-        :return: its result, of each learner
+        :param inputs: the arguments of ``Learner.action_step``, a tuple per learner, in their order
+        :return: the result of each learner
         """
 
     def release(self) -> None:
-        """Give each learner tensors of its own again."""
+        """Give each learner its own tensors again."""
 
 
-#: Makes gradient steps and actions of several learners one; None where each has its own.
+#: Function that combines the gradient steps and actions of several learners; None if each has its own.
 MakeJoint = Callable[[Sequence[Any]], Joint | None]
 
 
 def present() -> "Seat | None":
     """
-    :return: place of the training that this thread makes in its group; None in any other thread
+    :return: place of the training that this thread runs in its group; None in any other thread
     """
     return getattr(_HERE, "seat", None)
 
@@ -72,7 +72,7 @@ def present() -> "Seat | None":
 def seat_of(model: Any) -> "Seat | None":
     """
     :param model: a model
-    :return: its place in a group, where its ``learn`` is what this thread makes there; None for any other
+    :return: its place in a group, if this thread runs its ``learn`` there; None for any other model
     """
     seat = present()
     return seat if seat is not None and seat.model is model else None
@@ -82,9 +82,9 @@ class Seat:
     """
     Place of one training in a group.
 
-    :param name: names it in messages
-    :param body: makes the whole training
-    :param folder: of its run, if that is known beforehand
+    :param name: name in messages
+    :param body: function that runs the whole training
+    :param folder: folder of its run, if known beforehand
     """
 
     def __init__(self, name: str, body: Callable[[], None], folder: Path | None = None):
@@ -96,18 +96,18 @@ class Seat:
         self.turn.acquire()
         self.generators = Generators()
         self.group: Group
-        #: The model whose ``learn`` takes part, and its learner, when they are made.
+        #: The model whose ``learn`` takes part, and its learner, once they are made.
         self.model: Any = None
         self.learner: Any = None
         #: Whether its ``learn`` is under way, from the common beginning on.
         self.takes_part = False
-        #: Whether it ever was.
+        #: Whether its ``learn`` ever was under way.
         self.began = False
         #: Whether it saves checkpoints.
         self.saves = False
         #: Whether its checkpoints are at the same steps as the others'.
         self.aligned = True
-        #: Whether it is elsewhere in its training than the others, and takes its gradient steps by itself.
+        #: Whether it is at another point of its training than the others, and takes its gradient steps by itself.
         self.alone = False
         #: Environment steps at the end of its latest turn.
         self.turned: int | None = None
@@ -122,7 +122,7 @@ class Seat:
 
     def meet(self, meeting: str) -> None:
         """
-        Wait until the others have come to a meeting too, and what it is for is done.
+        Wait until the others have reached a meeting too, and its work is done.
 
         :param meeting: one of the five
         :raises LeftWithTheOthers: another training has failed
@@ -142,8 +142,8 @@ class Seat:
 
         :param meeting: which of the two
         :param inputs: the arguments of ``Learner.gradient_step``, or ``action_step``
-        :return: its result; None where there are no others, or theirs is of another kind, so that it has still to be
-            done
+        :return: the result; None if there are no others, or their inputs are of another kind, so that the work has
+            still to be done
         """
         if len(self.group.stepping()) < 2:
             return None
@@ -163,11 +163,11 @@ class Seat:
 
     def leaves(self, now: int) -> bool:
         """
-        Tell at the end of a turn whether the training is to be saved and to end. All that are equally far leave at the
-        end of the same turn, so that their checkpoints are of the same step.
+        Decide at the end of a turn whether the training is to be saved and ended. All trainings that are equally far
+        leave at the end of the same turn, so that their checkpoints are of the same step.
 
         :param now: environment steps
-        :return: whether it is
+        :return: whether it is to be saved and ended
         """
         self.turned = now
         group = self.group
@@ -176,7 +176,7 @@ class Seat:
         if self.alone or not self.aligned:
             return True
         if group.leaves_at is None:
-            # Whoever has ended this turn already goes on to the end of the next one.
+            # A training that has already ended this turn continues to the end of the next one.
             others = [seat.turned for seat in group.seats if seat is not self and seat.with_others and seat.aligned]
             group.leaves_at = max([now, *(steps + 1 for steps in others if steps is not None)])
         return now >= group.leaves_at
@@ -187,8 +187,8 @@ class Group:
     Trainings in lockstep.
 
     :param seats: their places, in their order
-    :param make_joint: makes their gradient steps one
-    :param received: tells the signal by which the process was asked to end; None for none
+    :param make_joint: function that combines their gradient steps
+    :param received: returns the signal by which the process was asked to end; None for none
     """
 
     def __init__(self, seats: Sequence[Seat], make_joint: MakeJoint, received: Callable[[], int | None] = lambda: None):
@@ -197,22 +197,22 @@ class Group:
             seat.group = self
         #: Error that ends every training at its next meeting.
         self.stop: BaseException | None = None
-        #: Trainings that have ended by an error, by which the others end as soon as they are saved.
+        #: Trainings that have ended by an error; the others then end as soon as they are saved.
         self.failed: list[Seat] = []
         #: Environment steps at which all leave.
         self.leaves_at: int | None = None
-        #: Checkpoints from which the runs go on (``run_folder.Starts``); None before that is known.
+        #: Checkpoints from which the runs resume (``run_folder.Starts``); None until known.
         self.starts: Any = None
         self._joint: Joint | None = None
         self._over = threading.Event()
-        # The GPU that is the current one where the trainings are started; None before CUDA is used.
+        # The current GPU of the thread that starts the trainings; None before CUDA is used.
         self._gpu: int | None = None
 
     # ---------------------------------------------------------------- the whole
 
     def run(self) -> None:
         """
-        Make the trainings. The errors by which they ended are at their places.
+        Run the trainings. The errors by which they ended are stored at their places.
 
         :raises BaseException: what is raised in this thread meanwhile, as by Ctrl-C; or what kept all of them from
             being made together
@@ -241,7 +241,7 @@ class Group:
         _HERE.seat = seat
         try:
             if self._gpu is not None:
-                # A thread begins with the first one.
+                # A new thread begins with the first GPU.
                 torch.cuda.set_device(self._gpu)
             seat.generators.put_back()
             if self.stop is None and not self.failed:
@@ -265,9 +265,9 @@ class Group:
 
     def pass_on(self, seat: Seat) -> None:
         """
-        Let the next training go on until it is another's turn, and so on.
+        Hand the turn to the next training, and wait until it is this one's turn again.
 
-        :param seat: whose turn is over; it goes on when this returns
+        :param seat: place of the training whose turn is over; it continues when this returns
         """
         following = self._following()
         assert following is not None
@@ -280,7 +280,7 @@ class Group:
         seat.on_turn()
 
     def _following(self) -> Seat | None:
-        """Whose turn it is next; None when all have ended."""
+        """Place of the training whose turn is next; None when all have ended."""
         while True:
             there = [seat for seat in self.seats if seat.at is not _ENDED]
             if not there:
@@ -291,20 +291,22 @@ class Group:
             self._hold(there)
 
     def _hold(self, there: list[Seat]) -> None:
-        """Hold a meeting that everybody who has to has come to. All wait at one."""
+        """Hold a meeting that all trainings it needs have reached. All wait at a meeting."""
         try:
             stepping = self.stepping()
             if stepping and all(seat.at is GRADIENT_STEP for seat in stepping):
-                # Whoever is elsewhere goes on too, lest those steps wait for it for ever, or it for them.
+                # Trainings at other meetings continue too, so that neither they nor these steps wait for the other for
+                # ever.
                 self._do_together(stepping, GRADIENT_STEP)
                 ready = there
             elif acting := [seat for seat in there if seat.at is ACTIONS]:
-                # Before the environments' step. Where not all act, one at random, say, each does by itself.
+                # Before the environments' step. If not all act (one may act at random), each computes its actions
+                # alone.
                 if acting == stepping:
                     self._do_together(stepping, ACTIONS)
                 ready = acting
             elif any(seat.at is ENVIRONMENTS for seat in there):
-                # First: a learner that waits at a gradient step waits for those that have still to come to one.
+                # First: a learner at a gradient step waits for those that have still to reach one.
                 ready = [seat for seat in there if seat.at is ENVIRONMENTS]
             else:
                 ready = there
@@ -346,7 +348,7 @@ class Group:
 
     @property
     def steps_together(self) -> bool:
-        """Whether gradient steps are one at present."""
+        """Whether gradient steps are taken together at present."""
         return self._joint is not None
 
     @property
@@ -355,14 +357,14 @@ class Group:
         return 0.0 if self._joint is None else self._joint.seconds_compiling
 
     def part(self) -> None:
-        """Give each learner tensors of its own again; the next gradient step together makes them common anew."""
+        """Give each learner its own tensors again; the next gradient step together combines them anew."""
         joint, self._joint = self._joint, None
         if joint is not None:
             joint.release()
 
     def leave(self, seat: Seat) -> None:
         """
-        Let a training go on by itself.
+        Let a training continue by itself.
 
         :param seat: its place
         """
@@ -372,7 +374,7 @@ class Group:
 
 
 def _are_alike(a: Any, b: Any) -> bool:
-    """Whether two learners' inputs differ in numbers only: one may have further transitions, or update its targets."""
+    """Whether two learners' inputs differ in numbers only, not in further transitions or an update of the targets."""
     if isinstance(a, torch.Tensor):
         return isinstance(b, torch.Tensor) and a.shape == b.shape
     if isinstance(a, dict):
@@ -384,10 +386,10 @@ def _are_alike(a: Any, b: Any) -> bool:
 
 def are_real(values: Sequence[Any]) -> bool:
     """
-    Tell real numbers from counts and words: learners may differ in them.
+    Distinguish real numbers, in which learners may differ, from counts and words.
 
     :param values: values of learners
-    :return: whether they are numbers, of which one at least is a float
+    :return: whether they are numbers, of which at least one is a float
     """
     floats = [isinstance(value, float) for value in values]
     return any(floats) and all(is_float or type(value) is int for is_float, value in zip(floats, values, strict=True))
@@ -397,7 +399,7 @@ def are_real(values: Sequence[Any]) -> bool:
 
 
 class Generators:
-    """States of the generators that a process has once, as they are when this is made: torch's, NumPy's, Python's."""
+    """States of a process's global generators (torch's, NumPy's, Python's) at construction."""
 
     def __init__(self) -> None:
         self._numpy = copy.deepcopy(mtrand.get_bit_generator())
@@ -407,7 +409,7 @@ class Generators:
         """
         Take the states as they are now.
 
-        :param numpy_too: whether NumPy's is among them, which is an object that stays as it is when it is exchanged
+        :param numpy_too: whether to take NumPy's too, an object that keeps its state when it is exchanged
         """
         self._torch, self._python = torch.get_rng_state(), random.getstate()
         self._cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else None
@@ -416,7 +418,7 @@ class Generators:
         self._gauss = _spare_gauss()
 
     def put_back(self) -> None:
-        """Put the states in force."""
+        """Restore the states."""
         torch.set_rng_state(self._torch)
         random.setstate(self._python)
         if self._cuda is not None:
@@ -427,8 +429,8 @@ class Generators:
 
 class _NoBits:
     """
-    Bit generator without a state, in whose place NumPy's global generator tells what it keeps beside one, a normal
-    number to spare, in a microsecond: with the 624 words of its own that takes 200.
+    Bit generator without a state. With it in place, NumPy's global generator returns what it keeps beside the bit
+    generator, a spare normal number, in a microsecond; with its own 624 words that takes 200.
     """
 
     def __init__(self) -> None:

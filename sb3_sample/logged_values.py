@@ -1,4 +1,4 @@
-"""Metrics in Stable-Baselines3's logger that stay on the device until somebody reads them."""
+"""Metrics in Stable-Baselines3's logger that stay on the device until they are read."""
 
 from collections import defaultdict
 from collections.abc import ItemsView, Iterator, Mapping, ValuesView
@@ -10,11 +10,11 @@ from stable_baselines3.common.logger import Logger
 
 class LoggedValues(defaultdict[str, Any]):
     """
-    ``Logger.name_to_value``, of which some values may still be on the device. Whoever reads one of those, or all
-    values, gets floats, and only then the host waits. Whoever copies it gets a plain ``defaultdict``.
+    ``Logger.name_to_value``, some values of which may still be on the device. Reading one of those, or all values,
+    gives floats, and only then does the host wait. A copy is a plain ``defaultdict``.
 
-    A name that is not there reads as 0.0, as in Stable-Baselines3, but is not put there by that: at the next dump some
-    of the formats would end the training, since it has no entry in ``name_to_excluded``.
+    A missing name reads as 0.0, as in Stable-Baselines3, but reading does not add it: without an entry in
+    ``name_to_excluded``, it would make some of the formats end the training at the next dump.
 
     :param values: values by name
     """
@@ -37,10 +37,9 @@ class LoggedValues(defaultdict[str, Any]):
     @classmethod
     def record_later(cls, logger: Logger, metrics: Mapping[str, torch.Tensor]) -> None:
         """
-        Record metrics without waiting for the device; not in a logger with a ``record`` of its own, which has to be
-        given numbers.
+        Record metrics without waiting for the device; not in a logger with its own ``record``, which needs numbers.
 
-        :param logger: where
+        :param logger: the logger
         :param metrics: scalars by name, all on one device
         """
         if getattr(logger.record, "__func__", None) is not Logger.record:
@@ -79,7 +78,7 @@ class LoggedValues(defaultdict[str, Any]):
         return ValuesView(self)
 
     def __iter__(self) -> Iterator[str]:
-        # With an iterator of its own, dict(...), {**...} and the like ask __getitem__ for each value.
+        # Since __iter__ is overridden, dict(...), {**...} and the like call __getitem__ for each value.
         return super().__iter__()
 
     def __eq__(self, other: object) -> bool:

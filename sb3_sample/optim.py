@@ -19,9 +19,9 @@ class AdamW(Optimizer):
     Adam with decoupled weight decay: ``p <- p - lr * (m_hat / (sqrt(v_hat) + eps) + weight_decay * p)``.
 
     ``torch.optim.AdamW`` multiplies by ``1 - lr * weight_decay`` instead. With BRO's settings
-    (3e-4 * 1e-4) that factor is closer to 1 than float32 can tell apart from ``1 - 2**-24``, and the decay
-    comes out 2.6 times too strong. Here decay and Adam's direction are added first and subtracted at once, as in
-    the published code. With ``weight_decay=0`` this is plain Adam. The arithmetic is torch's fused kernel's.
+    (3e-4 * 1e-4) float32 cannot tell that factor apart from ``1 - 2**-24``, and the decay comes out 2.6 times too
+    strong. Here decay and Adam's direction are added first and subtracted at once, as in the published code. With
+    ``weight_decay=0`` this is plain Adam. The arithmetic is that of torch's fused kernel.
 
     :param params: parameters, or groups of them
     :param lr: learning rate
@@ -48,14 +48,14 @@ class AdamW(Optimizer):
         if not weight_decay >= 0:
             raise ValueError(f"weight_decay must be at least 0, not {weight_decay}")
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps, "weight_decay": weight_decay})
-        #: Whether steps read the learning rates from tensors, as one that is captured must; numbers are quicker.
+        #: Whether steps read the learning rates from tensors, as a captured step must; numbers are faster.
         self.capturable = False
         # The groups' learning rates as a tensor, and the numbers that it holds.
         self._rates: torch.Tensor | None = None
         self._rates_held: list[float | tuple[float, ...]] = []
         # By group, how many steps each parameter has taken.
         self._steps: list[torch.Tensor] = []
-        # Number of parameters whose moments exist; another one if moments were cleared.
+        # Number of parameters whose moments exist; the state has another number if moments were cleared.
         self._n_prepared = -1
         #: Whether the learners whose parameters are stacked have taken different numbers of steps.
         self.counts_differ = False
@@ -81,8 +81,8 @@ class AdamW(Optimizer):
     @torch.no_grad()
     def prepare(self) -> None:
         """
-        Bring everything that :meth:`apply` reads up to date: the moments exist, and the learning rates of the groups
-        stand in tensors. Compiled and captured steps, which know tensors only, then find both.
+        Update everything that :meth:`apply` reads: the moments are made, and the groups' learning rates put into
+        tensors. Compiled and captured steps, which know only tensors, then find both.
         """
         self.prepare_rates()
         if len(self.state) == self._n_prepared == sum(len(group["params"]) for group in self.param_groups):
@@ -92,7 +92,7 @@ class AdamW(Optimizer):
             params = group["params"]
             if i < len(self._steps) and all("step" in self.state[p] for p in params):
                 continue
-            # A parameter's number of steps is its place in one vector, so that all are counted at once.
+            # The parameters' numbers of steps are elements of one vector, so that all are counted at once.
             steps = torch.tensor(
                 [float(self.state[p].get("step", 0)) for p in params], dtype=torch.float32, device=device
             )
@@ -112,8 +112,8 @@ class AdamW(Optimizer):
 
     @torch.no_grad()
     def prepare_rates(self) -> None:
-        """Bring the tensors with the learning rates up to date, which change with the steps in a schedule."""
-        # Of stacked parameters of several learners, a group may have a rate for each.
+        """Update the tensors with the learning rates, which change with the steps in a schedule."""
+        # With stacked parameters of several learners, a group may have a rate for each learner.
         rates = [lr if isinstance(lr := group["lr"], tuple) else float(lr) for group in self.param_groups]
         first = self.param_groups[0]["params"][0]
         device = first.device
@@ -127,7 +127,7 @@ class AdamW(Optimizer):
             self._rates = torch.tensor(rates, dtype=dtype, device=device)
         else:
             for i, (rate, held) in enumerate(zip(rates, self._rates_held, strict=True)):
-                # Filled in, as a copy from the host would wait for a GPU.
+                # fill_, since a copy from the host would wait for a GPU.
                 for j, value in enumerate(rate if isinstance(rate, tuple) else (rate,)):
                     if rate != held:
                         (self._rates[i, j] if isinstance(rate, tuple) else self._rates[i]).fill_(value)
@@ -135,7 +135,7 @@ class AdamW(Optimizer):
 
     def read_tensors(self) -> list[torch.Tensor]:
         """
-        :return: what a step reads besides parameters, gradients and state: learning rates and numbers of steps
+        :return: tensors that a step reads besides parameters, gradients and state: learning rates and numbers of steps
         """
         return [*([] if self._rates is None else [self._rates]), *self._steps]
 
@@ -148,7 +148,7 @@ class AdamW(Optimizer):
     @torch.no_grad()
     def apply(self, gradients: Sequence[torch.Tensor | None]) -> None:
         """
-        Take one step with gradients that are given; ``prepare`` comes first.
+        Take one step with the given gradients; ``prepare`` comes first.
 
         :param gradients: in the order of the parameters, group by group; a parameter without one is left alone
         """
@@ -162,7 +162,7 @@ class AdamW(Optimizer):
             if len(used) == len(params):
                 steps.add_(1)
             else:
-                # One by one, as indices would come from the host, for which a GPU waits, and a capture cannot.
+                # One by one, since indices would come from the host, for which a GPU waits, and a capture cannot.
                 for j, _, _ in used:
                     steps[..., j].add_(1)
             rows: list[tuple[torch.Tensor, ...]] = [
@@ -173,7 +173,7 @@ class AdamW(Optimizer):
             if is_tracing() or differ:
                 _plain_adamw(group, rows, self._rates[i], steps, places)
                 continue
-            # Learners side by side have taken as many steps.
+            # Stacked learners have taken the same number of steps.
             counts = steps[0] if steps.dim() > 1 else steps
             rows = [(*tensors, counts[j]) for tensors, j in zip(rows, places, strict=True)]
             rate = self._rates[i] if self.capturable else group["lr"]
@@ -195,13 +195,13 @@ def _plain_adamw(
     places: Sequence[int],
 ) -> None:
     """
-    The step written out for all parameters at once, which a compiler fuses. The corrections, 1 minus nearly 1, need
+    AdamW's step written out for all parameters at once, which a compiler fuses. The corrections, 1 minus nearly 1, need
     float64. Counts of steps, rates and decays may be those of S learners, whose parameters are stacked.
 
     :param rows: parameter, gradient, moments
     :param rate: the group's learning rate, or (S,)
-    :param steps: taken by each of the group's parameters, (P,) or (S, P)
-    :param places: of the rows' parameters among the P
+    :param steps: steps taken by each of the group's parameters, (P,) or (S, P)
+    :param places: places of the rows' parameters among the P
     """
     beta1, beta2 = group["betas"]
     p, grad, exp_avg, exp_avg_sq = map(list, zip(*rows, strict=True))
@@ -238,7 +238,7 @@ def _by_learner(values: torch.Tensor, p: torch.Tensor) -> torch.Tensor:
 
 
 def _laid_out_like(p: torch.Tensor, grad: torch.Tensor) -> torch.Tensor:
-    """The gradient in the parameter's memory layout, which the fused kernel takes for granted."""
+    """The gradient in the parameter's memory layout, which the fused kernel assumes."""
     return grad if grad.stride() == p.stride() else torch.empty_like(p).copy_(grad)
 
 
@@ -288,7 +288,7 @@ def sharpness_aware_gradients(
 
     :param loss: the loss at p, a scalar with its graph
     :param evaluate: computes the loss anew
-    :param parameters: what it is minimised over
+    :param parameters: parameters over which it is minimised
     :param radius: length of the step uphill
     :param n_copies: for each parameter, the number of networks stacked in its leading axis, or None if it is not
         stacked; those of the same number belong together

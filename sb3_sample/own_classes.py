@@ -1,4 +1,4 @@
-"""Classes in the place of names: what they must define, how they are made, and errors that name class and argument."""
+"""Classes in place of names: what they must define, how they are made, and errors that name class and argument."""
 
 import difflib
 import inspect
@@ -12,7 +12,7 @@ from torch.optim import Optimizer
 
 from sb3_sample.warn import warn
 
-#: Classes whose names were warned of.
+#: Classes whose names were already checked.
 _told: weakref.WeakSet[type] = weakref.WeakSet()
 
 
@@ -26,9 +26,9 @@ def make(
     :param choice: its value
     :param cls: the class
     :param base: base class of the choices
-    :param given: what it is made of
+    :param given: what it is made from, by position
     :param kwargs: its arguments, those of the argument ``<argument>_kwargs``
-    :param fixed: what it is made of besides, by name
+    :param fixed: what else it is made from, by name
     :return: the object
     :raises ValueError: if the class lacks a method, does not take these arguments, has not made its base, or does not
         list an optimizer that it has
@@ -39,11 +39,11 @@ def make(
     try:
         made = cls(*given, **fixed, **kwargs)
     except Exception as error:
-        # Of torch, where something is assigned.
+        # From torch, when something is assigned.
         if isinstance(error, AttributeError) and "__init__() call" in str(error):
             raise ValueError(_without_base(argument, cls)) from error
         name = next(iter(inspect.signature(cls).parameters), "")
-        # The learner, taken for one of its arguments.
+        # The class has taken the learner for one of its arguments.
         if not fixed and name != _first(fixed) and any(type(each).__name__ in str(error) for each in given):
             raise ValueError(f"{_without_first(argument, cls, fixed)}, not {name} ({error})") from error
         raise
@@ -54,7 +54,7 @@ def make(
 
 
 def _check_optimizers(argument: str, made: Any) -> None:
-    """Optimizers that a part does not list are neither saved nor started anew at a reset."""
+    """Check that a part lists its optimizers: others are neither saved nor started anew at a reset."""
     if not hasattr(made, "optimizers"):
         return
     listed = {id(optimizer) for optimizer in made.optimizers().values()}
@@ -72,8 +72,8 @@ def _without_base(argument: str, cls: Any) -> str:
 
 def check(argument: str, cls: type, base: type) -> None:
     """
-    Check what a class defines. Names that are nearly those of the base's, and that the class itself makes no use of,
-    are warned of.
+    Check what a class defines. A warning is given for names that are close to the base's and that the class itself does
+    not use.
 
     :param argument: name of the argument that has chosen it
     :param cls: the class
@@ -102,7 +102,7 @@ def check(argument: str, cls: type, base: type) -> None:
 
 
 def _check_signature(argument: str, cls: type, base: type, name: str) -> None:
-    """Check that a method takes what the base's is called with, all of it by position."""
+    """Check that a method takes the arguments that the base's is called with, all by position."""
     own, wanted = inspect.getattr_static(cls, name), inspect.getattr_static(base, name, None)
     if not (isinstance(own, types.FunctionType) and isinstance(wanted, types.FunctionType)):
         return
@@ -119,7 +119,7 @@ def _check_signature(argument: str, cls: type, base: type, name: str) -> None:
 
 
 def names_in(value: Any) -> Iterator[str]:
-    """Attributes and functions that a method makes use of."""
+    """Attributes and functions that a method uses."""
     functions = (value.fget, value.fset) if isinstance(value, property) else (inspect.unwrap(_function_of(value)),)
     codes = [function.__code__ for function in functions if isinstance(function, types.FunctionType)]
     while codes:
@@ -149,7 +149,7 @@ def _check_first(
     kwargs: dict[str, Any],
     fixed: dict[str, Any],
 ) -> None:
-    """Check that what a part is made of does not take the place of one of its arguments."""
+    """Check that what a part is made from does not take the place of one of its arguments."""
     first = next(iter(signature.parameters.values()), None)
     if not given or (first is not None and first.name == _first(fixed)):
         return
@@ -166,9 +166,9 @@ def check_arguments(
     :param argument: name of the argument that has chosen it
     :param choice: its value
     :param cls: the class
-    :param given: what it is made of
+    :param given: what it is made from, by position
     :param kwargs: its arguments, those of the argument ``<argument>_kwargs``
-    :param fixed: what it is made of besides, by name
+    :param fixed: what else it is made from, by name
     :raises ValueError: if it takes other ones
     """
     signature = inspect.signature(cls)

@@ -1,10 +1,9 @@
 """
-The public door for parts of one's own: everything here stays under this name, wherever it moves inside.
+The public interface for user-defined parts: everything here keeps its name, wherever it moves inside the package.
 
 A part is a class, accepted where a name is: ``pessimism=``, ``exploration=``, ``value_head=``, ``reward_scale=``,
-``batch_transforms=``,
-``policy_kwargs=dict(critic_network=..., actor_network=...)``. An agent of one's own is a class that declares its
-arguments by ``argument``. docs/parts.md says what each has to have.
+``batch_transforms=``, ``policy_kwargs=dict(critic_network=..., actor_network=...)``. A user-defined agent is a class
+that declares its arguments by ``argument``. docs/parts.md says what each must define.
 """
 
 from sb3_sample import kinds

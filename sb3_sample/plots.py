@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DATA = Path(__file__).parent / "data" / "published_curves.csv.gz"
-#: The published algorithms that are drawn unless others are asked for.
+#: The published algorithms that are drawn by default.
 PUBLISHED = ("BRO", "BRO Fast", "SAC")
 #: Columns of the table of a curve, by simulator step, over the seeds. The standard deviation is the sample's (n - 1).
 COLUMNS = ["env_step", "n_seeds", "mean", "std", "min", "max", "iqm"]
-#: The zoo's name of our algorithm, where it is not the published one's.
+#: The zoo's names of our algorithms, where they differ from the published names.
 ZOO_NAMES = {"flashsac": "flash_sac", "sac": "sac_sample"}
 METRICS = {"return": "return", "success_rate": "success rate"}
 #: Rows of the printed table per curve.
@@ -45,7 +45,7 @@ class Run:
     """
     The measurements of one run.
 
-    :param label: name of the curve that the run is a seed of
+    :param label: name of the curve of which the run is a seed
     :param path: the run's folder
     :param steps: simulator steps, increasing, (T,)
     :param values: mean over the episodes of the evaluation, or of the bin, at each of them, (T,)
@@ -101,17 +101,17 @@ def published_curves(env_id: str) -> pd.DataFrame:
 @functools.cache
 def all_published_curves() -> pd.DataFrame:
     """
-    :return: those of all tasks, as ``data/README.md`` describes them. Not to be changed: it is read once
+    :return: the curves of all tasks, as ``data/README.md`` describes them. The table is cached: do not change it
     """
     return pd.read_csv(DATA)
 
 
 def named_algorithms(name: str, available: Sequence[str]) -> list[str]:
     """
-    :param name: e.g. "BRO (RR=10)" or, without the bracket, "BRO", which means all of that name unless one is called
-        just so; "all"
-    :param available: the algorithms that there are
-    :return: those that it names
+    :param name: e.g. "BRO (RR=10)" or, without the bracket, "BRO", which means all of that name unless one has exactly
+        this name; "all"
+    :param available: the algorithms to choose from
+    :return: the algorithms that it names
     """
     exact = [algorithm for algorithm in available if name.lower() == algorithm.lower()]
     return exact or [
@@ -120,7 +120,7 @@ def named_algorithms(name: str, available: Sequence[str]) -> list[str]:
 
 
 def _published_task(env_id: str) -> str:
-    """The task of the published curves, where its version is not that of the id; else empty."""
+    """The task of the published curves, if its version is not that of the id; else empty."""
     suite, task = published_key(env_id)
     return {"metaworld": f"{task}-v2", "gymnasium": task}.get(suite, "")
 
@@ -134,8 +134,8 @@ def select_published(env_id: str, names: Sequence[str] | None, metric: str) -> l
     """
     :param env_id: id of the environment
     :param names: published algorithms, e.g. "BRO (RR=10)" or, without the bracket, "BRO", which means all of that name
-        unless one is called just so ("SAC" is one set of curves, "SAC (TD-MPC2 authors)" another); "all"; none if
-        empty; if None those of ``PUBLISHED`` that there are
+        unless one has exactly this name ("SAC" is one set of curves, "SAC (TD-MPC2 authors)" another); "all"; none if
+        empty; if None those of ``PUBLISHED`` that exist
     :param metric: "return" or "success_rate"
     :return: their curves
     :raises ValueError: there is no curve of that name
@@ -163,7 +163,7 @@ def select_published(env_id: str, names: Sequence[str] | None, metric: str) -> l
 
 
 def _folders(path: Path) -> Iterator[Path]:
-    """The folder and all below it; links are not followed, and there is no limit to how deep they lie."""
+    """The folder and all below it; links are not followed, and the depth is not limited."""
     waiting = [path] if path.is_dir() else []
     while waiting:
         folder = waiting.pop()
@@ -192,8 +192,8 @@ def find_runs(path: Path) -> list[Path]:
 
 def read_run(folder: Path, label: str, metric: str, bin_steps: int) -> Run:
     """
-    Read ``evaluations.npz``, or, where there is none, the training episodes in the Monitor files. Steps are of the
-    simulator, as those of the published curves, whatever the action repeat.
+    Read ``evaluations.npz``, or, if there is none, the training episodes in the Monitor files. Steps are simulator
+    steps, like those of the published curves, whatever the action repeat.
 
     :param folder: the run's folder
     :param label: name of its curve
@@ -229,15 +229,15 @@ def _episodes(folder: Path, metric: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ends(folder: Path, episodes: pd.DataFrame) -> np.ndarray:
-    """Simulator step at the end of each episode of Monitor's."""
+    """Simulator step at the end of each of Monitor's episodes."""
     return episodes["l"].cumsum().to_numpy() * read_settings(folder).repeat
 
 
 def _with_episodes(labelled: Sequence[tuple[str, Path]]) -> list[tuple[str, Path]]:
     """
     :param labelled: labels and folders of runs
-    :return: those that have evaluations or a finished training episode; each of the others, which have just begun or
-        are just writing their evaluations, is a line on stderr
+    :return: those that have evaluations or a finished training episode; a line on stderr names each of the others,
+        which have just begun or are just writing their evaluations
     :raises ValueError: there are none
     """
     found = []
@@ -265,8 +265,8 @@ def _default_bin(folders: Sequence[Path]) -> int:
 
 def summarize(runs: Sequence[Run]) -> pd.DataFrame:
     """
-    Mean, standard deviation, range and interquartile mean over seeds, at the steps that all runs have. Where they have
-    none in common, the runs are interpolated linearly at the steps of the one with the fewest, as far as all reach.
+    Mean, standard deviation, range and interquartile mean over seeds, at the steps that all runs have. If they have
+    none in common, the runs are interpolated linearly at the steps of the run with the fewest, as far as all reach.
 
     :param runs: at least one
     :return: columns ``COLUMNS``
@@ -302,7 +302,7 @@ def summarize(runs: Sequence[Run]) -> pd.DataFrame:
 @contextlib.contextmanager
 def needing_matplotlib() -> Iterator[None]:
     """
-    Around its imports.
+    Context for imports of matplotlib.
 
     :raises ImportError: it is not installed; says of which extra it is
     """
@@ -318,7 +318,7 @@ def draw(env_id: str, curves: Sequence[Curve], metric: str, xlim: tuple[float, f
     :param curves: what to draw; published ones are dashed
     :param metric: "return" or "success_rate"
     :param xlim: first and last simulator step; if None from 0 to the end of the longest curve that is not published
-    :return: the picture: lines are means, shaded the range over seeds
+    :return: the picture: lines are means, shaded areas the range over seeds
     :raises ImportError: matplotlib is not installed
     """
     with needing_matplotlib():
@@ -382,12 +382,12 @@ def format_table(curves: Sequence[Curve], all_steps: bool = False) -> str:
     """
     :param curves: at least one that is not published
     :param all_steps: every step, not only ``MAX_TABLE_STEPS`` spread over them
-    :return: Markdown table of the curves at the steps that all have in common, or else a curve of ours and a published
-        one, or else at ours
+    :return: Markdown table of the curves at the steps that all have in common, or else that one of our curves and a
+        published one have in common, or else at our steps
     """
     own = np.unique(np.concatenate([curve.data["env_step"] for curve in curves if not curve.published]))
     others = [curve.data["env_step"] for curve in curves if curve.published]
-    # Best where all curves have a value, else where one of ours and a published one have.
+    # Preferably steps at which all curves have a value, else those at which one of ours and a published one do.
     shared_by_any = np.intersect1d(own, np.concatenate(others)) if others else own
     shared_by_all = functools.reduce(np.intersect1d, [curve.data["env_step"] for curve in curves])
     steps = next((steps for steps in (shared_by_all, shared_by_any) if len(steps)), own)
@@ -500,7 +500,7 @@ def _plot(args: argparse.Namespace) -> None:
 
 
 def _picture(env_id: str, is_given: bool) -> Path:
-    """The picture's name, if it is not given. A run's file does not choose which of the user's files is replaced."""
+    """The picture's name, if it is not given. A run's file must not choose which of the user's files is replaced."""
     path = Path(env_id.replace("/", "-") + ".png")
     if path.exists() and not is_given and env_id not in gym.registry:
         raise ValueError(f"output must be given: {path} is there, and {env_id!r} is known from the runs' files only")

@@ -1,6 +1,6 @@
 """
-Logs of a run, read for the plots and to go on with it: ``evaluations.npz`` of ``EvalCallback`` and the files of
-``Monitor``. A run's folder may come from anybody: what is no such log is refused before it takes time or memory.
+Logs of a run, read for the plots and to resume it: ``evaluations.npz`` of ``EvalCallback`` and the files of
+``Monitor``. A run's folder may come from anybody: anything else is refused before it takes time or memory.
 """
 
 import io
@@ -19,15 +19,15 @@ from sb3_sample.saving.container import check_table
 from sb3_sample.saving.untrusted import BadFile, open_regular, parse_json
 
 EVALUATIONS = "evaluations.npz"
-#: In a run's folder, that of the checkpoints and the log of its steps on a data set, where others follow.
+#: Subfolder of a run's folder, with the checkpoints and the log of its steps on a data set, if other steps follow.
 OFFLINE = "offline"
-#: Arrays of the evaluations, and bytes of all of them: 400,000 evaluations of ten episodes.
+#: Most arrays of the evaluations, and most bytes of all of them: 400,000 evaluations of ten episodes.
 MAX_ARRAYS, MAX_BYTES = 16, 32 * 2**20
-#: Bytes of a header of NumPy, and of a line of Monitor's.
+#: Most bytes of a NumPy header, and of a line of a Monitor file.
 MAX_HEADER, MAX_LINE = 1000, 2**16
-#: Bytes of a file of Monitor's, its numbers (of a million episodes), and its columns.
+#: Most bytes of a Monitor file, most numbers in it (of a million episodes), and most columns.
 MAX_MONITOR, MAX_FIELDS, MAX_COLUMNS = 64 * 2**20, 3_000_000, 64
-#: Columns of Monitor's files that anything is drawn of.
+#: Columns of Monitor files that plots use.
 _COLUMNS = ("r", "l", "t", "is_success")
 #: Pattern of Gymnasium's ids.
 _ENV_ID = re.compile(r"[\w:.-]+(/[\w:.-]+)*")
@@ -54,8 +54,8 @@ class Evaluations(dict[str, np.ndarray]):
 def is_truncated(folder: str | Path) -> bool:
     """
     :param folder: a run's folder
-    :return: whether its evaluations lack their end because the run is under way, in which case the next evaluation
-        writes them anew: it has checkpoints, and no model of its end
+    :return: whether its evaluations are truncated because the run is under way, in which case the next evaluation
+        writes them anew: the run has checkpoints, and no final model
     :raises BadFile: if they are a pipe or a device
     """
     folder = Path(folder)
@@ -73,7 +73,7 @@ def read_evaluations(path: str | Path) -> Evaluations:
     """
     :param path: ``evaluations.npz``
     :return: "timesteps", increasing, of shape (T,); "results", the returns, of shape (T, number of episodes), and
-        whatever else was recorded, of the one or the other shape
+        everything else that was recorded, of one or the other shape
     :raises BadFile: (a ``ValueError``) if it is no such file
     :raises OSError: if it cannot be read
     """
@@ -86,7 +86,7 @@ def read_evaluations(path: str | Path) -> Evaluations:
                     found[name] = _read_array(archive, entry)
         except BadFile as error:
             raise BadFile(f"{path} holds no evaluations: {error}") from error
-        except Exception as error:  # what the archive's and NumPy's readers meet in a file can be anything
+        except Exception as error:  # the readers of archives and of NumPy can raise anything
             raise BadFile(f"{path} holds no evaluations: {type(error).__name__}: {error}") from error
     _check_evaluations(found)
     return found
@@ -106,7 +106,7 @@ def _arrays(archive: zipfile.ZipFile) -> Iterator[tuple[str, zipfile.ZipInfo]]:
 
 
 def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
-    """An array, of as many numbers as there are bytes for them."""
+    """Read an array, whose shape and type must match its bytes."""
     with archive.open(entry) as file:
         if np.lib.format.read_magic(file) != (1, 0):
             raise BadFile(f"{entry.filename!r:.100} is in another format")
@@ -137,15 +137,15 @@ def _check_evaluations(found: Evaluations) -> None:
 def monitor_files(folder: str | Path) -> list[Path]:
     """
     :param folder: a run's folder
-    :return: its files of Monitor's, one an environment
+    :return: its Monitor files, one per environment
     """
     return sorted(Path(folder).glob(f"*{Monitor.EXT}"))
 
 
 def monitor_head(path: str | Path) -> dict[str, Any]:
     """
-    :param path: a file of Monitor's
-    :return: what its first line says: "t_start", seconds, and "env_id", None if that names no environment
+    :param path: a Monitor file
+    :return: content of its first line: "t_start", seconds, and "env_id", None if that names no environment
     :raises BadFile: (a ``ValueError``) if it says something else, or no columns follow
     :raises OSError: if it cannot be read
     """
@@ -175,8 +175,8 @@ def read_monitors(folder: str | Path) -> pd.DataFrame:
     last line, of a run that was killed, is left out.
 
     :param folder: the run's folder
-    :return: columns "r", the return, "l", the length in steps, "t", seconds since the run began, by which they are
-        sorted, and "is_success", if there is one
+    :return: columns "r", the return, "l", the length in steps, "t", seconds since the run began, by which the episodes
+        are sorted, and "is_success", if there is one
     :raises LoadMonitorResultsError: if there are no such files
     :raises BadFile: (a ``ValueError``) if one is no such file
     :raises OSError: if one cannot be read
@@ -201,7 +201,7 @@ def _read_monitor(path: Path) -> tuple[pd.DataFrame, float]:
         head = _head(file, path)
         columns = _columns(file, path)
         _check_size(file, path)
-        # In pieces: what is taken as a table is many times its bytes.
+        # In pieces: a table takes many times the bytes of its text.
         parts = [_table(columns, path)]
         while block := file.read(_BLOCK):
             parts.append(_table(columns + block + file.readline(), path))
@@ -223,7 +223,7 @@ def _columns(file: IO[bytes], path: str | Path) -> bytes:
 
 
 def _check_size(file: IO[bytes], path: Path) -> None:
-    """See that the rest of a file is not too much to be read, and go back to where it is."""
+    """Check that the rest of a file is not too large to read, and return to the present position."""
     start, fields = file.tell(), 0
     while block := file.read(_BLOCK):
         fields += block.count(b",") + block.count(b"\n")
@@ -236,5 +236,5 @@ def _table(data: bytes, path: Path) -> pd.DataFrame:
     try:
         frame = pd.read_csv(io.BytesIO(data), index_col=False, usecols=lambda name: name in _COLUMNS, low_memory=False)
         return frame.astype(float)
-    except Exception as error:  # pandas has many for what is no table
+    except Exception as error:  # pandas has many errors for what is no table
         raise BadFile(f"{path} is no file of Monitor's: {type(error).__name__}: {error}") from error

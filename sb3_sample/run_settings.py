@@ -1,5 +1,5 @@
 """
-Algorithm, environment and arguments of a run, by its files of settings: ``run.json`` of ``sb3-sample train --run-dir``,
+Algorithm, environment and arguments of a run, from its settings files: ``run.json`` of ``sb3-sample train --run-dir``,
 ``args.yml`` and ``config.yml`` of the zoo, or the head of a Monitor file. A run's folder may come from anybody: nothing
 in it is imported or called.
 """
@@ -17,16 +17,17 @@ from sb3_sample.run_logs import monitor_files, monitor_head
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 
 RECORD = "run.json"
-#: In the folder of a study: its runs' folder, and the list of them.
+#: In the folder of a study: the folder of its runs, and the list of the runs.
 STUDY_RUNS, STUDY_LIST = "runs", "study.json"
-#: Bytes of a file of settings, and values in such a file.
+#: Most bytes of a settings file, and most values in it.
 _MAX_SETTINGS, _MAX_VALUES = 2**18, 5_000
-#: Settings of a run that say nothing of the agent.
+#: Settings of a run that do not describe the agent.
 _OF_THE_RUN = {
     "algo", "env", "seed", "trained_agent", "truncate_last_trajectory", "vec_env", "eval_env_kwargs", "eval_freq",
     "eval_episodes", "n_eval_envs", "save_freq", "n_timesteps", "callback",
 }  # fmt: skip
-#: Wrappers of the zoo's settings that hold an action for several steps, by default for 4: the argument for how many.
+#: Wrappers of the zoo's settings that hold an action for several steps, 4 by default, and the argument that sets how
+#: many.
 _SKIPPING = {
     **dict.fromkeys(("FrameSkip", "MaxAndSkipEnv", "MaxAndSkipObservation"), "skip"),
     **dict.fromkeys(("AtariFrames", "AtariPreprocessing", "AtariWrapper"), "frame_skip"),
@@ -36,11 +37,11 @@ _SKIPPING = {
 class RunSettings(NamedTuple):
     """
     :param agent: name; None if the run's files do not say
-    :param arguments: of the agent
+    :param arguments: arguments of the agent
     :param task: id of the environment; None if the files do not say
-    :param seed: None if they do not say
-    :param repeat: simulator steps of a step of the environment
-    :param skip: steps of the environment, as Monitor counts them, of a step of the agent
+    :param seed: seed; None if the files do not say
+    :param repeat: simulator steps per step of the environment
+    :param skip: steps of the environment, as Monitor counts them, per step of the agent
     """
 
     agent: str | None
@@ -62,8 +63,8 @@ def run_env_id(folder: Path) -> str | None:
 
 def study_of(folder: Path) -> Path | None:
     """
-    :param folder: a run's
-    :return: the study that it is in as ``runs/<agent and grid>/<task>/<seed>``; None if it is in none
+    :param folder: a run's folder
+    :return: the study that contains it as ``runs/<agent and grid>/<task>/<seed>``; None if there is none
     """
     above = folder.absolute().parents
     is_in_one = len(above) > 3 and above[2].name == STUDY_RUNS and (above[3] / STUDY_LIST).is_file()
@@ -72,8 +73,8 @@ def study_of(folder: Path) -> Path | None:
 
 def read_settings(folder: Path) -> RunSettings:
     """
-    :param folder: a run's
-    :return: what its files say of it
+    :param folder: a run's folder
+    :return: the settings in its files
     :raises BadFile: (a ``ValueError``) a file is damaged
     :raises OSError: if a file cannot be read
     """
@@ -111,9 +112,9 @@ def _of_settings(settings: dict[str, Any], head: Mapping[str, Any], path: Path) 
 
 def simulator_steps(arguments: Mapping[str, Any]) -> int:
     """
-    :param arguments: of a run, as a table of runs has them
-    :return: simulator steps of a step of the agent: what its environment repeats an action for, times what its wrappers
-        hold one for
+    :param arguments: arguments of a run, as in a table of runs
+    :return: simulator steps per step of the agent: the action repeat of its environment, times the steps for which its
+        wrappers hold an action
     """
     return int(_action_repeat(arguments)) * _skipped(arguments.get("env_wrapper"))
 
@@ -137,13 +138,13 @@ def _skipped(wrappers: Any) -> int:
 def plain_id(env_id: str) -> str:
     """
     :param env_id: id of an environment
-    :return: the id without this package's name before it
+    :return: the id without this package's name as its prefix
     """
     return env_id.removeprefix(f"{PACKAGE}:")
 
 
 def _literal(text: Any) -> Any:
-    """The value of a setting as ``repr`` has written it; the text itself where that is no plain value."""
+    """The value of a setting that ``repr`` has written; the text itself if it is no plain value."""
     try:
         value = ast.literal_eval(text)
         return _plain(value, [_MAX_VALUES])
@@ -153,9 +154,9 @@ def _literal(text: Any) -> Any:
 
 def _plain(value: Any, left: list[int]) -> Any:
     """
-    :param value: of a file of settings
-    :param left: how many values there may still be, since an alias in YAML stands for many
-    :return: the same of what JSON knows
+    :param value: value from a settings file
+    :param left: number of values that are still allowed, since an alias in YAML stands for many
+    :return: the value in JSON's types
     """
     left[0] -= 1
     if left[0] < 0:
@@ -170,7 +171,7 @@ def _plain(value: Any, left: list[int]) -> Any:
 
 
 class _Settings(yaml.CSafeLoader if hasattr(yaml, "CSafeLoader") else yaml.SafeLoader):  # type: ignore[misc]
-    """Makes plain values only: a class is its name, and nothing is imported or called."""
+    """Make plain values only: a class becomes its name, and nothing is imported or called."""
 
 
 def _named(_: Any, name: str, __: Any) -> str:
@@ -196,7 +197,7 @@ def _yaml(path: Path) -> dict[str, Any]:
     data = read_regular(path, _MAX_SETTINGS)
     try:
         settings = yaml.load(data, _Settings)  # a safe loader
-    except Exception as error:  # PyYAML's constructors raise whatever they meet
+    except Exception as error:  # PyYAML's constructors can raise anything
         raise BadFile(f"{path} is no YAML file of the zoo: {type(error).__name__}: {error}") from error
     if not isinstance(settings, dict):
         raise BadFile(f"{path} does not hold settings by name")

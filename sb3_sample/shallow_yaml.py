@@ -1,4 +1,4 @@
-"""YAML of files that anybody may have written: limited nesting, in which reading is quadratic and recurses."""
+"""YAML of files that anybody may have written: nesting is limited, since reading recurses and is quadratic in it."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ MAX_DEPTH = 50
 
 
 class ShallowLoader(yaml.SafeLoader):
-    """Makes plain values of YAML that nests at most ``MAX_DEPTH`` deep; a deeper one is a ``MarkedYAMLError``."""
+    """Make plain values of YAML nested at most ``MAX_DEPTH`` deep; deeper nesting is a ``MarkedYAMLError``."""
 
     def fetch_flow_collection_start(self, token: Any) -> None:
         self._limit(self.flow_level)

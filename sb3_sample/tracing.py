@@ -1,8 +1,8 @@
 """
 Tracing of a gradient step: a run that records tensor operations as a graph, gradients and optimizers' steps included.
 
-Traced code is compiled. Code that is quick as it stands and slow in a compiled graph, or the reverse, asks
-:func:`is_tracing` which of two equal forms is wanted.
+Traced code is compiled. Code that is fast as it stands and slow in a compiled graph, or the reverse, chooses between
+two equal forms by :func:`is_tracing`.
 """
 
 import threading
@@ -30,11 +30,11 @@ def is_tracing() -> bool:
 
 
 class ReadsOnTheHost(RuntimeError):
-    """Error of a traced function that asks for the value of a tensor: the graph would repeat this one value."""
+    """Error of a traced function that reads the value of a tensor: the graph would repeat this one value."""
 
 
 class _HostReads(TorchFunctionMode):
-    """Refusal of everything that takes numbers out of tensors."""
+    """Mode that refuses everything that reads numbers from tensors."""
 
     NAMES = (
         "item", "tolist", "numpy", "__array__", "__bool__", "__float__", "__int__", "__index__", "__complex__",
@@ -50,7 +50,7 @@ class _HostReads(TorchFunctionMode):
 
 @contextmanager
 def undone(state: Sequence[torch.Tensor], device: torch.device) -> Iterator[None]:
-    """Take back what is done to tensors and to torch's generators."""
+    """Undo changes to tensors and to torch's generators."""
     saved = [tensor.detach().clone() for tensor in state]
     devices = [device] if device.type == "cuda" else []
     try:
@@ -66,18 +66,18 @@ def trace(
     run: Callable[..., Sequence[torch.Tensor]], state: Sequence[torch.Tensor], inputs: Sequence[torch.Tensor]
 ) -> GraphModule:
     """
-    Trace a function that changes tensors in place. It is run once, and what it does to them is undone.
+    Trace a function that changes tensors in place. It is run once, and its changes to them are undone.
 
-    :param run: takes the inputs, and gives tensors
-    :param state: tensors that it reads and changes besides, each once
+    :param run: function of the inputs that returns tensors
+    :param state: further tensors that it reads and changes, each once
     :param inputs: its inputs, no two the same tensor
-    :return: the same as a graph of tensor operations, which takes the state and then the inputs
+    :return: the function as a graph of tensor operations, which takes the state and then the inputs
     :raises ReadsOnTheHost: if it asks for the value of a tensor
     """
     with undone(state, state[0].device):
         _local.on = True
         try:
-            # The backward pass is recorded too, which another thread would run.
+            # The backward pass is recorded too, which another thread would otherwise run.
             with torch.autograd.set_multithreading_enabled(False), _HostReads():
                 graph: GraphModule = make_fx(lambda *tensors: tuple(run(*tensors[len(state) :])))(*state, *inputs)
         finally:
@@ -91,11 +91,11 @@ def compile_graph(graph: GraphModule, inputs: Sequence[torch.Tensor]) -> Callabl
 
     :param graph: from :func:`trace`
     :param inputs: the state and the inputs
-    :return: function of the same, which changes the state in place
+    :return: function of these tensors, which changes the state in place
     """
     from torch._inductor.compile_fx import compile_fx
 
-    # In torch 2.11 it fails on steps of many tensors at once, which the optimizers take.
+    # In torch 2.11 this pass fails on the optimizers' steps, which take many tensors at once.
     patches = {"loop_ordering_after_fusion": False}
     with _users_that_read_nothing():
         compiled: Any = compile_fx(graph, list(inputs), config_patches=patches)
@@ -105,10 +105,10 @@ def compile_graph(graph: GraphModule, inputs: Sequence[torch.Tensor]) -> Callabl
 @contextmanager
 def _users_that_read_nothing() -> Iterator[None]:
     """
-    Let Inductor ask loops how they read a buffer that they do not read. Its C++ backend asks all users of a buffer that
-    could stay within fused loops, also those that only have to wait for it, such as the write to a parameter from whose
-    old value it was computed, and fails with a KeyError (pytorch/pytorch#196570, open in torch 2.14). Answered with
-    None, it keeps the buffer where it is.
+    Let Inductor query how loops read a buffer that they do not read. Its C++ backend queries all users of a buffer that
+    could stay within fused loops, including those that only have to wait for it, such as the write to a parameter from
+    whose old value it was computed, and fails with a KeyError (pytorch/pytorch#196570, open in torch 2.14). If the
+    answer is None, it keeps the buffer where it is.
     """
     from torch._inductor.loop_body import LoopBody
 

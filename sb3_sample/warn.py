@@ -1,16 +1,16 @@
-"""Warnings, laid to the line of the user's program that they are about."""
+"""Warnings, attributed to the line of the user's program that they are about."""
 
 import sys
 import warnings
 
-#: Packages and modules between that line and what warns.
+#: Packages and modules between that line and the code that warns.
 _BETWEEN = {"sb3_sample", "stable_baselines3", "contextlib", "functools"}
 
 
 def warn(message: str) -> None:
     """
-    Warn, as of the innermost line outside this package and Stable-Baselines3. A thread of this package's own has no
-    such line: there it is the one that warns.
+    Warn, attributing the warning to the innermost line outside this package and Stable-Baselines3. A thread of this
+    package's own has no such line: there it is attributed to the line that warns.
 
     :param message: what to say
     """

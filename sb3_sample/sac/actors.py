@@ -23,13 +23,13 @@ from sb3_sample.sac.trunks import keep_at_rest, make_trunk, with_plain_sizes
 
 # The log standard deviation is squashed into this interval by a tanh.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
-#: Where the likelihood of an action on a bound is taken (IQL's published code clips the data there).
+#: Bound to which actions are clipped before their likelihood is taken, as IQL's published code clips the data.
 LARGEST_ACTION = 1 - 1e-5
 #: Largest action of DrQ-v2.
 INSIDE = 1 - 1e-6
 #: Arguments of a Gaussian actor that say how its standard deviation is bounded.
 LOG_STD_ARGUMENTS = ("log_std_min", "log_std_max", "clip_log_std")
-#: All of its own.
+#: All arguments specific to a Gaussian actor.
 GAUSSIAN_ARGUMENTS = (*LOG_STD_ARGUMENTS, "initial_std")
 
 
@@ -44,20 +44,21 @@ class Actor(NetworkFeatures, BasePolicy):
     :param network_kwargs: its arguments
     :param features_extractor: extractor of the observation's features
     :param normalize_images: whether images are divided by 255
-    :param shares_encoder: whether the extractor is the critics', whose features are read without gradient
+    :param shares_encoder: whether the extractor belongs to the critics; its features are then read without gradient
     :param log_std_min: lower bound of the log standard deviation
     :param log_std_max: upper bound
-    :param clip_log_std: whether it is clipped to them, without a gradient outside, instead of squashed by a tanh
-    :param initial_std: standard deviation before the squashing at the start, about; None: that of the published code,
-        e^-4 between the usual bounds. A likelihood of given actions starts from a wide one, lest its first gradients be
-        thousands
+    :param clip_log_std: whether the log standard deviation is clipped to the bounds, without a gradient outside,
+        instead of squashed by a tanh
+    :param initial_std: approximate standard deviation before the squashing at the start; None: the published code's,
+        e^-4 between the usual bounds. If the actor learns by the likelihood of given actions, it starts from a wide
+        one; otherwise its first gradients would be thousands
     :raises ValueError: if an argument is out of range
     """
 
     action_space: spaces.Box
     #: Whether the policy is a distribution, with an entropy that can be rewarded.
     has_entropy: ClassVar[bool] = True
-    #: Whether it explores with a standard deviation of its own.
+    #: Whether the policy explores with its own standard deviation.
     has_std: ClassVar[bool] = True
     #: Arguments that ``actor_kwargs`` of a policy takes.
     ARGUMENTS: ClassVar[tuple[str, ...]] = GAUSSIAN_ARGUMENTS
@@ -105,12 +106,12 @@ class Actor(NetworkFeatures, BasePolicy):
         if initial_std is not None:
             self._network_args["initial_std"] = initial_std
             self._start_from(initial_std)
-        #: Stable-Baselines3's distribution of the actions, for its own use: nothing here reads it.
+        #: Distribution of the actions, for Stable-Baselines3's own use: nothing here reads it.
         self.action_dist = SquashedDiagGaussianDistribution(self.action_dim)
         keep_at_rest(self)
 
     def _start_from(self, initial_std: float) -> None:
-        """Have the head of the log standard deviation start nearly the same for all observations, of any size."""
+        """Initialise the log standard deviation to nearly the same value for all observations, however large."""
         if type(self.log_std) is not nn.Linear:
             raise ValueError(
                 f"initial_std={initial_std} is set by a plain output layer, and that of actor_network="
@@ -133,15 +134,15 @@ class Actor(NetworkFeatures, BasePolicy):
 
     def share(self, encoder: nn.Module) -> None:
         """
-        Read the features of another module's extractor, without a gradient to it and in evaluation mode: its running
-        statistics are moved by its owner's forward passes alone.
+        Read the features of another module's extractor, without a gradient to it and in evaluation mode: only its
+        owner's forward passes update its running statistics.
 
         :param encoder: features extractor, which is in the parameters, the state and the modes of its owner only
         """
         share(self, encoder)
 
     def __getstate__(self) -> dict[str, Any]:
-        # The last actions that somebody asked the distribution for go with no copy: they may have a gradient.
+        # A copy gets a fresh distribution: the actions last sampled from the old one may have a gradient.
         fresh = SquashedDiagGaussianDistribution(self.action_dim)
         return {name: fresh if name == "action_dist" else value for name, value in vars(self).items()}
 
@@ -160,7 +161,7 @@ class Actor(NetworkFeatures, BasePolicy):
         return self.extract_features(seen, self.features_extractor)
 
     def project(self) -> None:
-        """Called after every step of the optimizer: bring weights back to where they belong, in place."""
+        """Project weights back onto their constraints, in place; called after every step of the optimizer."""
         self.trunk.project()
         for head in self._heads():
             project_weights(head)
@@ -170,7 +171,8 @@ class Actor(NetworkFeatures, BasePolicy):
 
     def statistics(self) -> list[torch.Tensor]:
         """
-        :return: running statistics that a target actor takes over: those of trunk and own features extractor
+        :return: running statistics that a target actor takes over: the trunk's and those of the actor's own features
+            extractor
         """
         assert self.features_extractor is not None
         extractor = () if self.shares_encoder else self.features_extractor.buffers()
@@ -198,8 +200,8 @@ class Actor(NetworkFeatures, BasePolicy):
 
         :param obs: observations, (B, O), or a dict of them, or their features
         :param noise: standard normal noise, (B, A); drawn if None
-        :param following: further observations, stacked below these in the forward pass, for the sake of batch
-            statistics; None for none
+        :param following: further observations, stacked below ``obs`` in the forward pass for the batch statistics; None
+            for none
         :return: action in [-1, 1], (B, A), and its log-probability, (B, 1)
         """
         features = self.features(obs)
@@ -217,7 +219,8 @@ class Actor(NetworkFeatures, BasePolicy):
         Log-probability of given actions.
 
         :param obs: observations, (B, O), or a dict of them, or their features
-        :param actions: in [-1, 1], (B, A); on a bound, where it is infinite, it is taken a little inside
+        :param actions: in [-1, 1], (B, A); an action on a bound, where the log-probability is infinite, is moved
+            slightly inside
         :return: (B, 1)
         """
         mean, log_std = self.gaussian(self.features(obs))
@@ -249,7 +252,7 @@ class Actor(NetworkFeatures, BasePolicy):
 
     def act(self, mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """
-        The action that a Gaussian stands for while exploring.
+        Exploratory action of a Gaussian.
 
         :param mean: pre-tanh mean, (B, A)
         :param std: (B, A)
@@ -260,7 +263,7 @@ class Actor(NetworkFeatures, BasePolicy):
 
     def learned_action(self, mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """
-        The action through which an actor's gradient goes.
+        Action through which the actor's gradient flows.
 
         :param mean: pre-tanh mean, (B, A)
         :param std: (B, A)
@@ -277,7 +280,7 @@ class Actor(NetworkFeatures, BasePolicy):
 
         :param mean: pre-tanh mean, (B, A)
         :param std: (B, A)
-        :param reference_mean: pre-tanh mean of the other one, (B, A)
+        :param reference_mean: pre-tanh mean of the other policy, (B, A)
         :param reference_std: (B, A)
         :return: summed over the dimensions, (B, 1)
         """
@@ -299,7 +302,7 @@ class Actor(NetworkFeatures, BasePolicy):
 class MeanActor(Actor):
     """
     Deterministic actor ``a = tanh(mean)``, without target actor, smoothing or exploration noise (DAC, table 1). The
-    head of its log standard deviation does not learn; it is there so that an optimistic actor made like it is a
+    head of its log standard deviation does not learn; it exists so that an optimistic actor built in the same way is a
     Gaussian.
     """
 
@@ -332,11 +335,11 @@ class MeanActor(Actor):
         following: PyTorchObs | Encoded | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """
-        The action that the actor learns through: no noise, and 0 for the log-probability that it has not.
+        Action that the actor learns through, without noise, and 0 in place of a log-probability.
 
         :param obs: observations, (B, O), or a dict of them, or their features
-        :param noise: ignored, there is none
-        :param following: further observations, stacked below these in the forward pass; None for none
+        :param noise: ignored: the action has no noise
+        :param following: further observations, stacked below ``obs`` in the forward pass; None for none
         :return: action in [-1, 1], (B, A), and zeros, (B, 1)
         """
         features = self.features(obs)
@@ -348,7 +351,7 @@ class MeanActor(Actor):
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
         """
         :param obs: observations, (B, O), or a dict of them
-        :param deterministic: without meaning, the actor always is, as in stable_baselines3's TD3
+        :param deterministic: ignored: the actor always is deterministic, as in stable_baselines3's TD3
         :return: actions in [-1, 1], (B, A)
         """
         return self.sample(obs)[0]
@@ -366,7 +369,7 @@ class DeterministicActor(MeanActor):
     """
 
     has_std: ClassVar[bool] = True
-    #: Whether TD targets have the actions of a Polyak average of it.
+    #: Whether TD targets use the actions of a target actor, a Polyak average of this one.
     has_target: ClassVar[bool] = True
     ARGUMENTS: ClassVar[tuple[str, ...]] = ("exploration_noise", "target_noise", "target_noise_clip")
     _kind: ClassVar[str] = "a deterministic actor (backbone='td3')"
@@ -430,7 +433,7 @@ class DeterministicActor(MeanActor):
 
         :param mean: pre-tanh mean, (B, A)
         :param std: of the exploration noise, (B, A)
-        :param reference_mean: pre-tanh mean of the other one, (B, A)
+        :param reference_mean: pre-tanh mean of the other policy, (B, A)
         :param reference_std: (B, A)
         :return: summed over the dimensions, (B, 1)
         """
@@ -439,15 +442,15 @@ class DeterministicActor(MeanActor):
 
 class NoisyActor(DeterministicActor):
     """
-    Deterministic actor of DrQ-v2 (Yarats et al. 2022), ``a = tanh(mean)``: exploration, the TD target's action and the
-    one that it learns through all have Gaussian noise of one standard deviation, ``noise_std``, which moves with the
-    training; clipped but in exploration. Actions are clamped just inside of [-1, 1], with a gradient as if they were
-    not. There is no target actor.
+    Deterministic actor of DrQ-v2 (Yarats et al. 2022), ``a = tanh(mean)``: the exploratory action, the TD target's
+    action and the action that the actor learns through all have Gaussian noise of the same standard deviation,
+    ``noise_std``, which changes during training; the noise is clipped except in exploration. Actions are clamped just
+    inside [-1, 1], with a gradient as if they were not. There is no target actor.
 
-    :param args: as of :class:`DeterministicActor`
-    :param noise_clip: bound of the noise but in exploration
-    :param noise_std: its standard deviation at the start, in actions of [-1, 1]
-    :param kwargs: as of :class:`DeterministicActor`, but for the noise
+    :param args: as for :class:`DeterministicActor`
+    :param noise_clip: bound of the noise, except in exploration
+    :param noise_std: standard deviation of the noise at the start, in actions of [-1, 1]
+    :param kwargs: as for :class:`DeterministicActor`, except the noise
     :raises ValueError: if one of the two is out of range
     """
 
@@ -462,7 +465,7 @@ class NoisyActor(DeterministicActor):
         check_value("noise_std", noise_std, ABOVE_0)
         self._noise_args = {"noise_clip": noise_clip, "noise_std": noise_std}
         self.register_buffer("noise_std", torch.tensor(float(noise_std)))
-        # With the above.
+        # Anew, with the buffer above.
         keep_at_rest(self)
 
     def gaussian(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -476,11 +479,11 @@ class NoisyActor(DeterministicActor):
         following: PyTorchObs | Encoded | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """
-        The action of a TD target, and the one that the actor learns through.
+        Action with clipped noise, for TD targets and for the actor's loss.
 
         :param obs: observations, (B, O), or a dict of them, or their features
         :param noise: standard normal noise, (B, A); drawn if None
-        :param following: further observations, stacked below these in the forward pass; None for none
+        :param following: further observations, stacked below ``obs`` in the forward pass; None for none
         :return: action inside of [-1, 1], (B, A), and zeros, (B, 1)
         """
         action, log_prob = super().sample(obs, None, following)
@@ -494,7 +497,7 @@ class NoisyActor(DeterministicActor):
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
         """
         :param obs: observations, (B, O), or a dict of them
-        :param deterministic: without meaning, the actor always is
+        :param deterministic: ignored: the actor always is deterministic
         :return: actions in [-1, 1], (B, A)
         """
         return super().sample(obs)[0]

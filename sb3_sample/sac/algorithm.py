@@ -1,7 +1,7 @@
 """
-The off-policy family as Stable-Baselines3's: acting, storing, when and how often to learn, logging, files.
+The off-policy family as a Stable-Baselines3 algorithm: acting, storing, when and how often to learn, logging, files.
 
-The update is the learner's (``sb3_sample/learner/learner.py``).
+The learner does the update (``sb3_sample/learner/learner.py``).
 """
 
 import collections
@@ -115,18 +115,18 @@ class SAC(  # type: ignore[misc]  # actor
         # Saved by its parts.
         "_learner": Kept.NOWHERE,
         "_source": Kept.NOWHERE,
-        # Files name it by its fingerprint.
+        # Files refer to it by its fingerprint.
         "prior_data": Kept.NOWHERE,
         "_learns_from": Kept.NOWHERE,
-        # Of the present ``learn``.
+        # Of the ``learn`` under way.
         "_apart": Kept.NOWHERE,
         "_acts_at": Kept.NOWHERE,
-        # Attributes of Stable-Baselines3's, and arguments only of a model without an environment.
+        # Attributes of Stable-Baselines3, and arguments only for a model without an environment.
         "observation_space": Kept.EVERYWHERE,
         "action_space": Kept.EVERYWHERE,
         "_watch": Kept.NOWHERE,
         "_plain_attributes": Kept.NOWHERE,
-        # For the log of a run that goes on.
+        # For the log of a resumed run.
         "_metrics": Kept.IN_CHECKPOINTS,
         # An argument that changes with every step.
         "action_noise": Kept.EVERYWHERE,
@@ -136,13 +136,14 @@ class SAC(  # type: ignore[misc]  # actor
         check_program(type(self), given)
         checks.check_use_sde(given["use_sde"])
         if given["policy"] == "MlpPolicy" and is_multi_task(getattr(given["env"], "observation_space", None)):
-            # A vector and the number of a task are no more than that policy is for.
+            # "MlpPolicy" is accepted, since the observation is only a vector and the number of a task.
             given["policy"] = "MultiInputPolicy"
         if given["train_freq"] is not None or given["gradient_steps"] is not None:
             # Stable-Baselines3's two arguments are in force.
             given["replay_ratio"] = None
         if given["reset_gradient_steps"] is not None and given["resets"] is default_of(type(self), "resets"):
-            # Those that a class has of its own give way. By identity: equal ones that are passed are another object.
+            # A class's default resets give way. Compared by identity: resets that are passed, even equal ones, are
+            # another object.
             given["resets"] = ()
         for name in "train_freq", "gradient_steps":
             given[name] = 1 if given[name] is None else given[name]
@@ -154,29 +155,30 @@ class SAC(  # type: ignore[misc]  # actor
         if self.env is None and spaces_given["action_space"] is not None:
             check_action_space(spaces_given["action_space"], "action_space")
             vars(self).update(spaces_given, n_envs=1)
-        #: Whether the gradient step is compiled; None while that is not decided. Saved: a loaded model goes on with it.
+        #: Whether the gradient step is compiled; None until that is decided. Saved: a loaded model keeps it.
         self.compiled: bool | None = None
         #: A callback that wants gradients in ``.grad`` sets this: the last of the next gradient steps is run eagerly.
         self.keep_next_gradients = False
         self._keeps_gradients = False
         #: Transitions stored over the model's life; unlike ``num_timesteps`` never zeroed by ``learn``.
         self.num_transitions = 0
-        #: The same of each task, where several take a step together.
+        #: The same per task, where several tasks take a step together.
         self.num_task_steps = 0
         # Gradient steps taken when everything last started anew.
         self._began_at = 0
         #: Gradient steps of ``learn_offline`` over the model's life.
         self._n_offline_updates = 0
-        # The data set of a ``learn_offline`` under way, and what a file names of the prior data.
+        # The data set of a ``learn_offline`` under way.
         self._learns_from: Dataset | None = None
-        # Whether a ``learn`` under way acts in a thread of its own, and how often a second; and that thread.
+        # Whether the ``learn`` under way acts in a separate thread, and at how many steps a second; and that thread.
         self._acts_at: tuple[bool, float | None] = (False, None)
         self._apart: Apart | None = None
+        # What a file records of the prior data.
         self._prior_of: dict[str, Any] | None = None
-        #: Gradient steps planned, for ``learning_rate_schedule``; None while they are not known.
+        #: Gradient steps planned, for ``learning_rate_schedule``; None until known.
         self.planned_updates: int | None = self.schedule_steps
-        #: Frames that the environment stacks in an observation, each of which the replay stores once; None for none.
-        #: Saved: a model loaded without an environment goes on with it.
+        #: Number of frames that the environment stacks in an observation; the replay stores each frame once. None for
+        #: none. Saved: a model loaded without an environment needs it.
         self.frame_stack: int | None = None
         # Gradient steps owed but not yet taken, the fraction that a replay ratio leaves over.
         self._updates_owed = 0.0
@@ -184,15 +186,15 @@ class SAC(  # type: ignore[misc]  # actor
         if is_set_up and hasattr(self, "observation_space"):
             self._setup_model()
         elif is_set_up:
-            # A model that is to learn from data: its networks are made when the spaces are known.
+            # A model that is to learn from data: its networks are made once the spaces are known.
             check_every(self, needs_spaces=False)
 
     # ---------------------------------------------------------------- construction
 
     def _setup_model(self) -> None:
         with warnings.catch_warnings():
-            # Of Stable-Baselines3, which tells its own buffer of n-step returns only where it has chosen it. Here they
-            # all are told, and others are refused.
+            # From Stable-Baselines3, which passes n_steps to its own n-step buffer only if it has chosen that buffer
+            # itself. Here every n-step buffer gets it, and other buffers are refused.
             warnings.filterwarnings("ignore", message="`n_steps=")
             super()._setup_model()
         assert self.replay_buffer is not None
@@ -209,7 +211,7 @@ class SAC(  # type: ignore[misc]  # actor
         self._watch = MetricWatch(self.device)
 
     def _take_prior_data(self, data: Dataset) -> None:
-        """Note which the prior data are; a loaded model may have had others."""
+        """Record which data the prior data are, and warn if a loaded model had others."""
         now = {"fingerprint": data.fingerprint, "size": len(data)}
         if self._prior_of is not None and self._prior_of != now:
             warn(
@@ -219,7 +221,7 @@ class SAC(  # type: ignore[misc]  # actor
         self._prior_of = now
 
     def _tell_of(self, data: Dataset) -> None:
-        """Tell the rule that scales rewards of a data set, if it waits for one."""
+        """Pass a data set's return range to the rule that scales rewards, if the rule waits for one."""
         if self.learner.reward_scaler is not None and self.learner.reward_scaler.waits_for_data:
             self.learner.reward_scaler.on_dataset(data.return_range)
 
@@ -251,7 +253,7 @@ class SAC(  # type: ignore[misc]  # actor
         if self.replay_buffer_class is None and self.n_steps > 1:
             stacks = "frame_stack" in self.replay_buffer_kwargs
             self.replay_buffer_class = CompactNStepReplayBuffer if stacks else NStepReplayBuffer
-        # Stable-Baselines3's has settings of its own where the algorithm has none.
+        # With n_steps=1, Stable-Baselines3's NStepReplayBuffer keeps its own settings.
         told = NStepReplayBuffer if self.n_steps > 1 else CompactNStepReplayBuffer
         if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, told):
             of_steps = {"n_steps": self.n_steps, "gamma": self.gamma}
@@ -259,8 +261,8 @@ class SAC(  # type: ignore[misc]  # actor
         if self.replay_buffer_class is None:
             self.replay_buffer_class = CompactDictReplayBuffer if is_dict else CompactReplayBuffer
         if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, CompactReplay):
-            # It saves the memory in any case. Where Stable-Baselines3 reads the argument, it would end an episode that
-            # only its own variant needs to have ended.
+            # Compact replay saves the memory in any case. If set, the argument would make Stable-Baselines3 end an
+            # episode, which only its own variant needs.
             self.optimize_memory_usage = False
 
     def _n_critics(self) -> int:
@@ -297,7 +299,7 @@ class SAC(  # type: ignore[misc]  # actor
     def _made(cls, content: Any, attributes: dict[str, Any], kwargs: dict[str, Any], *args: Any) -> Any:
         n_step_buffers = NStepReplayBuffer, CompactNStepReplayBuffer
         if "n_steps" in kwargs and attributes.get("replay_buffer_class") in n_step_buffers:
-            # It was chosen for the file's n_steps, which files of before have among its arguments.
+            # The class was chosen for the file's n_steps, which older files list among the buffer's arguments.
             attributes["replay_buffer_class"] = None
             of_buffer = attributes.get("replay_buffer_kwargs")
             if isinstance(of_buffer, dict):
@@ -321,8 +323,8 @@ class SAC(  # type: ignore[misc]  # actor
         """
         Set another environment, as in Stable-Baselines3; for a model without spaces, its first.
 
-        :param env: the environment, of the same spaces and as many as the model was made with
-        :param force_reset: whether it is reset before training goes on
+        :param env: the environment, with the spaces and the number of environments that the model was made with
+        :param force_reset: whether it is reset before training continues
         :raises ValueError: if its spaces or its number of environments differ
         """
         venv, is_first = self._wrap_env(env, self.verbose), self.env is None
@@ -334,10 +336,10 @@ class SAC(  # type: ignore[misc]  # actor
         checks.check_device_buffer(self, unwrap_vec_normalize(venv))
         super().set_env(venv, force_reset)
         if is_first and self.seed is not None:
-            # As where it is an argument.
+            # As if the environment had been a constructor argument.
             venv.seed(self.seed)
         if isinstance(self.replay_buffer, HerReplayBuffer):
-            # Its own ``set_env`` is for the first one.
+            # Its own ``set_env`` accepts the first environment only.
             self.replay_buffer.env = venv
 
     # ---------------------------------------------------------------- acting
@@ -352,9 +354,9 @@ class SAC(  # type: ignore[misc]  # actor
         """
         Choose actions, as in Stable-Baselines3.
 
-        :param observation: as the environment gives it, one or a batch. Of several tasks ``{"observation": ...,
-            "task": k}``, k being the number of the task, also for a batch
-        :param state: as in Stable-Baselines3, without meaning here
+        :param observation: as the environment gives it, one or a batch. With several tasks ``{"observation": ...,
+            "task": k}``, where k is the number of the task, also for a batch
+        :param state: as in Stable-Baselines3; ignored here
         :param episode_start: likewise
         :param deterministic: the mean action instead of a sample
         :return: actions, and ``state``
@@ -368,7 +370,7 @@ class SAC(  # type: ignore[misc]  # actor
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         self.learner.on_observations(self._last_obs)
-        # A model that has learned from data acts by it from the beginning.
+        # A model that has learned from data acts by its policy from the beginning.
         at_random = self._n_of_warm_up < learning_starts and self._n_offline_updates == 0
         unscaled, scaled = self._choose(self.learner, self._last_obs, at_random, n_envs)
         if action_noise is None:
@@ -382,7 +384,7 @@ class SAC(  # type: ignore[misc]  # actor
         """
         Choose the actions of a step in training.
 
-        :param learner: whose networks act
+        :param learner: learner whose networks act
         :param observations: of all environments
         :param at_random: whether the actions are uniformly random
         :param n_envs: number of environments
@@ -414,7 +416,7 @@ class SAC(  # type: ignore[misc]  # actor
     ) -> None:
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         if self._vec_normalize_env is None:
-            # Set by it all the same; saved, it says that there was a VecNormalize.
+            # Stable-Baselines3 sets it all the same; in a file it would mean that there was a VecNormalize.
             self._last_original_obs = None
         self.learner.learning_starts = self.learning_starts
         rewards = reward if self._vec_normalize_env is None else self._vec_normalize_env.get_original_reward()
@@ -453,9 +455,9 @@ class SAC(  # type: ignore[misc]  # actor
         control_frequency: float | None = None,
     ) -> Self:
         """
-        Train, as in Stable-Baselines3; with ``checkpoint``, so that nothing is lost when the program ends before it is
-        done: the same program, started again, goes on where the folder's last checkpoint is, and the result is the same
-        bit by bit (docs/saving.md).
+        Train, as in Stable-Baselines3. With ``checkpoint``, nothing is lost if the program ends before the training is
+        done: the same program, started again, resumes from the folder's last checkpoint, and the result is the same bit
+        for bit (docs/saving.md).
 
         :param total_timesteps: environment steps to take
         :param callback: called at every step
@@ -465,10 +467,10 @@ class SAC(  # type: ignore[misc]  # actor
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
         :param checkpoint: folder of the run; None for no checkpoints. Each call of ``learn`` needs a folder of its own
         :param checkpoint_freq: environment steps between two checkpoints
-        :param asynchronous: whether a thread acts while gradient steps are taken, up to the replay ratio, for robots
-            and other environments that take their time (docs/asynchronous.md). The result is then not the same bit by
-            bit
-        :param control_frequency: steps a second of that thread; None: at the environment's own pace
+        :param asynchronous: whether a separate thread acts while gradient steps are taken, up to the replay ratio, for
+            robots and other environments whose steps take time (docs/asynchronous.md). The result is then not the same
+            bit for bit
+        :param control_frequency: steps a second of the acting thread; None: at the environment's own pace
         :return: the trained model
         :raises ValueError: if an argument is out of range, or the folder is of another run (the message names what
             differs) or of an earlier call of ``learn``, cannot be used, or has checkpoints that are all damaged
@@ -505,8 +507,9 @@ class SAC(  # type: ignore[misc]  # actor
     ) -> Self:
         """
         Train on a data set. Steps are gradient steps here: ``num_timesteps`` counts them, callbacks are called after
-        each (``EvalCallback(eval_freq=1_000)`` evaluates every 1,000), checkpoints and log have them. The environment,
-        if there is one, is left alone. A ``learn`` that follows acts by what was learned from its first step on.
+        each (``EvalCallback(eval_freq=1_000)`` evaluates every 1,000), and checkpoints and log count them. The
+        environment, if there is one, is left alone. A later ``learn`` acts by the learned policy from its first step
+        on.
 
         :param dataset: the transitions. They are drawn by NumPy's global generator, which the model's seed sets and
             checkpoints hold
@@ -516,7 +519,7 @@ class SAC(  # type: ignore[misc]  # actor
         :param tb_log_name: name of the run in the TensorBoard log; the class's name if None
         :param reset_num_timesteps: whether ``num_timesteps`` starts at zero again
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
-        :param checkpoint: folder of the run, as in ``learn``; one of its own
+        :param checkpoint: folder of the run, as in ``learn``; each call needs its own
         :param checkpoint_freq: gradient steps between two checkpoints
         :return: the trained model
         :raises ValueError: if an argument is out of range, or the data set has other observations or actions than the
@@ -540,7 +543,7 @@ class SAC(  # type: ignore[misc]  # actor
 
     @contextlib.contextmanager
     def _learning_from(self, dataset: Dataset) -> Iterator[None]:
-        """Have a data set in the place of the replay buffer, and something in the place of an environment."""
+        """Put a data set in the place of the replay buffer, and a placeholder in the place of a missing environment."""
         if not hasattr(self, "observation_space"):
             self.observation_space, self.action_space, self.n_envs = dataset.observation_space, dataset.action_space, 1
             self._setup_model()
@@ -579,7 +582,8 @@ class SAC(  # type: ignore[misc]  # actor
         if not self._custom_logger:
             self._logger = configure_logger(self.verbose, self.tensorboard_log, name, reset_num_timesteps)
         if progress_bar:
-            # Beside one callback, as Stable-Baselines3 puts its own: checkpoints know the callback with and without it.
+            # Beside a single callback, as Stable-Baselines3 adds its own bar: checkpoints know the callback with and
+            # without it.
             one = CallbackList(callback) if isinstance(callback, list) else callback
             callback = [one if isinstance(one, BaseCallback) else ConvertCallback(one), GradientStepBar()]
         return self._total_timesteps, self._init_callback(callback)
@@ -627,7 +631,7 @@ class SAC(  # type: ignore[misc]  # actor
     def _on_environment_reset(self) -> None:
         self.learner.on_environment_reset()
         if isinstance(self.replay_buffer, (NStepReplayBuffer, HerReplayBuffer)):
-            # Returns would sum the rewards of the next episode, and goals be those that it reaches.
+            # Otherwise returns would include rewards of the next episode, and goals would be those reached in it.
             end_episodes(self.replay_buffer)
 
     def train(self, gradient_steps: int, batch_size: int | None = None) -> None:
@@ -647,7 +651,7 @@ class SAC(  # type: ignore[misc]  # actor
             self.learner.set_learning_rate(self.lr_schedule(self._current_progress_remaining))
         self.learner.before_updates()
         taken = 0
-        # Each step renews the priorities of which the next one's batch is drawn.
+        # Each step updates the priorities by which the next step's batch is drawn.
         at_once = 1 if isinstance(self.replay_buffer, PrioritizedReplay) else MAX_BATCHES_AT_ONCE
         while taken < gradient_steps:
             n_batches = self.plasticity.before_gradient_steps(self.learner, min(at_once, gradient_steps - taken))
@@ -673,7 +677,7 @@ class SAC(  # type: ignore[misc]  # actor
         """Whether the gradient steps that follow draw their batches themselves, from all that is stored now."""
         buffer = self.replay_buffer
         draws = isinstance(buffer, DeviceReplayBuffer) and buffer.sampling == "device"
-        # An offline training has another source, and gradients are kept of steps on given batches only.
+        # Offline training has another source, and gradients are kept only for steps on given batches.
         draws = draws and self._learns_from is None and not self.keep_next_gradients
         if not draws:
             return False
@@ -683,7 +687,7 @@ class SAC(  # type: ignore[misc]  # actor
         return True
 
     def _drawn_update(self, batch_size: int) -> dict[str, torch.Tensor]:
-        """One gradient step of the learner that draws its batch itself, with what its rule of pessimism judges."""
+        """One gradient step for which the learner draws the batch itself, and what its rule of pessimism needs."""
         buffer = self.replay_buffer
         assert buffer is not None
         held_out = n_held_out(self)
@@ -699,11 +703,11 @@ class SAC(  # type: ignore[misc]  # actor
         """
 
     def _set_training_mode(self, mode: bool) -> None:
-        """Dropout and power iterations: on during gradient steps, off whoever acts."""
+        """Switch dropout and power iterations: on during gradient steps, off for acting."""
         self.learner.set_training_mode(mode)
 
     def _update(self, batch: Batch, noise: Noise | None = None) -> dict[str, torch.Tensor]:
-        """One gradient step of the learner, with what its rule of pessimism judges besides; see ``Learner.step``."""
+        """One gradient step of the learner, with more transitions for its rule of pessimism; see ``Learner.step``."""
         eager, self._keeps_gradients = self._keeps_gradients, False
         if eager:
             self.keep_next_gradients = False

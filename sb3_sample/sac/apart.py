@@ -17,21 +17,21 @@ from sb3_sample.learner.exploration import Exploration, HeldNoise, OptimisticAct
 from sb3_sample.training.acting import ActingThread, Chosen, Step
 from sb3_sample.warn import warn
 
-#: Gradient steps after which parameters are handed over to whoever acts.
+#: Gradient steps after which parameters are handed over to the acting thread.
 MAX_AGE = 4
-#: Gradient steps that could not be taken in time lapse after so many seconds.
+#: Seconds after which gradient steps that could not be taken in time lapse.
 LAPSE = 1.0
-#: Share of missed periods that is warned of, once there are enough of them.
+#: Share of missed periods above which a warning is given, once there are enough periods.
 MISSED, ENOUGH = 0.01, 100
-#: Share of lapsed gradient steps that is warned of, after as many periods.
+#: Share of lapsed gradient steps above which a warning is given, after the same number of periods.
 LAPSED = 0.1
-#: Explorations that act without the critics, which then are not handed over.
+#: Explorations that act without the critics; with them, the critics are not handed over.
 _WITHOUT_CRITICS = (Exploration, HeldNoise, OptimisticActor, OptimisticShift)
 
 
 class Apart:
     """
-    An acting thread with networks of its own, and what is counted of it.
+    An acting thread with its own networks, and its counts.
 
     :param model: the algorithm
     :param frequency: steps a second; None: at the environment's pace
@@ -41,7 +41,7 @@ class Apart:
         self._model, self._frequency = model, frequency
         self._learner = model._make_learner(counts=model)
         self._learner.set_training_mode(False)
-        # Not captured: meanwhile the learner could not draw from the GPU's generator.
+        # Not captured: during the capture the learner could not draw from the GPU's generator.
         self._learner.make_acting = lambda learner: None
         # Held while actions are chosen, and while parameters are handed over.
         self._lock = threading.Lock()
@@ -70,11 +70,11 @@ class Apart:
     # ---------------------------------------------------------------- parameters
 
     def _all_pairs(self) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-        """Tensors of what acts, and those of what learns that they follow."""
+        """Tensors of the acting networks, and the learner's tensors that they are copied from."""
         learner = self._model.learner
         needs_critics = type(learner.explorer) not in _WITHOUT_CRITICS
         theirs, ours = _tensors(learner), _tensors(self._learner)
-        # Where it is shared, the encoder that the actor reads is the critics'.
+        # If the encoder is shared, the actor reads the critics'.
         shared = "networks.critic.features_extractor." if learner.networks.share_features_extractor else None
         names = [
             name
@@ -90,12 +90,12 @@ class Apart:
 
     @property
     def age(self) -> int:
-        """Gradient steps between what learns and what acts."""
+        """Gradient steps by which the acting parameters lag behind the learner's."""
         return self._model._n_updates - self._handed_over_at  # type: ignore[no-any-return]
 
     def after_gradient_steps(self, n: int) -> None:
         """
-        Hand over what was learned, before what acts is too old.
+        Hand over the learned parameters before those that act become too old.
 
         :param n: gradient steps just taken
         """
@@ -128,7 +128,7 @@ class Apart:
         self._recent.append((step.begun, n_due))
         while self._recent[0][0] <= step.begun - LAPSE:
             self._recent.popleft()
-        # More than this is due for steps of before.
+        # Gradient steps beyond this number are due for earlier steps.
         most_due = max(sum(n for _, n in self._recent), 1)
         if self.n_due > most_due:
             self._n_lapsed += self.n_due - most_due
@@ -161,7 +161,7 @@ class Apart:
         )
 
     def record(self) -> None:
-        """Put what was counted into the log."""
+        """Log the counts."""
         logger = self._model.logger
         logger.record("asynchronous/replay_ratio", self._n_taken / max(self._n_stored, 1))
         logger.record("asynchronous/lapsed_updates", self._n_lapsed)
@@ -176,11 +176,11 @@ class Apart:
 
 
 def _tensors(learner: Any) -> dict[str, torch.Tensor]:
-    """Tensors that acting depends on, by name; by several where one is shared."""
+    """Tensors that acting depends on, by name; a shared tensor has several names."""
     networks = learner.networks
     found = dict(networks.named_parameters("networks", remove_duplicate=False))
     found |= dict(networks.named_buffers("networks", remove_duplicate=False))
-    # Not the explorer's buffers, which may be of its own course.
+    # Not the explorer's buffers, which may hold the progress of the acting explorer itself.
     found |= dict(learner.explorer.named_parameters("explorer"))
     return found | dict(learner.pessimism_rule.named_parameters("pessimism"))
 
@@ -195,7 +195,7 @@ class ActsApart:
     @contextlib.contextmanager
     def _acting(self: Any, asynchronous: bool, control_frequency: float | None) -> Iterator[None]:
         """
-        Act so during a ``learn``.
+        Act in the given way during a ``learn``.
 
         :param asynchronous: its argument
         :param control_frequency: its argument
@@ -211,7 +211,7 @@ class ActsApart:
             if apart is not None:
                 apart.thread.stop()
                 if self.num_timesteps < self._total_timesteps:
-                    # The environment may be farther than what was stored, so that its episode cannot go on.
+                    # The environment may be ahead of the stored transitions, so its episode cannot be continued.
                     self._last_obs = None
 
     def _check_acting(self: Any, asynchronous: bool, control_frequency: float | None) -> None:
@@ -244,7 +244,7 @@ class ActsApart:
             )
 
     def _turn_apart(self: Any, callback: BaseCallback, log_interval: int) -> bool:
-        """Take over what the acting thread has done, then take gradient steps that are due."""
+        """Take over the acting thread's steps, then take gradient steps that are due."""
         if self._apart is None:
             self._apart = Apart(self, self._acts_at[1])
             self._apart.thread.start()
@@ -267,7 +267,7 @@ class ActsApart:
         return all(self._take_over(step, callback, log_interval) for step in self._apart.thread.taken(wait=False))
 
     def _take_over(self: Any, step: Step, callback: BaseCallback, log_interval: int) -> bool:
-        """As Stable-Baselines3 treats a step of its own; callbacks read these names in the variables."""
+        """Treat a step as Stable-Baselines3 treats its own; callbacks read these names among the local variables."""
         env, replay_buffer = self.env, self.replay_buffer
         actions, buffer_actions, new_obs = step.actions, step.scaled, step.new_obs
         rewards, dones, infos = step.rewards, step.dones, step.infos

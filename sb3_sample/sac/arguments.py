@@ -1,4 +1,4 @@
-"""Arguments of the off-policy family: what each is, and what it may be."""
+"""Arguments of the off-policy family: their meaning and their allowed values."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -43,7 +43,7 @@ def transform_choice(value: Any) -> tuple[Any, Any]:
     """
     Read an entry of ``batch_transforms``.
 
-    :param value: a class, or a pair of one and its arguments
+    :param value: a class, or a pair of a class and its arguments
     :return: the class and its arguments
     """
     return tuple(value) if isinstance(value, (tuple, list)) and len(value) == 2 else (value, {})
@@ -55,21 +55,22 @@ def _is_transform(value: Any) -> bool:
 
 
 class SACArguments(Resumable):
-    """Arguments that every off-policy algorithm has, those of Stable-Baselines3 first and by position too."""
+    """Arguments of every off-policy algorithm; those of Stable-Baselines3 come first and work by position too."""
 
     _policy: str | type[SACPolicy] = argument(alias="policy", kw_only=False, of_training=True)
     """"MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class"""
     _env: gym.Env[Any, Any] | VecEnv | str | None = argument(alias="env", kw_only=False, of_training=True)
-    """the environment, an id, or a vectorised environment; its action space a bounded Box. None for a model that learns
-    from data: its spaces are those of the data set, unless they are arguments"""
+    """the environment, an id, or a vectorised environment; its action space must be a bounded Box. None for a model
+    that learns from data: its spaces are those of the data set, unless they are passed as arguments"""
     learning_rate: float | Schedule = argument(default=3e-4, kind=LEARNING_RATE, kw_only=False)
-    """of all networks and the temperature; a number or a function of the remaining progress (from 1 to 0)"""
+    """learning rate of all networks and the temperature; a number or a function of the remaining progress (from 1 to
+    0)"""
     buffer_size: int = argument(default=1_000_000, kind=integer(1), kw_only=False, of_training=True)
     """capacity of the replay buffer in transitions"""
     learning_starts: int = argument(default=10_000, kind=integer(0), kw_only=False, of_training=True)
     """transitions with uniformly random actions before the first gradient step, counted over the model's life"""
     batch_size: int = argument(default=256, kind=integer(1), kw_only=False, of_training=True)
-    """transitions a gradient step"""
+    """transitions per gradient step"""
     tau: float = argument(default=0.005, kind=number("lie in (0, 1]", lambda value: 0 < value <= 1), kw_only=False)
     """weight of the new critics in the Polyak average of the targets, in (0, 1]"""
     gamma: float = argument(default=0.99, kind=UNIT, kw_only=False)
@@ -77,8 +78,8 @@ class SACArguments(Resumable):
     _train_freq: int | tuple[int, str] | None = argument(
         alias="train_freq", default=None, kw_only=False, of_training=True
     )
-    """as in Stable-Baselines3, every how many steps (or ``(n, "episode")``) to train; if given, with
-    ``gradient_steps``, it replaces ``replay_ratio``"""
+    """as in Stable-Baselines3, number of steps between two trainings, or ``(n, "episode")``; if given, it and
+    ``gradient_steps`` replace ``replay_ratio``"""
     _gradient_steps: int | None = argument(
         alias="gradient_steps",
         default=None,
@@ -86,7 +87,7 @@ class SACArguments(Resumable):
         kw_only=False,
         of_training=True,
     )
-    """as in Stable-Baselines3, gradient steps each time (-1: as many as transitions were collected); if given, it
+    """as in Stable-Baselines3, gradient steps per training (-1: as many as transitions were collected); if given, it
     replaces ``replay_ratio``"""
     action_noise: ActionNoise | None = argument(
         default=None, kind=instance(ActionNoise).or_none(), kw_only=False, of_training=True
@@ -95,14 +96,14 @@ class SACArguments(Resumable):
     replay_buffer_class: type[ReplayBuffer] | None = argument(
         default=None, kind=subclass(ReplayBuffer).or_none(), kw_only=False, of_training=True
     )
-    """class of the replay buffer; chosen by the observation space if None, one that stores one observation a step"""
+    """class of the replay buffer; None: one that fits the observation space and stores one observation per step"""
     _replay_buffer_kwargs: dict[str, Any] | None = argument(
         alias="replay_buffer_kwargs", default=None, kind=DICT, kw_only=False, of_training=True
     )
-    """its arguments; ``memory_map="folder"`` keeps the default buffer in files"""
+    """arguments of the replay buffer; ``memory_map="folder"`` keeps the default buffer in files"""
     optimize_memory_usage: bool = argument(default=False, kw_only=False, of_training=True)
-    """for a ``replay_buffer_class`` that knows it. The default buffer saves the memory anyway, with time limits
-    handled, and takes either value"""
+    """for a ``replay_buffer_class`` that supports it. The default buffer saves the memory anyway, handles time limits,
+    and accepts either value"""
     n_steps: int = argument(default=1, kind=integer(1), kw_only=False, of_training=True)
     """n-step returns, as in Stable-Baselines3"""
     ent_coef: str | float = argument(default="auto", kw_only=False)
@@ -110,30 +111,30 @@ class SACArguments(Resumable):
     target_update_interval: int | None = argument(default=1, kind=integer(1).or_none("policy_delay"), kw_only=False)
     """gradient steps between two updates of the targets; None: ``policy_delay``"""
     target_entropy: str | float | Sequence[float] = argument(default="auto", kw_only=False)
-    """entropy that the learned temperature aims at; "auto" is -|A|/2, of all dimensions of the action, also of those
-    that a task has no use for. As in Stable-Baselines3, a number once the model is made; set anew, it counts from the
-    next ``train`` on. With ``task_temperatures`` also a list, one for each task"""
+    """entropy that the learned temperature aims at; "auto" is -|A|/2, where |A| counts all dimensions of the action,
+    including those that a task does not use. As in Stable-Baselines3, it is a number once the model is made; a new
+    value takes effect at the next ``train``. With ``task_temperatures`` also a list, one for each task"""
     replay_ratio: float | None = argument(default=2, kind=AT_LEAST_0.or_none(), of_training=True)
     """gradient steps per environment transition after the warm-up, whatever the number of environments; may be below
     1. Where several tasks take a step together, per transition of each task"""
     n_quantiles: int | None = argument(default=None, kind=integer(1).or_none("scalar critics"))
-    """quantiles a critic; None for scalar critics"""
+    """quantiles per critic; None for scalar critics"""
     value_head: str | type[ValueHead] | None = argument(
         default=None, kind=one_of(VALUE_HEADS, ValueHead).or_none("scalars or quantiles")
     )
     """"categorical", "hl_gauss", "half_squared" (scalars, half the squared error), or a class derived from
-    ``ValueHead``, in the place of those two; with ``n_quantiles=None``"""
+    ``ValueHead``, instead of scalars or quantiles; requires ``n_quantiles=None``"""
     value_head_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
-    """its arguments"""
+    """arguments of the value head"""
     pessimism: float | str | type[Pessimism] = argument(default=1.0)
     """weight of the critics' spread that is subtracted from their mean, at least 0; 1 is the minimum of two critics, 0
-    the mean. Or the rule that moves it: "gpl", "opl", "top", "vpl", or a class derived from ``Pessimism``"""
+    the mean. Or a rule that moves the weight: "gpl", "opl", "top", "vpl", or a class derived from ``Pessimism``"""
     pessimism_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
-    """arguments of the rule"""
+    """arguments of the rule of pessimism"""
     actor_pessimism: float | None = argument(default=None)
-    """a weight for the actor's objective alone (REDQ and DroQ: 0); None: the same"""
+    """weight of the spread for the actor's objective alone (REDQ and DroQ: 0); None: the same as for the target"""
     target_subset: int | None = argument(default=None)
-    """how many critics, drawn at random, make the TD target (REDQ: 2); None: all"""
+    """number of critics, drawn at random, that make the TD target (REDQ: 2); None: all"""
     validation_proportion: float = argument(
         default=0.0, kind=number("lie in [0, 1)", lambda value: 0 <= value < 1), of_training=True
     )
@@ -142,42 +143,43 @@ class SACArguments(Resumable):
     """policy that acts while training: "actor", "held_noise" (FlashSAC), "oac", "optimistic_actor" (DAC),
     "optimistic_shift" (BRO), "scheduled_noise" (DrQ-v2), or a class derived from ``Exploration``"""
     exploration_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
-    """its arguments"""
+    """arguments of the exploration"""
     backbone: str = argument(
         default="sac",
         kind=Kind("be one of ['sac', 'td3']", lambda value: isinstance(value, str) and value in ("sac", "td3")),
     )
     """"sac", or "td3": a deterministic actor, without entropy"""
     policy_delay: int = argument(default=1, kind=integer(1))
-    """gradient steps between two of the actors' and of the temperature"""
+    """gradient steps between two updates of actors and temperature"""
     actor_at_once: bool = argument(default=False, kind=TRUE_OR_FALSE)
-    """whether the first of ``policy_delay`` gradient steps is the actors', and not the last (XQC, FlashSAC)"""
+    """whether the actors learn in the first of every ``policy_delay`` gradient steps instead of the last (XQC,
+    FlashSAC)"""
     actor_first: bool = argument(default=False, kind=TRUE_OR_FALSE)
-    """whether actors and temperature learn before the critics in a gradient step, whose target is then of the new
-    actor and temperature (SimbaV2, FlashSAC)"""
+    """whether actors and temperature learn before the critics in a gradient step; the TD target then uses the new actor
+    and temperature (SimbaV2, FlashSAC)"""
     learning_rate_schedule: str | None = argument(
         default=None,
         kind=Kind(f"be one of {list(SCHEDULES)}", lambda value: value in SCHEDULES).or_none("no such schedule"),
     )
     """"linear" or "cosine": decay from ``learning_rate``, a number, to ``final_learning_rate`` over the planned
-    gradient steps, each optimizer by the steps that it has taken; the final rate from there on"""
+    gradient steps, for each optimizer by its own number of steps; the final rate thereafter"""
     final_learning_rate: float = argument(default=0.0, kind=AT_LEAST_0)
     """rate at the end of the schedule"""
     schedule_steps: int | None = argument(default=None, kind=integer(1).or_none("those of the first learn"))
     """planned gradient steps; None: environment steps of the first ``learn``, random ones included, times the replay
-    ratio, which later calls do not change"""
+    ratio; later calls do not change the number"""
     warm_up_steps: int = argument(default=0, kind=integer(0))
-    """planned gradient steps that come before the decay, in which the rate rises linearly to ``learning_rate``"""
+    """planned gradient steps before the decay, in which the rate rises linearly to ``learning_rate``"""
     warm_up_learning_rate: float | None = argument(default=0.0, kind=AT_LEAST_0.or_none("learning_rate"))
-    """rate from which it rises; None: ``learning_rate``, which it then keeps"""
+    """learning rate at the start of the warm-up; None: ``learning_rate``, throughout the warm-up"""
     resets: Sequence[int] | int = argument(default=())
-    """environment steps at which all parameters start anew, counted in transitions over the model's life, of each task
-    where several take a step together; or one integer for every so many"""
+    """environment steps at which all parameters start anew, counted in transitions over the model's life (of each task,
+    where several tasks take a step together); or an integer, the number of steps between two resets"""
     reset_gradient_steps: int | None = argument(default=None, kind=integer(1).or_none("no such resets"))
-    """resets after every so many gradient steps of the model's life instead (SR-SAC's original: 2,560,000), in the
-    place of a class's own ``resets``; None for none. Not together with ``resets``"""
+    """gradient steps of the model's life between two resets (SR-SAC's original: 2,560,000); it replaces a class's
+    default ``resets`` and cannot be combined with ``resets`` that are passed. None for none"""
     reset_shrink: float = argument(default=0.0, kind=number("lie in [0, 1)", lambda value: 0 <= value < 1))
-    """share of the old parameters that a reset leaves (shrink and perturb), in [0, 1)"""
+    """share of the old parameters that a reset keeps (shrink and perturb), in [0, 1)"""
     resets_keep: Sequence[str] = argument(
         default=(),
         kind=Kind(
@@ -185,11 +187,12 @@ class SACArguments(Resumable):
             lambda value: isinstance(value, (list, tuple)) and all(each == "encoder" for each in value),
         ),
     )
-    """what a reset leaves as it is: ``("encoder",)`` for the features extractor that actors share with the critics,
-    that of the targets and their part of the optimizer (the primacy bias, Nikishin et al. 2022, from pixels)"""
+    """parts that a reset leaves as they are: ``("encoder",)`` for the features extractor that actors share with the
+    critics, the targets' extractor, and their part of the optimizer (the primacy bias, Nikishin et al. 2022, from
+    pixels)"""
     resets_to: str = argument(default="fresh", kind=one_of(RESETS_TO))
-    """what a reset returns to: "fresh", newly drawn parameters, or "start", those that the model began with, as in
-    BRO's published code; with the parameters of a file (``load``, ``set_parameters``), those that its model began
+    """parameters after a reset: "fresh", newly drawn ones, or "start", those that the model began with, as in BRO's
+    published code; if the parameters come from a file (``load``, ``set_parameters``), those that the file's model began
     with"""
     redo_period: int | None = argument(default=None, kind=integer(1).or_none("no recycling"))
     """gradient steps between two recyclings of the critics' dormant neurons (ReDo; the original: 1,000); None for
@@ -205,47 +208,49 @@ class SACArguments(Resumable):
             lambda value: isinstance(value, Sequence) and all(map(_is_transform, value)),
         ),
     )
-    """classes derived from ``BatchTransform``, or pairs of one and its arguments, which every batch goes through before
-    it is learned from"""
+    """classes derived from ``BatchTransform``, or pairs of a class and its arguments, applied to every batch before it
+    is learned from"""
     augmentation: str | None = argument(default=None, kind=one_of(AUGMENTATIONS).or_none("images as they are"))
-    """"shift": every image of a batch is shifted by a few pixels at random (DrQ), after ``batch_transforms``. Actors
-    then share the critics' features extractor, but for BC's and IQL's, unless ``policy_kwargs`` has
+    """"shift": every image of a batch is shifted by a few pixels at random (DrQ), after ``batch_transforms``. Actors,
+    except those of BC and IQL, then share the critics' features extractor, unless ``policy_kwargs`` has
     ``share_features_extractor=False``"""
     augmentation_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
-    """its arguments: ``pad``, 4 pixels, and DrQ's K and M, ``target_copies`` and ``online_copies``, 1 each"""
+    """arguments of the augmentation: ``pad``, 4 pixels, and DrQ's K and M, ``target_copies`` and ``online_copies``, 1
+    each"""
     reward_scale: str | type[RewardScale] | None = argument(
         default=None, kind=one_of(REWARD_SCALES, RewardScale).or_none("rewards as they are")
     )
     """rule by which rewards are divided by a running measure of the return: "simbav2", "xqc", "flashsac", "brc", or a
     class derived from ``RewardScale``; or "linear": rewards times a factor, plus a number"""
     reward_scale_kwargs: dict[str, Any] | None = argument(default=None, kind=DICT)
-    """its arguments"""
+    """arguments of the rule that scales rewards"""
     normalize_observations: bool = argument(default=False, kind=TRUE_OR_FALSE)
-    """whether the networks read observations less their running mean, by their running standard deviation. The
-    statistics are the policy's, and move while training only"""
+    """whether the networks read observations minus their running mean, divided by their running standard deviation. The
+    statistics belong to the policy and are updated only while training"""
     multitask: bool = argument(default=False, kind=TRUE_OR_FALSE)
-    """whether the networks read the task as a one-hot vector and are all twice as wide (BRO, figure 19), where the
-    observations tell one of several (``multi_task_env``). False: as wide as ever, with the one-hot vector; for ``BRC``
-    with an embedding of the task in its place"""
+    """for observations that contain the task (``multi_task_env``), whether the networks read it as a one-hot vector and
+    are all twice as wide (BRO, figure 19). False: of the usual width, with the one-hot vector, or in ``BRC`` with an
+    embedding of the task"""
     task_temperatures: bool = argument(default=False, kind=TRUE_OR_FALSE)
-    """whether each of several tasks has a temperature of its own, which is learned"""
+    """whether each of several tasks has its own learned temperature"""
     use_sde: bool = argument(default=False, of_training=True)
     """not supported, refused if True"""
     sde_sample_freq: int = argument(default=-1, kind=integer(-1), of_training=True)
-    """as in Stable-Baselines3, without meaning where ``use_sde`` is False"""
+    """as in Stable-Baselines3, without effect if ``use_sde`` is False"""
     use_sde_at_warmup: bool = argument(default=False, of_training=True)
-    """as in Stable-Baselines3, without meaning where ``use_sde`` is False"""
+    """as in Stable-Baselines3, without effect if ``use_sde`` is False"""
     prior_data: Dataset | None = argument(default=None, kind=instance(Dataset).or_none(), of_training=True)
-    """transitions that are there already, of which ``learn`` takes a share of every batch (RLPD, Ball et al. 2023).
-    Files hold its fingerprint only; pass it to ``load`` too"""
+    """existing transitions, from which ``learn`` takes a share of every batch (RLPD, Ball et al. 2023). Files hold only
+    a fingerprint of the data; pass the data to ``load`` too"""
     prior_share: float = argument(
         default=0.5, kind=number("lie in (0, 1)", lambda value: 0 < value < 1), of_training=True
     )
-    """that share"""
+    """share of ``prior_data`` in every batch"""
     _observation_space: spaces.Space | None = argument(alias="observation_space", default=None, of_training=True)
-    """of a model without an environment, with ``action_space``; None: the environment's, or the data set's"""
+    """observation space of a model without an environment, passed together with ``action_space``; None: the
+    environment's, or the data set's"""
     _action_space: spaces.Box | None = argument(alias="action_space", default=None, of_training=True)
-    """of a model without an environment, with ``observation_space``"""
+    """action space of a model without an environment, passed together with ``observation_space``"""
     compile: bool | str = argument(default="auto")
-    """whether Inductor makes one program of the gradient step; "auto": where that pays back within the run, on
-    a CPU or a GPU with a compiler at hand, see docs/performance.md"""
+    """whether Inductor compiles the gradient step into one program; "auto": if that pays off within the run, on a CPU
+    or a GPU with a compiler available, see docs/performance.md"""

@@ -23,11 +23,11 @@ class BRC(SAC):
     target and actor; rewards divided by a measure of the returns of finished episodes; weight decay; no resets and no
     optimism.
 
-    With observations that tell one of several tasks (``multi_task_env``), critics and actor read a learned embedding of
-    the task beside the observation, and rewards are scaled by task. The embeddings are the critics', which learn them;
-    the actor reads them without gradient. Target entropy and temperature are one for all tasks, unless
-    ``task_temperatures``. The published batch is then 1,024. With ``multitask=True`` the task is a one-hot vector, as
-    in BRO, instead of an embedding.
+    With observations that contain the task (``multi_task_env``), critics and actor read a learned embedding of the task
+    beside the observation, and rewards are scaled per task. The embeddings belong to the critics, which learn them; the
+    actor reads them without gradient. All tasks share one target entropy and one temperature, unless
+    ``task_temperatures``. The published batch size is then 1,024. With ``multitask=True`` the task is a one-hot vector,
+    as in BRO, instead of an embedding.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """

@@ -27,7 +27,7 @@ MODEL_SIZES: dict[str, tuple[int, int]] = {
 BRO_RESETS = (15_000, 50_000, 250_000, 500_000, 750_000, 1_000_000, 1_500_000, 2_000_000)
 BRO_FAST_RESETS = (15_000,)
 
-#: Arguments that are the optimistic actor's.
+#: Arguments of the optimistic actor.
 OPTIMISTIC_SHIFT_SETTINGS = (
     "kl_target",
     "std_multiplier",
@@ -46,32 +46,32 @@ class BRO(SAC):
     while the pessimistic one learns and is evaluated.
 
     Defaults are those of the published curves. Where the paper's text and the published code differ, the code is
-    followed: the actors have one residual block (of table 5 it is not certain whether it says two), and the divergence
-    goes from the optimistic to the pessimistic actor (algorithm 2 writes the other order). docs/bro.md lists all
-    differences and misprints.
+    followed: the actors have one residual block (it is not certain whether table 5 says two), and the divergence goes
+    from the optimistic to the pessimistic actor (algorithm 2 has the reverse order). docs/bro.md lists all differences
+    and misprints.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
     learning_rate: float | Schedule = argument(default=3e-4, kw_only=False)
-    """of actor, critics, optimistic actor and temperature; a number or a function of the remaining progress (from 1 to
-    0)"""
+    """learning rate of actor, critics, optimistic actor and temperature; a number or a function of the remaining
+    progress (from 1 to 0)"""
     learning_starts: int = argument(default=2_500, kw_only=False)
     """transitions with uniformly random actions before the first gradient step, counted over the model's life"""
     batch_size: int = argument(default=128, kw_only=False)
-    """transitions a gradient step"""
+    """transitions per gradient step"""
     replay_ratio: float | None = argument(default=10)
     """gradient steps per environment transition after the warm-up, whatever the number of environments; may be below
     1"""
     model_size: str | Sequence[int] | None = argument(default="4.92M")
     """size of the critics by its name in BRO, table 7 ("0.55M", "1.05M", "2.83M", "4.92M", "26.31M"), or (residual
-    blocks, width); the actors are the same in all. None if ``policy_kwargs`` describe the critics"""
+    blocks, width); the actors are the same at every size. None if ``policy_kwargs`` describe the critics"""
     n_quantiles: int | None = argument(default=100)
-    """quantiles a critic; None for scalar critics"""
+    """quantiles per critic; None for scalar critics"""
     pessimism: float | str | type[Pessimism] = argument(default=0.0)
     """weight of the critics' spread that is subtracted from their mean, at least 0; or a rule, as in ``SAC``"""
     kl_target: float = argument(default=0.05)
-    """KL divergence per action dimension between the two actors that optimism is adjusted to"""
+    """target for the KL divergence per action dimension between the two actors, to which optimism is adjusted"""
     std_multiplier: float = argument(default=0.75)
     """factor on the standard deviation of the actor while exploring"""
     initial_optimism: float = argument(default=1.0)
@@ -87,10 +87,10 @@ class BRO(SAC):
     exploration_kwargs: dict[str, Any] | None = argument(default=None)
     """further arguments of the exploration"""
     resets: Sequence[int] | int = argument(default=BRO_RESETS)
-    """environment steps at which all parameters start anew, counted in transitions over the model's life; or one
-    integer for every so many"""
+    """environment steps at which all parameters start anew, counted in transitions over the model's life; or an
+    integer, the number of steps between two resets"""
     resets_to: str = argument(default="start")
-    """what a reset returns to: "start", the parameters that the model began with, or "fresh", newly drawn ones"""
+    """parameters after a reset: "start", those that the model began with, or "fresh", newly drawn ones"""
 
     temperature_beta1: ClassVar[float] = 0.5
 
@@ -141,14 +141,14 @@ class BROFast(BRO):
 class BROTD3(BRO):
     """
     BRO on TD3 instead of soft actor-critic (section E.3 and figure 17; TD3 by Fujimoto et al. 2018): deterministic
-    actors, a target actor, smoothed target actions, delayed actor updates, and no entropy. The rest, the two actors
-    included, is BRO's.
+    actors, a target actor, smoothed target actions, delayed actor updates, and no entropy. Everything else, including
+    the two actors, is BRO's.
 
-    The paper says no more than that; decided here: exploration adds Gaussian noise to the optimistic actor's action;
-    the KL divergence of the two actors is taken between Gaussians of that noise around their actions; the actors, the
-    target actor and the targets move every second gradient step, as in TD3; ``std_multiplier`` is 1, so that the noise
-    is what ``exploration_noise`` says; and pessimism stays at BRO's 0, where TD3 has the minimum
-    (``pessimism=1``).
+    The paper says no more than that; the following is decided here: exploration adds Gaussian noise to the optimistic
+    actor's action; the KL divergence of the two actors is taken between Gaussians of that noise around their actions;
+    the actors, the target actor and the targets move every second gradient step, as in TD3; ``std_multiplier`` is 1, so
+    that the noise has the standard deviation ``exploration_noise``; and pessimism stays at BRO's 0, where TD3 has the
+    minimum (``pessimism=1``).
 
     ``ent_coef`` and ``target_entropy`` have no meaning here.
 
@@ -160,15 +160,15 @@ class BROTD3(BRO):
     target_noise: float = argument(default=0.2)
     """standard deviation of the noise on the target's action"""
     target_noise_clip: float = argument(default=0.5)
-    """bound of that noise"""
+    """bound of the noise on the target's action"""
     policy_delay: int = argument(default=2)
-    """gradient steps between two of the actors'"""
+    """gradient steps between two updates of the actors"""
     target_update_interval: int | None = argument(default=None, kw_only=False)
     """gradient steps between two updates of the target critics; None: ``policy_delay``"""
     std_multiplier: float = argument(default=1.0)
     """factor on the noise of the optimistic actor"""
     backbone: str = argument(default="td3")
-    """"td3"; with "sac" it is ``BRO``"""
+    """"td3"; for "sac", use ``BRO``"""
 
     def _check_arguments(self) -> None:
         super()._check_arguments()

@@ -1,4 +1,4 @@
-"""Checks of the off-policy family's arguments: what does not go together, and what is more than a kind of value."""
+"""Checks of the off-policy family's arguments: combinations, and conditions beyond the kind of a value."""
 
 import math
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ def check(agent: Any) -> None:
     :raises ValueError: if an argument is out of range or contradicts another
     """
     if agent.augmentation in AUGMENTATIONS and hasattr(agent, "observation_space"):
-        # Before a policy asks for less of them.
+        # Before the policy's check, which demands less of the images.
         check_images(f"augmentation={agent.augmentation!r}", agent.observation_space)
     check_every(agent)
     n_critics = check_value("n_critics", agent._n_critics(), integer(1))
@@ -93,7 +93,7 @@ def check(agent: Any) -> None:
 
 def check_spaces(observation_space: Any, action_space: Any, env: Any) -> None:
     """
-    Check the spaces that are arguments.
+    Check the spaces passed as arguments.
 
     :param observation_space: the argument
     :param action_space: the argument
@@ -113,7 +113,7 @@ def check_spaces(observation_space: Any, action_space: Any, env: Any) -> None:
 
 def check_dataset(name: str, dataset: Any, observation_space: Any, action_space: Any) -> None:
     """
-    Check that a data set is one for a model.
+    Check that a data set fits a model.
 
     :param name: the argument
     :param dataset: the data set
@@ -162,13 +162,13 @@ def check_offline(agent: Any) -> None:
 
 
 def _check_statistics(normalize: Any) -> None:
-    """Whether a ``VecNormalize``, if any, has statistics to normalise a data set by."""
+    """Check that a ``VecNormalize``, if any, has statistics to normalise a data set by."""
     if normalize is None:
         return
     counts = []
     if normalize.norm_obs:
         of_parts = normalize.obs_rms.values() if isinstance(normalize.obs_rms, dict) else [normalize.obs_rms]
-        # A reset has given one observation of each environment.
+        # A reset has counted one observation of each environment.
         counts += [of_part.count - normalize.num_envs for of_part in of_parts]
     if normalize.norm_reward:
         counts.append(normalize.ret_rms.count)
@@ -182,9 +182,9 @@ def _check_statistics(normalize: Any) -> None:
 
 def check_prior_of(value: Any) -> None:
     """
-    Check what a file says of prior data.
+    Check a file's record of prior data.
 
-    :param value: it
+    :param value: the record
     :raises ValueError: if it is something else
     """
     kinds = {"fingerprint": str, "size": int}
@@ -194,8 +194,8 @@ def check_prior_of(value: Any) -> None:
 
 def prior_words(prior_of: dict[str, Any]) -> str:
     """
-    :param prior_of: what a file says of prior data
-    :return: the same in words
+    :param prior_of: a file's record of prior data
+    :return: the record in words
     """
     return f"{prior_of['size']:,} transitions of prior data, sha256 {prior_of['fingerprint'][:16]}"
 
@@ -211,14 +211,14 @@ def _parts(space: Any) -> dict[str, Any]:
 
 
 def _means_alike(ours: Any, theirs: Any) -> bool:
-    """Whether numbers of the same shape have one meaning: as many classes, or pictures of one range."""
+    """Whether numbers of the same shape have the same meaning: equally many classes, or pictures of the same range."""
     if not (isinstance(ours, spaces.Box) and isinstance(theirs, spaces.Box)):
         return bool(ours == theirs)
     return len(ours.shape) != 3 or np.dtype(ours.dtype).kind == np.dtype(theirs.dtype).kind
 
 
 def _check_prior_data(agent: Any) -> None:
-    """Whether batches can have their share of the prior data."""
+    """Check that batches can have their share of the prior data."""
     if agent._prior_of is not None:
         check_prior_of(agent._prior_of)
     if agent.prior_data is None:
@@ -253,7 +253,7 @@ def _check_prior_data(agent: Any) -> None:
 
 def check_one_reward_scale(agent: Any) -> None:
     """
-    Check that rewards are scaled once.
+    Check that rewards are scaled only once.
 
     :param agent: an algorithm
     :raises ValueError: if its environment scales them too
@@ -282,13 +282,13 @@ def check_scale_is_known(agent: Any) -> None:
 
 
 def _check_schedule(agent: Any) -> None:
-    """Whether a schedule over planned gradient steps goes with the rate."""
+    """Check that a schedule over planned gradient steps goes with the learning rate."""
     if agent.learning_rate_schedule is None:
         names = ["final_learning_rate", "schedule_steps", "warm_up_steps", "warm_up_learning_rate"]
         check_unused(agent, names, "learning_rate_schedule=None")
         return
     if isinstance(agent.learning_rate, ConstantSchedule):
-        # A number, as the zoo passes it on.
+        # A number, in the form in which the zoo passes it on.
         agent.learning_rate = agent.learning_rate.val
     if callable(agent.learning_rate):
         raise ValueError(
@@ -311,7 +311,7 @@ def _check_schedule(agent: Any) -> None:
 
 
 def _check_tasks(agent: Any) -> None:
-    """Whether what is said of tasks goes with the observations, and with the temperature."""
+    """Check that the arguments about tasks go with the observations and the temperature."""
     for name in ("multitask", "task_temperatures"):
         if getattr(agent, name) and not is_multi_task(agent.observation_space):
             raise ValueError(
@@ -319,7 +319,7 @@ def _check_tasks(agent: Any) -> None:
                 f"{agent.observation_space}: leave it out"
             )
     if agent.n_tasks > 1 and agent.observation_space["task"].start != 0:
-        # They look up what they have of each task by its number.
+        # Both look up a task's values by its number.
         for name, value, by_task in (
             ("task_temperatures", agent.task_temperatures, agent.task_temperatures),
             ("reward_scale", agent.reward_scale, agent.reward_scale == "brc"),
@@ -344,7 +344,7 @@ def _check_tasks(agent: Any) -> None:
 
 
 def _check_augmentation(agent: Any) -> None:
-    """Whether there are images to be augmented, and an encoder to be kept."""
+    """Check that arguments of the augmentation have one, and that ``resets_keep`` has resets and a shared encoder."""
     if agent.augmentation is None:
         check_unused(agent, ["augmentation_kwargs"], "augmentation=None")
     if not agent.resets_keep:
@@ -361,7 +361,7 @@ def _check_augmentation(agent: Any) -> None:
 def has_resets(resets: Any) -> bool:
     """
     :param resets: the argument of that name, checked or not
-    :return: whether it asks for a reset: it is no empty sequence
+    :return: whether it asks for a reset: it is not an empty sequence
     """
     return not (isinstance(resets, (Sequence, np.ndarray)) and len(resets) == 0)
 
@@ -445,7 +445,7 @@ def _check_pessimism(agent: Any) -> None:
 
 
 def _check_buffer_class(agent: Any) -> None:
-    """Whether the buffer is one for the observations."""
+    """Check that the buffer can hold the observations."""
     cls, space = agent.replay_buffer_class, agent.observation_space
     is_dict = isinstance(space, spaces.Dict)
     if cls is None:
@@ -499,7 +499,7 @@ def _check_replay(agent: Any) -> None:
 
 
 def _check_memory_map(agent: Any) -> None:
-    """A buffer in files: only those of this package know it."""
+    """Check a buffer in files, which only this package's buffers support."""
     cls, is_split = agent.replay_buffer_class, agent.validation_proportion > 0
     stacks = "frame_stack" in (agent.replay_buffer_kwargs or {})
     stacks = stacks or stacked_frames(agent.env, agent.observation_space) is not None
@@ -643,7 +643,7 @@ def check_once(kwargs_name: str, kwargs: dict[str, Any] | None, arguments: dict[
     """
     :param kwargs_name: name of an argument that is a dict
     :param kwargs: its value
-    :param arguments: by key of the dict, the argument of the class that is the same setting
+    :param arguments: for each key of the dict, the argument of the class that is the same setting
     :raises ValueError: if the dict has such a key
     """
     for key in kwargs or {}:
@@ -656,7 +656,7 @@ def as_number(name: str, value: Any, otherwise: str, shown: Any = None) -> float
     :param name: name of an argument
     :param value: its value
     :param otherwise: what else is allowed, for the error
-    :param shown: the value as the error shows it, if that is another
+    :param shown: the value as the error shows it, if different
     :return: the value as a number
     :raises ValueError: if it is not one
     """

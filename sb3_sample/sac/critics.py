@@ -33,14 +33,14 @@ class CriticEnsemble(NetworkFeatures, BaseModel):
     :param n_critics: E
     :param n_outputs: K, the number of quantiles, or 1
     :param normalize_images: whether images are divided by 255
-    :param shares_encoder: whether the extractor is that of other critics, whose features are read without gradient and
-        in evaluation mode
+    :param shares_encoder: whether the extractor belongs to other critics; its features are then read without gradient
+        and in evaluation mode
     """
 
     action_space: spaces.Box
     #: View in evaluation mode, for all but the critics' own step, if the trunk ``stacks_rows``.
     at_rest: Any = None
-    #: Whether the features extractor is that of other critics.
+    #: Whether the features extractor belongs to other critics.
     shares_encoder: bool = False
     #: The learner's value head, which says what the outputs mean; None without a learner.
     value_head: Any = None
@@ -78,7 +78,7 @@ class CriticEnsemble(NetworkFeatures, BaseModel):
         """
         :param obs: observations, (B, O), or a dict of them, or their features
         :param actions: actions in [-1, 1], (B, A)
-        :return: what the trunk takes, (B, F + A)
+        :return: input of the trunk, (B, F + A)
         """
         if isinstance(obs, Encoded):
             return torch.cat((obs.features, actions), dim=1)
@@ -87,7 +87,7 @@ class CriticEnsemble(NetworkFeatures, BaseModel):
     def features(self, obs: PyTorchObs) -> torch.Tensor:
         """
         :param obs: observations, (B, O), or a dict of them
-        :return: their features, (B, F), with a gradient to an encoder of their own
+        :return: their features, (B, F), with a gradient to the encoder if it is the critics' own
         """
         seen: PyTorchObs = obs if self.observation_norm is None else self.observation_norm(obs)
         if self.shares_encoder:
@@ -113,14 +113,14 @@ class CriticEnsemble(NetworkFeatures, BaseModel):
         """
         :param obs: observations, (B, O), or a dict of them
         :param actions: actions in [-1, 1], (B, A)
-        :return: Stable-Baselines3's tuple of E tensors, (B, K) each, that is a tensor (E, B, K) too
+        :return: Stable-Baselines3's tuple of E tensors, (B, K) each, which is also a tensor (E, B, K)
         """
         q = self.q_values(obs, actions)
         return QValues(q)
 
     def q1_forward(self, obs: PyTorchObs, actions: torch.Tensor) -> torch.Tensor:
         """
-        As in Stable-Baselines3, but that all critics are evaluated.
+        As in Stable-Baselines3, except that all critics are evaluated.
 
         :param obs: observations, (B, O), or a dict of them
         :param actions: actions in [-1, 1], (B, A)
@@ -142,8 +142,8 @@ class CriticEnsemble(NetworkFeatures, BaseModel):
     @property
     def q_networks(self) -> list[Callable[[torch.Tensor], torch.Tensor]]:
         """
-        Each critic as a function of features and actions, (B, F + A) to (B, K). They are no modules as in
-        Stable-Baselines3: the parameters of all lie together, (E, ...).
+        Each critic as a function of features and actions, (B, F + A) to (B, K). Unlike in Stable-Baselines3, they are
+        not modules: the parameters of all critics are stored together, (E, ...).
         """
 
         def network(index: int, inputs: torch.Tensor) -> torch.Tensor:
@@ -152,13 +152,13 @@ class CriticEnsemble(NetworkFeatures, BaseModel):
         return [functools.partial(network, index) for index in range(self.n_critics)]
 
     def project(self) -> None:
-        """Called after every step of the optimizer: bring weights back to where they belong, in place."""
+        """Project weights back onto their constraints, in place; called after every step of the optimizer."""
         self.trunk.project()
         project_weights(self.head)
 
     def statistics(self) -> list[torch.Tensor]:
         """
-        :return: running statistics that the target critics take over: those of features extractor and trunk
+        :return: running statistics that the target critics take over: the features extractor's and the trunk's
         """
         assert self.features_extractor is not None
         extractor = () if self.shares_encoder else self.features_extractor.buffers()
@@ -216,6 +216,6 @@ class ValueNetwork(NetworkFeatures, BaseModel):
         return self.head(self.trunk(self.extract_features(seen, self.features_extractor)))
 
     def project(self) -> None:
-        """Called after every step of the optimizer: bring weights back to where they belong, in place."""
+        """Project weights back onto their constraints, in place; called after every step of the optimizer."""
         self.trunk.project()
         project_weights(self.head)

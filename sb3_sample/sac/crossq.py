@@ -19,14 +19,14 @@ class CrossQ(SAC):
     CrossQ: soft actor-critic with batch norm and without target networks (Bhatt et al. 2024,
     https://arxiv.org/abs/1902.05605), and CrossQ+WN (Palenicek et al. 2025, https://arxiv.org/abs/2502.07523).
 
-    Networks with batch renormalisation ("crossq"), whose critics judge current and next state and action in one forward
-    pass of twice the rows, so that batch statistics are those of both, and whose next values come from that pass. One
+    Networks with batch renormalisation ("crossq"). The critics evaluate current and next states and actions in one
+    forward pass of twice the rows, so that batch statistics cover both; the next values come from that pass. One
     gradient step a transition; the actor learns in every third. Defaults are those of the published runs on MuJoCo.
     docs/crossq.md has the differences from ``sb3_contrib.CrossQ``.
 
-    ``weight_norm=True`` is CrossQ+WN as XQC's authors compare with it: weights of unit norm, weight decay of the other
-    parameters, batch norm in the place of renormalisation, target networks, smaller critics, two gradient steps a
-    transition, and a learning rate that falls linearly. Arguments that are not passed then have other defaults:
+    ``weight_norm=True`` is CrossQ+WN in the version that XQC's authors compare with: weights of unit norm, weight decay
+    of the other parameters, batch norm in the place of renormalisation, target networks, smaller critics, two gradient
+    steps a transition, and a learning rate that falls linearly. Arguments that are not passed then have other defaults:
     ``learning_rate=3e-4``, ``learning_rate_schedule="linear"``, ``final_learning_rate=3e-5``, ``ent_coef="auto_0.01"``,
     ``replay_ratio=2``, ``actor_at_once=True``, ``weight_decay=0.01``.
 
@@ -34,7 +34,8 @@ class CrossQ(SAC):
     """
 
     learning_rate: float | Schedule = argument(default=1e-3, kw_only=False)
-    """of actor, critics and temperature; a number or a function of the remaining progress (from 1 to 0)"""
+    """learning rate of actor, critics and temperature; a number or a function of the remaining progress (from 1 to
+    0)"""
     learning_starts: int = argument(default=5_000, kw_only=False)
     """transitions with uniformly random actions before the first gradient step, counted over the model's life"""
     target_entropy: str | float = argument(default="auto", kw_only=False)
@@ -50,7 +51,7 @@ class CrossQ(SAC):
     """"half_squared" (scalars, half the squared error), "categorical", "hl_gauss", or a class derived from
     ``ValueHead``; None: scalar critics by the squared error, or ``n_quantiles``"""
     policy_delay: int = argument(default=3)
-    """gradient steps between two of the actors' and of the temperature"""
+    """gradient steps between two updates of actors and temperature"""
 
     #: Defaults with ``weight_norm``, of the published configuration.
     WITH_WEIGHT_NORM: ClassVar[dict[str, Any]] = {

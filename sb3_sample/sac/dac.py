@@ -13,9 +13,9 @@ from sb3_sample.learner.objectives import Objective, OptimisticValue
 from sb3_sample.sac import checks
 from sb3_sample.sac.algorithm import SAC
 
-#: Arguments of the optimistic actor that it has where it is the only one, too.
+#: Arguments of the optimistic actor that also apply if it is the only actor.
 OPTIMISTIC_SETTINGS = ("std_multiplier", "uncertainty", "initial_optimism")
-#: Arguments that tie it to the pessimistic one.
+#: Arguments that tie it to the pessimistic actor.
 DIVERGENCE_SETTINGS = (
     "kl_target",
     "initial_kl_weight",
@@ -25,7 +25,7 @@ DIVERGENCE_SETTINGS = (
     "kl_direction",
     "reinitialize_every",
 )
-#: Arguments that are the optimistic actor's.
+#: All arguments of the optimistic actor.
 OPTIMISTIC_ACTOR_SETTINGS = (*OPTIMISTIC_SETTINGS, *DIVERGENCE_SETTINGS)
 
 _ACTORS = Kind("be 'stochastic' or 'deterministic'", lambda value: value in ("stochastic", "deterministic"))
@@ -35,13 +35,13 @@ class DAC(SAC):
     """
     DAC: decoupled policy actor-critic (Nauman and Cygan 2023, https://arxiv.org/abs/2310.19527, algorithm 1).
 
-    Soft actor-critic with a second actor, a network of its own, that explores by climbing an optimistic value, while
+    Soft actor-critic with a second actor, a separate network, that explores by maximising an optimistic value, while
     the pessimistic actor learns from its data, makes the TD targets and is evaluated. Optimism and the weight of the
     divergence between the two are learned.
 
-    Where the paper's text and the published code differ, the update follows the code, whose every number it
-    reproduces; :class:`~sb3_sample.learner.exploration.OptimisticActor` names the differences. The networks follow the
-    paper, two hidden layers of 256 without layer norm, with which the DAC, VPL and BRO papers compare; the published
+    Where the paper's text and the published code differ, the update follows the code and reproduces its every number;
+    :class:`~sb3_sample.learner.exploration.OptimisticActor` names the differences. The networks follow the paper, two
+    hidden layers of 256 without layer norm, which the comparisons of the DAC, VPL and BRO papers use; the published
     code has ``policy_kwargs=dict(net_arch=[256] * 3, critic_network_kwargs=dict(layer_norm=True))``.
 
     The variants of the paper's table 1 are arguments: docs/dac.md has them row by row.
@@ -50,9 +50,10 @@ class DAC(SAC):
     """
 
     learning_rate: float | Schedule = argument(default=3e-4, kw_only=False)
-    """of both actors, critics and temperature; a number or a function of the remaining progress (from 1 to 0)"""
+    """learning rate of both actors, critics and temperature; a number or a function of the remaining progress (from 1
+    to 0)"""
     kl_target: float = argument(default=0.5)
-    """KL divergence per action dimension between the two actors that optimism is adjusted to"""
+    """target for the KL divergence per action dimension between the two actors, to which optimism is adjusted"""
     std_multiplier: float = argument(default=1.25)
     """factor on the optimistic actor's standard deviation while exploring"""
     uncertainty: str = argument(default="epistemic")
@@ -61,13 +62,14 @@ class DAC(SAC):
     """weight of the critics' spread for the optimistic actor at the start, above minus the pessimism; None: 0.5 above
     it, as published"""
     initial_kl_weight: float = argument(default=1.0, kind=AT_LEAST_0)
-    """weight of the divergence in its loss, at the start; at 0 it stays 0, while optimism is still adjusted"""
+    """weight of the divergence in the optimistic actor's loss, at the start; at 0 it stays 0, while optimism is still
+    adjusted"""
     adjustment_learning_rate: float = argument(default=3e-5)
     """learning rate of optimism and of the divergence's weight"""
     optimism_learning_rate: float | None = argument(default=None, kind=AT_LEAST_0.or_none("adjustment_learning_rate"))
     """learning rate of optimism alone; None: ``adjustment_learning_rate``; 0: it stays at its start"""
     kl_weight_learning_rate: float | None = argument(default=None, kind=AT_LEAST_0.or_none("adjustment_learning_rate"))
-    """the same of the divergence's weight"""
+    """learning rate of the divergence's weight alone; None: ``adjustment_learning_rate``; 0: it stays at its start"""
     kl_direction: str = argument(default="optimistic_to_pessimistic")
     """"optimistic_to_pessimistic", or "pessimistic_to_optimistic" as in the paper's text"""
     reinitialize_every: int | None = argument(default=25_000)
@@ -82,8 +84,8 @@ class DAC(SAC):
         kind=_ACTORS.or_none("one optimistic actor that explores, makes the targets and is evaluated"),
     )
     """"stochastic", or "deterministic": no entropy, no temperature, no noise on the target's action, and the optimistic
-    actor's standard deviation in the divergence. None: there is none, and one optimistic actor, of constant optimism,
-    explores, makes the TD targets and is evaluated. Both deterministic: ``backbone="td3"``"""
+    actor's standard deviation in the divergence. None: a single optimistic actor, of constant optimism, explores, makes
+    the TD targets and is evaluated. For two deterministic actors, pass ``backbone="td3"``"""
     optimistic_entropy: bool = argument(default=False, kind=TRUE_OR_FALSE)
     """with ``pessimistic_actor=None``, whether the actor's loss rewards the entropy, as the TD target does anyway"""
 
@@ -103,7 +105,7 @@ class DAC(SAC):
         self._check_actors()
 
     def _check_actors(self) -> None:
-        """The variants of table 1."""
+        """Check the variants of table 1."""
         alone = self.pessimistic_actor is None
         if self.backbone == "td3":
             check_unused(self, ("optimistic_actor", "pessimistic_actor"), "backbone='td3', whose actors are both")

@@ -39,7 +39,7 @@ _RANGE = Kind(
 _NOISE = ("exploration_noise", "target_noise", "target_noise_clip")
 #: Arguments of the encoder's loss.
 _EMBEDDING_LOSS = EmbeddingLoss._fields
-#: Arguments of the family that only have the values here, and why.
+#: Arguments of the family that are fixed: their values, and why.
 _FIXED: dict[str, tuple[Any, str]] = {
     "tau": (1.0, "its targets are copies, made every target_update_interval gradient steps"),
     "backbone": ("td3", "its actor is TD3's"),
@@ -59,15 +59,16 @@ _FIXED: dict[str, tuple[Any, str]] = {
 
 class DebiasedRQ(SAC):
     """
-    DR.Q ("Debiased model-based Representations for Q-learning", https://arxiv.org/abs/2605.11711), here under the name
-    of what it is, so that nobody takes it for DrQ, the method for pixels: TD3 on learned embeddings of states and
-    actions. The embeddings predict the next embedding and the reward over windows of several steps, and are told from
-    others by InfoNCE; between blocks of their updates they stand still. The replay is prioritised and fades with age.
+    DR.Q ("Debiased model-based Representations for Q-learning", https://arxiv.org/abs/2605.11711), called
+    ``DebiasedRQ`` so that it is not taken for DrQ, the method for pixels: TD3 on learned embeddings of states and
+    actions. The embeddings predict the next embedding and the reward over windows of several steps, and InfoNCE
+    distinguishes them from others; they are fixed between blocks of their updates. The replay is prioritised and fades
+    with age.
 
     The defaults are those of the published code, one set for all tasks; on the tasks of DeepMind Control and
-    HumanoidBench its steps are of environments with ``action_repeat=2``. Built from a specification of the update;
-    docs/dr_q.md names it, and what differs: the next observation of a transition that ends an episode by termination
-    is the episode's last one, also within the windows.
+    HumanoidBench, that code's steps are those of environments with ``action_repeat=2``. The class is built from a
+    specification of the update; docs/dr_q.md names it, and the difference: if a transition ends an episode by
+    termination, its next observation is the episode's last one, also within the windows.
 
     ``ent_coef`` and ``target_entropy`` have no meaning here.
 
@@ -87,7 +88,7 @@ class DebiasedRQ(SAC):
     """target encoder"""
 
     learning_rate: float | Schedule = argument(default=3e-4, kw_only=False)
-    """of encoder, critics and actor; a number or a function of the remaining progress (from 1 to 0)"""
+    """learning rate of encoder, critics and actor; a number or a function of the remaining progress (from 1 to 0)"""
     learning_starts: int = argument(default=10_000, kw_only=False)
     """transitions and ends of episodes with uniformly random actions before the first gradient step, counted over the
     model's life"""
@@ -99,21 +100,22 @@ class DebiasedRQ(SAC):
     n_steps: int = argument(default=3, kw_only=False)
     """n-step returns of the critics' targets"""
     target_update_interval: int | None = argument(default=250, kw_only=False)
-    """gradient steps between two copies of the targets, and steps of the encoder at each; None: ``policy_delay``"""
+    """gradient steps between two updates of the targets, which are copies, and steps of the encoder at each update;
+    None: ``policy_delay``"""
     replay_ratio: float | None = argument(default=1)
     """gradient steps of critics and actor per environment transition after the warm-up, whatever the number of
     environments; may be below 1. The encoder takes as many, in blocks"""
     pessimism: float | str | type[Pessimism] = argument(default=1.0)
     """weight of the critics' spread that is subtracted from their mean in the target, at least 0; 1 is the minimum of
-    two critics. No rule that moves it"""
+    two critics. Rules that move it are not supported"""
     actor_pessimism: float | None = argument(default=0.0)
-    """the same in the actor's objective; None: as in the target"""
+    """weight of the spread in the actor's objective; None: as in the target"""
     exploration_noise: float = argument(default=0.2, kind=ABOVE_0)
     """standard deviation of the noise while exploring, in actions of [-1, 1]"""
     target_noise: float = argument(default=0.2, kind=AT_LEAST_0)
     """standard deviation of the noise on the target's action"""
     target_noise_clip: float = argument(default=0.3, kind=AT_LEAST_0)
-    """bound of that noise"""
+    """bound of the noise on the target's action"""
     weight_decay: float = argument(default=0.01, kind=AT_LEAST_0)
     """decoupled weight decay of encoder, critics and actor"""
     encoder_horizon: int = argument(default=5, kind=integer(1))
@@ -134,7 +136,7 @@ class DebiasedRQ(SAC):
     def _construct(self, given: Given) -> None:
         #: Transitions and ends of episodes that were stored over the model's life, each in a slot of the buffer.
         self.num_slots = 0
-        # Ends of the latest step, which count with the next one.
+        # Ends of episodes at the latest step, which count with the next step.
         self._ends = 0
         super()._construct(given)
 

@@ -18,19 +18,19 @@ from sb3_sample.sac.policies import CnnPolicy, SACPolicy
 
 
 class _FromPixels(SAC):
-    """SAC with the encoder, the projections and the layers of DrQ; augmentation is its way."""
+    """SAC with the encoder, the projections, the layers and the augmentation of DrQ."""
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": CnnPolicy}
 
     buffer_size: int = argument(default=100_000, kw_only=False)
-    """capacity of the replay buffer in transitions, 21 kB each of 84 by 84 pixels where an environment says that it
-    stacks frames"""
+    """capacity of the replay buffer in transitions; with 84 by 84 pixels, each takes 21 kB if the environment declares
+    that it stacks frames"""
     tau: float = argument(default=0.01, kw_only=False)
     """weight of the new critics in the Polyak average of the targets, in (0, 1]"""
     augmentation: str | None = argument(default="shift")
     """"shift": every image of a batch is shifted by a few pixels at random; None for none"""
     layer_norm: bool = argument(default=False, kind=TRUE_OR_FALSE)
-    """whether the critics' hidden layers are normalised, Dense, layer norm, ReLU ("Overestimation, overfitting, and
+    """whether the critics' hidden layers have layer norm: Dense, layer norm, ReLU ("Overestimation, overfitting, and
     plasticity in actor-critic", Nauman et al. 2024, table 2, "+ LN")"""
 
     def _check_arguments(self) -> None:
@@ -64,7 +64,7 @@ class _FromPixels(SAC):
 
     def _encoder_kwargs(self) -> dict[str, Any]:
         """
-        :return: the encoder's arguments, if it is that of DrQ
+        :return: the encoder's arguments, if it is DrQ's
         """
         return {}
 
@@ -73,8 +73,8 @@ class DrQ(_FromPixels):
     """
     DrQ (Kostrikov et al. 2021, https://arxiv.org/abs/2004.13649): soft actor-critic from images, which are shifted by a
     few pixels at random. The critics' target is the mean over K shifts of the next image, their loss the sum over M
-    shifts of the image. Critics and actor share an encoder of four convolutions, which the critics train; each has a
-    projection of its own to 50 features.
+    shifts of the image. Critics and actor share an encoder of four convolutions, which the critics train; each has its
+    own projection to 50 features.
 
     Defaults are those of the published PyTorch code; docs/drq.md has those of the JAX code behind "The primacy bias".
 
@@ -82,11 +82,12 @@ class DrQ(_FromPixels):
     """
 
     learning_rate: float | Schedule = argument(default=1e-3, kw_only=False)
-    """of all networks and the temperature; a number or a function of the remaining progress (from 1 to 0)"""
+    """learning rate of all networks and the temperature; a number or a function of the remaining progress (from 1 to
+    0)"""
     learning_starts: int = argument(default=1_000, kw_only=False)
     """transitions with uniformly random actions before the first gradient step, counted over the model's life"""
     batch_size: int = argument(default=512, kw_only=False)
-    """transitions a gradient step"""
+    """transitions per gradient step"""
     ent_coef: str | float = argument(default="auto_0.1", kw_only=False)
     """temperature: "auto" learns it from 1, "auto_0.1" from that start, a number fixes it"""
     target_update_interval: int | None = argument(default=2, kw_only=False)
@@ -95,11 +96,11 @@ class DrQ(_FromPixels):
     """gradient steps per environment transition after the warm-up, whatever the number of environments; may be below
     1"""
     policy_delay: int = argument(default=2)
-    """gradient steps between two of the actors' and of the temperature"""
+    """gradient steps between two updates of actors and temperature"""
     target_copies: int = argument(default=2, kind=integer(1))
-    """K, shifts of a next image, over which the critics' target is the mean"""
+    """K, number of shifts of a next image over which the critics' target is averaged"""
     online_copies: int = argument(default=2, kind=integer(1))
-    """M, shifts of an image, over which the critics' loss is the sum"""
+    """M, number of shifts of an image over which the critics' loss is summed"""
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
@@ -121,10 +122,10 @@ class DrQ(_FromPixels):
 
 class DrQv2Policy(CnnPolicy):
     """
-    The networks of DrQ-v2: a deterministic actor whose noise moves with the training.
+    The networks of DrQ-v2: a deterministic actor whose noise changes during training.
 
-    :param args: as of ``CnnPolicy``
-    :param kwargs: as of ``CnnPolicy``; ``actor_kwargs`` has ``noise_clip`` and ``noise_std``
+    :param args: as for ``CnnPolicy``
+    :param kwargs: as for ``CnnPolicy``; ``actor_kwargs`` has ``noise_clip`` and ``noise_std``
     """
 
     backbones: ClassVar[dict[str, type[Actor]]] = {"td3": NoisyActor}
@@ -133,9 +134,9 @@ class DrQv2Policy(CnnPolicy):
 class DrQv2(_FromPixels):
     """
     DrQ-v2 (Yarats et al. 2022, https://arxiv.org/abs/2107.09645): DDPG with two critics from images, which are shifted
-    by a few pixels at random; returns of three steps, and Gaussian noise that fades with the training, clipped in the
+    by a few pixels at random; returns of three steps, and Gaussian noise that declines during training, clipped in the
     critics' target and in the actor's loss. The encoder has no target, and the actor learns from the features that the
-    critics saw. Each of the two has a projection of its own to 50 features.
+    critics saw. Actor and critics each have their own projection to 50 features.
 
     Defaults are those of the published code for its tasks of medium difficulty.
 
@@ -146,10 +147,10 @@ class DrQv2(_FromPixels):
     policy_base: ClassVar[type[SACPolicy]] = DrQv2Policy
 
     learning_rate: float | Schedule = argument(default=1e-4, kw_only=False)
-    """of all networks; a number or a function of the remaining progress (from 1 to 0)"""
+    """learning rate of all networks; a number or a function of the remaining progress (from 1 to 0)"""
     buffer_size: int = argument(default=1_000_000, kw_only=False)
-    """capacity of the replay buffer in transitions, 21 GB of 84 by 84 pixels; ``replay_buffer_kwargs`` with
-    ``memory_map`` keeps them in files"""
+    """capacity of the replay buffer in transitions, 21 GB with 84 by 84 pixels; ``replay_buffer_kwargs`` with
+    ``memory_map`` keeps the transitions in files"""
     learning_starts: int = argument(default=2_000, kw_only=False)
     """transitions with uniformly random actions before the first gradient step, counted over the model's life"""
     n_steps: int = argument(default=3, kw_only=False)
@@ -159,12 +160,13 @@ class DrQv2(_FromPixels):
     1"""
     noise_schedule: Sequence[float] = argument(default=(1.0, 0.1, 500_000), kind=NOISE_SCHEDULE)
     """standard deviation of the noise at the beginning and at the end of its linear decline, in actions of [-1, 1], and
-    the transitions over the model's life that it takes: 100,000 for DrQ-v2's easy tasks, 2,000,000 for its hard ones"""
+    the length of the decline, in transitions over the model's life: 100,000 for DrQ-v2's easy tasks, 2,000,000 for its
+    hard ones"""
     noise_clip: float = argument(default=0.3, kind=AT_LEAST_0)
     """bound of the noise in the critics' target and in the actor's loss"""
     exploration: str | type[Exploration] = argument(default="scheduled_noise")
-    """policy that acts while training: "scheduled_noise", which moves the noise; with another it stays at the first
-    standard deviation of ``noise_schedule``"""
+    """policy that acts while training: "scheduled_noise", which follows ``noise_schedule``; with any other the noise
+    stays at the schedule's first standard deviation"""
     backbone: str = argument(default="td3")
     """"td3"; no other"""
 

@@ -34,17 +34,17 @@ from sb3_sample.sac.policies import SACPolicy
 
 class Encoder(BaseFeaturesExtractor):
     """
-    Encoder of states and actions, with the linear model of what follows: the next state's embedding, the reward, and
-    an output for the end of the episode that the published code does not train.
+    Encoder of states and actions, with a linear model of the next state's embedding, the reward, and the end of the
+    episode, whose output the published code does not train.
 
     :param observation_space: observation space
-    :param features_extractor: what the observation goes through first
+    :param features_extractor: extractor that the observation goes through first
     :param action_dim: A
-    :param width: of the hidden layers
+    :param width: width of the hidden layers
     :param state_embedding: size of a state's embedding, D
     :param action_embedding: size of an action's embedding
     :param pair_embedding: size of the embedding of both, P
-    :param n_reward_atoms: K, rewards that the model distinguishes
+    :param n_reward_atoms: K, number of rewards that the model distinguishes
     """
 
     def __init__(
@@ -95,8 +95,8 @@ class Encoder(BaseFeaturesExtractor):
 
 class EmbeddedCritics(CriticEnsemble):
     """
-    E critics of embeddings of states and actions. The encoder is not theirs: they give it no gradient, and it is in the
-    parameters, the state and the modes of its owner only.
+    E critics that read embeddings of states and actions. The encoder is not part of them: they give it no gradient, and
+    it is in the parameters, the state and the modes of its owner only.
 
     :param observation_space: observation space
     :param action_space: action space
@@ -124,7 +124,7 @@ class EmbeddedCritics(CriticEnsemble):
         self._embedded_args = {"hidden_sizes": hidden_sizes, "n_outputs": n_outputs}
         self.trunk = NormedMLP(encoder.pair_dim, hidden_sizes, n_copies=n_critics)
         self.head = xavier_linear(self.trunk.out_features, n_outputs, n_critics)
-        # Past nn.Module's own setattr, which would register it.
+        # Bypass nn.Module's own setattr, which would register it.
         vars(self)["_encoder"] = evaluated(encoder)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -143,7 +143,7 @@ class EmbeddedCritics(CriticEnsemble):
 
     def statistics(self) -> list[torch.Tensor]:
         """
-        :return: none: the networks have no running statistics
+        :return: empty: the networks have no running statistics
         """
         return []
 
@@ -155,23 +155,23 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
     :param observation_space: observation space
     :param action_space: action space, a bounded Box
     :param lr_schedule: learning rate schedule; its value at the start is used here
-    :param net_arch: widths of the hidden layers as in Stable-Baselines3, a list or ``dict(pi=[...], qf=[...])``; 512
-        each if None, two of the actor and three of the critics
+    :param net_arch: widths of the hidden layers as in Stable-Baselines3, a list or ``dict(pi=[...], qf=[...])``; if
+        None, two of 512 for the actor and three for the critics
     :param encoder_width: width of the encoder's hidden layers
     :param state_embedding: size of a state's embedding
     :param action_embedding: size of an action's embedding
     :param pair_embedding: size of the embedding of both
     :param n_reward_atoms: rewards that the model of the environment distinguishes
     :param n_critics: E, the number of critics
-    :param n_outputs: outputs a critic, as the value head asks for
+    :param n_outputs: outputs per critic, as the value head requires
     :param features_extractor_class: features extractor, the first part of the encoder
     :param features_extractor_kwargs: its arguments
     :param normalize_images: whether images are divided by 255
     :param backbone: "td3"
     :param actor_kwargs: ``exploration_noise``, ``target_noise``, ``target_noise_clip``
     :param optimizer_class: optimizer of encoder, actor and critics
-    :param optimizer_kwargs: its arguments, but for the learning rate
-    :param width_factor: by which all hidden layers and embeddings are wider than their arguments say
+    :param optimizer_kwargs: its arguments, except the learning rate
+    :param width_factor: factor on the widths of all hidden layers and embeddings
     :raises ValueError: if an argument is out of range
     """
 
@@ -202,7 +202,7 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
         width_factor: int = 1,
     ):
         drawn_from = torch.get_rng_state()
-        # The parts of the base class are not these.
+        # Not SACPolicy's own constructor, which makes other networks.
         BasePolicy.__init__(
             self,
             observation_space,
@@ -276,7 +276,7 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
 
     def make_actor(self) -> DeterministicActor:
         """
-        :return: an actor of the policy's settings, with parameters of its own, that reads the encoder's embeddings
+        :return: an actor with the policy's settings and its own parameters, which reads the encoder's embeddings
         """
         hidden_sizes, kwargs = self._actor_args
         actor = DeterministicActor(
@@ -297,14 +297,14 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
         Embed states, with a gradient to the encoder.
 
         :param obs: observations, (B, O), or a dict of them
-        :param target: by the target encoder
+        :param target: whether by the target encoder
         :return: their embeddings, (B, D)
         """
         return self.extract_features(obs, self.encoder_target if target else self.encoder)  # type: ignore[no-any-return]
 
 
 class DebiasedRQCnnPolicy(DebiasedRQPolicy):
-    """The same with a CNN before the encoder, for images."""
+    """Networks of DR.Q with a CNN before the encoder, for images."""
 
     def __init__(self, *args: Any, **kwargs: Any):
         kwargs.setdefault("features_extractor_class", NatureCNN)
@@ -313,8 +313,8 @@ class DebiasedRQCnnPolicy(DebiasedRQPolicy):
 
 class DebiasedRQMultiInputPolicy(DebiasedRQPolicy):
     """
-    The same with an extractor for dict observations before the encoder; ``TaskOneHot`` if they tell the task beside a
-    vector.
+    Networks of DR.Q with an extractor for dict observations before the encoder; ``TaskOneHot`` if they are a vector and
+    the task.
 
     :param observation_space: observation space
     """

@@ -20,16 +20,16 @@ _SIZES = Kind(
 
 class ConvEncoder(BaseFeaturesExtractor):
     """
-    Convolutions with a ReLU after each, flattened: the encoder of DrQ and DrQ-v2 (Kostrikov et al. 2021, Yarats et al.
-    2022) as it is; that of the JAX code behind the primacy bias (Nikishin et al. 2022) with ``filters=(32, 64, 128,
-    256)``, ``strides=(2, 2, 2, 2)``, ``padding="same"``. Kernels are orthogonal with a gain of √2, biases zero.
+    Convolutions with a ReLU after each, flattened: by default the encoder of DrQ and DrQ-v2 (Kostrikov et al. 2021,
+    Yarats et al. 2022); with ``filters=(32, 64, 128, 256)``, ``strides=(2, 2, 2, 2)`` and ``padding="same"``, that of
+    the JAX code behind the primacy bias (Nikishin et al. 2022). Kernels are orthogonal with a gain of √2, biases zero.
 
     :param observation_space: space of images, channels first
     :param filters: channels of each convolution
-    :param strides: of each
-    :param kernel_size: of all, in pixels
-    :param padding: "valid" for none, or "same", as many zeros that an output has 1 / stride of the input's pixels, the
-        odd one at the lower right
+    :param strides: stride of each convolution
+    :param kernel_size: kernel size of all convolutions, in pixels
+    :param padding: "valid" for none, or "same": enough zeros for an output of 1 / stride of the input's pixels, the odd
+        one at the lower right
     :param offset: subtracted from the images, which Stable-Baselines3 divides by 255 (DrQ-v2: 0.5)
     :raises ValueError: if an argument is out of range, or images are too small
     """
@@ -86,7 +86,7 @@ class ConvEncoder(BaseFeaturesExtractor):
         """
         x = observations - self.offset if self.offset else observations
         if x.device.type == "cpu":
-            # The convolutions of a CPU are quicker so, forward and backward; their outputs stay so, up to the last.
+            # On a CPU, convolutions are faster in this format, forward and backward; all their outputs keep it.
             x = x.contiguous(memory_format=torch.channels_last)
         return self.layers(x).flatten(start_dim=1)  # type: ignore[no-any-return]
 

@@ -30,16 +30,16 @@ class TensorFeatures:
 
 
 class NetworkFeatures(TensorFeatures):
-    """The same of actors and critics, which read observations through the policy's normalisation if it has one."""
+    """The same for actors and critics, which read observations through the policy's normalisation if it has one."""
 
     #: The policy's running normalisation of observations, None for none.
     observation_norm: RunningNorm | None = None
 
     def save(self, path: str) -> None:
         """
-        Save it alone, as in Stable-Baselines3.
+        Save the network alone, as in Stable-Baselines3.
 
-        :param path: of the file
+        :param path: path of the file
         :raises ValueError: observations are normalised by the policy's statistics, which the file would be without
         """
         if self.observation_norm is not None:
@@ -52,14 +52,14 @@ class NetworkFeatures(TensorFeatures):
 
 def share(network: Any, encoder: nn.Module) -> None:
     """
-    Have a network read the features of another module's extractor, without a gradient to it and in evaluation mode: its
-    running statistics are moved by its owner's forward passes alone.
+    Have a network read the features of another module's extractor, without a gradient to it and in evaluation mode:
+    only its owner's forward passes update its running statistics.
 
     :param network: actor or critics; their ``_encoder`` is the view in evaluation mode
     :param encoder: features extractor, which is in the parameters, the state and the modes of its owner only
     """
     network._modules.pop("features_extractor", None)
-    # Past nn.Module's own setattr, which would register them.
+    # Bypass nn.Module's own setattr, which would register them.
     vars(network).update(features_extractor=encoder, _encoder=evaluated(encoder))
 
 
@@ -75,5 +75,5 @@ def _preprocessed(observations: Any, space: spaces.Space[Any], normalize_images:
 
 
 def _one_hot(numbers: torch.Tensor, n: int) -> torch.Tensor:
-    """As ``torch.nn.functional.one_hot``, which looks at the largest number on the host."""
+    """As ``torch.nn.functional.one_hot``, but without reading the largest number on the host."""
     return (numbers.long().unsqueeze(-1) == torch.arange(n, device=numbers.device)).float()

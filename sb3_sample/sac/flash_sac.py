@@ -24,25 +24,24 @@ _SIZES: dict[str, dict[str, Any]] = {
 
 class FlashSAC(SAC):
     """
-    FlashSAC (Holiday Robot 2026, https://arxiv.org/abs/2604.04539), with the settings of its runs on simulators of a
-    CPU.
+    FlashSAC (Holiday Robot 2026, https://arxiv.org/abs/2604.04539), with the settings of its runs on CPU simulators.
 
     Residual networks with batch norm whose weights, scales and shifts keep their norms ("flash"), critics as
     classifiers over 101 atoms in [-5, 5], rewards divided by a running measure of the return, noise that is held for
-    some steps while exploring, and a learning rate that falls by a cosine to a half over the planned gradient steps.
-    Critics, their targets and the actor see current and next states in one forward pass, so that batch statistics are
-    those of both. Actor and temperature learn in the first of every two gradient steps, before the critics.
+    some steps while exploring, and a learning rate that falls along a cosine to half over the planned gradient steps.
+    Critics, their targets and the actor see current and next states in one forward pass, so that batch statistics cover
+    both. Actor and temperature learn in the first of every two gradient steps, before the critics.
 
-    Defaults are those of the published runs on DeepMind Control, with one environment step an action.
+    Defaults are those of the published runs on DeepMind Control, with one environment step per action.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
     learning_rate: float | Schedule = argument(default=3e-4, kw_only=False)
-    """of actor, critics and temperature at the start; a function of the remaining progress (from 1 to 0) goes with
-    ``learning_rate_schedule=None`` only"""
+    """learning rate of actor, critics and temperature at the start; a function of the remaining progress (from 1 to 0)
+    requires ``learning_rate_schedule=None``"""
     batch_size: int = argument(default=512, kw_only=False)
-    """transitions a gradient step"""
+    """transitions per gradient step"""
     tau: float = argument(default=0.01, kw_only=False)
     """weight of the new critics in the Polyak average of the targets, in (0, 1]"""
     ent_coef: str | float = argument(default="auto_0.01", kw_only=False)
@@ -51,7 +50,7 @@ class FlashSAC(SAC):
     """entropy that the learned temperature aims at; "auto" is that of a Gaussian with the standard deviation
     ``target_std``"""
     target_std: float = argument(default=0.15, kind=ABOVE_0)
-    """standard deviation of each action dimension whose entropy ``target_entropy="auto"`` is"""
+    """standard deviation, in each action dimension, of the Gaussian whose entropy is ``target_entropy="auto"``"""
     replay_ratio: float | None = argument(default=1)
     """gradient steps per environment transition after the warm-up, whatever the number of environments; may be below
     1"""
@@ -61,9 +60,9 @@ class FlashSAC(SAC):
     exploration: str | type[Exploration] = argument(default="held_noise")
     """policy that acts while training: "held_noise", or another of ``SAC``'s"""
     policy_delay: int = argument(default=2)
-    """gradient steps between two of the actors' and of the temperature"""
+    """gradient steps between two updates of actors and temperature"""
     actor_at_once: bool = argument(default=True)
-    """whether the first of ``policy_delay`` gradient steps is the actors', and not the last"""
+    """whether the actors learn in the first of every ``policy_delay`` gradient steps instead of the last"""
     actor_first: bool = argument(default=True)
     """whether actors and temperature learn before the critics in a gradient step"""
     learning_rate_schedule: str | None = argument(default="cosine")
@@ -71,14 +70,15 @@ class FlashSAC(SAC):
     final_learning_rate: float = argument(default=1.5e-4)
     """rate at the end of the schedule"""
     warm_up_steps: int = argument(default=1)
-    """planned gradient steps that come before the decay, in which the rate rises linearly to ``learning_rate``"""
+    """planned gradient steps before the decay, in which the rate rises linearly to ``learning_rate``"""
     warm_up_learning_rate: float | None = argument(default=None)
-    """rate from which it rises; None: ``learning_rate``, which it then keeps"""
+    """learning rate at the start of the warm-up; None: ``learning_rate``, throughout the warm-up"""
     reward_scale: str | type[RewardScale] | None = argument(default="flashsac")
     """rule by which rewards are divided by a running measure of the return; None for none"""
 
     def _construct(self, given: Given) -> None:
-        # Of what is passed: a model that is made, or loaded, has the number that "auto" came to beside it.
+        # Only arguments that are passed: in a model already made, or loaded, target_entropy is the number that "auto"
+        # stood for.
         if "target_std" in given.passed and given["target_std"] != default_of(type(self), "target_std"):
             self._check_one_target({name: value for name, value in given.items() if name in given.passed})
         super()._construct(given)

@@ -50,27 +50,27 @@ def train_many(
     **arguments: Any,
 ) -> list[Agent]:
     """
-    Train many learners in one process, one a seed, in lockstep (docs/many_learners.md). Each is the training that
-    ``cls(policy, env, seed=seed, **arguments).learn(total_timesteps)`` is alone, with environments, replay, random
-    numbers, log, evaluations and checkpoints of its own; their gradient steps are taken together where that pays.
+    Train many learners in one process, one per seed, in lockstep (docs/many_learners.md). Each training equals
+    ``cls(policy, env, seed=seed, **arguments).learn(total_timesteps)`` alone, with its own environments, replay, random
+    numbers, log, evaluations and checkpoints; gradient steps are taken together where that pays.
 
     A learner that diverges is stopped, named in a warning when that happens and again at the end, and returned as it
-    was then; the others go on. After any other error the others save their checkpoints, if they have any, and it is
-    raised.
+    was then; the other learners continue. After any other error, the other learners save their checkpoints, if they
+    have any, and the error is raised.
 
     :param cls: class of an off-policy algorithm of this package
-    :param policy: as of ``cls``
-    :param env: id of the environment, or a function without arguments that makes one, or a vectorised one
+    :param policy: as for ``cls``
+    :param env: id of the environment, or a function without arguments that makes an environment or a vectorised one
     :param seeds: the learners' seeds
     :param total_timesteps: environment steps of each learner
     :param per_learner: arguments of ``cls`` that differ by learner: for each, a list in the order of the seeds
     :param callback: function of a learner's index that makes its callback
-    :param log_interval: as of ``learn``
+    :param log_interval: as for ``learn``
     :param checkpoint: folder of all runs, in which each learner has a run folder, ``seed-3`` and so on; None for no
-        checkpoints. The same program, started again, goes on with all of them
+        checkpoints. The same program, started again, resumes all of them
     :param checkpoint_freq: environment steps of each learner between two of its checkpoints
-    :param eval_env: environment of evaluations, as ``env``; None for no evaluations, which with a ``checkpoint`` are
-        written to each run's folder (``evaluations.npz``)
+    :param eval_env: environment of evaluations, given like ``env``; None for no evaluations. With a ``checkpoint`` they
+        are written to each run's folder (``evaluations.npz``)
     :param eval_freq: environment steps of each learner between two evaluations
     :param n_eval_episodes: episodes of an evaluation
     :param n_envs: environments of each learner
@@ -107,7 +107,7 @@ def train_many(
         made = _environment(env, n_envs, vec_env_cls)
         own = {**arguments, **{name: values[index] for name, values in differing.items()}}
         if isinstance(noise := own.get("action_noise"), ActionNoise):
-            # It may hold the state of a process, which moves with a learner's steps.
+            # It may hold the state of a stochastic process, which advances with a learner's steps.
             own["action_noise"] = copy.deepcopy(noise)
         model = models[index] = cls(policy, made, seed=seed, **own)
         callbacks = None if callback is None else callback(index)
@@ -141,11 +141,11 @@ def train_many(
 
 def train_together(seats: Sequence[Seat], folder: str | Path | None) -> None:
     """
-    Make trainings in lockstep.
+    Run trainings in lockstep.
 
     :param seats: their places
-    :param folder: of what they save, for messages, in which case a first SIGINT or SIGTERM ends them when all are
-        saved; None if they save nothing
+    :param folder: folder that they save to, for messages; a first SIGINT or SIGTERM then ends them when all are saved.
+        None if they save nothing
     :raises Exception: by which a training has ended; a warning names it
     :raises KeyboardInterrupt: after SIGINT; a ``SystemExit`` after SIGTERM
     """
@@ -267,7 +267,7 @@ def _evaluation(env: Any, seed: int, every: int, episodes: int, n_envs: int, fol
     venv = made if isinstance(made, VecEnv) else DummyVecEnv([functools.partial(_monitored, lambda: made)])
     venv.seed(seed)
     log = None if folder is None else str(folder)
-    # It counts steps that all environments take together.
+    # EvalCallback counts steps that all environments take together.
     return EvalCallback(venv, n_eval_episodes=episodes, eval_freq=max(every // n_envs, 1), log_path=log, verbose=0)
 
 

@@ -22,7 +22,7 @@ class FamilyLog(MetricsLog):
     def _record_tasks(self: Any) -> None:
         """
         Record each task's mean return and success rate over the episodes of ``ep_info_buffer``, which have the task's
-        id from ``multi_task_env``. Not for the terminal, where 50 tasks would be 100 lines.
+        id from ``multi_task_env``. They are not shown in the terminal, where 50 tasks would be 100 lines.
         """
         episodes: dict[str, list[dict[str, Any]]] = {}
         for episode in self.ep_info_buffer or ():

@@ -1,4 +1,4 @@
-"""The learner of a model's own: ``BRO.learner(...)`` makes one, ``model.learner`` is the one inside a model."""
+"""Learners of the models: ``BRO.learner(...)`` makes one by itself, ``model.learner`` is the one inside a model."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -39,7 +39,7 @@ T = TypeVar("T")
 
 
 class LearnerOf:
-    """Descriptor: on a class a function that makes a learner, on a model the model's own."""
+    """Descriptor: on a class, a function that makes a learner; on a model, the model's own learner."""
 
     def __get__(self, model: Any, cls: Any) -> Any:
         if model is None:
@@ -67,17 +67,16 @@ def _maker(cls: Any) -> Callable[..., Learner]:
         Make a learner with the parts of this algorithm, without an environment, a replay buffer or a file.
 
         ``resets`` and the episodes of "top" count environment steps and do nothing unless ``on_step`` is called;
-        ``reset_gradient_steps`` counts what the learner does itself. A learning rate that is a function stays at its
-        first value until ``set_learning_rate``, and a ``learning_rate_schedule`` does not decay unless
-        ``schedule_steps`` is given, or ``planned_updates`` set. ``compile="auto"`` compiles nothing, since how many
-        steps will follow is not known. Statistics of rewards and observations are those of ``on_step`` and
-        ``on_observations``.
+        ``reset_gradient_steps`` counts the learner's own steps. A learning rate that is a function stays at its first
+        value until ``set_learning_rate``, and a ``learning_rate_schedule`` does not decay unless ``schedule_steps`` is
+        given, or ``planned_updates`` set. ``compile="auto"`` compiles nothing, since the number of steps to come is
+        unknown. Statistics of rewards and observations come from ``on_step`` and ``on_observations``.
 
         :param observation_space: observation space
         :param action_space: action space, a bounded Box; batches have actions in [-1, 1]
         :param seed: seed of the learner's own generators: initial weights, noise, acting
-        :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class; None: by the observation space,
-            "CnnPolicy" for one of images
+        :param policy: "MlpPolicy", "CnnPolicy", "MultiInputPolicy" or a policy class; None: chosen by the observation
+            space, "CnnPolicy" for images
         :param device: "auto", "cpu", "cuda", ...
         :param arguments: arguments of the class that say what is learned and how
         :return: the learner
@@ -125,7 +124,7 @@ def check_action_space(space: spaces.Space, argument: str = "env") -> None:
     """
     Check an action space.
 
-    :param space: of actions
+    :param space: action space
     :param argument: where it comes from: "env", or the argument "action_space" itself
     :raises ValueError: if it is not a Box with finite bounds, low below high
     """
@@ -154,7 +153,7 @@ class OfLearner(Generic[T]):
 
 
 class HasLearner:
-    """A model's learner: how it is made of the arguments, and the model's names for what it has."""
+    """A model's learner: how it is made from the arguments, and its parts as attributes of the model."""
 
     policy: SACPolicy
     learner = LearnerOf()
@@ -185,9 +184,9 @@ class HasLearner:
     reward_scaler = OfLearner[RewardScale | None]()
     """rule by which rewards are scaled; None for none"""
     observation_statistics = OfLearner[ObservationStatistics | None]()
-    """feeder of the observations' statistics; None without"""
+    """updates the observations' statistics; None without them"""
     gradients_are_stale = OfLearner[bool]()
-    """whether ``.grad`` holds the gradients of another gradient step than the last"""
+    """whether ``.grad`` holds the gradients of a gradient step other than the last"""
     #: The class of the learner.
     learner_class: ClassVar[type[Learner]] = Learner
     #: beta1 of the temperature's Adam.
@@ -227,7 +226,7 @@ class HasLearner:
 
     @classmethod
     def _completed(cls, content: Any, kwargs: dict[str, Any]) -> dict[str, Any]:
-        """Transforms without arguments of their own have those of the file's at the same place, if it is that class."""
+        """Give transforms without arguments those of the file's transform at the same place, if of the same class."""
         given, theirs = kwargs.get("batch_transforms"), content.classes_in("batch_transforms")
         if theirs is None or not isinstance(given, Sequence):
             return kwargs
@@ -245,12 +244,12 @@ class HasLearner:
 
     @property
     def n_tasks(self: Any) -> int:
-        """Tasks that the observations tell apart; 1 if they tell none."""
+        """Number of tasks that the observations distinguish; 1 if they contain no task."""
         return number_of_tasks(self.observation_space)
 
     @property
     def _width_factor(self: Any) -> int:
-        """By which networks are wider than described: 2 with ``multitask`` and several tasks."""
+        """Factor on the widths of the networks: 2 with ``multitask`` and several tasks, else 1."""
         return 2 if self.multitask and self.n_tasks > 1 else 1
 
     @property
@@ -272,14 +271,14 @@ class HasLearner:
         return self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs)
 
     def _take_settings(self: Any) -> None:
-        """Have the learner take up what was set since the last gradient step."""
+        """Pass to the learner the settings changed since the last gradient step."""
         self._take_target_entropy()
         self.learner.set_target_entropy(self._target_entropy)
         for name in Learner.SETTINGS:
             setattr(self.learner, name, getattr(self, name))
 
     def _take_target_entropy(self: Any) -> None:
-        """Take up what ``target_entropy`` says, which is a number afterwards, or a list of them, one a task."""
+        """Resolve ``target_entropy``, which is then a number, or a list of numbers, one per task."""
         checks.check_target_entropy(self)
         if self.target_entropy == "auto":
             self._target_entropy = self._auto_target_entropy(get_action_dim(self.action_space))
@@ -294,7 +293,7 @@ class HasLearner:
     def _auto_target_entropy(self: Any, action_dim: int) -> float:
         """
         :param action_dim: dimension of the actions
-        :return: what ``target_entropy="auto"`` means
+        :return: value of ``target_entropy="auto"``
         """
         return -action_dim / 2
 
@@ -344,7 +343,7 @@ class HasLearner:
 
     def make_explorer(self: Any, learner: Learner) -> Exploration:
         """
-        :param learner: whose it is
+        :param learner: learner that it belongs to
         :return: a freshly initialised explorer
         """
         make = chosen("exploration", self.exploration, EXPLORATIONS, Exploration)
@@ -353,7 +352,7 @@ class HasLearner:
 
     def make_pessimism(self: Any, learner: Learner) -> Pessimism:
         """
-        :param learner: whose it is
+        :param learner: learner that it belongs to
         :return: a freshly initialised rule of pessimism
         """
         if not isinstance(self.pessimism, (str, type)):
@@ -364,14 +363,14 @@ class HasLearner:
 
     def make_objective(self: Any, learner: Learner) -> Objective:
         """
-        :param learner: whose it is
+        :param learner: learner that it belongs to
         :return: a freshly initialised objective
         """
         return Objective()
 
     def make_reward_scaler(self: Any, learner: Learner) -> RewardScale:
         """
-        :param learner: whose it is
+        :param learner: learner that it belongs to
         :return: a rule that scales rewards, without statistics yet
         """
         make = chosen("reward_scale", self.reward_scale, REWARD_SCALES, RewardScale)
@@ -402,7 +401,7 @@ class HasLearner:
         Start every network, optimizer and learned number anew, in place; the replay buffer stays.
 
         :param shrink: share of the old parameters that stays
-        :param keep: what stays as it is, "encoder" for an encoder that the critics share with the actors
+        :param keep: parts that stay as they are, "encoder" for an encoder that the critics share with the actors
         :param to: "fresh" for new parameters, "start" for those that the model began with
         :raises ValueError: if ``to`` is neither
         """

@@ -1,4 +1,4 @@
-"""Tasks in the observations of the off-policy family: how networks read them, and how ``predict`` is told one."""
+"""Tasks in the observations of the off-policy family: how networks read them, and how ``predict`` takes them."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -15,8 +15,8 @@ from sb3_sample.networks import RunningNorm
 
 def is_multi_task(space: spaces.Space | None) -> bool:
     """
-    :param space: of observations
-    :return: whether they tell the task: a Dict of "observation", a Box, and "task", a Discrete
+    :param space: observation space
+    :return: whether observations contain the task: a Dict of "observation", a Box, and "task", a Discrete
     """
     if not isinstance(space, spaces.Dict) or space.spaces.keys() != {"observation", "task"}:
         return False
@@ -25,23 +25,23 @@ def is_multi_task(space: spaces.Space | None) -> bool:
 
 def number_of_tasks(space: spaces.Space | None) -> int:
     """
-    :param space: of observations
-    :return: how many tasks they tell apart; 1 if they tell none
+    :param space: observation space
+    :return: number of tasks that observations distinguish; 1 if they contain no task
     """
     return int(space["task"].n) if is_multi_task(space) else 1  # type: ignore[index]
 
 
 def reads_one_hot(space: spaces.Space) -> bool:
     """
-    :param space: of observations
-    :return: whether :class:`TaskOneHot` reads them: they tell the task, and are no images
+    :param space: observation space
+    :return: whether :class:`TaskOneHot` reads them: observations contain the task and are not images
     """
     return is_multi_task(space) and not is_image_space(space["observation"])  # type: ignore[index]
 
 
 class TaskOneHot(BaseFeaturesExtractor):
     """
-    Observation and the one-hot vector of its task (BRO, figure 19); the observation alone where there is one task.
+    Observation and the one-hot vector of its task (BRO, figure 19); the observation alone if there is one task.
 
     :param observation_space: a Dict of "observation", a Box, and "task", a Discrete
     """
@@ -62,8 +62,8 @@ class TaskOneHot(BaseFeaturesExtractor):
 
 def dict_extractor(space: spaces.Space) -> type[BaseFeaturesExtractor]:
     """
-    :param space: of dict observations
-    :return: class of the features extractor that reads them unless another is asked for
+    :param space: space of dict observations
+    :return: default class of their features extractor
     """
     return TaskOneHot if reads_one_hot(space) else CombinedExtractor
 
@@ -73,14 +73,14 @@ class TaskEmbedding(BaseFeaturesExtractor):
     Observation and the embedding of its task, a learned vector divided by its length (BRC).
 
     :param observation_space: a Dict of "observation", a Box, and "task", a Discrete
-    :param size: of an embedding
+    :param size: size of an embedding
     """
 
     def __init__(self, observation_space: spaces.Dict, size: int = 32):
         task = observation_space["task"]
         assert isinstance(task, spaces.Discrete)
         super().__init__(observation_space, get_flattened_obs_dim(observation_space["observation"]) + size)
-        #: A row for each task, whose length is learned as well and without effect on the embedding.
+        #: A row for each task; its length is learned as well, without effect on the embedding.
         self.table = nn.Parameter(torch.randn(int(task.n), size) / size**0.5)
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
@@ -94,14 +94,14 @@ class TaskEmbedding(BaseFeaturesExtractor):
 
 
 class TaskRunningNorm(RunningNorm):
-    """Running normalisation of observations that tell their task, which it leaves as it is: one for all tasks."""
+    """Running normalisation of observations that contain their task: one for all tasks, without change to the task."""
 
     def update(self, values: Any, more_count: float = 0.0) -> None:
         """
         Add observations.
 
         :param values: "observation", (n, ...), and "task"
-        :param more_count: as of :class:`RunningNorm`
+        :param more_count: as for :class:`RunningNorm`
         """
         super().update(values["observation"], more_count)
 
@@ -115,9 +115,9 @@ class TaskRunningNorm(RunningNorm):
 
 def told_task(space: spaces.Dict, observation: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Check the task that ``predict`` is told, and repeat a single one for each row of a batch.
+    Check the task that ``predict`` is given, and repeat a single one for each row of a batch.
 
-    :param space: of observations that tell the task
+    :param space: space of observations that contain the task
     :param observation: "observation", (O,) or (B, O), and "task", a number, or (B,) of them
     :return: the same with a task for each observation
     :raises ValueError: if it has other entries, or a task is no number of one

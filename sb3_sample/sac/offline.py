@@ -16,11 +16,11 @@ from sb3_sample.sac.algorithm import SAC
 
 class BC(SAC):
     """
-    Behavioural cloning: ``learn_offline`` makes the batch's actions likely, by a tanh-Gaussian actor, or near, by a
-    deterministic one and the squared distance.
+    Behavioural cloning: ``learn_offline`` maximises the likelihood of the batch's actions under a tanh-Gaussian actor,
+    or minimises the squared distance of a deterministic actor's actions to them.
 
-    It has no use for critics; those that every policy of the family has are of one unit here and do not learn. It does
-    not learn in an environment: what it has cloned can only be copied there.
+    It needs no critics; those that every policy of the family has consist of one unit here and do not learn. It does
+    not learn in an environment.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -80,17 +80,17 @@ class IQL(SAC):
     Implicit Q-learning (Kostrikov et al. 2021, https://arxiv.org/abs/2110.06169): ``learn_offline`` on a data set, then
     ``learn`` in an environment, with ``prior_data=`` to keep the data set in the batches, as the paper does.
 
-    Defaults are the paper's for MuJoCo; for AntMaze ``expectile=0.9, inverse_temperature=10`` and rewards less 1, for
-    Adroit ``inverse_temperature=0.5`` and a dropout of 0.1 of the actor. The actor differs from the published one: a
-    tanh-Gaussian, as in the whole family, whose standard deviation depends on the state, and a constant learning rate
-    instead of a cosine for the actor; pass a schedule to have one.
+    Defaults are the paper's for MuJoCo; for AntMaze ``expectile=0.9, inverse_temperature=10`` and rewards minus 1, for
+    Adroit ``inverse_temperature=0.5`` and a dropout of 0.1 in the actor. The actor differs from the published one: it
+    is a tanh-Gaussian, as in the whole family, whose standard deviation depends on the state, and its learning rate is
+    constant instead of following a cosine, unless a schedule is passed.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
     learning_starts: int = argument(default=1_000, kw_only=False)
-    """transitions before the first gradient step of ``learn``, with actions of what was learned offline, if anything
-    was"""
+    """transitions before the first gradient step of ``learn``, with actions of the policy learned offline, if there is
+    one"""
     replay_ratio: float | None = argument(default=1)
     """gradient steps per environment transition of ``learn``"""
     expectile: float = argument(default=0.7, kind=number("lie in (0, 1)", lambda value: 0 < value < 1))
@@ -129,25 +129,25 @@ class IQL(SAC):
 class TD3BC(SAC):
     """
     TD3+BC (Fujimoto and Gu 2021, https://arxiv.org/abs/2106.06860): TD3 whose actor stays near the batch's actions.
-    ``learn`` goes on in an environment, near the replay buffer's.
+    ``learn`` continues in an environment, near the replay buffer's actions.
 
     The paper normalises observations by the data set's statistics, as ``normalize_observations=True`` does. Its actor
-    follows the first critic, here the mean of the critics.
+    climbs the first critic; here it climbs the mean of the critics.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
     alpha: float = argument(default=2.5, kind=ABOVE_0)
-    """weight of the value, which is divided by its mean size in the batch, beside the squared distance"""
+    """weight of the value, divided by its mean size in the batch, relative to the squared distance"""
     actor_pessimism: float | None = argument(default=0.0)
-    """a weight of pessimism for the actor's objective alone"""
+    """weight of pessimism for the actor's objective alone"""
     policy_delay: int = argument(default=2)
-    """gradient steps between two of the actor's"""
+    """gradient steps between two updates of the actor"""
     target_update_interval: int | None = argument(default=None, kw_only=False)
     """gradient steps between two updates of the targets; None: ``policy_delay``"""
     learning_starts: int = argument(default=1_000, kw_only=False)
-    """transitions before the first gradient step of ``learn``, with actions of what was learned offline, if anything
-    was"""
+    """transitions before the first gradient step of ``learn``, with actions of the policy learned offline, if there is
+    one"""
     replay_ratio: float | None = argument(default=1)
     """gradient steps per environment transition of ``learn``"""
     backbone: str = argument(default="td3")
@@ -162,7 +162,7 @@ class TD3BC(SAC):
 
 
 def _starting_wide(kwargs: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of a policy whose actor learns by the likelihood of actions, from a standard deviation of 1."""
+    """Arguments of a policy whose actor learns by the likelihood of actions, starting at a standard deviation of 1."""
     return {**kwargs, "actor_kwargs": {"initial_std": 1.0, **(kwargs.get("actor_kwargs") or {})}}
 
 
@@ -189,7 +189,7 @@ def _check_copies(learner: Learner, names: Sequence[str], why: str) -> None:
 
 
 def _check_explores_by_actor(agent: SAC) -> None:
-    """Optimism, learned pessimism and resets ask for critics."""
+    """Check that neither exploration nor pessimism needs critics that learn."""
     if agent.exploration != "actor" or isinstance(agent.pessimism, (str, type)):
         raise ValueError(
             f"exploration={agent.exploration!r} and pessimism={agent.pessimism!r} ask for critics, which "

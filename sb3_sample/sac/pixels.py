@@ -24,7 +24,7 @@ def stacked_frames(env: Any, space: Any) -> int | None:
         n_frames = layer.stacked_obs.n_stack if isinstance(layer, VecFrameStack) else None
         layer = layer.venv
     if n_frames is None:
-        # Asked first, since a worker of SubprocVecEnv does not survive the question for what is not there.
+        # has_attr comes first, since a worker of SubprocVecEnv dies if asked for an attribute that does not exist.
         n_frames = env.get_attr("stacked_frames", 0)[0] if env.has_attr("stacked_frames") else None
     return n_frames if isinstance(n_frames, int) and n_frames > 1 and space.shape[0] % n_frames == 0 else None
 
@@ -33,7 +33,7 @@ def check_images(who: str, space: Any) -> None:
     """
     Check that observations are images as convolutions take them.
 
-    :param who: what asks for them, for the error
+    :param who: name of what needs images, for the error
     :param space: observation space
     :raises ValueError: if they are not uint8, 0 to 255, channels first, and nothing else
     """

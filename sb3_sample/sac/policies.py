@@ -32,7 +32,7 @@ from sb3_sample.sac.trunks import network_args
 
 class SACPolicy(BasePolicy):
     """
-    The networks that act and judge: actor, critics, target critics.
+    The family's networks: actor, critics, target critics.
 
     :param observation_space: observation space
     :param action_space: action space, a bounded Box
@@ -43,10 +43,10 @@ class SACPolicy(BasePolicy):
     :param critic_network: trunk of the critics by its name in ``NETWORKS``, or a class derived from ``Network``
     :param critic_network_kwargs: its arguments (``hidden_sizes``, ``layer_norm``, ``dropout``, ...; ``width``,
         ``n_blocks``)
-    :param actor_network: trunk of the actor, the same
+    :param actor_network: trunk of the actor, given in the same way
     :param actor_network_kwargs: its arguments
     :param n_critics: E, the number of critics
-    :param n_outputs: outputs a critic, as the value head asks for
+    :param n_outputs: outputs per critic, as the value head requires
     :param features_extractor_class: features extractor; actor and critics get one each, or share one
     :param features_extractor_kwargs: its arguments
     :param normalize_images: whether images are divided by 255
@@ -54,25 +54,25 @@ class SACPolicy(BasePolicy):
     :param actor_kwargs: arguments of the actor: with "sac" ``log_std_min``, ``log_std_max``, ``clip_log_std``,
         ``initial_std``, with "td3" ``exploration_noise``, ``target_noise``, ``target_noise_clip``
     :param optimizer_class: optimizer of actor and critics
-    :param optimizer_kwargs: its arguments, but for the learning rate
-    :param critic_optimizer_kwargs: arguments of the critics' optimizer alone, over ``optimizer_kwargs``
+    :param optimizer_kwargs: its arguments, except the learning rate
+    :param critic_optimizer_kwargs: arguments of the critics' optimizer alone, which override ``optimizer_kwargs``
     :param share_features_extractor: whether actor and critics share one features extractor, the encoder. As in
-        Stable-Baselines3, False by default. There the encoder is the actor's, trained by the actor's loss; here it
-        is the critics', trained by theirs, and the actors read its features without gradient, encoded anew after
-        the critics' step (SAC-AE, Yarats et al. 2021; DrQ, Kostrikov et al. 2021; DrQ-v2 reads those from before
-        the step, see ``actor_features``). The actors read it in evaluation mode. The target critics have a Polyak
-        average of it, which a target actor reads too, unless ``target_encoder`` says otherwise
+        Stable-Baselines3, False by default. There the encoder belongs to the actor and is trained by the actor's loss;
+        here it belongs to the critics and is trained by their loss, and the actors read its features without gradient,
+        encoded anew after the critics' step (SAC-AE, Yarats et al. 2021; DrQ, Kostrikov et al. 2021; DrQ-v2 reads the
+        features from before the step, see ``actor_features``). The actors read it in evaluation mode. The target
+        critics have a Polyak average of it, which a target actor reads too, unless ``target_encoder`` says otherwise
     :param normalize_observations: whether all networks read observations through one running normalisation,
         ``observation_norm``, whose statistics are in the policy
-    :param width_factor: by which the hidden layers of all trunks are wider than their arguments say
-    :param target_encoder: of a shared encoder, which one target critics read: "own", a Polyak average, or "online", the
-        critics' without gradient; next observations are then encoded once (DrQ-v2)
-    :param actor_features: of a shared encoder, which features actors learn from: those "after" the critics' step, or
-        "before" it, those of that step; observations are then encoded once (DrQ-v2)
+    :param width_factor: factor on the widths of all trunks' hidden layers
+    :param target_encoder: if the encoder is shared, the one that target critics read: "own", a Polyak average, or
+        "online", the critics' without gradient; next observations are then encoded once (DrQ-v2)
+    :param actor_features: if the encoder is shared, the features that actors learn from: those encoded "after" the
+        critics' step, or "before" it, those of that step; observations are then encoded once (DrQ-v2)
     :param encoder_learning_rate: learning rate of a shared encoder, which no schedule changes; None: the critics'
     :param projection: outputs of a dense layer with layer norm and tanh that features go through first, one for the
         actor and one for all critics (DrQ: 50); None for none
-    :param projection_gain: of its orthogonal kernel
+    :param projection_gain: gain of the projection's orthogonal kernel
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
@@ -192,7 +192,7 @@ class SACPolicy(BasePolicy):
         if share_features_extractor:
             self.critic = critics()
         self.actor = self.make_actor()
-        #: The actor of the TD targets: a Polyak average with "td3", the actor itself with "sac".
+        #: Polyak average of the actor for the TD targets, with "td3"; None if they use the actor itself.
         self.actor_target: Actor | None = None
         if isinstance(self.actor, DeterministicActor) and self.actor.has_target:
             self.actor_target = copy.deepcopy(self.actor).requires_grad_(False)
@@ -267,7 +267,7 @@ class SACPolicy(BasePolicy):
 
     def encoders(self) -> list[nn.Module]:
         """
-        :return: encoders that a reset may keep: that of the critics, and that of their targets, if they have their own
+        :return: encoders that a reset may keep: the critics', and the target critics' if they have their own
         """
         critics = (self.critic, self.critic_target)
         return [critic.features_extractor for critic in critics if not critic.shares_encoder]  # type: ignore[misc]
@@ -275,14 +275,14 @@ class SACPolicy(BasePolicy):
     def _share_norm(self, network: Any) -> None:
         """Have a network read observations through the policy's own normalisation, which is in the policy's state."""
         if self.observation_norm is not None:
-            # Past nn.Module's own setattr, which would register it.
+            # Bypass nn.Module's own setattr, which would register it.
             for each in (network, getattr(network, "at_rest", None)):
                 if each is not None:
                     vars(each)["observation_norm"] = self.observation_norm
 
     def make_actor(self) -> Actor:
         """
-        :return: an actor of the policy's class and settings, with parameters of its own but for a shared encoder
+        :return: an actor of the policy's class and settings, with its own parameters except for a shared encoder
         """
         args, kwargs = self._actor_args
         shared = self.share_features_extractor
@@ -301,7 +301,7 @@ class SACPolicy(BasePolicy):
 
     def make_value(self) -> ValueNetwork:
         """
-        :return: a value network with the critics' settings, a features extractor of its own included
+        :return: a value network with the critics' settings and its own features extractor
         """
         extractor = self.make_features_extractor()
         value = ValueNetwork(
@@ -317,8 +317,8 @@ class SACPolicy(BasePolicy):
     def make_optimizer(self, parameters: Any, learning_rate: float, **kwargs: Any) -> torch.optim.Optimizer:
         """
         :param parameters: what to optimise
-        :param learning_rate: at the start
-        :param kwargs: settings over the policy's
+        :param learning_rate: learning rate at the start
+        :param kwargs: settings that override the policy's
         :return: an optimizer of the policy's class and settings
         """
         settings = {**self.optimizer_kwargs, **kwargs}
@@ -383,8 +383,8 @@ class SACPolicy(BasePolicy):
     def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
         """
         :param scaled_action: actions in [-1, 1], (B, A)
-        :return: the same in the action space's own bounds, (B, A), inside them also where scaling rounds. As in
-            Stable-Baselines3, they are floats also where the space is one of integers
+        :return: the same in the action space's own bounds, (B, A), inside them even if scaling rounds. As in
+            Stable-Baselines3, they are floats even if the space is one of integers
         """
         bounds = self._float_bounds(scaled_action.dtype)
         if bounds is None:
@@ -396,8 +396,8 @@ class SACPolicy(BasePolicy):
         """
         Bounds of a space of integers as floats, since small integers cannot hold their difference.
 
-        :param dtype: of the actions
-        :return: the bounds in the type that Stable-Baselines3's arithmetic has; None where the space is one of floats
+        :param dtype: type of the actions
+        :return: the bounds in the type of Stable-Baselines3's arithmetic; None if the space is one of floats
         """
         space = self.action_space
         if np.issubdtype(space.dtype, np.floating):
@@ -408,15 +408,15 @@ class SACPolicy(BasePolicy):
 
     def set_training_mode(self, mode: bool) -> None:
         """
-        :param mode: training (True) or evaluation mode of actor and critics. Of the targets, the features extractors
-            stay in evaluation mode, the rest follows: dropout is active in the target critics too (DroQ)
+        :param mode: training (True) or evaluation mode of actor and critics. In the targets, the features extractors
+            stay in evaluation mode and the rest follows: dropout is active in the target critics too (DroQ)
         """
         self._mode_switch(mode)
         self.training = mode
 
 
 def _running_norm(space: spaces.Space) -> RunningNorm:
-    """Running normalisation of observations, without their task if they tell one."""
+    """Running normalisation of observations, without their task if they contain one."""
     if is_multi_task(space):
         return TaskRunningNorm(_normalized_shape(space["observation"]))  # type: ignore[index]
     return RunningNorm(_normalized_shape(space))
@@ -440,7 +440,7 @@ MlpPolicy = SACPolicy
 
 
 class CnnPolicy(SACPolicy):
-    """The same with a CNN as features extractor, for images."""
+    """:class:`SACPolicy` with a CNN as features extractor, for images."""
 
     def __init__(self, *args: Any, **kwargs: Any):
         kwargs.setdefault("features_extractor_class", NatureCNN)
@@ -449,7 +449,7 @@ class CnnPolicy(SACPolicy):
 
 class MultiInputPolicy(SACPolicy):
     """
-    The same with an extractor for dict observations; ``TaskOneHot`` if they tell the task beside a vector.
+    :class:`SACPolicy` with an extractor for dict observations; ``TaskOneHot`` if they are a vector and the task.
 
     :param observation_space: observation space
     """

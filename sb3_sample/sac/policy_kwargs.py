@@ -1,4 +1,4 @@
-"""Arguments of a policy, completed by those of an agent and of its published networks where the user's say nothing."""
+"""The user's arguments of a policy, completed by those of an agent and of its published networks."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,8 +8,8 @@ def with_networks(kwargs: Mapping[str, Any], network: str, settings: Mapping[str
     """
     :param kwargs: arguments of the policy
     :param network: name of the network of critics and actor
-    :param settings: its arguments, of "critic" and "actor"
-    :return: the arguments, with those where the network is this one
+    :param settings: arguments of the network, for "critic" and "actor"
+    :return: the policy's arguments, completed by ``settings`` where the network is ``network``
     """
     kwargs = dict(kwargs)
     for who, published in settings.items():
@@ -29,8 +29,8 @@ def with_hidden_sizes(
     """
     :param kwargs: arguments of the policy
     :param network: name of the network of critics and actor
-    :param hidden_sizes: widths of its hidden layers, of "critic" and "actor", unless there is a ``net_arch``
-    :param more: further arguments of it
+    :param hidden_sizes: widths of its hidden layers, for "critic" and "actor", unless there is a ``net_arch``
+    :param more: further arguments of the network
     :param actor: arguments of a Gaussian actor
     :return: the arguments
     """
@@ -46,8 +46,8 @@ def with_hidden_sizes(
 def with_weight_decay(kwargs: Mapping[str, Any], weight_decay: float) -> dict[str, Any]:
     """
     :param kwargs: arguments of the policy
-    :param weight_decay: of the optimizers of all networks
-    :return: the arguments with it
+    :param weight_decay: weight decay of the optimizers of all networks
+    :return: the arguments with the weight decay
     """
     optimizer = {**(kwargs.get("optimizer_kwargs") or {}), "weight_decay": weight_decay}
     return {**kwargs, "optimizer_kwargs": optimizer}

@@ -10,7 +10,7 @@ from sb3_sample.networks import CReLU
 from sb3_sample.sac import checks
 from sb3_sample.sac.algorithm import SAC
 
-#: The groups of the regularization study, section 3, each with what it may hold.
+#: The groups of the regularization study, section 3, each with its choices.
 CRITIC_REGULARIZATIONS = ("none", "cdq", "gpl", "top")
 NETWORK_REGULARIZATIONS = ("none", "layer_norm", "spectral_norm", "weight_decay")
 PLASTICITY_REGULARIZATIONS = ("none", "crelu", "redo", "resets", "sam")
@@ -22,17 +22,18 @@ class RegularizedSAC(SAC):
     overfitting, and plasticity in actor-critic", https://arxiv.org/abs/2403.00514, section 3): one choice from each of
     three groups makes the 64 agents of the paper, and the last two groups take any mixture, ReDo included.
 
-    The network regularizations are the critics' alone, and CReLU is the activation of actor and critics (appendix B of
-    the paper); resets are of everything; SAM and ReDo act on the critics. The settings are the paper's where it gives
-    them: layer norm on every hidden layer, spectral norm on the last one, weight decay on every parameter, CReLU with
-    twice the width, GPL's learning rate of 1e-5. Where it refers to the original papers, their values are taken and are
-    arguments here: SAM's radius 0.05 (Foret et al. 2021), resets every 160,000 environment steps (as in the
+    The network regularizations apply to the critics alone, and CReLU is the activation of actor and critics (appendix B
+    of the paper); resets apply to everything; SAM and ReDo act on the critics. The settings are the paper's where it
+    gives them: layer norm on every hidden layer, spectral norm on the last one, weight decay on every parameter, CReLU
+    with twice the width, GPL's learning rate of 1e-5. Where it refers to the original papers, their values are the
+    defaults of arguments here: SAM's radius 0.05 (Foret et al. 2021), resets every 160,000 environment steps (as in the
     validation-buffer paper), ReDo every 1,000 gradient steps at a threshold of 0.025 (Sokar et al. 2023).
 
-    The coefficient of the weight decay is in no text. Here it is 0.01, the default of torch's AdamW; that of optax's,
-    the library of the authors' later code, is 1e-4, as in BRO. A gradient step takes ``learning_rate * weight_decay``
-    of a parameter: over the two million steps of the low replay regime, at a learning rate of 3e-4, 1e-4 shrinks it by
-    6 % in all, which is hardly a regularization, and 0.01 to a four-hundredth. ``weight_decay=1e-4`` is the other one.
+    No text states the coefficient of the weight decay. Here it is 0.01, the default of torch's AdamW; the default of
+    optax, the library of the authors' later code, is 1e-4, as in BRO. A gradient step takes away the share
+    ``learning_rate * weight_decay`` of a parameter: over the two million steps of the low replay regime, at a learning
+    rate of 3e-4, 1e-4 shrinks it by 6 % in all, which is hardly a regularization, and 0.01 shrinks it to a
+    four-hundredth. ``weight_decay=1e-4`` chooses the other coefficient.
 
     The low replay regime is the default; ``replay_ratio=16`` is the high one.
 
@@ -40,7 +41,7 @@ class RegularizedSAC(SAC):
     """
 
     critic_regularization: str = argument(default="cdq")
-    """"none" (the mean of the critics), "cdq" (their minimum), "gpl" or "top"; in the place of ``pessimism``"""
+    """"none" (the mean of the critics), "cdq" (their minimum), "gpl" or "top"; it replaces ``pessimism``"""
     network_regularization: str | Sequence[str] = argument(default="none")
     """"none", or any of "layer_norm", "spectral_norm", "weight_decay", one or several"""
     plasticity_regularization: str | Sequence[str] = argument(default="none")
@@ -48,15 +49,15 @@ class RegularizedSAC(SAC):
     weight_decay: float | None = argument(default=None, kind=AT_LEAST_0.or_none())
     """for "weight_decay", its coefficient; None: 0.01, torch's default (optax's: 1e-4)"""
     sam_radius: float | None = argument(default=None)
-    """for "sam"; None: 0.05"""
+    """for "sam", its radius; None: 0.05"""
     resets: Sequence[int] | int | None = argument(default=None)  # type: ignore[assignment]  # None until it is stored
-    """for "resets", environment steps between two, or the steps of all; None: 160,000, or none with
+    """for "resets", environment steps between two resets, or the steps of all resets; None: 160,000, or none with
     ``reset_gradient_steps``"""
     reset_gradient_steps: int | None = argument(default=None)
-    """for "resets", gradient steps between two instead"""
+    """for "resets", gradient steps between two resets instead"""
     resets_to: str = argument(default="start")
-    """what they return to: "start", the parameters that the model began with, as in the study's code, or "fresh",
-    newly drawn ones"""
+    """for "resets", parameters after a reset: "start", those that the model began with, as in the study's code, or
+    "fresh", newly drawn ones"""
     redo_period: int | None = argument(default=None)
     """for "redo", gradient steps between two recyclings; None: 1,000"""
     pessimism: float | str | type[Pessimism] | None = argument(  # type: ignore[assignment]  # None until it is stored
@@ -149,7 +150,7 @@ class RegularizedSAC(SAC):
 
 
 def _pessimism(critic_regularization: str) -> float | str:
-    """The family's name of a choice."""
+    """Value of ``pessimism`` for a choice."""
     if critic_regularization not in CRITIC_REGULARIZATIONS:
         raise ValueError(
             f"critic_regularization must be one of {list(CRITIC_REGULARIZATIONS)}, not {critic_regularization!r}"

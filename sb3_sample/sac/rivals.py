@@ -1,4 +1,4 @@
-"""The rivals of the papers: rules of pessimism (TOP, GPL, OPL), OAC's exploration, SR-SAC's resets."""
+"""Algorithms that the papers compare with: rules of pessimism (TOP, GPL, OPL), OAC's exploration, SR-SAC's resets."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -10,7 +10,8 @@ from sb3_sample.learner.pessimism import Pessimism
 from sb3_sample.sac import checks
 from sb3_sample.sac.algorithm import SAC
 
-#: SR-SAC's environment steps between two resets. An object of its own, which no 160_000 in a program is.
+#: SR-SAC's environment steps between two resets. A separate object, recognised by identity: no literal 160_000 in a
+#: program is the same.
 SR_SAC_RESETS = int("160_000")
 
 
@@ -52,7 +53,7 @@ class TOPSAC(_RuleSAC):
     arms: Sequence[float] = argument(default=(0.0, 1.0))
     """the pessimisms to choose among"""
     bandit_learning_rate: float = argument(default=0.1)
-    """of the bandit, for returns of up to 1000"""
+    """learning rate of the bandit, for returns of up to 1000"""
 
 
 class GPLSAC(_RuleSAC):
@@ -75,7 +76,7 @@ class GPLSAC(_RuleSAC):
     initial_pessimism: float = argument(default=1.0)
     """pessimism at the start and after a reset"""
     pessimism_learning_rate: float = argument(default=5e-5)
-    """of the pessimism; 5e-5 as in the VPL paper (1e-5 in the regularization study, 2403.00514)"""
+    """learning rate of the pessimism; 5e-5 as in the VPL paper (1e-5 in the regularization study, 2403.00514)"""
 
 
 class OPLSAC(_RuleSAC):
@@ -99,9 +100,9 @@ class OPLSAC(_RuleSAC):
     initial_pessimism: float = argument(default=1.0)
     """pessimism at the start and after a reset"""
     pessimism_learning_rate: float = argument(default=5e-5)
-    """of the pessimism"""
+    """learning rate of the pessimism"""
     segment_length: int = argument(default=8)
-    """steps of each environment that it looks back"""
+    """latest steps of each environment that the rule uses"""
     td_lambda: float = argument(default=0.95)
     """lambda of the returns"""
 
@@ -118,7 +119,7 @@ class OAC(SAC):
     optimism: float = argument(default=4.36)
     """weight of the critics' spread in the upper bound"""
     kl_radius: float = argument(default=3.69**2 / 2)
-    """KL divergence to the actor, summed over the action's dimensions, that the shift may cost"""
+    """KL divergence to the actor, summed over the action's dimensions, that the shift may cause"""
     exploration: str | type[Exploration] = argument(default="oac")
     """policy that acts while training: "oac", or another of ``SAC``'s"""
 
@@ -142,7 +143,8 @@ class SRSAC(SAC):
     SR-SAC: soft actor-critic scaled by resetting (D'Oro et al. 2022), with the settings of DAC, VPL and the
     regularization study (2403.00514): sixteen gradient steps a transition, and full-parameter resets every 160,000
     environment steps. (The BRO paper compares with ``replay_ratio=32``.) The original resets every 2,560,000 gradient
-    steps, whatever the replay ratio: ``reset_gradient_steps=2_560_000``; at sixteen a transition that is as often.
+    steps, whatever the replay ratio: ``reset_gradient_steps=2_560_000``; at sixteen gradient steps a transition that is
+    equally often.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -150,8 +152,8 @@ class SRSAC(SAC):
     replay_ratio: float | None = argument(default=16)
     """gradient steps per environment transition"""
     resets: Sequence[int] | int = argument(default=SR_SAC_RESETS)
-    """environment steps between two resets, or the steps of all of them; the default gives way to
-    ``reset_gradient_steps``"""
+    """environment steps between two resets, or the steps of all of them; ``reset_gradient_steps`` replaces the
+    default"""
     resets_to: str = argument(default="start")
-    """what a reset returns to: "start", the parameters that the model began with, as in the original's code, or
-    "fresh", newly drawn ones"""
+    """parameters after a reset: "start", those that the model began with, as in the original's code, or "fresh", newly
+    drawn ones"""

@@ -1,4 +1,4 @@
-"""Stable-Baselines3's names for what ``SAC`` here has under others; docs/sac.md has the table."""
+"""Stable-Baselines3's names for attributes that ``SAC`` here has under other names; docs/sac.md has the table."""
 
 import math
 from typing import Any
@@ -13,14 +13,14 @@ from sb3_sample.sac.model_learner import HasLearner
 
 class SB3Names(HasLearner):
     """
-    Attributes as ``stable_baselines3.SAC`` has them. A temperature that is set is put in the place of the old one, so
-    that it counts from the next gradient step on, however that is run.
+    Attributes as ``stable_baselines3.SAC`` has them. Setting a temperature changes it in place, so that it takes effect
+    at the next gradient step, however that step is run.
     """
 
     @property
     def log_ent_coef(self) -> torch.Tensor | None:
         """
-        Logarithm of the temperature, a scalar that is learned, or (n_tasks,) with ``task_temperatures``; None if the
+        Logarithm of the temperature, a learned scalar, or (n_tasks,) with ``task_temperatures``; None if the
         temperature is fixed.
         """
         return self.temperature.log_value if isinstance(self.temperature, LogScalar) else None
@@ -65,5 +65,5 @@ class SB3Names(HasLearner):
 
     @property
     def batch_norm_stats_target(self) -> list[torch.Tensor]:
-        """The same of the target critics."""
+        """Running statistics in the target critics' network."""
         return get_parameters_by_name(self.critic_target, ["running_"])

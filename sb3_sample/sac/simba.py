@@ -23,17 +23,18 @@ class SimBa(SAC):
     """
     SimBa: soft actor-critic with a simplicity bias of its networks (Lee et al. 2024, https://arxiv.org/abs/2410.09754).
 
-    Observations less their running mean by their running standard deviation, residual networks with layer norms and
-    inverted bottlenecks ("simba"), weight decay, and little else. Defaults are those of the published runs on
-    DeepMind Control, with two environment steps an action (``action_repeat=2`` of the environment): one critic, since
-    the episodes do not terminate; where they do (Gymnasium's MuJoCo, HumanoidBench), two with their minimum,
-    ``n_critics=2``. docs/simba.md says what was taken from where.
+    Observations normalised by their running mean and standard deviation, residual networks with layer norms and
+    inverted bottlenecks ("simba"), weight decay, and little else. Defaults are those of the published runs on DeepMind
+    Control, with two environment steps per action (``action_repeat=2`` of the environment): one critic, since the
+    episodes do not terminate; where they do (Gymnasium's MuJoCo, HumanoidBench), two critics and their minimum,
+    ``n_critics=2``. docs/simba.md gives the sources.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
     learning_rate: float | Schedule = argument(default=1e-4, kw_only=False)
-    """of actor, critics and temperature; a number or a function of the remaining progress (from 1 to 0)"""
+    """learning rate of actor, critics and temperature; a number or a function of the remaining progress (from 1 to
+    0)"""
     learning_starts: int = argument(default=5_000, kw_only=False)
     """transitions with uniformly random actions before the first gradient step, counted over the model's life"""
     ent_coef: str | float = argument(default="auto_0.01", kw_only=False)
@@ -43,8 +44,8 @@ class SimBa(SAC):
     weight_decay: float = argument(default=1e-2, kind=AT_LEAST_0)
     """decoupled weight decay of critics and actor"""
     normalize_observations: bool = argument(default=True)
-    """whether the networks read observations less their running mean, by their running standard deviation. The
-    statistics are the policy's, and move while training only"""
+    """whether the networks read observations minus their running mean, divided by their running standard deviation. The
+    statistics belong to the policy and are updated only while training"""
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
@@ -64,9 +65,9 @@ class SimbaV2(SAC):
 
     Networks whose weights have unit norm and whose features lie on a sphere ("simbav2"), critics as classifiers over
     101 atoms in [-5, 5], rewards divided by a running measure of the return, normalised observations, and a learning
-    rate that falls linearly to a half over the planned gradient steps. Actor and temperature learn before the critics.
+    rate that falls linearly to half over the planned gradient steps. Actor and temperature learn before the critics.
 
-    Defaults are those of the published runs on DeepMind Control, with two environment steps an action
+    Defaults are those of the published runs on DeepMind Control, with two environment steps per action
     (``action_repeat=2`` of the environment): one critic, since the episodes do not terminate. Where they do
     (Gymnasium's MuJoCo, HumanoidBench), there are two, with the distribution of the smaller one, ``n_critics=2``; and
     ``gamma`` is 1 - 5 / T within [0.95, 0.995], T being the episode's length in actions.
@@ -75,8 +76,8 @@ class SimbaV2(SAC):
     """
 
     learning_rate: float | Schedule = argument(default=1e-4, kw_only=False)
-    """of actor, critics and temperature at the start; a function of the remaining progress (from 1 to 0) goes with
-    ``learning_rate_schedule=None`` only"""
+    """learning rate of actor, critics and temperature at the start; a function of the remaining progress (from 1 to 0)
+    requires ``learning_rate_schedule=None``"""
     learning_starts: int = argument(default=5_000, kw_only=False)
     """transitions with uniformly random actions before the first gradient step, counted over the model's life"""
     ent_coef: str | float = argument(default="auto_0.01", kw_only=False)
@@ -94,8 +95,8 @@ class SimbaV2(SAC):
     reward_scale: str | type[RewardScale] | None = argument(default="simbav2")
     """rule by which rewards are divided by a running measure of the return; None for none"""
     normalize_observations: bool = argument(default=True)
-    """whether the networks read observations less their running mean, by their running standard deviation. The
-    statistics are the policy's, and move while training only"""
+    """whether the networks read observations minus their running mean, divided by their running standard deviation. The
+    statistics belong to the policy and are updated only while training"""
 
     def _n_critics(self) -> int:
         return self.n_critics

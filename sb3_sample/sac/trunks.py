@@ -49,7 +49,7 @@ def make_trunk(argument: str, cls: type[Network], in_features: int, kwargs: dict
 
 
 def with_plain_sizes(space: spaces.Space) -> spaces.Space:
-    """A space whose Discrete parts have Python's numbers for sizes, since a compiler does not take NumPy's."""
+    """Copy of a space whose Discrete parts have Python's integers as sizes: compilers do not accept NumPy's."""
     space = copy.copy(space)
     if isinstance(space, spaces.Dict):
         space.spaces = {key: with_plain_sizes(part) for key, part in space.spaces.items()}
@@ -69,5 +69,5 @@ def keep_at_rest(owner: Any) -> None:
             "and trains_in_target=False the running ones: leave one of them out"
         )
     if choice is not None:
-        # Past nn.Module's own setattr, which would register it.
+        # Bypass nn.Module's own setattr, which would register it.
         vars(owner)["at_rest"] = evaluated(owner)

@@ -27,7 +27,7 @@ class UpdateSchedule(DecidesCompiling, UpdatesOwed):
             # Optimizers count their steps over the model's life.
             coming = round(self._updates_in(n_steps))
             self.planned_updates = self._n_updates + coming if coming else None
-            # With a replay ratio of 0, or below one step in all, the next call that has some plans them.
+            # With a replay ratio of 0, or less than one step in all, a later call that takes some plans them.
             if self.planned_updates is None and n_steps > 0 and self.replay_ratio is None:
                 raise ValueError(
                     f"schedule_steps must be given, as learning_rate_schedule={self.learning_rate_schedule!r} needs to "
@@ -44,7 +44,7 @@ class UpdateSchedule(DecidesCompiling, UpdatesOwed):
         return n_steps if self._learns_from is not None else super()._updates_in(n_steps)
 
     def _after_turns(self: Any) -> None:
-        """Say if nothing was learned for want of steps."""
+        """Warn if nothing was learned because there were too few steps."""
         wanted = self.gradient_steps if self.replay_ratio is None else self.replay_ratio
         if self._n_updates > 0 or self.num_transitions == 0 or wanted == 0 or not self._is_warming_up():
             return
@@ -61,18 +61,18 @@ class UpdateSchedule(DecidesCompiling, UpdatesOwed):
         assert self.replay_buffer is not None
         if self._n_of_warm_up <= self.learning_starts:
             return True
-        # A model that was loaded without its buffer fills it first, acting with what it has learned.
+        # A model loaded without its buffer fills the buffer first, acting by its learned policy.
         capacity = self.replay_buffer.buffer_size * self.n_envs
         return self._n_in_buffer < min(self.learning_starts, capacity)
 
     @property
     def _n_of_warm_up(self: Any) -> int:
-        """Count of ``learning_starts``: transitions over the model's life."""
+        """Transitions over the model's life, which ``learning_starts`` counts."""
         return self.num_transitions
 
     @property
     def _n_in_buffer(self: Any) -> int:
-        """The same in the replay buffer."""
+        """Transitions in the replay buffer, counted in the same way."""
         assert self.replay_buffer is not None
         return self.replay_buffer.size() * self.n_envs
 

@@ -15,11 +15,11 @@ class VPLSAC(SAC):
     https://arxiv.org/abs/2403.01014, eq. 12 and algorithm 1).
 
     A share of the transitions is held out of training, and the pessimism of the critics' targets is learned on it: it
-    moves to where the targets' error is least on data that the critics have not seen. With ``replay_ratio=16,
-    resets=160_000`` it is the paper's SR-SAC-VPL.
+    moves to the value with the least error of the targets on data that the critics have not seen. With
+    ``replay_ratio=16, resets=160_000`` it is the paper's SR-SAC-VPL.
 
-    :class:`~sb3_sample.learner.pessimism.LearnedPessimism` says what the paper leaves open and how it is decided. The
-    paper's variants are arguments: ``pessimism_source="replay"`` or ``"recent"``, ``pessimism_loss="dual"``,
+    :class:`~sb3_sample.learner.pessimism.LearnedPessimism` states what the paper leaves open and what is decided here.
+    The paper's variants are arguments: ``pessimism_source="replay"`` or ``"recent"``, ``pessimism_loss="dual"``,
     ``validation_proportion``, and ``pessimism=1.0`` for the "regret" run, which holds the transitions out and leaves
     the pessimism fixed.
 
@@ -34,13 +34,13 @@ class VPLSAC(SAC):
     initial_pessimism: float = argument(default=1.0)
     """pessimism at the start and after a reset"""
     pessimism_learning_rate: float = argument(default=5e-5)
-    """of the pessimism"""
+    """learning rate of the pessimism"""
     pessimism_source: str = argument(default="validation")
     """transitions that the pessimism learns from: "validation", "replay" or "recent" ones"""
     pessimism_loss: str = argument(default="squared")
     """"squared" (eq. 12) or "dual" (eq. 6)"""
     pessimism: float | str | type[Pessimism] = argument(default="vpl")
-    """"vpl", or a number for a fixed one"""
+    """"vpl", or a number for a fixed pessimism"""
 
     def _check_arguments(self) -> None:
         if isinstance(self.pessimism, (str, type)) and self.pessimism != "vpl":

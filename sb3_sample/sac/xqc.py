@@ -20,19 +20,19 @@ class XQC(SAC):
 
     Networks with batch norm before every activation and weights of unit norm ("xqc"), critics as classifiers over 101
     atoms in [-5, 5], rewards divided by the standard deviation of the return, and a learning rate that falls linearly
-    to a tenth over the planned gradient steps. Critics and their targets judge current and next state and action in one
-    forward pass each, so that batch statistics are those of both. The actor learns in the first of every three gradient
+    to a tenth over the planned gradient steps. Critics and their targets evaluate current and next states and actions
+    in one forward pass each, so that batch statistics cover both. The actor learns in the first of every three gradient
     steps.
 
-    Defaults are those of the published runs on DeepMind Control, with two environment steps an action
-    (``action_repeat=2`` of the environment). For others, ``gamma`` is what :meth:`discount` gives.
+    Defaults are those of the published runs on DeepMind Control, with two environment steps per action
+    (``action_repeat=2`` of the environment). For other runs, :meth:`discount` gives ``gamma``.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
 
     learning_rate: float | Schedule = argument(default=3e-4, kw_only=False)
-    """of actor, critics and temperature at the start; a function of the remaining progress (from 1 to 0) goes with
-    ``learning_rate_schedule=None`` only"""
+    """learning rate of actor, critics and temperature at the start; a function of the remaining progress (from 1 to 0)
+    requires ``learning_rate_schedule=None``"""
     learning_starts: int = argument(default=5_000, kw_only=False)
     """transitions with uniformly random actions before the first gradient step, counted over the model's life"""
     ent_coef: str | float = argument(default="auto_0.01", kw_only=False)
@@ -41,9 +41,9 @@ class XQC(SAC):
     """"categorical" or "hl_gauss", from -5 to 5 unless ``value_head_kwargs`` say otherwise, "half_squared", or a class
     derived from ``ValueHead``; None: scalar critics, or ``n_quantiles``"""
     policy_delay: int = argument(default=3)
-    """gradient steps between two of the actors' and of the temperature"""
+    """gradient steps between two updates of actors and temperature"""
     actor_at_once: bool = argument(default=True)
-    """whether the first of ``policy_delay`` gradient steps is the actors', and not the last"""
+    """whether the actors learn in the first of every ``policy_delay`` gradient steps instead of the last"""
     learning_rate_schedule: str | None = argument(default="linear")
     """"linear" or "cosine": decay to ``final_learning_rate`` over the planned gradient steps; None for none"""
     final_learning_rate: float = argument(default=3e-5)
@@ -57,8 +57,8 @@ class XQC(SAC):
         Compute the published discount factor, ``1 - 5 / T`` within [0.95, 0.995].
 
         :param episode_steps: environment steps of an episode
-        :param action_repeat: environment steps an action, so that T is their quotient
-        :return: for ``gamma``
+        :param action_repeat: environment steps per action; T is ``episode_steps / action_repeat``
+        :return: the discount factor, for ``gamma``
         :raises ValueError: if an argument is out of range
         """
         check_value("episode_steps", episode_steps, ABOVE_0)

@@ -1,4 +1,4 @@
-"""Acting in a thread of its own, at a fixed frequency or at the environment's pace, while others learn."""
+"""Acting in a separate thread, at a fixed frequency or at the environment's pace, during learning."""
 
 import math
 import queue
@@ -11,9 +11,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-#: Share of a period by which a step may begin late without its being the next period's.
+#: Share of a period by which a step may begin late without counting as the next period's.
 GRACE = 0.05
-#: Seconds for which a thread that holds the interpreter may keep one waiting that is to act.
+#: Seconds for which another thread that holds the interpreter may keep the acting thread waiting.
 SWITCH_INTERVAL = 0.0005
 
 
@@ -30,13 +30,13 @@ class RealClock:
 
     def now(self) -> float:
         """
-        :return: seconds since some moment
+        :return: seconds since an arbitrary moment
         """
         return time.perf_counter()
 
     def wait_until(self, when: float) -> None:
         """
-        :param when: a moment, as ``now`` has it
+        :param when: a moment, as returned by ``now``
         """
         left = when - time.perf_counter()
         if left > 0:
@@ -51,7 +51,7 @@ class Step(NamedTuple):
     """
     One step of all environments.
 
-    :param observations: acted on, (n_envs, O) or a dict
+    :param observations: observations acted on, (n_envs, O) or a dict
     :param actions: in the environment's units, (n_envs, A)
     :param scaled: in [-1, 1], as they are stored, (n_envs, A)
     :param new_obs: (n_envs, O) or a dict
@@ -61,7 +61,7 @@ class Step(NamedTuple):
     :param age: gradient steps since the parameters that chose the actions were handed over; None for random actions
     :param late: seconds after the beginning of its period
     :param missed: periods before it in which no step began
-    :param begun: when it began, in seconds since some moment, rests left out
+    :param begun: when it began, in seconds since an arbitrary moment, rests left out
     """
 
     observations: Any
@@ -78,7 +78,7 @@ class Step(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """Actions and the age of what chose them, as in :class:`Step`."""
+    """Actions and the age of the parameters that chose them, as in :class:`Step`."""
 
     actions: np.ndarray
     scaled: np.ndarray
@@ -87,14 +87,14 @@ class Chosen(NamedTuple):
 
 class ActingThread:
     """
-    Steps of environments, taken by a thread. A step begins at the beginning of a period; where the one before, and the
-    choice of actions, last longer, at the next period that can still be met.
+    Thread that takes environment steps. A step begins with a period; if the previous step and the choice of actions
+    last longer, it begins with the next period that can still be met.
 
-    :param env: the environments, which nobody else steps meanwhile
+    :param env: the environments, which nothing else may step meanwhile
     :param choose: chooses actions, given observations and how many steps were taken before; called in the thread
-    :param observations: the environments' present ones
-    :param n_steps: number of steps after which it ends
-    :param period: seconds from the beginning of a step to that of the next; None: one follows the other
+    :param observations: present observations of the environments
+    :param n_steps: number of steps after which the thread ends
+    :param period: seconds between the beginnings of two steps; None: each step follows the previous one at once
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class ActingThread:
 
     def start(self) -> None:
         """Begin to act."""
-        # Computations in Python keep the acting thread waiting for so long.
+        # This bounds how long computations in Python keep the acting thread waiting.
         sys.setswitchinterval(SWITCH_INTERVAL)
         self._thread.start()
 
@@ -139,13 +139,13 @@ class ActingThread:
                 return found
             if isinstance(step, BaseException):
                 if found:
-                    self._taken.put(step)  # the last one that there is
+                    self._taken.put(step)  # nothing follows it
                     return found
                 raise step
             found.append(step)
 
     def rest(self) -> None:
-        """Have the step under way finished, and no other begun."""
+        """Let the step under way finish, and no other begin."""
         with self._condition:
             self._rests = True
             while not self._at_rest and self._thread.is_alive():
@@ -167,7 +167,7 @@ class ActingThread:
             sys.setswitchinterval(self._interval)
 
     def _has_rested(self) -> bool:
-        """Rest if it is asked for, and say whether it was."""
+        """Rest if requested, and return whether a rest was requested."""
         with self._condition:
             asked, begin = self._rests and not self._stops, self._clock.now()
             while self._rests and not self._stops:

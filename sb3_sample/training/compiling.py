@@ -1,4 +1,4 @@
-"""Whether compiling the gradient step pays for itself, of every algorithm with a replay buffer."""
+"""Whether compiling the gradient step pays for itself, for every algorithm with a replay buffer."""
 
 from typing import Any
 
@@ -15,12 +15,11 @@ class DecidesCompiling:
         """
         Decide, with ``compile="auto"`` once and for all, whether the coming gradient steps pay for compiling.
 
-        :param n_updates: gradient steps to come; 0 where that is not known
+        :param n_updates: gradient steps to come; 0 if unknown
         """
         if self.compiled is not None:
             return
-        # Warn of reasons not to compile only where compiling was asked for, and of an old torch, which is easily
-        # renewed.
+        # Warn of reasons not to compile only if compiling was requested, and of an old torch, which is easily updated.
         foreign = foreign_parts(self.learner) if n_updates >= PAYS_FROM else []
         if foreign and self.verbose >= 1:
             verb = "does" if len(foreign) == 1 else "do"

@@ -1,4 +1,4 @@
-"""Metrics of the gradient steps in Stable-Baselines3's logger, of every algorithm with a replay buffer."""
+"""Metrics of the gradient steps in Stable-Baselines3's logger, for every algorithm with a replay buffer."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ class MetricsLog:
 
     @property
     def logger(self: Any) -> Logger:
-        """The logger. Metrics in it may be on the device until somebody reads them."""
+        """The logger. Metrics in it may be on the device until they are read."""
         if isinstance(self._logger, Logger):
             LoggedValues.of(self._logger)
         return self._logger
@@ -26,9 +26,9 @@ class MetricsLog:
         return self.device.type != "cpu"
 
     def _record_metrics(self: Any) -> None:
-        """Record the metrics of the latest gradient step: numbers on a CPU, on a GPU what becomes them when read."""
+        """Record the latest gradient step's metrics: numbers on a CPU, on a GPU values that become numbers if read."""
         if not hasattr(self, "_logger"):
-            return  # There is none before ``learn`` or ``set_logger``.
+            return  # There is no logger before ``learn`` or ``set_logger``.
         if self._metrics_wait:
             LoggedValues.record_later(self.logger, self._metrics)
         else:
@@ -54,8 +54,8 @@ class MetricsLog:
         :raises TrainingDiverged: if one of them was NaN or infinite since the last time
         """
         self._watch.check()
-        # Those of the latest gradient step also where there was none since the last time; a callback may have put
-        # others in the place of those that there are.
+        # Metrics of the latest gradient step are logged even if there was none since the last log, except those that a
+        # callback has replaced.
         recorded = getattr(self.logger, "name_to_excluded", ())
         for name, value in self._metrics.items():
             if name not in recorded:

@@ -29,9 +29,9 @@ Self = TypeVar("Self", bound="Resumable")
 
 class Resumable(Constructed, Exportable, BaseAlgorithm):
     """
-    Base of both families, before ``SafeFiles`` and Stable-Baselines3's class: ``learn`` as a sequence of turns, after
-    each of which the training can be saved and continued with the result of a training without interruption. A family
-    defines the turn (:meth:`_turn`) and the steps before and after the turns.
+    Base of both families, before ``SafeFiles`` and Stable-Baselines3's class: ``learn`` is a sequence of turns; after
+    each of them the training can be saved, and continued with the same result as without interruption. A family defines
+    the turn (:meth:`_turn`) and the steps before and after the turns.
     """
 
     _stats_window_size: int = argument(alias="stats_window_size", default=100, kind=integer(1), of_training=True)
@@ -60,9 +60,9 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
         """
         Store the arguments that Stable-Baselines3's class does not know.
 
-        :param given: arguments by name, of which only these are left
+        :param given: arguments by name; those of Stable-Baselines3's class are removed
         :param of: Stable-Baselines3's class
-        :return: those that its constructor takes
+        :return: the arguments that its constructor takes
         """
         theirs = {name: given.pop(name) for name in inspect.signature(of).parameters.keys() & given.keys()}
         vars(self).update(given)
@@ -85,9 +85,9 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
         finally:
             vars(self).update(given)
         if self.device.type == "cpu":
-            # glibc hands freed memory back to the system above a threshold, at first below the size of one gradient or
-            # of one block of a simulation, and every use then pays for page faults. The threshold follows the largest
-            # block freed so far.
+            # glibc returns freed blocks above a threshold to the system. At first the threshold is below the size of
+            # one gradient or of one block of a simulation, and every use then pays for page faults; it follows the
+            # largest block freed so far.
             torch.empty(31 * 2**20, dtype=torch.uint8)
 
     def _check_arguments(self) -> None:
@@ -99,7 +99,7 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
         raise NotImplementedError
 
     def _complete_arguments(self) -> None:
-        """Add to the arguments of policy and buffer those of the algorithm, while they are built."""
+        """Add the algorithm's arguments to those of policy and buffer, while policy and buffer are built."""
         self.policy_kwargs = self._full_policy_kwargs()
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
@@ -123,15 +123,15 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
         """
         Set another environment, as in Stable-Baselines3.
 
-        :param env: the environment, of the same spaces and as many as the model was made with
-        :param force_reset: whether it is reset before training goes on
+        :param env: the environment, with the spaces and the number of environments that the model was made with
+        :param force_reset: whether it is reset before training continues
         :raises ValueError: if its spaces or its number of environments differ
         """
         check_n_envs(self, env)
         super().set_env(env, force_reset)
 
     def _on_environment_reset(self) -> None:
-        """Called when the environments were reset in the midst of their episodes."""
+        """Called when the environments were reset in the middle of their episodes."""
 
     # ---------------------------------------------------------------- training
 
@@ -148,9 +148,10 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
         learns_from: str = "",
     ) -> Self:
         """
-        Train. The arguments are those of ``learn``, by the same names, since callbacks read them in its variables.
+        Train. The arguments are those of ``learn``, by the same names, since callbacks read them among its local
+        variables.
 
-        :param learns_from: what is learned from instead of the environment, which is left alone; empty for the
+        :param learns_from: source of learning instead of the environment, which is left alone; empty for the
             environment
         """
         total_timesteps = check_learn(self, locals())
@@ -185,7 +186,7 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
         self, total_timesteps: int, callback: MaybeCallback, reset_num_timesteps: bool, name: str, progress_bar: bool
     ) -> tuple[int, BaseCallback]:
         """
-        Set counters, log and callbacks up, and reset the environments where Stable-Baselines3 does.
+        Set up counters, log and callbacks, and reset the environments where Stable-Baselines3 does.
 
         :return: steps at the end of the training, and the callback
         """
@@ -220,19 +221,19 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
         raise NotImplementedError
 
     def _whole_turn(self, callback: BaseCallback, log_interval: int, in_environment: bool) -> bool:
-        """Take a turn. One that is broken off leaves the environment ahead of what was stored of it."""
+        """Take a turn. An interrupted turn leaves the environment ahead of the stored transitions."""
         goes_on = False
         try:
             goes_on = self._turn(callback, log_interval)
         finally:
             if not goes_on and in_environment:
-                # A later ``learn`` begins with a reset, since the episode cannot go on.
+                # A later ``learn`` begins with a reset, since the episode cannot be continued.
                 self._last_obs = None
         return goes_on
 
     def _rest(self, callback: BaseCallback, log_interval: int) -> bool:
         """
-        Bring to an end whatever goes on beside the turns, before a checkpoint.
+        Pause everything that runs beside the turns, before a checkpoint.
 
         :param callback: as in :meth:`_turn`
         :param log_interval: as in :meth:`_turn`

@@ -1,4 +1,4 @@
-"""Part of ``learn`` in a group of trainings in lockstep (:mod:`sb3_sample.lockstep`)."""
+"""Participation of ``learn`` in a group of trainings in lockstep (:mod:`sb3_sample.lockstep`)."""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -19,10 +19,10 @@ def joint_of(learners: Sequence[Learner]) -> Joint | None:
     Decide how several learners take their gradient steps.
 
     :param learners: the learners, whose models are made
-    :return: what takes one step of each at once; None where each takes its own, one after the other
+    :return: object that takes one step of each at once; None if each takes its own, one after the other
     :raises ValueError: if something of theirs cannot be batched, or differs that must not; the message names it
     """
-    # On a CPU as many processes as cores are faster (docs/many_learners.md).
+    # On a CPU, one process per core is faster (docs/many_learners.md).
     return LearnerGroup(learners) if learners[0].device.type == "cuda" else None
 
 
@@ -64,7 +64,7 @@ class Member:
 
     @property
     def leaves_gradients(self) -> bool:
-        """Whether a step that is not asked to be eager leaves its gradients in ``.grad``."""
+        """Whether a step that is not called as eager leaves its gradients in ``.grad``."""
         return not self._seat.group.steps_together and self._own.leaves_gradients
 
     def serves(self, learner: Learner) -> bool:
@@ -94,7 +94,8 @@ class Member:
 
         :param learner: the learner
         :param inputs: the arguments of ``Learner.gradient_step``
-        :param eager: by itself, neither compiled nor captured this time, which leaves the gradients in ``.grad``
+        :param eager: whether to run it alone, neither compiled nor captured this time, which leaves the gradients in
+            ``.grad``
         :return: its result
         """
         answer = None if eager else self._seat.together(GRADIENT_STEP, inputs)
@@ -112,7 +113,7 @@ def _acting_of(seat: Seat, learner: Learner) -> Acting | None:
     own = acting_of(learner) or (lambda learner, inputs: learner.action_step(*inputs))
 
     def act(learner: Learner, inputs: tuple[Any, ...]) -> Metrics:
-        # Those of steps that are taken apart are computed apart.
+        # If gradient steps are taken separately, actions are computed separately.
         answer = seat.together(ACTIONS, inputs) if seat.group.steps_together else None
         return own(learner, inputs) if answer is None else answer
 
@@ -124,7 +125,7 @@ def all_made(model: Any) -> None:
     Wait in a group until the models of all its trainings are made, and check whether their gradient steps can be taken
     together. Without a group nothing happens.
 
-    :param model: this training's
+    :param model: this training's model
     :raises LeftWithTheOthers: a model could not be made, or they cannot
     """
     seat = present()
@@ -142,10 +143,10 @@ def _is_aligned(model: Any) -> bool:
 @contextlib.contextmanager
 def seated(model: Any) -> Iterator[Seat | None]:
     """
-    Have a ``learn`` take part in the group of this thread, if it is in one: the environments of all step together.
+    Make a ``learn`` part of this thread's group, if it is in one: the environments of all trainings step together.
 
     :param model: the model, set up for ``learn``
-    :return: its place; None where it trains alone, or within another training
+    :return: its place; None if it trains alone, or within another training
     """
     seat = seat_of(model)
     if seat is None:
@@ -155,7 +156,7 @@ def seated(model: Any) -> Iterator[Seat | None]:
     wait = innermost.step_wait
 
     def step_wait() -> Any:
-        # Those in processes of their own are under way.
+        # Environments in processes of their own are already stepping.
         seat.meet(ENVIRONMENTS)
         return wait()
 
@@ -174,7 +175,7 @@ def begin(seat: Seat | None) -> None:
     """
     Begin the turns of a training, all of a group together.
 
-    :param seat: its place; None where it trains alone
+    :param seat: its place; None if it trains alone
     """
     if seat is None:
         return

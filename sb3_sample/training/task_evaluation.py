@@ -20,11 +20,11 @@ from sb3_sample.saving.temporary import becoming
 
 class TaskEvaluation(NamedTuple):
     """
-    Evaluation of one task, a value an episode each.
+    Evaluation of one task; each list has one value per episode.
 
     :param returns: undiscounted returns
     :param lengths: in steps
-    :param successes: whether the episode was a success; empty if the environment does not tell it
+    :param successes: whether the episode was a success; empty if the environment does not report it
     """
 
     returns: list[float]
@@ -38,7 +38,7 @@ class TaskEvaluation(NamedTuple):
 
     @property
     def success_rate(self) -> float | None:
-        """Share of the episodes that were a success; None if the environment does not tell it."""
+        """Share of the episodes that were a success; None if the environment does not report it."""
         return float(np.mean(self.successes)) if self.successes else None
 
 
@@ -53,13 +53,13 @@ def evaluate_tasks(
     """
     Evaluate a model on each task, by Stable-Baselines3's ``evaluate_policy``.
 
-    :param model: the model, or whatever has its ``predict``
-    :param env: of :func:`~sb3_sample.envs.multi_task.multi_task_env`, wrapped or not
-    :param n_eval_episodes: episodes a task
-    :param deterministic: whether actions are the mean ones
+    :param model: the model, or any object with its ``predict``
+    :param env: environment of :func:`~sb3_sample.envs.multi_task.multi_task_env`, wrapped or not
+    :param n_eval_episodes: episodes per task
+    :param deterministic: whether to take mean actions
     :param render: whether the environments are drawn
-    :param warn: whether a missing ``Monitor`` is warned of
-    :return: by the task's id, in the order of the tasks
+    :param warn: whether to warn of a missing ``Monitor``
+    :return: evaluations by the task's id, in the order of the tasks
     :raises ValueError: if ``env`` is not of several tasks, or another argument is out of range
     """
     check_value("n_eval_episodes", n_eval_episodes, integer(1))
@@ -71,7 +71,7 @@ def evaluate_tasks(
             return
         i, info = local["i"], local["info"]
         task = of_env[i]
-        # Monitor's, or what evaluate_policy has counted without one.
+        # Monitor's episode, or what evaluate_policy has counted without a Monitor.
         episode = info.get("episode", {"r": local["current_rewards"][i], "l": local["current_lengths"][i]})
         task.returns.append(float(episode["r"]))
         task.lengths.append(int(episode["l"]))
@@ -92,12 +92,12 @@ def evaluate_tasks(
 
 def task_ids(name: str, env: Any) -> list[str]:
     """
-    :param name: of the argument, for the error
-    :param env: of :func:`~sb3_sample.envs.multi_task.multi_task_env`, wrapped or not
+    :param name: name of the argument, for the error
+    :param env: environment of :func:`~sb3_sample.envs.multi_task.multi_task_env`, wrapped or not
     :return: ids of its tasks, in their order
     :raises ValueError: if it is not of several tasks
     """
-    # Asked first, since a worker of SubprocVecEnv does not survive the question for what is not there.
+    # has_attr comes first, since a worker of SubprocVecEnv dies if asked for an attribute that does not exist.
     if not (hasattr(env, "has_attr") and env.has_attr("task_id")):
         raise ValueError(f"{name} must be of multi_task_env, whose environments have a task_id, not {env!r}")
     return [str(task_id) for task_id in env.get_attr("task_id")]
@@ -113,17 +113,18 @@ class MultiTaskEvalCallback(EvalCallback):
     ``timesteps`` are those of this task, and a ``run.json``: ``sb3_sample.study.read(log_path)`` has a run for each
     task. The best model is that of the highest mean return over all tasks.
 
-    :param eval_env: of ``multi_task_env``, an object of its own, with the spaces of the training's
+    :param eval_env: environment of ``multi_task_env``, separate from the training's and with the same spaces
     :param callback_on_new_best: called when there is a new best mean return
     :param callback_after_eval: called after each evaluation
-    :param n_eval_episodes: episodes a task
-    :param eval_freq: steps of all tasks together between two evaluations, which are as many steps of each task
+    :param n_eval_episodes: episodes per task
+    :param eval_freq: steps that all tasks take together between two evaluations, which is also the number of steps of
+        each task
     :param log_path: folder of the results; None for none
     :param best_model_save_path: folder of the best model; None for none
-    :param deterministic: whether actions are the mean ones
+    :param deterministic: whether to take mean actions
     :param render: whether the environments are drawn
     :param verbose: 0 nothing, 1 a line for each task
-    :param warn: whether a missing ``Monitor`` is warned of
+    :param warn: whether to warn of a missing ``Monitor``
     :param at_start: whether there is an evaluation before the first step
     :raises ValueError: if ``eval_env`` is not of several tasks, or another argument is out of range
     """
@@ -163,7 +164,7 @@ class MultiTaskEvalCallback(EvalCallback):
         )
         self.task_log_path = None if log_path is None else os.fspath(log_path)
         self.at_start = at_start
-        #: Steps a task at the evaluations, and the values of all episodes, (T, tasks, episodes).
+        #: Steps per task at the evaluations, and the values of all episodes, (T, tasks, episodes).
         self.evaluations_timesteps: list[int] = []
         self.evaluations_results: list[list[list[float]]] = []  # type: ignore[assignment]
         self.evaluations_length: list[list[list[int]]] = []  # type: ignore[assignment]
@@ -194,14 +195,14 @@ class MultiTaskEvalCallback(EvalCallback):
         if self.at_start and self.num_timesteps == 0 and not self.evaluations_timesteps:
             states = CallbackStates(self)
             self._evaluate()
-            # A run that goes on does not evaluate here again, and needs the results of its checkpoint.
+            # A resumed run does not evaluate here again, and needs the results of its checkpoint.
             states.note_changes()
 
     def _on_step(self) -> bool:
         return self._evaluate() if self.n_calls % self.eval_freq == 0 else True
 
     def _evaluate(self) -> bool:
-        """Evaluate all tasks, log and write what was found; whether the training goes on."""
+        """Evaluate all tasks, log and write the results; return whether the training continues."""
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
         found = evaluate_tasks(
@@ -263,7 +264,7 @@ class MultiTaskEvalCallback(EvalCallback):
                 np.savez(file, **arrays)
 
     def _record(self, task_id: str) -> dict[str, Any]:
-        """Head of a task's folder, as the table of runs reads it."""
+        """Record of a task's folder, as the table of runs reads it."""
         model: BaseAlgorithm = self.model
         return {
             "algo": type(model).__name__,

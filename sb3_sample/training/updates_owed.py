@@ -1,4 +1,4 @@
-"""Gradient steps that collected transitions call for, of every algorithm with a replay buffer."""
+"""Gradient steps due for collected transitions, in every algorithm with a replay buffer."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ class UpdatesOwed:
 
     @property
     def _tasks_together(self: Any) -> int:
-        """Tasks that take a step together; 1 where a single environment has one after the other."""
+        """Number of tasks that take a step together; 1 if a single environment has them one after the other."""
         return 1
 
     def _updates_in(self: Any, n_steps: int) -> float:
@@ -21,7 +21,7 @@ class UpdatesOwed:
         Count the gradient steps to come.
 
         :param n_steps: environment steps after the warm-up
-        :return: gradient steps in them; 0 where that is not known
+        :return: gradient steps in them; 0 if unknown
         """
         if self.replay_ratio is not None:
             return float(self.replay_ratio * n_steps / self._tasks_together)
@@ -29,12 +29,12 @@ class UpdatesOwed:
         if self.gradient_steps < 0:
             return n_steps
         if self.train_freq.unit is TrainFrequencyUnit.EPISODE:
-            return 0  # How long episodes are is not known.
+            return 0  # The length of episodes is unknown.
         return float(self.gradient_steps * n_steps / (self.n_envs * self.train_freq.frequency))
 
     def _updates_for(self: Any, n_collected: int) -> int:
         """
-        Count the gradient steps of transitions, and keep the fraction that a replay ratio leaves over.
+        Count the gradient steps due for transitions, and keep the fraction that a replay ratio leaves over.
 
         :param n_collected: transitions just collected, after the warm-up
         :return: gradient steps to take now
