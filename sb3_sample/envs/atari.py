@@ -1,8 +1,8 @@
 """
 Atari games (``ALE/<Game>-v5``) as value learners see them: stacks of gray frames, one decision every four frames.
 
-The wrappers are Stable-Baselines3's, without ``FireResetEnv``, as in Dopamine; the screen is the console's own gray
-one, as there. OpenCV is not needed: reducing a picture by areas is a product with two small matrices.
+The wrappers are Stable-Baselines3's, without ``FireResetEnv``, and the screen is the console's own gray one, both as in
+Dopamine. OpenCV is not needed: reducing a picture by areas is a product with two small matrices.
 """
 
 from typing import Any
@@ -16,7 +16,7 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_sample.envs.registration import ATARI, is_atari_id, make_env
 from sb3_sample.kinds import TRUE_OR_FALSE, check_value, integer
 
-#: Arguments of ``gym.make`` with which :class:`AtariFrames` does the rest: every frame, the gray screen.
+#: Arguments of ``gym.make`` for the game inside :class:`AtariFrames`: every frame, the gray screen.
 ENV_KWARGS: dict[str, Any] = {
     "frameskip": 1,
     "repeat_action_probability": 0.0,
@@ -40,7 +40,7 @@ def make_atari_env(env_id: str, training: bool = True, noop_max: int | None = 30
     :param env_id: ``"ALE/<Game>-v5"``
     :param training: whether a lost life ends an episode and rewards are clipped to their sign, as for learning; False
         for evaluation. ``Monitor``, inside of the wrappers, reports returns of whole games with rewards as they are
-    :param noop_max: frames without an action after a reset, at most (drawn from 1 on); None for none
+    :param noop_max: largest number of no-op frames after a reset (drawn from 1 on); None for none
     :param kwargs: arguments of ``gym.make`` (``render_mode``) and of the game (``mode``, ``difficulty``)
     :return: the environment; observations are uint8, (4, 84, 84), the newest frame last, zeros before an episode
     :raises ImportError: ``ale-py`` is not installed
@@ -57,8 +57,8 @@ class AreaResize(gym.ObservationWrapper[np.ndarray, int, np.ndarray]):
     """
     Reduction of gray pictures by the mean over areas (OpenCV's ``INTER_AREA``).
 
-    A pixel of the result is the mean of what lies under it, pixels that are there in part counting in part. The
-    overlaps are whole numbers of fractions of a pixel, so that the sums are exact in float32, and the same everywhere.
+    A pixel of the result is the mean of the pixels under it, each weighted by its overlap. Overlaps are whole multiples
+    of a fraction of a pixel, so that the sums are exact in float32, and the same everywhere.
 
     :param env: environment with pictures of uint8, (rows, columns)
     :param size: rows and columns of the result
@@ -90,17 +90,17 @@ class AreaResize(gym.ObservationWrapper[np.ndarray, int, np.ndarray]):
 
 class AtariFrames(gym.Wrapper[np.ndarray, int, np.ndarray, int]):
     """
-    All that stands between the console and a value learner: no-ops after a reset, the maximum of the last two of four
+    The processing between the console and a value learner: no-ops after a reset, the maximum of the last two of four
     frames, episodes that end with a life, 84 x 84 pixels, rewards clipped to their sign, four frames stacked.
 
-    A lost life does not restart the game: ``reset`` goes on from there, by one no-op (``EpisodicLifeEnv``). Frames from
-    before an episode's start, or before the life was lost, are zero.
+    A lost life does not restart the game: ``reset`` continues from there with one no-op (``EpisodicLifeEnv``). Frames
+    from before an episode's start, or before the life was lost, are zero.
 
     :param env: a game made with :data:`ENV_KWARGS`
     :param size: pixels of a frame's sides
     :param frame_stack: frames of an observation
     :param frame_skip: frames of a decision
-    :param noop_max: frames without an action after a reset, at most (drawn from 1 on); None for none
+    :param noop_max: largest number of no-op frames after a reset (drawn from 1 on); None for none
     :param episodic_life: whether a lost life ends an episode
     :param clip_reward: whether rewards are clipped to their sign
     :raises ValueError: an argument is out of range, or the game was made with other arguments

@@ -37,13 +37,13 @@ def select_gl_backend() -> None:
     Set ``MUJOCO_GL`` to ``egl`` or ``osmesa``, whichever library is there, on a Linux machine without a screen.
 
     MuJoCo's libraries read the variable when they are imported and otherwise take GLFW, which cannot draw without a
-    screen. A value that the user has set stays; where neither library is found nothing is set, and everything but
+    screen. A value that the user has set stays; if neither library is found, nothing is set, and everything but
     ``render`` works.
 
-    To be called before a library that opens its OpenGL when it is imported. Mesa's OpenGL and the Triton of PyTorch's
-    CUDA builds each bring an LLVM, and with Mesa's loaded first (PyOpenGL loads it for all to see) Triton ends the
-    process with a segmentation fault when PyTorch's optimizers import it. The other way round both work, so Triton is
-    imported here.
+    Call it before the import of a library that opens its OpenGL when imported. Mesa's OpenGL and the Triton of
+    PyTorch's CUDA builds each bring an LLVM. With Mesa's loaded first (PyOpenGL loads it with global symbols), Triton
+    ends the process with a segmentation fault when PyTorch's optimizers import it. In the other order both work, so
+    Triton is imported here.
     """
     with contextlib.suppress(ImportError):  # PyTorch's CPU builds come without it
         importlib.import_module("triton")

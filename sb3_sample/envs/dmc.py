@@ -1,12 +1,12 @@
 """
 The DeepMind Control suite as Gymnasium environments, ``dmc/<domain>-<task>-v0``.
 
-They stand on ``dm_control`` itself. Shimmy's ``DmControlCompatibilityV0`` was looked at (2.0.1) and not used: behind it
+They use ``dm_control`` itself. Shimmy's ``DmControlCompatibilityV0`` (2.0.1) was examined and not used: around it
 ``FlattenObservation`` concatenates the observation in alphabetical order, not in the order of the suite's observation
 spec that the published agents saw; observations and actions are float64 with the suite's own action bounds, so three
 more wrappers are needed, which together cost half a simulation step of cheetah-run; ``render_fps`` is the control
-period in milliseconds, written to an attribute that all instances share; and every step carries two entries in
-``info`` that SB3 copies and nobody reads.
+period in milliseconds, written to an attribute that all instances share; and every step carries two entries in ``info``
+that SB3 copies and nobody reads.
 """
 
 import os
@@ -31,10 +31,10 @@ EPISODE_STEPS = 1000
 PIXEL_CAMERAS = {"quadruped": 2}
 #: Weights of red, green and blue in a gray picture, in thousandths (luma of ITU-R BT.601).
 _GRAY = np.array([299, 587, 114], np.uint32)
-#: Pictures of an observation, unless another number is asked for.
+#: Default number of pictures in an observation.
 FRAME_STACK = 3
-#: dm-control asks for labmaze, which has no wheel after Python 3.12 and which the suite never imports. There the extra
-#: has everything but dm-control itself (setup.cfg).
+#: dm-control requires labmaze, which has no wheel after Python 3.12 and which the suite never imports. On later
+#: versions the extra has everything but dm-control itself (setup.cfg).
 _THEN = "pip install --no-deps dm-control" if sys.version_info >= (3, 13) else ""
 
 
@@ -46,8 +46,8 @@ class DMCEnv(gym.Env[np.ndarray, np.ndarray]):
     it is the latest pictures instead, uint8, channels first, the newest picture's channels last: (9, 84, 84) with
     ``pixels=84`` and ``frame_stack=3``. At a reset the first picture fills the stack. Action: float32 in [-1, 1], shape
     (A,), rescaled to the bounds of the suite's action spec where these differ (the quadruped). An episode has 1,000
-    control steps and then is ``truncated``; a task that ended itself with discount 0 would be ``terminated``, no task
-    of the suite does.
+    control steps and then is ``truncated``; a task that ended with discount 0 would be ``terminated``, but no task of
+    the suite does.
 
     ``reset(seed=s)`` fixes this and all following episodes: with ``s < 2**32`` they are those of
     ``suite.load(domain, task, task_kwargs={"random": s})``.
@@ -60,9 +60,10 @@ class DMCEnv(gym.Env[np.ndarray, np.ndarray]):
     :param render_mode: ``None`` or ``"rgb_array"``.
     :param width: Width of a picture in pixels.
     :param height: Height of a picture in pixels.
-    :param camera: Number or name of the camera; default: the first of the model, for observations of the quadruped 2.
+    :param camera: Number or name of the camera; default: the model's first, or 2 for observations of the quadruped.
     :param pixels: Height and width of the pictures that are observed; ``None``: the suite's own observation.
-    :param frame_stack: Pictures of an observation, one of each of the latest decisions; with ``pixels`` only.
+    :param frame_stack: Number of pictures in an observation, one for each of the latest decisions; with ``pixels``
+        only.
     :param gray: Whether these pictures have one channel, the luma, and not three; with ``pixels`` only.
     :raises ImportError: dm_control is not installed; or ``pixels`` are asked for, and no OpenGL can draw them.
     :raises ValueError: An argument is out of range, or the suite has no such task.
@@ -103,8 +104,8 @@ class DMCEnv(gym.Env[np.ndarray, np.ndarray]):
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": max(1, round(1.0 / decision_seconds))}
 
         self.pixels, self.gray = pixels, gray
-        #: Pictures that an observation consists of, along its first axis; ``None`` if it is none. Replay buffers that
-        #: store a picture once ask for it.
+        #: Number of pictures in an observation, along its first axis; ``None`` without pictures. Read by replay buffers
+        #: that store each picture once.
         self.stacked_frames = None if pixels is None else FRAME_STACK if frame_stack is None else frame_stack
         self.observation_space: spaces.Box
         if pixels is None:
@@ -130,7 +131,7 @@ class DMCEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """
-        :param seed: Restarts the stream of episodes; ``None`` goes on with it.
+        :param seed: Restarts the stream of episodes; ``None`` continues it.
         :param options: Not used.
         :return: Observation and an empty dict.
         """
@@ -169,7 +170,7 @@ class DMCEnv(gym.Env[np.ndarray, np.ndarray]):
         picture = self._picture()
         older = [picture] * (self.stacked_frames - 1) if self._stack is None else [self._stack[len(picture) :]]
         self._stack = np.concatenate([*older, picture])
-        # The stack is not the caller's.
+        # A copy, so that the caller cannot change the stack.
         return self._stack.copy()
 
     def _picture(self) -> np.ndarray:
@@ -180,14 +181,14 @@ class DMCEnv(gym.Env[np.ndarray, np.ndarray]):
         return ((picture @ _GRAY + 500) // 1000).astype(np.uint8)[None]
 
     def _check_renders(self) -> None:
-        """Draw a picture, so that what is missing for it is said where the environment is made."""
+        """Draw a picture, so that anything missing for it is reported when the environment is made."""
         try:
             self._picture()
         except ValueError as error:
             raise ValueError(
                 f"pixels={self.pixels!r} and camera={self.camera!r} must fit the model: {error}"
             ) from error
-        except Exception as error:  # whatever dm_control and the OpenGL libraries raise
+        except Exception as error:  # dm_control and the OpenGL libraries can raise anything
             raise ImportError(
                 f"pixels={self.pixels!r} needs an OpenGL that draws without a screen, and with MUJOCO_GL="
                 f"{os.environ.get('MUJOCO_GL', '')!r} there is none ({error}). Install one (apt-get install libegl1 "
@@ -205,7 +206,7 @@ class DMCEnv(gym.Env[np.ndarray, np.ndarray]):
         return self.dm_env.physics.render(height=self.height, width=self.width, camera_id=camera)
 
     def close(self) -> None:
-        # Frees the OpenGL context; left to the interpreter's exit it fails there.
+        # Frees the OpenGL context; if left to the interpreter's exit, that fails.
         self.dm_env.physics.free()
         self.dm_env.close()
 

@@ -82,14 +82,14 @@ class FiniteCheck:
 
 
 def _is_fine(array: np.ndarray) -> bool:
-    """Whether all are numbers that are finite as networks take them."""
+    """Whether all values are numbers that are finite in single precision."""
     kind = array.dtype.kind
     if kind == "f":
         if array.dtype.itemsize <= 4:
             return bool(np.isfinite(array).all())
-        # No comparison holds of a NaN.
+        # No comparison with NaN holds.
         return bool((np.abs(array) <= LARGEST).all())
-    # Of whatever a worker gives an array of objects is made: None becomes a NaN here.
+    # Any other values from a worker become an array of objects: None becomes NaN here.
     if kind != "O":
         # Integers (images) are always finite.
         return kind in "iub"

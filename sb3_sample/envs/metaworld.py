@@ -1,10 +1,10 @@
 """
 Meta-World as Gymnasium environments, ``metaworld/<task>-v3``: one task, goal observable, a new goal each episode.
 
-They stand on the task classes of ``metaworld.env_dict.ALL_V3_ENVIRONMENTS``. The library's own makers were looked at
-(3.0.0) and do something else: ``gym.make("Meta-World/MT1")`` draws from 50 goals made beforehand and wraps six times;
-the classes of ``ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE`` keep one goal for ever, drawn from NumPy's global generator, and
-take no camera or picture size; and every ``reset`` ignores its ``seed``.
+They use the task classes of ``metaworld.env_dict.ALL_V3_ENVIRONMENTS``. The library's own makers (3.0.0) were examined
+and behave differently: ``gym.make("Meta-World/MT1")`` draws from 50 goals made beforehand and adds six wrappers; the
+classes of ``ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE`` keep one goal for ever, drawn from NumPy's global generator, and take
+no camera or picture size; and every ``reset`` ignores its ``seed``.
 """
 
 from typing import Any
@@ -66,7 +66,7 @@ class MetaWorldEnv(gym.Env[np.ndarray, np.ndarray]):
             camera_name=camera if isinstance(camera, str) else None,
             camera_id=camera if isinstance(camera, int) else None,
         )
-        # The library sets these three through a pickled "task", which also would freeze the goal.
+        # The library sets these three through a pickled "task", which would also freeze the goal.
         self.sawyer._set_task_called = True
         self.sawyer._partially_observable = False
         self.sawyer._freeze_rand_vec = False
@@ -82,7 +82,7 @@ class MetaWorldEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """
-        :param seed: Restarts the stream of episodes; ``None`` goes on with it.
+        :param seed: Restarts the stream of episodes; ``None`` continues it.
         :param options: Not used.
         :return: Observation, float32 of shape (39,), and the library's info.
         """

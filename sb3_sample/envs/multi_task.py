@@ -1,4 +1,4 @@
-"""Several tasks as one vectorised environment, whose observations tell the task."""
+"""Several tasks as one vectorised environment, whose observations include the task."""
 
 import difflib
 import functools
@@ -18,18 +18,18 @@ from sb3_sample.envs.suites import SUITES
 
 class TaskEnv(gym.Wrapper):
     """
-    One of several tasks: the observation is padded with zeros at the end and stands beside the task's number, and what
-    the task has no use for is cut from the end of the action.
+    One of several tasks: the observation is padded with zeros at the end and accompanied by the task's number, and
+    dimensions that the task does not use are cut from the end of the action.
 
-    Where an episode ends, ``info["episode"]`` of ``Monitor`` gets "task", the task's id, and "is_success" if the
-    environment tells it, so that Stable-Baselines3's ``ep_info_buffer`` can be read by task.
+    At the end of an episode, ``info["episode"]`` of ``Monitor`` gets "task", the task's id, and "is_success" if the
+    environment reports it, so that Stable-Baselines3's ``ep_info_buffer`` can be read by task.
 
     :param env: the task's environment, with vectors as observations and actions
     :param task_id: its id
     :param task: its number
     :param observation_space: Dict of "observation", a Box of shape (O,), and "task", a Discrete
-    :param action_space: Box of shape (A,). If it is the environment's own, actions pass as they are; else it is
-        [-1, 1], and they are scaled to the environment's bounds
+    :param action_space: Box of shape (A,). If it is the environment's own, actions pass unchanged; otherwise actions
+        are in [-1, 1], and are scaled to the environment's bounds
     """
 
     def __init__(
@@ -84,20 +84,20 @@ def multi_task_env(
     """
     Make several tasks one vectorised environment: task k is its environment k, and all take a step together.
 
-    Observations are a Dict of "observation", padded with zeros at the end to the largest, and "task", the number
-    (Discrete). Actions have the size of the largest, and a task is given the first of them. Actions are in [-1, 1] and
-    scaled to the bounds of each task, but for a single task, whose spaces and actions are as they are. Each environment
+    Observations are a Dict of "observation", padded with zeros at the end to the size of the largest, and "task", the
+    task's number (Discrete). Actions have the size of the largest, and each task gets the first dimensions. Actions are
+    in [-1, 1] and scaled to the bounds of each task; a single task keeps its own spaces and actions. Each environment
     is wrapped in ``Monitor``, and ``env.get_attr("task_id")`` gives the ids in their order.
 
     :param ids: ids of environments and names of ``sb3_sample.envs.suites``, such as "MT10", "MT50" and "DMC_HARD"; one
         of them, or a list
-    :param seed: of the first task, the others have the following ones, as in ``make_vec_env``; None for none
+    :param seed: seed of the first task; the others have the following ones, as in ``make_vec_env``; None for none
     :param env_kwargs: arguments of ``make_env`` for each task, e.g. ``{"max_episode_steps": 500}``
     :param vec_env_cls: ``DummyVecEnv`` (None), ``SubprocVecEnv`` or another
     :param vec_env_kwargs: its arguments
     :param monitor_dir: folder of Monitor's files, ``<task>.monitor.csv``; None for none
     :return: the vectorised environment
-    :raises ValueError: if an id is unknown or there twice, or a task has other observations than vectors of floats, or
+    :raises ValueError: if an id is unknown or given twice, or a task has other observations than vectors of floats, or
         other actions than a bounded Box of one axis; the message names it
     :raises ImportError: the library of a task is not installed; the message says how to install it
     """
@@ -124,7 +124,7 @@ def multi_task_env(
     if vec_env_cls is None or vec_env_cls is DummyVecEnv:
         makers = [functools.partial(each, env) for each, env in zip(wrap, made, strict=True)]
     else:
-        # Elsewhere they are made anew: these have told their spaces.
+        # Other classes make the environments anew: these were only needed for their spaces.
         _close(made)
         makers = [functools.partial(_remade, each, kwargs) for each in wrap]
     make: Any = vec_env_cls or DummyVecEnv
@@ -174,13 +174,13 @@ def _check(task_id: str, env: gym.Env) -> None:
 
 
 def _common_spaces(envs: Sequence[gym.Env]) -> tuple[spaces.Dict, spaces.Box]:
-    """Spaces of all tasks; those of a single one are its own."""
+    """Common spaces of all tasks; a single task keeps its own."""
     observations: list[Any] = [env.observation_space for env in envs]
     actions: list[Any] = [env.action_space for env in envs]
     observation, action = observations[0], actions[0]
     if len(envs) > 1:
         sizes = [space.shape[0] for space in observations]
-        # Bounds of what is not there are those of its zeros.
+        # Padded entries are zero, and so are their bounds.
         low, high = np.zeros((2, len(envs), max(sizes)))
         for i, space in enumerate(observations):
             low[i, : sizes[i]], high[i, : sizes[i]] = space.low, space.high

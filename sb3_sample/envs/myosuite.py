@@ -20,10 +20,10 @@ class MyoSuiteEnv(gym.Env[np.ndarray, np.ndarray]):
 
     Observation: float32, shape (O,). Action: float32 in [-1, 1], shape (A,), the excitations of the muscles before the
     library's own squashing. The registered ids truncate after 100 steps, whatever the library's limit, and never
-    terminate: that the library would have ended the episode (an object dropped, the simulation unstable) is
-    ``info["done"]``. ``info["solved"]`` is the library's flag at this step, ``info["is_success"]`` whether it held at
-    any step of the episode so far. The library's copies of the observation and of the reward's terms
-    (``obs_dict``, ``rwd_dict``) are left out of ``info``, whose other entries are those terms.
+    terminate: ``info["done"]`` tells whether the library would have ended the episode (an object dropped, the
+    simulation unstable). ``info["solved"]`` is the library's flag at this step, ``info["is_success"]`` whether it held
+    at any step of the episode so far. The library's copies of the observation and of the reward's terms (``obs_dict``,
+    ``rwd_dict``) are left out of ``info``, whose other entries are those terms.
 
     ``reset(seed=s)`` fixes this and all following episodes.
 
@@ -50,7 +50,7 @@ class MyoSuiteEnv(gym.Env[np.ndarray, np.ndarray]):
         check_render_arguments(render_mode, width, height)
         select_gl_backend()
         import_library("myosuite", "myosuite")
-        # -1: no time limit of the library's; its wrapper that reports an unstable simulation stays.
+        # -1 removes the library's time limit; its wrapper that reports an unstable simulation stays.
         self.myo = gym.make(library_id, max_episode_steps=-1, disable_env_checker=True, render_mode=render_mode)
         self.render_mode = render_mode
         self._picture: dict[str, Any] = {"width": width, "height": height}
@@ -63,7 +63,7 @@ class MyoSuiteEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """
-        :param seed: Restarts the stream of episodes; ``None`` goes on with it.
+        :param seed: Restarts the stream of episodes; ``None`` continues it.
         :param options: Not used.
         :return: Observation, float32 of shape (O,), and the library's info.
         """

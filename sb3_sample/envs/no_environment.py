@@ -1,4 +1,4 @@
-"""Stand-in for the environment of a training that has none, or that leaves its own alone."""
+"""Stand-in for the environment of a training that has none, or that does not use its own."""
 
 from typing import Any
 
@@ -24,8 +24,8 @@ class _Nothing(gym.Env[Any, Any]):
 
 class NoEnvironment(DummyVecEnv):
     """
-    Vectorised environment of one that cannot be reset; a ``DummyVecEnv``, as callbacks compare the kinds of theirs and
-    of the training's.
+    Vectorised environment of one that cannot be reset; a ``DummyVecEnv``, since callbacks compare the type of their own
+    environment with the training's.
 
     :param observation_space: observation space
     :param action_space: action space

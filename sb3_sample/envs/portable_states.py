@@ -3,8 +3,8 @@ The state of an environment as plain values: arrays, numbers, strings, random ge
 can be written to a file and restored in another process, in an environment that was made in the same way.
 
 MuJoCo's data is not written as it lies in memory. The future follows from its integration state
-(``mjSTATE_INTEGRATION``); all other numbers follow from it or are left over from the last step, and the latter are read
-by some tasks before they are computed anew, so that they are written too.
+(``mjSTATE_INTEGRATION``); all other numbers follow from that state or are left over from the last step. Some tasks read
+these leftovers before they are computed anew, so they are written too.
 """
 
 import functools
@@ -26,24 +26,24 @@ from sb3_sample.envs.states import (
 )
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name
 
-#: Name of what :mod:`sb3_sample.saving.vec_envs` puts into an environment of another process.
+#: Attribute that :mod:`sb3_sample.saving.vec_envs` sets in an environment of another process.
 HELPER = "_sb3_sample_state"
-#: Attributes of wrappers that lead to what they wrap, are clocks, or ours.
+#: Attributes of wrappers that lead to the wrapped environment or are this package's.
 _SKIPPED = ("env", HELPER)
-#: Stable-Baselines3's Monitor counts seconds from when it was made, and its file says so.
+#: Stable-Baselines3's Monitor counts seconds from its creation, a time that its file records.
 _CLOCKS = {"stable_baselines3.common.monitor.Monitor": ("t_start",)}
 #: Arrays whose size depends on the contacts, and on which bodies touch each other; they are computed anew at each step,
 #: before they are read.
 _IN_ARENA = ("efc_", "iefc_", "island_", "map_", "iL", "iM", "iacc", "ifrc")
-#: Dimensions of MuJoCo's contacts; it uses those of a model unchecked.
+#: Valid dimensions of MuJoCo's contacts; MuJoCo uses those of a model unchecked.
 _CONTACT_DIMENSIONS = (1, 3, 4, 6)
 
 
 def pack(env: gym.Env) -> tuple[dict[str, Any], list[str]]:
     """
     :param env: an environment, wrapped or not
-    :return: its state; and what of it is not in it, because nothing is known about its class, as
-        ``class of the layer: attribute (class)``: the state is all of it if there is nothing of this kind
+    :return: its state; and the attributes missing from it because nothing is known about their class (none if it is
+        complete), as ``class of the layer: attribute (class)``
     """
     (state,), opaque = pack_all([env])
     return state, opaque
@@ -52,7 +52,7 @@ def pack(env: gym.Env) -> tuple[dict[str, Any], list[str]]:
 def pack_all(envs: Sequence[gym.Env]) -> tuple[list[dict[str, Any]], list[str]]:
     """
     :param envs: the environments of one process, which may share values, and the attributes of their classes
-    :return: their states; and what of them is not in it, as of :func:`pack`
+    :return: their states; and the attributes missing from them, as in :func:`pack`
     """
     describer = Describer(whole=True)
     states, opaque = [], []
@@ -77,10 +77,10 @@ def pack_all(envs: Sequence[gym.Env]) -> tuple[list[dict[str, Any]], list[str]]:
 
 def unpack(env: gym.Env, state: dict[str, Any]) -> None:
     """
-    Go back to a state: the same actions then give the same observations and rewards, bit by bit.
+    Restore a state: the same actions then give the same observations and rewards, bit for bit.
 
-    :param env: an environment made as the one that was packed
-    :param state: from :func:`pack`; it stays as it is
+    :param env: an environment made like the one that was packed
+    :param state: from :func:`pack`; it is not changed
     :raises DoesNotFit: the environment was made in another way
     """
     unpack_all([env], [state])
@@ -88,8 +88,8 @@ def unpack(env: gym.Env, state: dict[str, Any]) -> None:
 
 def unpack_all(envs: Sequence[gym.Env], states: Sequence[dict[str, Any]]) -> None:
     """
-    :param envs: environments made as those that were packed
-    :param states: from :func:`pack_all`; they stay as they are
+    :param envs: environments made like those that were packed
+    :param states: from :func:`pack_all`; they are not changed
     :raises DoesNotFit: the environments were made in another way
     """
     restorer = Restorer()
@@ -116,12 +116,12 @@ def _unpack(env: gym.Env, state: dict[str, Any], restorer: Restorer) -> None:
     restorer.enter(_saved_otherwise(env), _origin(simulator))
     for layer, saved in zip(layers, state["layers"], strict=True):
         restorer.attributes(layer, saved["attributes"], _skipped(layer))
-    # Checkpoints of earlier versions are without.
+    # Checkpoints of earlier versions have none.
     restorer.classes(state.get("classes", {}))
 
 
 def _saved_otherwise(env: gym.Env) -> list[Any]:
-    """Objects that are no attributes' values: each layer, and the simulator."""
+    """Objects that are not saved as values of attributes: each layer, and the simulator."""
     console = [env.unwrapped.ale] if is_atari(env) else []  # type: ignore[attr-defined]
     return [*layers_of(env), *(simulator_of(env) or ()), *_physics(env), *console]
 
@@ -158,7 +158,7 @@ def _unpack_simulator(model: Any, data: Any, state: dict[str, Any]) -> None:
     import mujoco
 
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
-    # Checkpoints of earlier versions are without options and masks; those of the environment stay.
+    # Checkpoints of earlier versions have no options and masks; those of the environment stay.
     recent = "options" in state
     own_arrays = (*model_arrays(), *more_model_arrays()) if recent else model_arrays()
     owners = {"model": (model, own_arrays), "data": (data, _data_arrays())}
@@ -178,14 +178,14 @@ def _unpack_simulator(model: Any, data: Any, state: dict[str, Any]) -> None:
         _check_options(options_of(model), options)
     set_model_numbers(model, {**state["model"], **options})
     mujoco.mj_setState(model, data, state["integration"], kind)
-    # Contacts and constraints, which dm_control computes at the end of a step for the next one.
+    # Compute contacts and constraints, as dm_control does at the end of a step for the next one.
     mujoco.mj_step1(model, data)
     for name in _data_arrays():
         getattr(data, name)[...] = state["data"][name]
 
 
 def _check_options(own: dict[str, Any], options: Any) -> None:
-    """Numbers of the model's structures, in the place of its own."""
+    """Check numbers that are to replace those of the model's structures."""
     import mujoco
 
     if not isinstance(options, dict) or options.keys() != own.keys():
@@ -207,7 +207,7 @@ def _check_options(own: dict[str, Any], options: Any) -> None:
 
 
 def _pack_console(env: Any) -> np.ndarray:
-    """The whole state of an Atari console, its generator included, as the bytes in which the emulator writes it."""
+    """The whole state of an Atari console, including its generator, as the bytes that the emulator writes."""
     return np.frombuffer(env.unwrapped.clone_state(include_rng=True).serialize(), np.uint8).copy()
 
 
@@ -218,12 +218,12 @@ def _unpack_console(env: Any, state: Any) -> None:
         raise DoesNotFit("the state of the Atari console is not what is saved of one")
     try:
         env.unwrapped.restore_state(ale_py.ALEState(state.tobytes()))
-    except SystemError as error:  # whatever the emulator raises of bytes that it did not write
+    except SystemError as error:  # the emulator's error for bytes that it did not write
         raise DoesNotFit("the state of the Atari console is damaged, or of another game") from error
 
 
 def _check_like(own: np.ndarray, array: Any, name: str) -> None:
-    """An array of the simulator, to be put in the place of its own."""
+    """Check an array that is to replace one of the simulator."""
     if not isinstance(array, np.ndarray) or array.shape != own.shape or array.dtype != own.dtype:
         saved = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else f"{array!r:.50}"
         raise DoesNotFit(

@@ -2,8 +2,8 @@
 The ids, listed so that registering them imports none of the libraries, and ``make_env``.
 
 Gymnasium has no registry that outlives a process (its plugin entry points went with 1.0), so a worker of
-``SubprocVecEnv`` started by ``spawn`` or ``forkserver`` knows only Gymnasium's own ids. A parent sends to such a
-worker SB3's ``CloudpickleWrapper``; :func:`register_in_workers` has multiprocessing pickle it in a way that
+``SubprocVecEnv`` started by ``spawn`` or ``forkserver`` knows only Gymnasium's own ids. A parent sends SB3's
+``CloudpickleWrapper`` to such a worker; :func:`register_in_workers` makes multiprocessing pickle it in a way that
 registers the ids before the environment is made.
 """
 
@@ -19,7 +19,7 @@ import gymnasium as gym
 from sb3_sample.extras import install
 
 PACKAGE = "sb3_sample"
-#: Before the ids of Atari games, which are ale-py's own.
+#: Prefix of the ids of Atari games, which are ale-py's own.
 ATARI = "ALE/"
 
 #: Domain to tasks: ``dm_control.suite.ALL_TASKS`` without the two lqr tasks (no time limit, unbounded actions).
@@ -145,7 +145,7 @@ def is_atari_id(env_id: Any) -> bool:
 
 def register_atari() -> None:
     """
-    Register the games with Gymnasium, which ``ale-py`` does when it is imported.
+    Register the games with Gymnasium, as ``ale-py`` does when it is imported.
 
     :raises ImportError: ``ale-py`` is not installed; the message says how to install it
     """
@@ -208,7 +208,7 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
 
 
 def register_in_workers() -> None:
-    """Have the workers of SB3's ``SubprocVecEnv`` register the ids, whichever way they are started."""
+    """Make the workers of SB3's ``SubprocVecEnv`` register the ids, however they are started."""
     from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
 
     def reduce(wrapper: CloudpickleWrapper) -> tuple[Callable[[bytes], CloudpickleWrapper], tuple[bytes]]:

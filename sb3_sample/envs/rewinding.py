@@ -1,4 +1,6 @@
-"""Q-values of actions at visited states: siblings of the environment go back to the states, and the policy goes on."""
+"""
+Q-values of actions at visited states: siblings of the environment are restored to the states, and the policy continues.
+"""
 
 import collections
 import copy
@@ -54,7 +56,7 @@ def stacked(observations: Sequence[Any]) -> Any:
     """
     Stack observations.
 
-    :param observations: B of one space
+    :param observations: B observations of one space
     :return: (B, ...), or a dict of such arrays
     """
     if isinstance(observations[0], dict):
@@ -94,13 +96,13 @@ def rewound_returns(
     :param states: B states
     :param actions: as the policy samples them, (B, ...)
     :param n_steps: steps from each state, at least 1, (B,)
-    :param rng: generator for what is random in the environments after the states
+    :param rng: generator for the randomness of the environments after the states
     :param gae_lambda: lambda; with 1 the discounted sum of the rewards and the last state's value
     :return: (B,), and how many steps were taken
     """
     returns, total = np.zeros(len(states)), 0
     left = np.array(n_steps)
-    # The longest first, so that few are left alone at the end.
+    # The longest first, so that few rollouts are left running alone at the end.
     waiting = list(np.argsort(-left, kind="stable")[::-1])
     discounts = np.ones(len(states))
     factor = agent.gamma * gae_lambda
@@ -128,7 +130,7 @@ def rewound_returns(
         valued = stopped if gae_lambda == 1 else ~terminated
         if valued.any():
             following[valued] = agent.values(rows_of(observations, valued))
-        # Where it goes on, the value counts with 1 - lambda; the rest is in the rewards to come.
+        # Where a rollout continues, the value counts with 1 - lambda; the rest is in the rewards to come.
         following[goes_on] *= 1 - gae_lambda
         rewards = agent.normalize_rewards(np.array([float(result[1]) for result in results]))
         returns[rows] += discounts[rows] * (rewards + agent.gamma * following)
@@ -145,14 +147,14 @@ def rewound_returns(
 
 def sibling_of(env: gym.Env) -> gym.Env:
     """
-    Make another environment like one, to restore its states in: of its ``spec`` if it has one, otherwise a copy, with
-    wrappers made anew by their arguments where they are recorded, and copied otherwise.
+    Make another environment like a given one, to restore its states in: from its ``spec`` if it has one, otherwise as a
+    copy. Wrappers are made anew from their arguments if these are recorded, otherwise copied.
 
     :param env: environment, wrapped or not
-    :return: another one with the same wrappers, in no particular state. Stable-Baselines3's ``Monitor`` writes no file
-        there
-    :raises ValueError: it is recorded as a video, as the other one would be, or a wrapper that can only be copied holds
-        on to the simulator
+    :return: another one with the same wrappers, in no particular state. Stable-Baselines3's ``Monitor`` in it writes no
+        file
+    :raises ValueError: it is recorded as a video, as the other one would be, or a wrapper that can only be copied
+        refers to the simulator
     """
     wrappers = []
     while isinstance(env, gym.Wrapper):
@@ -167,7 +169,7 @@ def sibling_of(env: gym.Env) -> gym.Env:
 def _wrapped_like(wrapper: gym.Wrapper, env: gym.Env) -> gym.Env:
     if isinstance(wrapper, Monitor):
         monitor: Any = Monitor(env, None, info_keywords=wrapper.info_keywords)
-        # Nobody asks for its episodes, and they would fill the memory.
+        # Its episodes are never read, and would fill the memory.
         for name in EPISODES:
             setattr(monitor, name, collections.deque(maxlen=0))
         return monitor  # type: ignore[no-any-return]
@@ -177,7 +179,7 @@ def _wrapped_like(wrapper: gym.Wrapper, env: gym.Env) -> gym.Env:
     recorded = getattr(wrapper, "_saved_kwargs", None)
     if recorded is not None:
         return make(env, **recorded)
-    # Its state is copied; the rest describes it, unless it leads to the environment itself.
+    # Its state is copied; the other attributes describe it, unless one refers to the environment itself.
     inside = [value for layer in layers_of(wrapper.env) for value in vars(layer).values() if is_simulator(value)]
     for name, value in vars(wrapper).items():
         if name != "env" and (isinstance(value, gym.Env) or any(value is each for each in inside)):
@@ -187,7 +189,7 @@ def _wrapped_like(wrapper: gym.Wrapper, env: gym.Env) -> gym.Env:
             )
     like = copy.copy(wrapper)
     like.env = env
-    # Methods that are bound to the wrapper or to what it wraps are bound to the others then.
+    # Methods that are bound to the wrapper or to a layer inside it become bound to the copies.
     layers = zip(layers_of(wrapper), layers_of(like), strict=True)
     others: dict[int, Any] = {id(layer): other for layer, other in layers}
     copied = state_attributes(wrapper)

@@ -1,10 +1,10 @@
 """
-Scores on a common scale, by which tasks are averaged: what is measured of a task, and what 0 and 1 stand for.
+Scores on a common scale, for averages over tasks: the measure of each task, and the meaning of 0 and 1.
 
-* DeepMind Control: the return over 1,000, its largest (BRO, section 3).
+* DeepMind Control: the return divided by 1,000, its maximum (BRO, section 3).
 * Meta-World, MyoSuite and Fetch: the success rate as it is.
-* MuJoCo: the return over the value of table 1 of "Value-Based Deep RL Scales Predictably" (Rybkin et al. 2025).
-* Atari: the return of a game between that of random play, 0, and that of a human, 1.
+* MuJoCo: the return divided by the value in table 1 of "Value-Based Deep RL Scales Predictably" (Rybkin et al. 2025).
+* Atari: the return of a game, scaled so that random play has 0 and a human 1.
 """
 
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from sb3_sample.envs.registration import PACKAGE
 
 class Score(NamedTuple):
     """
-    How a score is made of what was measured, ``(value - low) / (high - low)``. Nothing is clipped.
+    How a score follows from a measured value, ``(value - low) / (high - low)``. Nothing is clipped.
 
     :param metric: "return" or "success_rate"
     :param high: value whose score is 1
@@ -27,7 +27,7 @@ class Score(NamedTuple):
 
     def of(self, values: Any) -> Any:
         """
-        :param values: what was measured, of any shape
+        :param values: measured values, of any shape
         :return: the scores, of the same shape
         """
         return (values - self.low) / (self.high - self.low)
@@ -67,7 +67,7 @@ ATARI_100K: dict[str, tuple[float, float]] = {
 }
 _DMC_RETURN = 1_000.0
 _SUCCESS = ("metaworld/", "myosuite/", "Fetch")
-#: The tasks that have one, in words.
+#: The tasks that have a score, in words.
 SCORED = (
     "the tasks of dmc/ (returns), of metaworld/, myosuite/ and Fetch (success rates) and for "
     f"{', '.join(_GYMNASIUM)} and the 26 games of Atari-100k (returns)"

@@ -1,11 +1,11 @@
 """
-Saving the state of an environment and going back to it, so that other actions can be tried at a visited state.
+Save and restore the state of an environment, so that other actions can be tried at a visited state.
 
-A saved state is all that decides what comes next: the simulator's (``mjData``, with what was derived from positions and
-velocities, and the numbers of the model, which some tasks and wrappers draw anew for each episode, options such as
-gravity, contact masks and colours among them, but not kinds of parts and indices; or that of Atari's console), the
-task's, the counters of time limits and wrappers, and the random generators. It can be restored in the environment that
-it is of, any number of times, or in another one that was made in the same way.
+A saved state is all that decides the future: the state of the simulator (or of Atari's console) and of the task, the
+counters of time limits and wrappers, and the random generators. The simulator's state is ``mjData``, with the
+quantities derived from positions and velocities, and the numbers of the model, which some tasks and wrappers draw anew
+for each episode: options such as gravity, contact masks and colours are among them, kinds of parts and indices are not.
+A state can be restored any number of times, in its own environment or in another one that was made in the same way.
 """
 
 import collections
@@ -33,14 +33,14 @@ _GENERATORS = (np.random.Generator, np.random.RandomState)
 _NOT_STATE = (
     gym.Env, gym.Space, gym.envs.registration.EnvSpec, io.IOBase, type, types.ModuleType, types.FunctionType
 )  # fmt: skip
-#: Attributes of Monitor that report on all episodes so far. Nothing follows from them, nor from its clock.
+#: Attributes of Monitor that report on all episodes so far. Nothing depends on them, nor on its clock.
 EPISODES = ("episode_returns", "episode_lengths", "episode_times")
-#: Ends of the names of integer arrays of MuJoCo's model that are masks, switches and classes.
+#: Suffixes of the names of those integer arrays of MuJoCo's model that are masks, switches and classes.
 _SWITCHES = (
     "contype", "conaffinity", "condim", "_priority", "_group", "limited", "_active0", "_active", "_castshadow",
     "_actearly", "_actgravcomp", "_gaintype", "_biastype",
 )  # fmt: skip
-#: Functions that hold on to objects.
+#: Callables that hold references to objects.
 BOUND = (types.MethodType, functools.partial)
 
 
@@ -50,9 +50,10 @@ class EnvState(NamedTuple):
 
     :param layers: attributes of the environment's wrappers, outermost first, of the environment itself, and of its task
         and control loop if it is one of dm_control
-    :param data: copy of MuJoCo's data; None if it has no simulator
+    :param data: copy of MuJoCo's data; None without MuJoCo
     :param model: arrays of MuJoCo's model and numbers of its options, by name: ``body_mass``, ``opt.gravity``
-    :param console: of the Arcade Learning Environment, its generator included; None if it is not of it
+    :param console: state of the Arcade Learning Environment's console, including its generator; None for other
+        environments
     """
 
     layers: list[dict[str, Any]]
@@ -63,8 +64,8 @@ class EnvState(NamedTuple):
 
 def save_state(env: gym.Env) -> EnvState:
     """
-    :param env: environment of this package's ``dmc/``, of Gymnasium's MuJoCo, of Atari's (``ale-py``), or one whose
-        state is in its Python attributes (Gymnasium's classic control), wrapped or not
+    :param env: environment of this package's ``dmc/``, of Gymnasium's MuJoCo, of Atari (``ale-py``), or one whose state
+        is in its Python attributes (Gymnasium's classic control), wrapped or not
     :return: its state
     :raises TypeError: ``env`` is not a ``gymnasium.Env``
     """
@@ -81,13 +82,13 @@ def save_state(env: gym.Env) -> EnvState:
 
 def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None = None) -> None:
     """
-    Go back to a saved state: the same actions then give the same observations and rewards, bit by bit.
+    Restore a saved state: the same actions then give the same observations and rewards, bit for bit.
 
-    :param env: the environment that the state was saved of, or one made in the same way
-    :param state: from :func:`save_state`; it stays as it is
+    :param env: the environment that the state was saved from, or one made in the same way
+    :param state: from :func:`save_state`; it is not changed
     :param rng: if given, the environment's random generators are seeded anew from it, so that a task that is random
-        after its reset goes on at random from the state. That of Atari's console, which draws sticky actions, cannot be
-        seeded and is restored
+        after its reset continues at random from the state. The generator of Atari's console, which draws sticky
+        actions, cannot be seeded and is restored
     :raises ValueError: ``state`` is of an environment with other wrappers, or of another model
     """
     layers, simulator = layers_of(env), simulator_of(env)
@@ -122,7 +123,8 @@ def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None
 
 def check_restorable(env: gym.Env, other: gym.Env | None = None, n_steps: int = 20, seed: int = 0) -> None:
     """
-    Try it: random actions from a state that is reached by others, and once more from the same state restored.
+    Try saving and restoring: reach a state by random actions, take further ones, and repeat these from the restored
+    state.
 
     :param env: environment; it is reset
     :param other: environment to restore the state in, after a reset with another seed; ``env`` itself if None
@@ -140,7 +142,7 @@ def check_restorable(env: gym.Env, other: gym.Env | None = None, n_steps: int = 
     actions = [random_action(env.action_space, rng) for _ in range(n_steps)]
     first = list(_follow(env, actions))
     other = env if other is None else other
-    # Numbers that a reset draws must come back, too.
+    # Numbers that a reset draws must be restored, too.
     other.reset(seed=seed + 1)
     message = (
         f"env must be an environment whose state can be saved and restored, as those of dmc/, Gymnasium's MuJoCo and "
@@ -149,7 +151,7 @@ def check_restorable(env: gym.Env, other: gym.Env | None = None, n_steps: int = 
     restore_state(other, state)
     try:
         second = list(_follow(other, actions))
-    except Exception as error:  # whatever an environment raises whose state is only in part what it should be
+    except Exception as error:  # an environment whose state is restored only in part may raise anything
         raise ValueError(f"{message}it fails after its state was restored ({error!r})") from error
     if not _equal(first, second):
         raise ValueError(f"{message}the same actions gave something else after its state was restored")
@@ -183,7 +185,7 @@ def layers_of(env: gym.Env) -> list[Any]:
     dm_env = getattr(layers[-1], "dm_env", None)
     if dm_env is not None:
         return [*layers, dm_env, dm_env.task]
-    # An environment around one of another library, such as metaworld/.
+    # An environment around one of another library, as in metaworld/.
     inside = [layer for value in vars(layers[-1]).values() if isinstance(value, gym.Env) for layer in layers_of(value)]
     return layers + inside
 
@@ -191,7 +193,7 @@ def layers_of(env: gym.Env) -> list[Any]:
 def simulator_of(env: gym.Env) -> tuple[Any, Any] | None:
     """
     :param env: an environment, wrapped or not
-    :return: MuJoCo's model and data; None if it is not simulated by it
+    :return: MuJoCo's model and data; None if MuJoCo does not simulate it
     """
     base = env.unwrapped
     if hasattr(base, "dm_env"):
@@ -206,7 +208,7 @@ def simulator_of(env: gym.Env) -> tuple[Any, Any] | None:
 
 def model_numbers(model: Any) -> dict[str, Any]:
     """
-    :param model: MuJoCo's
+    :param model: MuJoCo's model
     :return: copies of its arrays that are not empty, and of the numbers of :func:`model_options`
     """
     names = (*model_arrays(), *more_model_arrays())
@@ -216,7 +218,7 @@ def model_numbers(model: Any) -> dict[str, Any]:
 
 def options_of(model: Any) -> dict[str, Any]:
     """
-    :param model: MuJoCo's
+    :param model: MuJoCo's model
     :return: copies of the numbers of :func:`model_options`, by name
     """
     options: dict[str, Any] = {}
@@ -230,8 +232,8 @@ def options_of(model: Any) -> dict[str, Any]:
 
 def set_model_numbers(model: Any, numbers: dict[str, Any]) -> None:
     """
-    :param model: MuJoCo's
-    :param numbers: of :func:`model_numbers`, or some of them; unchecked
+    :param model: MuJoCo's model
+    :param numbers: from :func:`model_numbers`, or some of them; unchecked
     """
     owners = {"": model, **{structure: operator.attrgetter(structure)(model) for structure in model_options()}}
     for name, value in numbers.items():
@@ -246,8 +248,8 @@ def set_model_numbers(model: Any, numbers: dict[str, Any]) -> None:
 def model_arrays() -> tuple[str, ...]:
     """
     :return: names of the arrays of a model that a task may draw anew: all of MuJoCo's own float type, and heights of
-        the ground. Not meshes, their search trees and textures, the megabytes of a model, which no task of these
-        suites changes
+        the ground. Meshes, their search trees and textures, the megabytes of a model, are not among them: no task of
+        these suites changes them
     """
     arrays = _arrays_of_a_model()
     return tuple(name for name, array in arrays.items() if array.dtype == np.float64 or name == "hfield_data")
@@ -256,8 +258,8 @@ def model_arrays() -> tuple[str, ...]:
 @functools.cache
 def more_model_arrays() -> tuple[str, ...]:
     """
-    :return: names of further arrays that a task or a wrapper may change: how things look, which of them touch each
-        other, and what is switched on. No indices in MuJoCo's memory, which it follows unchecked
+    :return: names of further arrays that a task or a wrapper may change: appearance, contact masks and switches.
+        Indices into MuJoCo's memory, which it follows unchecked, are not among them
     """
     arrays, known = _arrays_of_a_model(), model_arrays()
     return tuple(
@@ -270,8 +272,8 @@ def more_model_arrays() -> tuple[str, ...]:
 @functools.cache
 def model_options() -> dict[str, tuple[str, ...]]:
     """
-    :return: names of the numbers and arrays of a model's structures, by structure: options of the physics, means that
-        the solver measures by, and the light at the camera
+    :return: names of the numbers and arrays of a model's structures, by structure: options of the physics, mean values
+        by which the solver measures, and the light at the camera
     """
     model = _smallest_model()
     return {
@@ -288,7 +290,7 @@ def _smallest_model() -> Any:
 
 
 def _arrays_of_a_model() -> dict[str, np.ndarray]:
-    """All but meshes, skins and textures."""
+    """All arrays but those of meshes, skins and textures."""
     model = _smallest_model()
     names = [name for name in dir(model) if not name.startswith(("_", "mesh_", "tex_", "skin_", "bvh_", "oct_"))]
     return {name: value for name in names if isinstance(value := getattr(model, name), np.ndarray)}
@@ -296,11 +298,11 @@ def _arrays_of_a_model() -> dict[str, np.ndarray]:
 
 def state_attributes(layer: Any) -> dict[str, Any]:
     """
-    Select what may change of a wrapper or an environment.
+    Select the attributes of a wrapper or an environment that may change.
 
     :param layer: the wrapper or environment
-    :return: its attributes that are data through and through, by name, themselves and no copies. Not Monitor's lists of
-        all episodes, which grow with the training
+    :return: its attributes that consist of data only, by name, not copied; without Monitor's lists of all episodes,
+        which grow with the training
     """
     left_out = (*EPISODES, "t_start") if isinstance(layer, Monitor) else ()
     return {name: value for name, value in vars(layer).items() if name not in left_out and _is_state(value, set())}
@@ -308,13 +310,13 @@ def state_attributes(layer: Any) -> dict[str, Any]:
 
 def _is_state(value: Any, seen: set[int]) -> bool:
     """
-    Whether a value is data through and through: numbers, arrays, generators, containers and objects of them.
+    Whether a value consists of data only: numbers, arrays, generators, containers and objects of them.
 
     :param value: any
-    :param seen: ids of what is being looked at, or was, which refers to itself in a cycle
+    :param seen: ids of the values examined so far, which may refer to themselves in a cycle
     """
     if isinstance(value, np.ndarray):
-        # A view of the simulator's own memory, as some tasks of Meta-World keep, follows it.
+        # A view of the simulator's own memory, as some tasks of Meta-World keep, is restored with that memory.
         return not is_view_of_foreign_memory(value)
     if isinstance(value, (*_CONSTANTS, *_GENERATORS)):
         return True
@@ -326,7 +328,8 @@ def _is_state(value: Any, seen: set[int]) -> bool:
     if isinstance(value, _CONTAINERS):
         return all(_is_state(item, seen) for item in value)
     if isinstance(value, types.MethodType):
-        # That of an environment or a wrapper is none: its copy would be of a copy of them, which nobody steps.
+        # A method of an environment or a wrapper is no state: its copy would be bound to a copy of them, which nothing
+        # steps.
         return _is_state(value.__self__, seen)
     if isinstance(value, functools.partial):
         called = isinstance(value.func, types.FunctionType) or _is_state(value.func, seen)
@@ -342,14 +345,14 @@ def _is_state(value: Any, seen: set[int]) -> bool:
 
 def is_simulator(value: Any) -> bool:
     """
-    :param value: of an attribute of an environment
-    :return: whether it may be what simulates it: neither a part of the state nor a description
+    :param value: value of an attribute of an environment
+    :return: whether it may be the environment's simulator: neither a part of the state nor a description
     """
     return not _is_state(value, set()) and not isinstance(value, (*_NOT_STATE, *BOUND))
 
 
 def _bit_generator(generator: Any, seed: int) -> Any:
-    """A bit generator of the kind that the generator has."""
+    """A bit generator of the same kind as the generator's."""
     if isinstance(generator, np.random.RandomState):
         return np.random.MT19937(seed)
     return type(generator.bit_generator)(seed)
@@ -363,7 +366,7 @@ def _follow(env: gym.Env, actions: list[Any]) -> Iterator[tuple[Any, ...]]:
         observation, reward, terminated, truncated, _ = env.step(action)
         yield copy.deepcopy(observation), float(reward), terminated, truncated
         if terminated or truncated:
-            # The next episode is a part of the state as well: that of the generators.
+            # The next episode depends on the state as well: on that of the generators.
             yield copy.deepcopy(env.reset()[0]), 0.0, False, False
 
 

@@ -4,7 +4,7 @@ The papers' lists of tasks, as ids of this package.
 Where a paper's table differs from today's libraries:
 
 * BRO's table 4 gives the humanoid 24 actions; ``dm_control`` has 21 (and the 67 observations of the table).
-* BRO's table 4 lists Meta-World's pick-place, the published curves of BRO have pick-place-wall in its stead (those of
+* BRO's table 4 lists Meta-World's pick-place; the published curves of BRO have pick-place-wall instead (those of
   TD-MPC2 have both). The lists follow the table.
 * The papers ran Meta-World's v2 tasks; these are v3, the same tasks and observation on newer bindings of MuJoCo.
 * MBMA's tables abbreviate: "ball catch" is ball_in_cup-catch, "cart 2-poles" cartpole-two_poles, "finger turn"
@@ -105,10 +105,10 @@ REGULARIZATION_METAWORLD = _metaworld(
 #: The regularization study's 14 tasks.
 REGULARIZATION = REGULARIZATION_DMC + REGULARIZATION_METAWORLD
 
-#: DAC, the domains it names. Its 30 tasks stand in a table 3 that the dissertation's text of the paper does not
+#: DAC: the domains that it names. Its 30 tasks are in a table 3 that the dissertation's text of the paper does not
 #: contain, and no other list of them was found there: the text says that they come from DeepMind Control, Meta-World
-#: and MyoSuite, and names only "the dog and humanoid domains" (its figure 9, 3M steps against TD-MPC). This is what
-#: can be recovered: the locomotion tasks of those two domains, seven, not the 30.
+#: and MyoSuite, and names only "the dog and humanoid domains" (its figure 9, 3M steps against TD-MPC). This list has
+#: the tasks that can be recovered: the seven locomotion tasks of those two domains, not the 30.
 DAC_NAMED = _dmc("dog-stand", "dog-walk", "dog-trot", "dog-run", "humanoid-stand", "humanoid-walk", "humanoid-run")
 
 #: VPL-SAC, table 3: DeepMind Control (10).
@@ -164,8 +164,8 @@ MBMA_HARD = _dmc("quadruped-walk", "quadruped-run", "humanoid-stand", "humanoid-
 
 #: Dogs and humanoids, the seven hard tasks of DeepMind Control that BRC learns with one agent.
 DMC_HARD = DAC_NAMED
-#: Meta-World's MT10 and MT50, tasks for one agent, in the order of the library (``metaworld.env_dict``), whose position
-#: is a task's number.
+#: Meta-World's MT10 and MT50, tasks for one agent, in the order of the library (``metaworld.env_dict``): a task's
+#: position is its number.
 MT10 = _metaworld(
     "reach",
     "push",
@@ -236,9 +236,9 @@ SUITES: dict[str, tuple[str, ...]] = {
     name: tasks for name, tasks in list(globals().items()) if isinstance(tasks, tuple) and not name.startswith("_")
 }
 
-# The published curves of Gymnasium's tasks are of v4; v5 is the version of today.
+# The published curves of Gymnasium's tasks are of v4; today's version is v5.
 _GYMNASIUM = ("Ant", "HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup", "Walker2d")
-#: How HumanoidBench's ids begin. The package has none of them; who has installed it finds the curves.
+#: Prefixes of HumanoidBench's ids. This package has none of them; whoever has installed HumanoidBench finds the curves.
 _HUMANOIDBENCH = ("h1-", "h1hand-")
 
 
@@ -247,7 +247,7 @@ def published_key(env_id: str) -> tuple[str, str]:
     The names under which the published curves list an environment.
 
     :param env_id: An id, e.g. ``"metaworld/push-v3"``, ``"myosuite/key-turn-v0"``, ``"dmc/cheetah-run-v0"``,
-        ``"HalfCheetah-v5"`` or ``"h1-balance_hard-v0"``; the prefix ``sb3_sample:`` may stand before it.
+        ``"HalfCheetah-v5"`` or ``"h1-balance_hard-v0"``; the prefix ``sb3_sample:`` may precede it.
     :return: Suite and task: ``("metaworld", "push")``, ``("myosuite", "myo-key-turn")``, ``("dmc", "cheetah-run")``,
         ``("gymnasium", "HalfCheetah-v4")``, ``("humanoidbench", "h1-balance-hard-v0")``. Not every task has curves.
     :raises ValueError: The id is of none of these suites.
@@ -271,7 +271,8 @@ def published_key(env_id: str) -> tuple[str, str]:
 
 def published_id(suite: str, task: str) -> str:
     """
-    The other way round: the id of today's environment. Meta-World's curves are of v2, of which this package has v3.
+    The id of today's environment, the inverse of :func:`published_key`. Meta-World's curves are of v2; this package has
+    v3.
 
     :param suite: of the published curves
     :param task: likewise

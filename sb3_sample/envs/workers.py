@@ -1,6 +1,6 @@
 """
-Workers of vectorised environments that die, or hang: who, how and why, instead of a bare ``EOFError`` or of waiting
-without end; and, where it is asked for, another in the dead one's place.
+Workers of vectorised environments that die or hang: errors that say which, how and why, instead of a bare ``EOFError``
+or an endless wait; and, on request, a new worker in the dead one's place.
 """
 
 import contextlib
@@ -28,11 +28,11 @@ from stable_baselines3.common.vec_env.subproc_vec_env import _worker as serve
 
 from sb3_sample.warn import warn
 
-#: Seconds for a worker that has hung up to be gone.
+#: Seconds within which a worker that has closed its connection must end.
 PATIENCE = 5.0
-#: Seconds that making an environment may take, where answers have less: libraries are imported for it.
+#: Seconds that making an environment may take, where answers have less: it imports libraries.
 MAKING = 60.0
-#: Seconds between two looks of a worker at whether its parent lives.
+#: Seconds between a worker's checks that its parent lives.
 _LOOK = 0.5
 
 
@@ -44,8 +44,8 @@ class EnvironmentDied(RuntimeError):
     :param pid: of the process
     :param exit_code: of the process; the negative number of the signal that killed it; None if it is not known
     :param request: what it was asked to do, as Stable-Baselines3's workers call it ("step", "reset", ...)
-    :param trace: the traceback of the exception that ended it; None if it could not tell
-    :param note: what else is to be said
+    :param trace: the traceback of the exception that ended it; None if it could not report one
+    :param note: further text for the message
     :param silence: seconds without an answer after which it was killed; None if it died otherwise
     :param action: the last action that it was given; None if there was none
     """
@@ -86,8 +86,8 @@ class EnvironmentDied(RuntimeError):
 
     def noting(self, note: str) -> "EnvironmentDied":
         """
-        :param note: what else is to be said
-        :return: the same error that says it
+        :param note: further text for the message
+        :return: the same error with this note
         """
         cls, values = self.__reduce__()
         return cls(*values[:5], note, *values[6:])
@@ -105,15 +105,15 @@ class _Made(NamedTuple):
 
 class WatchedConnection:
     """
-    The connection to a worker, which says so when the worker has died, or hangs: at the answer, so that of several
-    workers that are asked one after the other each is asked.
+    Connection to a worker, which raises an error if the worker has died or hangs. The error comes when the answer is
+    read, so that all of several workers are asked first.
 
     :param connection: the connection
     :param process: the worker
     :param index: of its environment
     :param note: added to the error if the worker did not say why it ended
     :param timeout: seconds from a question to its answer, after which the worker is killed; None to wait without end.
-        It must be a worker that says when its environment is made
+        The worker must be one that reports when its environment is made
     """
 
     def __init__(self, connection: Connection, process: Any, index: int, note: str = "", timeout: float | None = None):
@@ -129,7 +129,7 @@ class WatchedConnection:
         """
         :param question: for the worker
         """
-        # Answers left over where another raised an error; an error here is told at the answer.
+        # Drop answers left over after the error of another worker; an error here is raised at the next answer.
         with contextlib.suppress(EnvironmentDied):
             while self._asked:
                 self.recv()
@@ -200,7 +200,7 @@ class WatchedConnection:
         self.send(("close", None))
         if self._error is None:
             self._process.join(self._timeout)
-        # Whatever is left of it.
+        # End it if it is still running.
         self._process.kill()
         self._process.join()
         self._connection.close()
@@ -214,8 +214,8 @@ class WatchedConnection:
 
 def watch_workers(venv: VecEnv) -> None:
     """
-    Let a ``SubprocVecEnv`` say which of its workers died and how, and close when some are dead. Other kinds stay as
-    they are.
+    Make a ``SubprocVecEnv`` report which of its workers died and how, and let it close when some are dead. Other
+    vectorised environments stay as they are.
 
     :param venv: a vectorised environment, wrapped or not
     """
@@ -237,8 +237,8 @@ def watch_workers(venv: VecEnv) -> None:
 
 def end_with_this_process(venv: VecEnv) -> None:
     """
-    Let the forked workers of a ``SubprocVecEnv`` end when this process does, however that ends: each holds copies of
-    the others' ends of their connections, so that none of them would hear of it. Other kinds stay as they are.
+    Make the forked workers of a ``SubprocVecEnv`` end when this process does, however it ends: each worker holds copies
+    of the others' ends of their connections, so that none would notice. Other vectorised environments stay as they are.
 
     :param venv: a vectorised environment, wrapped or not
     """
@@ -246,16 +246,16 @@ def end_with_this_process(venv: VecEnv) -> None:
     if not isinstance(innermost, SubprocVecEnv) or isinstance(innermost, SupervisedSubprocVecEnv):
         return
     if isinstance(innermost.processes[0], ForkProcess) and not innermost.waiting:
-        # Of one that has died is told at the next question.
+        # A worker that has died is reported at the next question.
         with contextlib.suppress(EnvironmentDied, EOFError, OSError):
             innermost.env_is_wrapped(_EndWithThisProcess())  # type: ignore[arg-type]
 
 
 def _end_with(parent: int) -> type:
     """
-    End this process when another is not its parent any more.
+    End this process when another is no longer its parent.
 
-    :param parent: the other
+    :param parent: the other's process id
     :return: a class that the environment may be wrapped in
     """
 
@@ -270,8 +270,8 @@ def _end_with(parent: int) -> type:
 
 class _EndWithThisProcess:
     """
-    Sent to a worker of Stable-Baselines3 in the place of a class, it is a call when it arrives: the workers answer a
-    fixed set of questions, of which none is this one.
+    Sent to a worker of Stable-Baselines3 in place of a class, it becomes a call of :func:`_end_with` there: the workers
+    answer a fixed set of questions, and none of them does this.
     """
 
     def __reduce__(self) -> Any:
@@ -288,10 +288,10 @@ def _close(venv: SubprocVecEnv) -> None:
 
 
 def _supervised(remote: Connection, parent_remote: Connection, env_fn: CloudpickleWrapper, parent: int | None) -> None:
-    """Stable-Baselines3's worker, which says when its environment is made, and at its end why it ends."""
-    # A terminal's Ctrl-C goes to every process: it is for the training to end its workers.
+    """Run Stable-Baselines3's worker; report when its environment is made and, if an exception ends it, why."""
+    # A terminal's Ctrl-C goes to every process, but only the training is to end its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # The parent of those that are not forked is a process that ends with the training's.
+    # Workers that are not forked have a parent that ends with the training's process.
     _end_with(os.getppid() if parent is None else parent)
 
     def make() -> gym.Env:
@@ -309,23 +309,23 @@ def _supervised(remote: Connection, parent_remote: Connection, env_fn: Cloudpick
 
 class SupervisedSubprocVecEnv(SubprocVecEnv):
     """
-    Stable-Baselines3's ``SubprocVecEnv``, whose errors have the traceback of the worker that died, and which can put
-    another worker in its place: to use where that stands, as ``vec_env_cls`` of ``make_vec_env`` too.
+    Stable-Baselines3's ``SubprocVecEnv`` with the traceback of a dead worker in its errors, and optional replacement of
+    dead workers. It can be used wherever a ``SubprocVecEnv`` can, also as ``vec_env_cls`` of ``make_vec_env``.
 
     A worker is replaced when it dies during ``step`` or ``reset``, by an exception or because the system killed it. Its
-    environment is made anew, with a seed of its own that follows from the one that ``seed`` was given, and its episode
-    ends as one that a time limit ends does: reward 0, ``TimeLimit.truncated``, the last observation that it gave as
-    ``terminal_observation``, and ``info["worker_died"]`` with the reason, which is also a warning. ``Monitor`` does not
-    count the episode. Values set by ``set_attr`` or ``env_method`` in the old one are lost.
+    environment is made anew, with its own seed that follows from the one given to ``seed``, and its episode ends as if
+    by a time limit: reward 0, ``TimeLimit.truncated``, the last observation that it gave as ``terminal_observation``,
+    and ``info["worker_died"]`` with the reason, which is also given as a warning. ``Monitor`` does not count the
+    episode. Values set by ``set_attr`` or ``env_method`` in the old environment are lost.
 
-    :param env_fns: make the environments, each in a process of its own
-    :param start_method: how processes are started, as there
+    :param env_fns: functions that make the environments, each in its own process
+    :param start_method: how processes are started, as in ``SubprocVecEnv``
     :param restart_envs: whether a worker that dies is replaced; otherwise its death is an error
-    :param max_restarts: how many are replaced in the life of this object, so that an environment that is broken does
-        end the training
-    :param timeout: seconds after which a worker that gives no answer is killed, which is a death like others; the error
-        names its last action. Making an environment may take a minute, if that is longer. None: a worker that hangs is
-        waited for without end
+    :param max_restarts: how many workers are replaced in the life of this object, so that a broken environment does end
+        the training
+    :param timeout: seconds without an answer after which a worker is killed, and treated like any dead one; the error
+        names its last action. Making an environment may take a minute, if that is longer. None: wait without end for a
+        worker that hangs
     :raises ValueError: if an argument is out of range
     :raises EnvironmentDied: if an environment cannot be made
     """
@@ -358,7 +358,7 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
         self._context = multiprocessing.get_context(start_method)
         self.processes: list[Any] = []
         self.remotes: Any = []
-        #: Of each environment, what it observed last.
+        #: The last observation of each environment.
         self.last_observations: list[Any] = [None] * len(self._env_fns)
         try:
             for index in range(len(self._env_fns)):
@@ -376,7 +376,7 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
         ours, theirs = self._context.Pipe()
         parent = os.getpid() if self._context.get_start_method() == "fork" else None
         arguments = (theirs, ours, CloudpickleWrapper(self._env_fns[index]), parent)
-        # A daemon ends with this process, however that ends.
+        # A daemon ends with this process when that exits; after SIGKILL :func:`_end_with` ends it.
         process = self._context.Process(target=_supervised, args=arguments, daemon=True)  # type: ignore[attr-defined]
         process.start()
         theirs.close()
@@ -386,7 +386,7 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
         """
         Set the seeds that the environments get at their next ``reset``, as in Stable-Baselines3.
 
-        :param seed: the first one's; drawn if None
+        :param seed: seed of the first environment; drawn if None
         :return: the seeds
         """
         seeds = super().seed(seed)
@@ -436,12 +436,12 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
 
     def _replace(self, index: int, error: EnvironmentDied) -> tuple[Any, dict[str, Any]]:
         """
-        Put another worker in the place of a dead one.
+        Replace a dead worker.
 
         :param index: of its environment
         :param error: how it died
         :return: first observation and info of the new environment
-        :raises EnvironmentDied: that is not wanted, or no more
+        :raises EnvironmentDied: replacement is not wanted, or no more is allowed
         """
         while self.restart_envs and self.n_restarts < self.max_restarts:
             self.n_restarts += 1
@@ -463,6 +463,6 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
 
     def close(self) -> None:
         """
-        End the workers, those that still live.
+        End the workers that still live.
         """
         _close(self)

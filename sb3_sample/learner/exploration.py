@@ -524,7 +524,7 @@ class OptimisticActor(OptimisticExploration):
         beta = float(learner.pessimism_rule.beta())
         distance = 0.5 if initial_optimism is None else initial_optimism + beta
         if learner.num_transitions > 0:
-            # Starts in the midst of training: a pessimism that moves may have fallen to minus initial_optimism or below.
+            # Starts during training: a pessimism that moves may have fallen to minus initial_optimism or below.
             distance = max(distance, self.BARRIER)
         if not 0 < distance < math.inf:
             raise ValueError(f"initial_optimism must be above minus the pessimism, {-beta}, not {initial_optimism}")

@@ -567,7 +567,7 @@ class Learner(Executable):
 
     @contextmanager
     def _updating(self) -> Iterator[None]:
-        """Prepare a gradient step of :meth:`update`: parts, resets, execution and training mode, which ends after it."""
+        """Prepare a gradient step of :meth:`update`: parts, resets, execution, and training mode until its end."""
         with self._random():
             if self._heard:
                 self.before_updates()

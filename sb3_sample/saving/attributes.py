@@ -1,8 +1,8 @@
 """
-Attributes of objects as trees of plain values, and back into objects that were made in the same way.
+Convert attributes of objects to trees of plain values, and restore them in objects that were made in the same way.
 
-No object is ever made from a tree: what a class is stays the business of the program, only the values of the attributes
-come from the tree. An object that attributes share, often a random generator, is shared again afterwards.
+No object is ever made from a tree: the program defines the classes, and only the values of the attributes come from the
+tree. An object that attributes share, often a random generator, is shared again afterwards.
 """
 
 import collections
@@ -42,7 +42,7 @@ _CONTAINERS = (list, tuple, dict, set, frozenset, collections.deque, np.ndarray)
 _INERT = (gym.envs.registration.EnvSpec, types.ModuleType, pathlib.PurePath, *FUNCTIONS)
 #: The generators of a process, which are saved with it.
 _GLOBAL = (random._inst, np.random.mtrand._rand, torch.default_generator)  # type: ignore[attr-defined]
-#: Modules of what draws and what writes, whose state decides nothing that follows.
+#: Modules for drawing and writing, whose state affects nothing that follows.
 _INERT_MODULES = (
     "gymnasium.envs.mujoco.mujoco_rendering", "pygame", "glfw", "OpenGL", "matplotlib", "moviepy", "logging", "tqdm",
     "rich", "stable_baselines3.common.logger",
@@ -56,12 +56,12 @@ _LIBRARIES = (
     "builtins", "abc", "typing", "collections", "enum", "numpy", "torch", "gymnasium", "stable_baselines3",
     "sb3_contrib", "sb3_sample", "mujoco", "dm_control", "dm_env", "metaworld", "myosuite",
 )  # fmt: skip
-#: Kinds that are no plain values, but can be told to have stayed the same.
+#: Immutable types that are not plain values; comparing values shows whether they stayed the same.
 _IMMUTABLE = (
     range, slice, re.Pattern, datetime.date, datetime.time, datetime.timedelta, datetime.tzinfo, decimal.Decimal,
     fractions.Fraction, uuid.UUID,
 )  # fmt: skip
-#: Attributes of classes besides data.
+#: Types of class attributes that are not data.
 _OF_CLASSES = (type, types.FunctionType, classmethod, staticmethod, property)
 _POINTER = struct.calcsize("P")
 
@@ -71,18 +71,18 @@ Node = dict[str, Any]
 _FIRST: weakref.WeakKeyDictionary[type, dict[str, Node]] = weakref.WeakKeyDictionary()
 
 
-#: Kinds of dict that can be made anew.
+#: Types of dict that can be made anew.
 _DICTS: dict[str, type[dict[Any, Any]]] = {
     f"{cls.__module__}.{cls.__qualname__}": cls for cls in (dict, collections.OrderedDict, collections.Counter)
 }
 
 
 class Opaque(ValueError):
-    """A value that cannot be told apart into plain ones."""
+    """A value that cannot be broken down into plain ones."""
 
 
 class DoesNotFit(ValueError):
-    """A tree that is not of the object that it is to be restored in."""
+    """A tree that does not belong to the object in which it is to be restored."""
 
 
 def class_name(value: Any) -> str:
@@ -101,7 +101,7 @@ def _in(value: Any, modules: Sequence[str]) -> bool:
 def is_inert(value: Any) -> bool:
     """
     :param value: the value of an attribute
-    :return: whether it has no state that anything that follows depends on
+    :return: whether it has no state that affects anything that follows
     """
     return isinstance(value, _INERT) or _in(value, _INERT_MODULES) or class_name(value) in _INERT_CLASSES
 
@@ -122,7 +122,7 @@ def _place(view: np.ndarray, origin: int) -> list[Any]:
 
 
 def _slots(cls: type) -> dict[str, Any]:
-    """The members that the classes of an object keep in slots, by name; those of a subclass hide its bases'."""
+    """Members that a class and its bases keep in slots, by name; those of a subclass hide those of its bases."""
     members: dict[str, Any] = {}
     for base in reversed(cls.__mro__):
         if "__slots__" in vars(base):
@@ -134,20 +134,20 @@ def _slots(cls: type) -> dict[str, Any]:
 def attributes_of(owner: Any) -> dict[str, Any]:
     """
     :param owner: an object
-    :return: its attributes, those in slots included
+    :return: its attributes, including those in slots
     """
     slots = {name: getattr(owner, name) for name in _slots(type(owner)) if hasattr(owner, name)}
     return {**slots, **getattr(owner, "__dict__", {})}
 
 
 def _keeps_more(cls: type) -> bool:
-    """Whether objects of a class have a state besides their attributes: in memory that a library in C has added."""
+    """Whether objects of a class have state besides their attributes, in memory that a C library has added."""
     n_pointers = len(_slots(cls)) + (cls.__dictoffset__ > 0) + (cls.__weakrefoffset__ > 0)
     return cls.__itemsize__ != 0 or cls.__basicsize__ > object.__basicsize__ + n_pointers * _POINTER
 
 
 def _data_of(cls: type) -> dict[str, Any]:
-    """The own attributes of a class that may be data which a program changes."""
+    """A class's own attributes that may be data which a program changes."""
     return {
         name: value
         for name, value in vars(cls).items()
@@ -159,7 +159,7 @@ def _data_of(cls: type) -> dict[str, Any]:
 
 
 def _classes_of(value: Any) -> list[type]:
-    """The classes of an object that the program itself, or a library that is not known, has written."""
+    """The classes of an object that come from the program itself or from an unknown library."""
     mro = type(value).__mro__
     return [cls for cls in mro if cls.__module__.partition(".")[0] not in _LIBRARIES]
 
@@ -169,7 +169,7 @@ def _has_state_dict(value: Any) -> bool:
 
 
 def _generators_of(space: gym.Space) -> Iterator[gym.Space]:
-    """A space and the spaces in it, each of which has a generator of its own."""
+    """A space and the spaces in it, each of which has its own generator."""
     yield space
     inside: Any = getattr(space, "spaces", ())
     for part in inside.values() if isinstance(inside, dict) else inside:
@@ -195,8 +195,8 @@ def _is_opaque(value: Any) -> bool:
 
 def _may_have(owner: Any, name: str) -> bool:
     """
-    Whether an object can have an attribute: one that is there, or comes in the course of its life, and is never what
-    its class does, but for a value that a class keeps once it is computed.
+    Whether an object can have an attribute: one that it has, or may get later, but nothing that defines the behaviour
+    of its class, except the kept value of a ``cached_property``.
     """
     kept = isinstance(inspect.getattr_static(type(owner), name, None), functools.cached_property)
     known = name in attributes_of(owner) or name in _slots(type(owner))
@@ -214,29 +214,29 @@ class Describer:
     Makes trees of the attributes of several objects that may share values.
 
     :param inert: further objects (by identity) whose state is saved elsewhere
-    :param whole: whether what functions hold is described too, which memory arrays share (:meth:`finish`), and what
-        classes keep (:meth:`classes`); otherwise functions are inert
+    :param whole: whether to describe also the values that functions hold, the memory that arrays share
+        (:meth:`finish`), and the data that classes keep (:meth:`classes`); otherwise functions are inert
     """
 
     def __init__(self, inert: Collection[Any] = (), whole: bool = False):
         self._whole = whole
         self._origin: int | None = None
         self._inert = {id(value) for value in (*_GLOBAL, *inert)}
-        # The objects are kept, so that no identity is given twice.
+        # References keep the objects alive, so that no identity is given twice.
         self._seen: dict[int, tuple[int, Any]] = {}
         self._count = 0
         self._place = ""
-        #: Arrays, with their descriptions and the attributes that they are of.
+        #: Arrays: the description, the array, and the attribute that it belongs to.
         self._arrays: list[tuple[Node, Any, str]] = []
         self._classes: dict[type, None] = {}
         self._n_classes = 0
 
     def enter(self, inert: Collection[Any], origin: int | None) -> None:
         """
-        Go on to further objects, which may share values with those that were described.
+        Continue with further objects, which may share values with those described so far.
 
         :param inert: further objects (by identity) whose state is saved elsewhere
-        :param origin: address of memory that is saved elsewhere: where a view of it lies is all that is described of it
+        :param origin: address of memory that is saved elsewhere; a view of it is described by its place alone
         """
         self._inert |= {id(value) for value in inert}
         self._origin = origin
@@ -245,8 +245,7 @@ class Describer:
         """
         :param owner: an object
         :param skip: names of attributes to leave out
-        :return: its attributes, without those that are inert; and what of them cannot be described, as
-            ``name (class)``
+        :return: its attributes, without the inert ones; and those that cannot be described, as ``name (class)``
         """
         self._note_classes(owner)
         own = {name: value for name, value in attributes_of(owner).items() if name not in skip}
@@ -266,7 +265,7 @@ class Describer:
                 described[name] = self.describe(value)
             except (Opaque, RecursionError) as error:
                 opaque.append(f"{name} ({error})")
-                # Objects that were described half way are not there to be referred to.
+                # Later references must not lead to objects that were described only in part.
                 for key in list(self._seen)[known:]:
                     del self._seen[key]
                 del self._arrays[n_arrays:]
@@ -281,13 +280,13 @@ class Describer:
 
     def classes(self) -> tuple[dict[str, dict[str, Node]], list[str]]:
         """
-        :return: of the classes of what was described since this was last called, the attributes that have changed
-            since they were first looked at in this process, by the name of the class; and what of them cannot be
-            described, as ``class: name (class)``
+        :return: for the classes of the objects described since the last call, by the name of the class, the attributes
+            that have changed since they were first looked at in this process; and those that cannot be described, as
+            ``class: name (class)``
         """
         described: dict[str, dict[str, Node]] = {}
         opaque: list[str] = []
-        # Their values may have further classes.
+        # Describing their values may add further classes.
         while self._n_classes < len(self._classes):
             cls = list(self._classes)[self._n_classes]
             self._n_classes += 1
@@ -306,7 +305,7 @@ class Describer:
         return described, opaque
 
     def _glance(self, value: Any) -> Node:
-        """A description that can be compared with one of another time."""
+        """A description that can be compared with one made at another time."""
         if isinstance(value, _IMMUTABLE):
             return {"value": value}
         other = Describer(whole=True)
@@ -318,9 +317,9 @@ class Describer:
 
     def finish(self) -> list[str]:
         """
-        Tell in the descriptions which arrays share memory, when everything is described that may share it.
+        Record in the descriptions which arrays share memory, once everything that may share it is described.
 
-        :return: what shares memory in a way that cannot be described, as ``class: name (why)``
+        :return: the attributes that share memory in a way that cannot be described, as ``class: name (why)``
         """
         opaque = []
         arrays = [array for _, value, _ in self._arrays if (array := as_array(value)) is not None]
@@ -342,7 +341,7 @@ class Describer:
         """
         :param value: any value
         :return: its tree
-        :raises Opaque: it cannot be described; the message names the class of what cannot
+        :raises Opaque: it cannot be described; the message names the class of the offending part
         """
         if isinstance(value, enum.Enum):
             return {"enum": member_of(value), "of": path_of(type(value))}
@@ -373,7 +372,7 @@ class Describer:
         if isinstance(value, torch.Generator):
             return {"torch_generator": value.get_state()}
         if type(value) is list:
-            # Long ones, as of all episodes' returns, are small as arrays.
+            # Long lists, such as the returns of all episodes, are small as arrays.
             for number, dtype in ((float, np.float64), (int, np.int64)):
                 if len(value) > 16 and all(type(item) is number and abs(item) < 2**63 for item in value):
                     return {"numbers": np.array(value, dtype)}
@@ -400,7 +399,7 @@ class Describer:
         if _has_state_dict(value):
             n_arrays = len(self._arrays)
             node = {"state_dict": self.describe(value.state_dict())}
-            # Its tensors are loaded into those that are there, which share what they shared.
+            # Its tensors are loaded into the present ones, which share memory as before.
             del self._arrays[n_arrays:]
             return node
         if _is_opaque(value):
@@ -423,7 +422,7 @@ class Restorer:
     """
     Gives objects the attributes that trees describe.
 
-    :param inert: as of the :class:`Describer`, the same objects in this process
+    :param inert: as for the :class:`Describer`, the same objects in this process
     """
 
     def __init__(self, inert: Collection[Any] = ()) -> None:
@@ -432,13 +431,13 @@ class Restorer:
         self._made: dict[int, Any] = {}
         self._blocks: dict[int, np.ndarray] = {}
         self._classes: dict[str, type] = {}
-        #: Attributes that stayed as they are, since the tree names other files in them; each once, however many
-        #: objects of a class have it.
+        #: Attributes that were left as they are, since the tree names other files in them; each is listed once, however
+        #: many objects of a class have it.
         self.kept: list[str] = []
 
     def enter(self, inert: Collection[Any], origin: int | None) -> None:
         """
-        Go on to further objects, as of :meth:`Describer.enter`.
+        Continue with further objects, as in :meth:`Describer.enter`.
 
         :param inert: the same objects in this process
         :param origin: the same memory in this process
@@ -450,12 +449,12 @@ class Restorer:
         self, owner: Any, described: dict[str, Node], skip: Collection[str] = (), anywhere: Collection[str] = ()
     ) -> None:
         """
-        :param owner: the object, made as the one that was described
+        :param owner: the object, made in the same way as the one that was described
         :param described: from :meth:`Describer.attributes`
         :param skip: names of attributes that were left out
         :param anywhere: names of attributes whose texts are never taken as names of files
-        :raises DoesNotFit: it is of another class, or was made in another way; or an attribute is described that never
-            is
+        :raises DoesNotFit: it is of another class, or was made in another way; or the tree describes an attribute that
+            is never saved
         """
         own, slots = attributes_of(owner), _slots(type(owner))
         self._classes.update((f"{cls.__module__}.{cls.__qualname__}", cls) for cls in _classes_of(owner))
@@ -483,9 +482,9 @@ class Restorer:
 
     def leave(self, node: Node, present: Any) -> None:
         """
-        Have what refers to an attribute that stays as it is refer to its present value.
+        Make references to an attribute that is left as it is lead to its present value.
 
-        :param node: the attribute's
+        :param node: the attribute's description
         :param present: the value that is there now
         """
         if type(node.get("id")) is int:
@@ -493,8 +492,8 @@ class Restorer:
 
     def classes(self, described: dict[str, dict[str, Node]]) -> None:
         """
-        :param described: from :meth:`Describer.classes`, of the classes of what was restored
-        :raises DoesNotFit: it is of other classes
+        :param described: from :meth:`Describer.classes`, for the classes of the objects that were restored
+        :raises DoesNotFit: it describes other classes
         """
         for class_, attributes in described.items():
             if class_ not in self._classes:
@@ -525,7 +524,7 @@ class Restorer:
         else:
             if self._is_inert(present) and not {"inert", "function"} & node.keys():
                 raise DoesNotFit(f"{name} is a {class_name(present)}, which stays as it is")
-            # Counted up when it was written, so that each has a hash of its own.
+            # Numbers were counted up on writing; within this bound each has a distinct hash.
             if type(node.get("id", 0)) is not int or not 0 <= node.get("id", 0) < 2**60:
                 raise DoesNotFit(f"{name} cannot have the number {node['id']!r:.50}")
             try:
@@ -548,7 +547,7 @@ class Restorer:
                 raise DoesNotFit(f"{name} is {class_name(present)}, but was {what}")
 
         def early(value: Any) -> Any:
-            """Known before its parts are, which may refer to it."""
+            """Register a value before its parts, which may refer to it."""
             if "id" in node:
                 self._made[node["id"]] = value
             return value
@@ -558,7 +557,7 @@ class Restorer:
                 fits = present.shape == value.shape and present.dtype == value.dtype
                 need(fits or not present.requires_grad, f"a tensor of {tuple(value.shape)} and {value.dtype}")
                 if present.requires_grad:
-                    # It is learned: an optimizer has it.
+                    # It is learned: an optimizer refers to it.
                     present.data.copy_(value)
                     return present
                 return value.clone().to(present.device)
@@ -596,7 +595,7 @@ class Restorer:
                 values = [self.restore(item, parts[i], part_name(name, f"[{i}]")) for i, item in enumerate(items)]
                 if what == "builtins.tuple":
                     return tuple(values)
-                # Named tuples take their items one by one, torch.Size and the like all together.
+                # Named tuples take their items as separate arguments, torch.Size and the like as one sequence.
                 return type(present)(*values) if hasattr(present, "_fields") else type(present)(values)
             case {"deque": items, "maxlen": maxlen}:
                 return collections.deque((self.restore(item, None, name) for item in items), maxlen)
@@ -604,7 +603,7 @@ class Restorer:
                 before = present if isinstance(present, dict) else {}
                 mapping: Any = _DICTS.get(what, dict)()
                 if class_name(mapping) != what:
-                    # One with a default of its own.
+                    # A dict with its own default.
                     need(class_name(present) == what, what)
                     mapping = copy.copy(present)
                     mapping.clear()
@@ -667,7 +666,7 @@ def with_what_they_refer_to(names: Iterable[str], described: dict[str, Node]) ->
     """
     :param names: of attributes
     :param described: from :meth:`Describer.attributes`
-    :return: these attributes and those that hold what they refer to, the latter first
+    :return: these attributes and those that hold the values that they refer to, the latter first
     """
     holders = {number: name for name, node in described.items() for number in _numbers(node, "id")}
     found, ahead = set(names) & described.keys(), list(names)
@@ -676,14 +675,14 @@ def with_what_they_refer_to(names: Iterable[str], described: dict[str, Node]) ->
             if (holder := holders[number]) not in found:
                 found.add(holder)
                 ahead.append(holder)
-    # The order of the description, in which nothing is referred to before it is described.
+    # In the order of the description, every value comes before the references to it.
     return {name: node for name, node in described.items() if name in found}
 
 
 def _numbers(tree: Any, key: str) -> Iterator[int]:
     """The numbers under a key, anywhere in a tree."""
     if isinstance(tree, dict):
-        # An object's attribute may have the name, and is a tree.
+        # An attribute of an object may have this name, but its value is a tree.
         if type(tree.get(key)) is int:
             yield tree[key]
         tree = tree.values()

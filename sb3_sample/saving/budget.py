@@ -1,4 +1,4 @@
-"""A limit on what a file can make the program do by the numbers in it, as the width of a network."""
+"""Limit the work and memory that numbers in a file, such as the width of a network, can demand."""
 
 import math
 import os
@@ -21,10 +21,10 @@ _COUNTED = ("arange", "linspace", "logspace", "randperm", "eye")
 
 class Budget(TorchDispatchMode):
     """
-    While it is in force (``with``), the tensors that are made, and the operations on tensors, are counted, before they
-    take memory or time.
+    Counts, inside its ``with`` block, the tensors that are made and the operations on tensors, before they take memory
+    or time.
 
-    :param tensors: the tensors of the file, which the budget is in proportion to
+    :param tensors: the tensors of the file; the budget is proportional to them
     :param name: the file, for messages
     """
 
@@ -34,7 +34,7 @@ class Budget(TorchDispatchMode):
         self.name = name
         self.bytes_left = BYTES + BYTES_PER_BYTE * size
         self.operations_left = OPERATIONS + OPERATIONS_PER_TENSOR * len(tensors)
-        # A replay buffer in the device's memory has its own size, which the file's parameters say nothing of.
+        # The size of a replay buffer in the device's memory does not follow from the file's parameters.
         self.zeros_left = self.bytes_left + _memory() // 2
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -67,12 +67,12 @@ class Budget(TorchDispatchMode):
 def _memory() -> int:
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):  # no such question on this system
+    except (AttributeError, ValueError, OSError):  # not available on this system
         return 2**34
 
 
 def _asked_for(name: str, args: Any, kwargs: Any) -> int:
-    """How many bytes an operation is about to make, where its arguments say so; its result is counted in any case."""
+    """Bytes that an operation is about to allocate, where its arguments tell; its result is counted in any case."""
     numel = 0
     if name in _SIZED:
         numel = math.prod(args[0])
@@ -84,6 +84,6 @@ def _asked_for(name: str, args: Any, kwargs: Any) -> int:
     elif name == "repeat":
         numel = args[0].numel() * math.prod(args[1])
     elif name in ("clone", "_to_copy"):
-        numel = args[0].numel()  # of an expanded tensor more than it takes itself
+        numel = args[0].numel()  # for an expanded tensor more than it takes itself
     dtype = kwargs.get("dtype") or torch.get_default_dtype()
     return numel * dtype.itemsize

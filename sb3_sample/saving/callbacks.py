@@ -1,6 +1,6 @@
 """
-The state of callbacks: of those that give one (``state_dict`` and ``load_state_dict``), and of all others what of their
-attributes has changed in a training, so that what was never changed stays as the present program says.
+The state of callbacks: their own if they have one (``state_dict`` and ``load_state_dict``), otherwise the attributes
+that have changed in a training, so that attributes that never changed keep the values of the present program.
 """
 
 import inspect
@@ -31,15 +31,14 @@ from sb3_sample.warn import warn
 #: Attributes that every callback has and that are not its own.
 _NOT_OWN = ("model", "parent", "locals", "globals", "verbose")
 #: Names of the attributes that this process's trainings have changed. The checkpoints of a second training of the same
-#: callback hold what only the first one has changed too.
+#: callback also hold the attributes that only the first one has changed.
 _CHANGED: MutableMapping[BaseCallback, set[str]] = WeakIdKeyDictionary()
 
 
 def without_progress_bar(callback: BaseCallback) -> BaseCallback:
     """
     :param callback: the callback of a training
-    :return: the same without the progress bar that ``learn`` put beside it, which may come and go between the parts of
-        a run
+    :return: the same without the progress bar that ``learn`` put beside it, which parts of a run may or may not have
     """
     if isinstance(callback, CallbackList):
         others = [child for child in callback.callbacks if not isinstance(child, ProgressBarCallback)]
@@ -55,7 +54,7 @@ def walk(callback: BaseCallback, path: str = "callback") -> Iterator[tuple[str, 
     :return: it and the callbacks that it calls, by their path
     """
     if isinstance(callback, ConvertCallback) and callback.callback is None:
-        return  # what Stable-Baselines3 makes of no callback
+        return  # Stable-Baselines3's stand-in for no callback
     yield path, callback
     for name, value in vars(callback).items():
         if name in _NOT_OWN:
@@ -71,7 +70,7 @@ def walk(callback: BaseCallback, path: str = "callback") -> Iterator[tuple[str, 
 def environments(callback: BaseCallback) -> Iterator[tuple[str, VecEnv | gym.Env]]:
     """
     :param callback: a callback
-    :return: the environments that it has of its own, by the name of the attribute
+    :return: its own environments, by the name of the attribute
     """
     for name, value in vars(callback).items():
         if name not in _NOT_OWN and isinstance(value, (VecEnv, gym.Env)):
@@ -83,7 +82,7 @@ def _gives_state(callback: BaseCallback) -> bool:
 
 
 def _state_of(callback: BaseCallback) -> tuple[Node | None, list[str]]:
-    """The state that a callback gives, if it gives one; and why it cannot be held, if it cannot."""
+    """The callback's own state, None if it has none; and the reason if a checkpoint cannot hold that state."""
     if not _gives_state(callback):
         return None, []
     try:
@@ -96,13 +95,13 @@ class CallbackStates:
     """
     The states of the callbacks of one training.
 
-    :param callback: the callback, when its ``on_training_start`` was called
+    :param callback: the callback, after its ``on_training_start``
     """
 
     def __init__(self, callback: BaseCallback):
         self._callbacks = dict(walk(without_progress_bar(callback)))
         self._before = {path: self._attributes(each)[0] for path, each in self._callbacks.items()}
-        # Paths of the callbacks of which it was warned that something is lost.
+        # Paths of the callbacks for which a warning was given that something is lost.
         self._told: set[str] = set()
         # Attributes that an earlier part of the run has changed belong to the state as well.
         self._changed = {path: _CHANGED.setdefault(each, set()) for path, each in self._callbacks.items()}
@@ -112,7 +111,7 @@ class CallbackStates:
 
     def lost(self) -> list[str]:
         """
-        :return: what of the callbacks a checkpoint cannot hold
+        :return: the parts of the callbacks that a checkpoint cannot hold
         """
         lost = []
         for path, callback in self._callbacks.items():
@@ -130,7 +129,7 @@ class CallbackStates:
         return {path: self._save(path, callback) for path, callback in self._callbacks.items()}
 
     def note_changes(self) -> None:
-        """Have what has changed since these states were made belong to the state in every training."""
+        """Add the attributes that have changed since these states were made to the state in every training."""
         for path, callback in self._callbacks.items():
             self._note(path, self._attributes(callback)[0])
 
@@ -156,7 +155,7 @@ class CallbackStates:
 
     def restore(self, states: dict[str, Any]) -> None:
         """
-        Give the callbacks the states of those in the same places; warn where there is another one, or none.
+        Give each callback the state saved at its path; warn if the callback there is another one, or missing.
 
         :param states: from :meth:`save`
         """
@@ -178,7 +177,7 @@ class CallbackStates:
         for name in attributes:
             if name in _skipped(callback) or not may_be_set(type(callback), name):
                 raise DoesNotFit(f"{name!r:.100} is not saved of it")
-        # Where it writes, and what it writes, is said by the present program.
+        # The present program decides where it writes, and what.
         said = [name for name in attributes if name in arguments and brings_text(attributes[name], own.get(name))]
         restorer = Restorer()
         for name in said:
@@ -197,7 +196,7 @@ class CallbackStates:
 
 
 def _skipped(callback: BaseCallback) -> Set[str]:
-    """Names of what is not saved of a callback, or is saved otherwise."""
+    """Names of the attributes of a callback that are not saved, or are saved otherwise."""
     if _gives_state(callback):
         return vars(callback).keys() - {"n_calls", "num_timesteps"}
     children = {name for name, value in vars(callback).items() if _is_or_holds_callbacks(value)}

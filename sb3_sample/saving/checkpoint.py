@@ -1,9 +1,9 @@
 """
-Checkpoints of a training, from which it goes on as if it had never been interrupted.
+Checkpoints of a training, from which it resumes as if it had never been interrupted.
 
-``learn`` calls three methods of a :class:`Checkpointer`: ``resume`` before its callbacks hear that the training starts,
-``start`` after that, and ``after_turn`` at the end of each turn of its loop, after the gradient steps, which is the one
-moment when everything agrees: between the environment's step and ``train`` a transition is in no buffer, or has no
+``learn`` calls three methods of a :class:`Checkpointer`: ``resume`` before the callbacks' ``on_training_start``,
+``start`` after it, and ``after_turn`` at the end of each turn of its loop, after the gradient steps. Only at that
+moment is the state consistent: between the environment's step and ``train`` a transition is in no buffer, or has no
 update yet.
 """
 
@@ -43,10 +43,10 @@ from sb3_sample.saving.rings import Ring
 from sb3_sample.saving.run_folder import MODEL, STATE, RunFolder, Segment
 from sb3_sample.warn import warn
 
-#: Environment steps between two checkpoints, unless ``learn`` is told otherwise.
+#: Environment steps between two checkpoints, by default.
 CHECKPOINT_FREQ = 10_000
 KIND, SEGMENT_KIND = "checkpoint", "replay rows"
-#: The kinds of what the state of a checkpoint consists of.
+#: The parts of a checkpoint's state, and their types.
 _PARTS: dict[str, type] = {
     "identity": dict, "attributes": dict, "elapsed_ns": int, "rings": dict, "env": dict, "callbacks": dict,
     "progress": dict, "logger": dict, "generators": dict,
@@ -58,9 +58,9 @@ _TRAINED: weakref.WeakKeyDictionary[Any, set[str]] = weakref.WeakKeyDictionary()
 def refuse_second_call(model: BaseAlgorithm, folder: str | Path | None) -> None:
     """
     Refuse a folder that an earlier ``learn`` of the same model has trained into. The program, started again after a
-    kill, would go on within the first call from what the second one has saved, and end elsewhere.
+    kill, would resume its first call from a checkpoint of the second one, and end elsewhere.
 
-    :param model: the algorithm, before anything of the call has changed it
+    :param model: the algorithm, before the call has changed it
     :param folder: the run's folder; None for no checkpoints
     :raises ValueError: it is no path, or an earlier call of ``learn`` of this model has ended with the folder
     """
@@ -76,15 +76,15 @@ def refuse_second_call(model: BaseAlgorithm, folder: str | Path | None) -> None:
 
 class Checkpointer:
     """
-    Saves a training and goes on with it. Used as a context, which gives the signals and the folder back; without a
-    folder it does nothing.
+    Saves and resumes a training. Used as a context manager, which releases the signals and the folder at its end;
+    without a folder it does nothing.
 
     :param model: the algorithm, set up for ``learn``
     :param callback: its callback
     :param folder: the run's folder; None for no checkpoints
     :param every: environment steps between two checkpoints, each at the end of the first turn at or after a multiple
-    :param learns_from: what is learned from instead of the environment, in words; its steps are gradient steps, and
-        the environment's state, which they leave alone, is not saved
+    :param learns_from: name of the source that is learned from instead of the environment; its steps are gradient
+        steps, and the environment's state, which they do not change, is not saved
     :raises ValueError: ``every`` is out of range, the folder cannot be used, or the model cannot be saved
     """
 
@@ -112,21 +112,21 @@ class Checkpointer:
         self._folder: RunFolder | None = None
         #: Its place among trainings in lockstep, if it has one.
         self._seat = seat_of(model)
-        #: Manifest and state of the checkpoint that the run goes on from.
+        #: State of the checkpoint from which the run resumes, with its path.
         self._resumed: dict[str, Any] | None = None
         self._manifest: dict[str, Any] = {"segments": {}}
         self._saved_at: int | None = None
-        #: Names of what was left out of a checkpoint, of which it was warned.
+        #: Names of the parts left out of a checkpoint, with a warning.
         self._left_out: set[str] = set()
         self._whole_at: int | None = None
         self._interrupts: Interrupts | None = None
-        # How many times every steps there were when it was last asked.
+        # Completed periods of ``every`` steps at the end of the last turn.
         self._period = 0
 
     @property
     def callback(self) -> BaseCallback:
         """
-        :return: what is to be called at every step: the callback, whose exceptions are kept until the turn is saved
+        :return: the callback to call at every step, whose exceptions are kept until the turn is saved
         """
         return self._callback if self._held is None else self._held
 
@@ -155,7 +155,7 @@ class Checkpointer:
         for path, each in self._callbacks():
             for name, ring in getattr(each, "checkpoint_rings", dict)().items():
                 self._rings[f"{path}.{name}"] = ring
-        # The step count at which this call begins is part of what the run is: a further call begins at another one.
+        # The step count at which this call begins is part of the run's identity: a further call begins at another one.
         begin = str(model.num_timesteps)
         self._identity = {**identity_of(model, self._env), "num_timesteps": [begin, begin]}
         if self._learns_from:
@@ -169,7 +169,7 @@ class Checkpointer:
             self._resumed["path"] = folder
 
     def _start_of(self, seat: Seat) -> tuple[Path, dict[str, Any]] | None:
-        """Where a run of a group goes on: all of them at the newest step that each has."""
+        """Where a run of a group resumes: all runs at the newest step of which each has a checkpoint."""
         assert self._folder is not None
         seat.folder = self._folder.path
         if not seat.aligned:
@@ -199,7 +199,7 @@ class Checkpointer:
             self._close(orderly=kind is None)
 
     def _save_if_whole(self) -> None:
-        # A callback that ends the training does so in the midst of a turn, of which nothing can be saved.
+        # A callback that ends the training does so in the middle of a turn, when nothing can be saved.
         if self._whole_at == self._model.num_timesteps != self._saved_at:
             self._try_to_save()
 
@@ -213,7 +213,7 @@ class Checkpointer:
             self._progress.close()
         self._folder.close()
 
-    # ---------------------------------------------------------------- going on
+    # ---------------------------------------------------------------- resuming
 
     def _check_identity(self, theirs: dict[str, list[str]]) -> None:
         ours = self._identity
@@ -223,8 +223,8 @@ class Checkpointer:
                 f"checkpoint={str(self._name)!r} is the folder of a training {which['dataset' in theirs]}, and this is "
                 f"one {which['dataset' in ours]}. Nothing was changed. Name another folder."
             )
-        # The class first, whose arguments have other defaults.
-        # An argument that only one of the two has is one of another version, of which the circumstances tell.
+        # The class comes first: arguments of another class have other defaults. An argument that only one of the two
+        # has comes from another version, which the circumstances report.
         for name in sorted(ours.keys() & theirs.keys(), key=lambda name: (name != "class", name)):
             present, saved = ours[name], theirs[name]
             if present[0] != saved[0]:
@@ -237,7 +237,7 @@ class Checkpointer:
         """
         Restore the algorithm, if there is something to restore.
 
-        :param total_timesteps: steps that the training is to have at its end; it is said if it has them already
+        :param total_timesteps: steps that the training is to have at its end; a warning is given if it has them already
         """
         if self._resumed is None:
             return
@@ -274,7 +274,7 @@ class Checkpointer:
                     rows = [s for s in segments if s.ring == _file_name(name)]
                     ring.restore(state["rings"][name], self._pieces(rows))
         if self._seat is not None:
-            # Some of those that are made together may have been a checkpoint ahead.
+            # Some trainings of a group may have been a checkpoint ahead.
             self._folder.go_back_to(model.num_timesteps)
         self._saved_at = self._whole_at = model.num_timesteps
 
@@ -311,8 +311,8 @@ class Checkpointer:
 
     def start(self) -> None:
         """
-        Restore what the start of a training changes: environments, callbacks, logger and generators; or, in a new
-        run, save its beginning, so that what cannot be saved is known at once.
+        Restore what the start of a training changes: environments, callbacks, logger and generators; or, in a new run,
+        save its beginning, so that parts that cannot be saved are known at once.
 
         :raises ValueError: the beginning cannot be saved
         """
@@ -342,7 +342,7 @@ class Checkpointer:
 
     def _warn_of_losses(self) -> None:
         missing = self._missing = vec_envs.save(self._env)[1]
-        # Where a run goes on without the episodes in progress, that they start anew is said then.
+        # If the checkpoint lacks the episodes in progress, ``_restore_rest`` warns that they start anew.
         if missing and (self._resumed is None or self._resumed["env"].get("environments") is not None):
             warn(
                 "The state of the environment cannot be saved, so that the episodes in progress start anew when the "
@@ -371,7 +371,7 @@ class Checkpointer:
         model: Any = self._model
         warn(f"The episodes in progress start anew: {'; '.join(reasons)}")
         if model.seed is not None:
-            # Not the episodes of the run's beginning once more.
+            # Otherwise the episodes of the run's beginning would come again.
             self._env.seed(model.seed + model.num_timesteps)
         model._last_obs = self._env.reset()
         model._last_episode_starts = np.ones((self._env.num_envs,), dtype=bool)
@@ -397,10 +397,10 @@ class Checkpointer:
 
     def after_turn(self) -> None:
         """
-        Save if it is time to, or leave if the process was asked to.
+        Save if a checkpoint is due, and leave if the process was asked to.
 
         :raises Exception: what a callback raised during the turn
-        :raises TrainingDiverged: something is not finite that would be saved
+        :raises TrainingDiverged: something that would be saved is not finite
         :raises KeyboardInterrupt: after SIGINT
         :raises SystemExit: after SIGTERM
         :raises LeftWithTheOthers: after the failure of another training in its group
@@ -422,10 +422,10 @@ class Checkpointer:
 
     def finish(self) -> None:
         """
-        Let the callback hear that the training ends. An error that it raises does not cost the turns since the last
+        Call the callback's ``on_training_end``. An error that it raises does not cost the turns since the last
         checkpoint.
 
-        :raises Exception: what it raises, or what it raised during a turn that it ended
+        :raises Exception: the callback's error, from this call or from a turn that it ended
         """
         if self._held is not None:
             self._held.raise_kept()
@@ -449,7 +449,7 @@ class Checkpointer:
     def _save(self) -> None:
         """
         :raises OSError: it cannot be written
-        :raises TrainingDiverged: it would hold what is not finite
+        :raises TrainingDiverged: it would hold numbers that are not finite
         """
         check_finite_parameters(self._model)
         known = self._manifest["segments"]
@@ -495,8 +495,8 @@ class Checkpointer:
 
     def _leave_out(self, state: dict[str, Any]) -> bool:
         """
-        Take out of a state the episodes in progress and the callbacks that no file holds, and say so once: better
-        without them than no checkpoint. Return whether anything was taken out.
+        Remove from a state the episodes in progress and the callbacks that no file can hold, with one warning: a
+        checkpoint without them is better than none. Return whether anything was removed.
         """
         reasons = {path: reason for path, each in state["callbacks"].items() if (reason := _refusal(each, path))}
         for path in reasons:
@@ -511,14 +511,14 @@ class Checkpointer:
         return bool(reasons)
 
     def _save_rows(self, name: str, ring: Ring, known: dict[str, Any]) -> dict[str, Any]:
-        """Write the rows that the files lack, and return the manifest's entry of all that are needed then."""
+        """Write the rows that the files lack, and return the manifest's entries for all rows that are then needed."""
         assert self._folder is not None
         first, last = ring.advance()
         oldest = last - ring.size()
         needed = {k: facts for k, facts in known.items() if facts["ring"] != name or facts["last"] > oldest}
         others = {k: facts for k, facts in needed.items() if facts["ring"] != name}
         if len(needed) - len(others) >= run_folder.MAX_SEGMENTS:
-            # Once in a while all of them in one piece, so that a manifest stays short.
+            # Once in a while write all rows in one piece, so that a manifest stays short.
             first, needed = oldest, others
         if first < last:
             segment = Segment(name, first, last)
@@ -528,7 +528,7 @@ class Checkpointer:
         return needed
 
     def _environments(self) -> list[VecEnv]:
-        """Those of the training first; then the callbacks'."""
+        """The training's environments first, then the callbacks'."""
         theirs = [env for _, each in self._callbacks() for _, env in environments(each)]
         assert self._model.env is not None
         return [self._model.env, *(env for env in theirs if isinstance(env, VecEnv))]
@@ -540,7 +540,7 @@ def _ring_of(model: Any) -> Ring:
 
 
 def _file_name(ring: str) -> str:
-    """A name for files, without what paths of callbacks may have in them."""
+    """A name for files, without the special characters that a callback's path may have."""
     return "".join(c if c.isalnum() else "_" for c in ring)
 
 
@@ -550,7 +550,7 @@ def _write(file: IO[bytes], kind: str, value: Any) -> None:
 
 
 def _refusal(value: Any, name: str) -> str:
-    """Say why a value has no place in a checkpoint, or takes more than half of it; empty if it has one."""
+    """Why a checkpoint cannot hold a value, or that it takes more than half of a limit; empty if it fits."""
     tensors: dict[str, torch.Tensor] = {}
     try:
         text = json.dumps(encode(value, name, tensors)).encode()
@@ -580,8 +580,8 @@ def _check_parts(state: Any, path: Path) -> None:
 
 def _own_modules(model: BaseAlgorithm) -> tuple[str, ...]:
     """
-    Packages whose classes a checkpoint's parameters may name: those that the parts of the model are of. Not whatever
-    the program has imported: objects of some classes do harm by being there, or by going away.
+    Packages whose classes a checkpoint's parameters may name: those that the parts of the model come from. Not every
+    package that the program has imported: for some classes, making or deleting an object does harm.
     """
     parts = [model, *vars(model).values(), *model.policy.modules()]
     packages = {cls.__module__.partition(".")[0] for part in parts for cls in type(part).__mro__}

@@ -1,4 +1,4 @@
-"""Checks of a model's file before torch and the algorithms use it, which check little themselves."""
+"""Validate a model's file before torch and the algorithms, which check little themselves, use it."""
 
 import collections.abc
 import functools
@@ -24,11 +24,12 @@ from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.replay import MAX_HER_TRANSITIONS, MAX_TRANSITIONS
 from sb3_sample.saving.statistics import check_finite_numbers
 
-#: Environments that a file can ask for.
+#: The largest number of environments that a file can ask for.
 MAX_ENVS = 100_000
 #: The largest width, depth or number of networks that a file can ask for. Python makes lists of such lengths.
 MAX_WIDTH = 1_000_000
-#: The most that a file can ask for of what costs work or memory by its value alone: far above what anybody trains with.
+#: The largest values that a file can ask for in arguments whose value alone costs work or memory: far above what
+#: anybody trains with.
 MOST = {
     "replay_ratio": 10_000, "gradient_steps": 1_000_000, "batch_size": 10_000_000, "n_steps": 10_000_000,
     "n_epochs": 100_000, "n_simulated": 1_000_000, "simulation_horizon": 100_000, "dynamics_batch_size": 10_000_000,
@@ -37,7 +38,7 @@ MOST = {
 }  # fmt: skip
 #: Bytes of a replay buffer that no machine holds.
 MAX_BUFFER_BYTES = 2**44
-#: Counts of what was done, and what is owed: less than a gradient step, but for rounding, at the end of each turn.
+#: Counts of what was done.
 _COUNTS = (
     "num_timesteps", "_num_timesteps_at_start", "_total_timesteps", "_episode_num", "_n_updates", "num_transitions",
     "_iteration", "_n_new", "_n_offline_updates", "num_rewound_steps", "num_task_steps", "_began_at",
@@ -63,7 +64,10 @@ def _tensors_in(value: Any, name: str) -> Iterator[tuple[str, torch.Tensor]]:
 
 
 def check_finite(owner: Any, state: Any, name: str, words: str, error: type[ValueError]) -> None:
-    """Parameters and what optimizers keep must be finite; a buffer, such as a mask, may hold infinity, but not NaN."""
+    """
+    Check that parameters and the state of optimizers are finite; a buffer, such as a mask, may hold infinity, but not
+    NaN.
+    """
     learned = None
     if isinstance(owner, torch.nn.Module):
         learned = {f"{name}.{key}" for key, _ in owner.named_parameters(remove_duplicate=False)}
@@ -78,13 +82,13 @@ def check_finite(owner: Any, state: Any, name: str, words: str, error: type[Valu
 def library_class(cls: type) -> type:
     """
     :param cls: class of an algorithm
-    :return: the nearest class above it that is of a library, itself perhaps
+    :return: the nearest class at or above it that belongs to a library
     """
     return next(base for base in cls.__mro__ if within(base.__module__, PACKAGES))
 
 
 def check_names(model: Any, attributes: dict[str, Any], name: str) -> None:
-    """A file sets attributes, but never in the place of a method or of what belongs to the class or the program."""
+    """Check that a file sets only attributes: no method, and nothing that belongs to the class or the program."""
     left_out = model._excluded_save_params()
     for key, value in attributes.items():
         own = vars(model).get(key)
@@ -137,9 +141,9 @@ def _bytes_of(space: Any) -> int:
 
 def check_counts(model: Any, name: str) -> None:
     """
-    :param model: a model with what a file sets
+    :param model: a model with the attributes from a file
     :param name: the file, for messages
-    :raises BadFile: if it has counted what no training comes to, or owes gradient steps that no turn of one owes
+    :raises BadFile: if a count is out of reach of any training, or it owes more gradient steps than a turn can leave
     """
     for key in _COUNTS:
         value = getattr(model, key, 0)
@@ -152,9 +156,10 @@ def check_counts(model: Any, name: str) -> None:
 
 def check_last_observations(model: Any, may_be_none: bool = False) -> None:
     """
-    :param model: a model with what a checkpoint sets: what its next step is stored with
+    :param model: a model with the attributes from a checkpoint, among them the observations with which its next step is
+        stored
     :param may_be_none: whether its environments need not have been reset yet
-    :raises BadFile: if it is not what its environments can have given
+    :raises BadFile: if its environments cannot have given these observations
     """
     for name in ("_last_obs", "_last_original_obs"):
         value = getattr(model, name)
@@ -169,7 +174,7 @@ def check_last_observations(model: Any, may_be_none: bool = False) -> None:
 
 
 def _shapes_of(observations: Any) -> Any:
-    """Without the axis of the environments."""
+    """Shapes without the axis of the environments."""
     if isinstance(observations, dict):
         return {key: array.shape[1:] for key, array in observations.items()}
     return None if observations is None else observations.shape[1:]
@@ -194,10 +199,12 @@ def _check_widths(value: Any, argument: str, name: str) -> None:
 
 def check_kinds(model: Any, attributes: dict[str, Any], name: str) -> None:
     """
-    :param model: a model of a library's class that is not set up: what a class of the user's own adds can be anything
+    :param model: a model of a library's class that is not set up: attributes that a user's own class adds can be
+        anything
     :param attributes: what a file sets
     :param name: the file, for messages
-    :raises BadFile: if a value is of another kind than the constructor or its present value say: a text for a number
+    :raises BadFile: if a value is of another kind than the constructor or the present value has, such as a text for a
+        number
     """
     cls: Any = type(model)
     hints = hints_of(cls)
@@ -211,7 +218,7 @@ def check_kinds(model: Any, attributes: dict[str, Any], name: str) -> None:
         elif isinstance(own, numbers.Real):
             fits = isinstance(value, numbers.Real)
         else:
-            # A default of the class, as no instance has one.
+            # The present value is a default of the class, since the instance has none.
             fits = key in vars(model) or own is None or isinstance(value, type(own))
         if not fits:
             raise BadFile(f"{name} is damaged: {key} cannot be {value!r:.100}")
@@ -221,7 +228,7 @@ def check_kinds(model: Any, attributes: dict[str, Any], name: str) -> None:
 def hints_of(cls: type) -> dict[str, Any]:
     """
     :param cls: class of an algorithm
-    :return: what its constructor and those of the classes above it take, by the argument's name
+    :return: the annotations of its constructor and of those of the classes above it, by the argument's name
     """
     hints: dict[str, Any] = {}
     for base in reversed(cls.__mro__):
@@ -235,7 +242,7 @@ def hints_of(cls: type) -> dict[str, Any]:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value is of an annotated kind, as far as that can be said; any number passes for any other."""
+    """Whether a value is of an annotated kind, as far as can be decided; any kind of number passes for any other."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         return any(_fits(value, part) for part in arguments)
@@ -257,10 +264,10 @@ def _fits(value: Any, hint: Any) -> bool:
 
 def check_extra(module: torch.nn.Module, state: Any, name: str) -> None:
     """
-    :param module: which knows what it keeps besides tensors
-    :param state: what a file has for it
+    :param module: the module; its own state shows what it keeps besides tensors
+    :param state: its state in a file
     :param name: the file and the module, for messages
-    :raises BadFile: if that is of another kind
+    :raises BadFile: if a part besides tensors is of another kind
     """
     for key, own in module.state_dict().items():
         if key.endswith("_extra_state") and isinstance(state, dict) and key in state and not _is_like(state[key], own):
@@ -302,12 +309,12 @@ def check_metadata(metadata: Any, name: str) -> None:
 
 def check_environment(env: Any, observation_space: Any, action_space: Any) -> None:
     """
-    Check that an environment is one for a model.
+    Check that an environment fits a model.
 
     :param env: the environment
     :param observation_space: the model's
     :param action_space: the model's
-    :raises ValueError: if its spaces are others; where they hold the same numbers, with the way to go on
+    :raises ValueError: if its spaces differ; if they hold the same numbers, the message says how to proceed
     """
     try:
         check_for_correct_spaces(env, observation_space, action_space)

@@ -25,9 +25,10 @@ MAX_DEPTH = 60
 INT_MAX = 2**63
 DTYPE_TEXT = re.compile(r"[<>|=][biufcSUMm][0-9]{1,9}(\[[0-9]*[a-zA-Z]+\])?")
 SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Dict, spaces.Tuple)
-#: Packages whose classes a file may name: as far as they are of the kinds below.
+#: Packages whose classes a file may name, if they are of the kinds below.
 PACKAGES = ("torch.nn", "torch.optim", "stable_baselines3", "sb3_contrib", "sb3_sample")
-#: Of these, what reading a file imports. Modules of the others must be there already: some write files when they are.
+#: Those of them that reading a file may import. Modules of the others must be imported already: some write files on
+#: import.
 IMPORTED = ("sb3_contrib", "stable_baselines3.common.sb2_compat")
 #: Classes that can be arguments of an algorithm: networks, policies, features extractors and activations;
 #: optimizers; buffers.
@@ -38,15 +39,15 @@ class NotPortable(ValueError):
     """A value that cannot stand in a file that runs no code."""
 
 
-#: Whether modules that are not there may be imported.
+#: Whether modules may be imported that the program has not imported yet.
 _imports = contextvars.ContextVar("imports", default=True)
 
 
 @contextlib.contextmanager
 def importing_nothing() -> Iterator[None]:
     """
-    Restrict what is read meanwhile to classes and functions of modules that the program has imported. A checkpoint is
-    read so: it may name whatever the program consists of, and must not say what else is run.
+    Restrict reading, meanwhile, to classes and functions of modules that the program has imported. Checkpoints are read
+    in this way: they may name any part of the program, but must not decide what else is run.
     """
     token = _imports.set(False)
     try:
@@ -95,7 +96,7 @@ def path_of(value: Any) -> str:
 def member_of(value: enum.Enum) -> str | int:
     """
     :param value: a member of an enumeration, or flags of one
-    :return: its name; of flags that are several together, or none, their number
+    :return: its name; for a combination of flags, or none, their number
     """
     if isinstance(value, enum.Flag) and value.name not in type(value).__members__:
         return int(value.value)
@@ -116,7 +117,7 @@ def of_member(cls: type[enum.Enum], member: Any) -> enum.Enum:
 def is_importable(value: Any) -> bool:
     """
     :param value: a class or a function
-    :return: whether its path leads to it, in this program: not to what is made inside of a function
+    :return: whether its path leads to it in this program, as it never does for anything made inside a function
     """
     return in_program(path_of(value)) is value
 
@@ -167,7 +168,7 @@ def resolve(path: str, trusted: Sequence[str]) -> Any:
 
 
 def _check_known(path: str, module: str, names: Sequence[str]) -> None:
-    """Of modules that nobody vouches for: public classes at the top of those that a file may name anyway."""
+    """Check a module that nobody vouches for: only public names at the top of modules of ``PACKAGES`` are allowed."""
     if not within(module, PACKAGES) or any(part.startswith("_") for part in module.split(".")):
         raise ValueError(f"{path!r:.300} is of a module that is not trusted")
     if len(names) > 1 or names[0].startswith("_"):
@@ -179,7 +180,7 @@ def _check_known(path: str, module: str, names: Sequence[str]) -> None:
 def has_state(cls: type) -> bool:
     """
     :param cls: any class
-    :return: whether its objects give a state and take it, as torch's modules and optimizers do
+    :return: whether its objects can save and load a state, as torch's modules and optimizers can
     """
     return hasattr(cls, "state_dict") and hasattr(cls, "load_state_dict")
 
@@ -190,8 +191,8 @@ def may_be_set(cls: type, name: str) -> bool:
 
     :param cls: the object's class
     :param name: name of an attribute
-    :return: whether the name is a plain one, under which the class has nothing, or a default that is plain data: no
-        method, property, class or function
+    :return: whether the name is a plain one, and the class has nothing under it, or only a default that is plain data:
+        no method, property, class or function
     """
     if not name.isidentifier() or name.startswith("__"):
         return False
@@ -283,7 +284,7 @@ def object_path(value: Any, table: Any) -> str | None:
     """
     :param value: an object
     :param table: allowed paths
-    :return: the path of its class if that is in the table, and the class the one found there
+    :return: the path of its class, if it is in the table and leads to that class; otherwise None
     """
     path = path_of(type(value))
     if path not in table:
@@ -298,7 +299,7 @@ def check_attribute(path: str, key: str, value: Any, name: str, error: type[Valu
     :param key: its attribute
     :param value: that attribute's value
     :param name: what the object is for, for messages
-    :param error: what is raised if the value is not what it must be
+    :param error: the exception to raise if the value is not allowed
     """
     if not OBJECTS[path][key](value):
         raise error(f"{name}: {key} of {path} cannot be {value!r}")
@@ -306,7 +307,7 @@ def check_attribute(path: str, key: str, value: Any, name: str, error: type[Valu
 
 def torch_has(dtype: np.dtype) -> bool:
     """
-    :param dtype: a kind of number of NumPy
+    :param dtype: a NumPy dtype
     :return: whether torch's tensors and files have it
     """
     return dtype.kind in "biufc" and getattr(torch, dtype.name, None) in DTYPES.values()

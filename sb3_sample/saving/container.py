@@ -1,9 +1,9 @@
 """
 The one file format: a zip of uncompressed entries, JSON and tensors, with checksums.
 
-Entries are ``tensors.safetensors``, ``data.json`` and ``checksums.json``, each stored as it is, so that nothing grows
-when it is read: a reader needs no more memory than the file is large, but for the JSON, whose size is capped. Anything
-else is refused before it is read.
+Entries are ``tensors.safetensors``, ``data.json`` and ``checksums.json``, each stored uncompressed, so that nothing
+grows when it is read: a reader needs no more memory than the size of the file, except for the JSON, whose size is
+capped. Anything else is refused before it is read.
 """
 
 import contextlib
@@ -34,20 +34,21 @@ from sb3_sample.warn import warn
 
 DATA, TENSORS, CHECKSUMS = "data.json", "tensors.safetensors", "checksums.json"
 ENTRIES = (TENSORS, DATA, CHECKSUMS)
-#: Raised when files can no longer be read by an older version.
+#: Incremented when older versions can no longer read the files.
 FORMAT = 1
-#: Bytes of JSON, in general and of some kinds: as objects of Python they take up to some thirty times as much memory.
+#: Largest size of the JSON in bytes, in general and for some kinds: as Python objects it takes up to some thirty times
+#: as much memory.
 MAX_JSON = 32 * 2**20
 MAX_JSON_OF = {"model": 8 * 2**20, "plotted runs": 2**20}
-#: Values in the JSON, however short they are, without and for the numbers of the tensors beside it: each takes some 100
-#: bytes as an object of Python, and a microsecond.
+#: Largest number of values in the JSON, however short, without tensors, and the bytes of tensors beside it that allow
+#: one more: each value takes some 100 bytes as a Python object, and a microsecond.
 MAX_VALUES, BYTES_PER_VALUE = 400_000, 16
-#: Tensors, each of which takes some ten microseconds, and values in what is said of them.
+#: Largest number of tensors, each of which takes some ten microseconds, and of values in their header.
 MAX_TENSORS = 50_000
 MAX_HEADER_VALUES = 12 * MAX_TENSORS
-#: Dimensions of a tensor, as many as NumPy has.
+#: Largest number of dimensions of a tensor, the same as NumPy's.
 MAX_DIMENSIONS = 64
-#: The kinds of number of the safetensors format.
+#: The dtypes of the safetensors format.
 DTYPES = {
     "F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16, "I64": torch.int64,
     "I32": torch.int32, "I16": torch.int16, "I8": torch.int8, "U8": torch.uint8, "BOOL": torch.bool,
@@ -61,17 +62,18 @@ _PICKLED = (
     "is pickled, and reading it can run any code that its author wanted. If you trust its author, "
     "read it with allow_pickle=True, and save it again without to have a safe file"
 )
-#: How systems say that a folder cannot be opened to be synced, or not synced, though files in it are written.
+#: Errors with which systems report that a folder cannot be opened to be synced, or cannot be synced, though files in it
+#: are written.
 _NOT_OFFERED = (
     errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF, errno.EACCES, errno.EPERM, errno.EISDIR,
 )  # fmt: skip
-#: Folders of which it was said.
+#: Folders for which the warning was given.
 _not_synced: set[pathlib.Path] = set()
 PathOrFile = str | pathlib.Path | IO[bytes]
 
 
 class TooLarge(ValueError):
-    """Content larger than a reader takes, which is not written."""
+    """Content larger than a reader accepts, which is not written."""
 
 
 # ---------------------------------------------------------------- writing
@@ -79,12 +81,12 @@ class TooLarge(ValueError):
 
 def write(path_or_file: PathOrFile, kind: str, tree: Any, tensors: dict[str, torch.Tensor]) -> None:
     """
-    Write a file. At a path it replaces what is there at once and only when it is complete, so that whatever happens
-    either the old or the new file is there, and whole.
+    Write a file. At a path it replaces an existing file in one step, and only when it is complete, so that whatever
+    happens either the old or the new file is there, and whole.
 
     :param path_or_file: a path, or a binary file open for writing
-    :param kind: what the file is, "model" for example; asked for when it is read
-    :param tree: what JSON can hold
+    :param kind: what the file is, "model" for example; checked when it is read
+    :param tree: a tree that JSON can hold
     :param tensors: strided tensors on the CPU
     :raises OSError: if it cannot be written; it names the path
     :raises TooLarge: (a ``ValueError``) if the tree takes more than 32 MiB of JSON, or 8 MiB for a model; if it holds
@@ -113,7 +115,7 @@ def write(path_or_file: PathOrFile, kind: str, tree: Any, tensors: dict[str, tor
 def n_values(data: bytes) -> int:
     """
     :param data: JSON
-    :return: how many values it holds at most; what looks like more in texts counts, too
+    :return: the largest number of values that it can hold; commas and brackets in texts count too
     """
     return sum(map(data.count, (b",", b"[", b"{")))
 
@@ -128,7 +130,7 @@ def most_values(n_bytes: int) -> int:
 
 def versions() -> dict[str, str]:
     """
-    :return: the versions of what has a part in a file
+    :return: the versions of the libraries that are involved in a file
     """
     modules = {"sb3_sample": sb3_sample_version, "stable_baselines3": sb3.__version__, "gymnasium": gym.__version__}
     libraries = {"torch": str(torch.__version__), "numpy": np.__version__, "python": platform.python_version()}
@@ -140,9 +142,9 @@ def replacing(path: pathlib.Path) -> Iterator[IO[bytes]]:
     """
     A file that takes the place of another when it is complete and on the disk.
 
-    :param path: where it shall be
-    :return: what to write to
-    :raises OSError: if it cannot be written; what was there is still there, and nothing else
+    :param path: of the file to replace
+    :return: the file to write to
+    :raises OSError: if it cannot be written; the old file is then unchanged, and nothing else is left
     """
     # A link stays one.
     path = pathlib.Path(os.path.realpath(path))
@@ -158,7 +160,7 @@ def replacing(path: pathlib.Path) -> Iterator[IO[bytes]]:
 def sync_folder(folder: pathlib.Path) -> None:
     """
     Make sure that the names of a folder's files are on the disk, where the system offers it. Where it does not, as on
-    network shares, that is said once.
+    network shares, warn once.
 
     :param folder: the folder
     :raises OSError: if the disk is at fault
@@ -190,7 +192,7 @@ def _say_not_synced(folder: pathlib.Path, error: OSError) -> None:
 def is_sha256(value: Any) -> bool:
     """
     :param value: anything
-    :return: whether it is a checksum as files and manifests have them
+    :return: whether it has the form of the checksums in files and manifests
     """
     return isinstance(value, str) and _SHA256.fullmatch(value) is not None
 
@@ -239,7 +241,7 @@ def read(path_or_file: PathOrFile, kind: str) -> tuple[Any, dict[str, torch.Tens
     Read a file that :func:`write` made, and check all of it.
 
     :param path_or_file: a path, or a binary file open for reading
-    :param kind: what it must be
+    :param kind: the kind that it must be
     :return: the tree and the tensors
     :raises BadFile: if it is anything else, or damaged
     :raises OSError: if it cannot be read
@@ -250,11 +252,11 @@ def read(path_or_file: PathOrFile, kind: str) -> tuple[Any, dict[str, torch.Tens
 
 def read_with_versions(path_or_file: PathOrFile, kind: str) -> tuple[Any, dict[str, torch.Tensor], dict[str, str]]:
     """
-    As :func:`read`.
+    Read a file as :func:`read` does, and its versions.
 
     :param path_or_file: a path, or a binary file open for reading
-    :param kind: what it must be
-    :return: the tree, the tensors, and the versions of what it was written with
+    :param kind: the kind that it must be
+    :return: the tree, the tensors, and the versions of the libraries that it was written with
     """
     if not isinstance(path_or_file, (str, pathlib.Path)):
         return _read(path_or_file, kind, str(getattr(path_or_file, "name", "the file")))
@@ -334,7 +336,7 @@ def check_table(file: IO[bytes], size: int, name: str) -> None:
             raise BadFile(f"{name} is damaged: its table of contents does not end where it must")
         n_entries, length, offset = struct.unpack("<QQQ", tail[-66:-42])
         table_end = size - 98
-    # Stable-Baselines3's files are told apart by their names, later.
+    # Stable-Baselines3's files are recognised later, by the names of their entries.
     if n_entries > 1000 or length > 2**18:
         raise BadFile(f"{name} is no file of sb3_sample: it has {n_entries} entries")
     if offset + length != table_end:
@@ -345,13 +347,13 @@ def _data(archive: zipfile.ZipFile, checksum: Any, most: int, name: str) -> Any:
     data = archive.read(DATA)
     _compare(hashlib.sha256(data), checksum, name, DATA)
     text = _text(data, name, most)
-    # Texts in it are the third copy.
+    # The texts parsed from it would be a third copy.
     del data
     return _json(text, name)
 
 
 def _text(data: bytes, name: str, most: int) -> str:
-    """The text of JSON, if it holds no more than so many values."""
+    """The text of JSON, if it holds at most ``most`` values."""
     if (n := n_values(data)) > most:
         raise BadFile(f"{name} is damaged or hostile: its JSON holds {n} values, more than the {most} allowed")
     return data.decode()
@@ -398,7 +400,7 @@ def _compare(digest: Any, expected: Any, name: str, entry: str) -> None:
 
 
 def _read_safetensors(entry: IO[bytes], size: int, name: str) -> tuple[dict[str, torch.Tensor], Any]:
-    """The tensors, each read into its own memory, after the header was found to fit to the bytes that are there."""
+    """Read the tensors, each into its own memory, after checking that the header fits the bytes that are there."""
     digest = hashlib.sha256()
     start = entry.read(8)
     if len(start) < 8:

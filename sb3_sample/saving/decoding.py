@@ -1,4 +1,4 @@
-"""Reading of values that ``encoding.py`` wrote: nothing is made but what this file and ``classes.py`` name."""
+"""Read values that ``encoding.py`` wrote: only objects that this file and ``classes.py`` name are made."""
 
 import base64
 import binascii
@@ -37,7 +37,7 @@ from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.generators import check_python_state, numpy_generator
 from sb3_sample.saving.hashes import distinct_hashes, part_name
 
-#: Errors of the library's constructors where a file holds nonsense.
+#: Errors of a library's constructors if a file holds nonsense.
 _NONSENSE = (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError, AssertionError, RuntimeError)
 
 
@@ -56,8 +56,8 @@ class NotTrusted(BadFile):
 
 def decode(tree: Any, tensors: dict[str, torch.Tensor], name: str, trusted: Sequence[str] = ()) -> Any:
     """
-    The value that ``encode`` was given. Tensors that it refers to are taken out of ``tensors``, so that none is there
-    twice and those that nobody refers to are left.
+    Rebuild the value that ``encode`` was given. Tensors that it refers to are taken out of ``tensors``, so that none is
+    used twice and unused ones are left.
 
     :param tree: the tree
     :param tensors: its arrays and tensors; the value keeps their memory
@@ -275,7 +275,7 @@ def _read_dtype(text: Any, name: str) -> np.dtype:
 
 
 def _read_torch_dtype(text: Any, name: str) -> torch.dtype:
-    # Not by getattr, which imports what torch leaves to a later import.
+    # Not by getattr, which triggers torch's lazy imports.
     dtype = vars(torch).get(text) if isinstance(text, str) else None
     if not isinstance(dtype, torch.dtype):
         raise BadFile(f"{name}: {text!r} is no kind of number of torch")
@@ -300,7 +300,7 @@ def _from_bytes(data: bytes, dtype_text: Any, shape: Any, name: str) -> np.ndarr
     return array
 
 
-#: Readers by tag: of what stands behind the tag, the whole object, its name and its depth.
+#: Readers by tag. Their arguments: the decoder, the value of the tag, the whole object, its name and its depth.
 _READERS: dict[str, Callable[[_Decoder, Any, Any, str, int], Any]] = {
     "left_out": _Decoder._left_out,
     "int": lambda d, tree, whole, name, depth: int(tree, 16),
@@ -336,7 +336,7 @@ _READERS: dict[str, Callable[[_Decoder, Any, Any, str, int], Any]] = {
     "random": _Decoder._random,
     "torch_generator": _Decoder._torch_generator,
 }
-#: Entries beside a tag.
+#: Further entries that may stand beside a tag.
 _FURTHER: dict[str, tuple[str, ...]] = {
     "deque": ("maxlen",),
     "raw_array": ("dtype", "shape"),

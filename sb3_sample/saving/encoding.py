@@ -1,9 +1,9 @@
 """
-Values as trees of JSON with their arrays beside them, and back: what a file that runs no code can hold.
+Values as trees of JSON with their arrays beside them, and back: the content of files that run no code.
 
-In a tree None, booleans, texts, lists, and numbers that JSON has stand for themselves. Anything else is an object with
-one key, which says what it is: ``{"tuple": [1, 2]}``, ``{"array": "observations"}``. Reading makes nothing but what
-this file and the tables of ``classes.py`` name, whatever stands in the tree.
+In a tree, None, booleans, texts, lists, and numbers that JSON has stand for themselves. Anything else is an object with
+a key that says what it is, some with further ones: ``{"tuple": [1, 2]}``, ``{"array": "observations"}``. Whatever the
+tree holds, reading makes only objects that this file and the tables of ``classes.py`` name.
 """
 
 import base64
@@ -53,11 +53,11 @@ from sb3_sample.saving.schedules import ScheduleTable
 
 __all__ = ["Encoder", "Lenient", "NotPortable", "decode", "encode", "is_left_out"]
 
-#: In the place of a value that is left out, with the reason.
+#: Replaces a value that is left out, and holds the reason.
 LEFT_OUT = "left_out"
-#: Lists of numbers that are longer are arrays in the file.
+#: Longer lists of numbers are arrays in the file.
 LONG = 16
-#: Objects that train, or are trained in, which are more than their attributes.
+#: Types of objects that take part in a training and hold more state than their attributes.
 _OF_TRAINING = (BaseAlgorithm, BaseBuffer, BaseCallback, VecEnv, gym.Env, gym.Space)
 #: Random generators, which are written by their state.
 GENERATORS = (np.random.Generator, np.random.RandomState, random.Random, torch.Generator)
@@ -66,13 +66,13 @@ NAMED = (type, types.FunctionType, types.BuiltinFunctionType)
 
 
 class _Plain:
-    """A class of whose objects the attributes are all there is."""
+    """A class whose objects consist of their attributes alone."""
 
 
 def bytes_of(tensor: torch.Tensor) -> bytes:
     """
-    :param tensor: of any kind of number, also of those that NumPy has not
-    :return: its numbers
+    :param tensor: of any dtype, including those that NumPy lacks
+    :return: the bytes of its numbers
     """
     flat = tensor.detach().cpu().contiguous().reshape(-1)
     return flat.view(torch.uint8).numpy().tobytes()
@@ -80,18 +80,18 @@ def bytes_of(tensor: torch.Tensor) -> bytes:
 
 def encode(value: Any, name: str, tensors: dict[str, torch.Tensor], schedule: bool = False) -> Any:
     """
-    A value as a tree of JSON. Tensors on other devices are copied to the CPU, where :func:`decode` leaves them. A value
-    that occurs twice is two values afterwards, and a generator can draw on, but not spawn as before.
+    Encode a value as a tree of JSON. Tensors on other devices are copied to the CPU, where :func:`decode` leaves them.
+    A value that occurs twice becomes two values, and a generator can continue to draw, but not spawn as before.
 
-    Classes and functions are written by their names, whosever they are, and objects of a class by their attributes:
-    whether they may be named is asked by who reads them.
+    Classes and functions of any origin are written by their names, and objects of a class by their attributes; the
+    reader decides whether they may be named.
 
     :param value: the value
     :param name: what it is, for messages and for the names of its arrays
     :param tensors: takes its arrays and tensors, without copying what is on the CPU already
-    :param schedule: whether it is a schedule, of which a table is as good as its name where it has none
+    :param schedule: whether it is a schedule, for which a table can stand if it has no name
     :return: the tree
-    :raises NotPortable: if it holds what has no place in such a file; the message says what and where
+    :raises NotPortable: if it holds something that such a file cannot; the message says what and where
     """
     return Encoder(tensors).encode(value, name, schedule=schedule)
 
@@ -105,7 +105,7 @@ class Encoder:
 
     def __init__(self, tensors: dict[str, torch.Tensor]):
         self.tensors = tensors
-        #: Paths of classes and functions that whoever reads the file has to vouch for, by what they are the value of.
+        #: Paths of classes and functions that a reader of the file has to vouch for, by the name of the value.
         self.foreign: dict[str, str] = {}
         self._inside: set[int] = set()
 
@@ -133,10 +133,10 @@ class Encoder:
         """
         :param value: the value
         :param name: what it is
-        :param depth: how deep it lies in another
+        :param depth: how deeply it is nested
         :param schedule: whether it is a schedule
         :return: its tree
-        :raises NotPortable: as :func:`encode`
+        :raises NotPortable: as in :func:`encode`
         """
         cls = type(value)
         if depth > MAX_DEPTH or id(value) in self._inside:
@@ -144,7 +144,7 @@ class Encoder:
         if value is None or cls is bool or cls is str:
             return value
         if cls is int:
-            # JSON's readers differ beyond, and hexadecimal digits are read in linear time.
+            # Beyond this range JSON's readers differ; hexadecimal digits are read in linear time.
             return value if -INT_MAX <= value < INT_MAX else {"int": hex(value)}
         if cls is float:
             return value if math.isfinite(value) else {"float": repr(value)}
@@ -157,7 +157,10 @@ class Encoder:
             self._inside.discard(id(value))
 
     def _schedule(self, value: Any, name: str, depth: int) -> Any:
-        """By its name, or an object by its attributes; where no name leads to it, or they are not plain, by a table."""
+        """
+        Encode a schedule by its name, or an object by its attributes; by a table if no name leads to it, or its
+        attributes are not plain.
+        """
         if is_importable(value if isinstance(value, NAMED) else type(value)):
             with contextlib.suppress(NotPortable), self.all_or_nothing():
                 return Encoder.encode(self, value, name, depth)
@@ -262,7 +265,7 @@ class Encoder:
         return self._generator(value, name, depth) or self._instance(value, name, depth)
 
     def _path(self, value: Any, name: str) -> str:
-        """The path of a class or function; noted where it is not known to everybody who reads the file."""
+        """The path of a class or function; noted in ``foreign`` if a reader has to vouch for it."""
         path = path_of(value)
         if not isinstance(value, type) and not is_importable(value):
             raise NotPortable(
@@ -281,14 +284,14 @@ class Encoder:
             raise NotPortable(f"{name}: an object of {path} with other attributes than {sorted(OBJECTS[path])}")
         state = {}
         for key, item in vars(value).items():
-            # An argument is known to the user by its own name, not by that of what Stable-Baselines3 wraps it in.
+            # The user knows an argument by its own name, not by that of Stable-Baselines3's wrapper.
             wraps = key == "value_schedule"
             state[key] = self.encode(item, name if wraps else f"{name}.{key}", depth + 1, schedule=wraps)
             check_attribute(path, key, item, name, NotPortable)
         return {"object": path, "attributes": state}
 
     def _instance(self, value: Any, name: str, depth: int) -> dict[str, Any] | None:
-        """An object of a class of the user's own by its attributes, if it consists of nothing else."""
+        """Encode an object of a user's class by its attributes, if it consists of nothing else."""
         cls = type(value)
         is_plain = cls.__basicsize__ == _Plain.__basicsize__ and cls.__dictoffset__ != 0
         has_more = issubclass(cls, _OF_TRAINING) or within(cls.__module__, PACKAGES)
@@ -342,7 +345,7 @@ class Encoder:
 
 class Lenient(Encoder):
     """
-    An encoder that goes on without what no file can hold.
+    An encoder that leaves out what no file can hold.
 
     :param tensors: takes the values' arrays and tensors
     """
@@ -357,7 +360,7 @@ class Lenient(Encoder):
         :param value: the value
         :param name: what it is
         :param schedule: whether it is a schedule
-        :return: its tree; or, if a part of it has no place in a file, what stands for it (:func:`is_left_out`)
+        :return: its tree; or, if no file can hold a part of it, the placeholder (:func:`is_left_out`)
         """
         try:
             with self.all_or_nothing():
@@ -367,9 +370,9 @@ class Lenient(Encoder):
 
     def leave_out(self, name: str, reason: str) -> dict[str, str]:
         """
-        :param name: a value that shall not be in the file
+        :param name: the value to leave out
         :param reason: why
-        :return: what stands for it
+        :return: its placeholder
         """
         self.left_out[name] = reason
         return {LEFT_OUT: reason}

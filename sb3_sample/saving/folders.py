@@ -1,6 +1,6 @@
 """
-Files of a folder that somebody else may have filled: reached by plain names from the folder itself, never through a
-link, and regular files only.
+Access to the files of a folder that somebody else may have filled: regular files only, by plain names from the folder
+itself, never through a link.
 """
 
 import contextlib
@@ -18,11 +18,11 @@ try:
 except ImportError:  # on Windows
     fcntl = None  # type: ignore[assignment]
 
-#: Whether the system reaches files from an open folder, so that no part of their path can be exchanged in between.
+#: Whether the system opens files relative to an open folder, so that no part of their path can be exchanged meanwhile.
 _AT = os.open in os.supports_dir_fd and os.scandir in os.supports_fd
 _READ = os.O_RDONLY | getattr(os, "O_BINARY", 0)
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
-#: A link is an error, a pipe is not waited for, a terminal does not become that of this process.
+#: A link is an error, a pipe does not block, and a terminal does not become this process's controlling one.
 _GUARD = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC"))
 
 
@@ -70,7 +70,7 @@ class Folder:
                 os.close(self._descriptor)
 
     def _place(self, name: str) -> dict[str, Any]:
-        """How ``os`` is told of a file."""
+        """Arguments that name a file to functions of ``os``."""
         if not is_plain(name):
             raise NotPlain(errno.EINVAL, "is no plain name of a file", name)
         if self._descriptor is None:
@@ -81,7 +81,7 @@ class Folder:
 
     def names(self) -> list[str]:
         """
-        :return: of everything in it, sorted
+        :return: the names of everything in it, sorted
         """
         with os.scandir(self.path if self._descriptor is None else self._descriptor) as entries:
             return sorted(entry.name for entry in entries)
@@ -89,7 +89,7 @@ class Folder:
     def look(self, name: str) -> os.stat_result | None:
         """
         :param name: of something in it
-        :return: what it is, a link itself and not its target; None if it is not there
+        :return: its status, of a link itself and not of its target; None if it is not there
         """
         try:
             return os.stat(**self._place(name), follow_symlinks=False)
@@ -124,8 +124,8 @@ class Folder:
         :param name: of a file in it
         :param flags: as ``os.open`` takes them
         :return: a descriptor of the file
-        :raises NotPlain: it is a link, a pipe, a device or a folder; or it is to be written to, and has other names
-            too, as a file elsewhere
+        :raises NotPlain: it is a link, a pipe, a device or a folder; or it is to be written to, and has further names
+            (hard links)
         :raises OSError: it cannot be opened
         """
         self._refuse_link(name)
@@ -142,7 +142,7 @@ class Folder:
         return opened
 
     def _refuse_link(self, name: str) -> None:
-        # Opening says so too, in other words on each system.
+        # Opening a link fails too, with another error on each system.
         if self.is_link(name):
             raise NotPlain(errno.ELOOP, "is a link, and none is followed there", str(self.path / name))
 
@@ -167,8 +167,8 @@ class Folder:
 
     def separate(self, name: str) -> None:
         """
-        Give a file that has other names too, as those that ``cp -al`` makes, a copy of its own, so that writing to it
-        changes nothing elsewhere.
+        Replace a file that has further names (hard links, as ``cp -al`` makes) by a copy, so that writing to it changes
+        nothing elsewhere.
 
         :param name: of a file in it, which need not be there
         """
@@ -203,7 +203,7 @@ class Folder:
 
     def remove(self, name: str) -> None:
         """
-        :param name: of a file in it, or of a link, which is removed and not what it leads to; nothing happens if it is
+        :param name: of a file in it, or of a link, which is removed itself, not its target; nothing happens if it is
             not there
         """
         with contextlib.suppress(FileNotFoundError):
@@ -218,8 +218,8 @@ class Folder:
 
 def _above_the_standard_streams(descriptor: int) -> int:
     """
-    A descriptor of the same file that is not that of a standard stream, whose number is free in a program that has
-    closed it: what the program prints would be written into the file.
+    A descriptor of the same file whose number is not that of a standard stream. Such a number is free if the program
+    has closed the stream, and its output would then be written into the file.
     """
     if descriptor > 2 or fcntl is None:
         return descriptor

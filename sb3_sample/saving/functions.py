@@ -1,6 +1,6 @@
 """
-State that functions keep from one call to the next: what they are bound to, the arguments of a ``partial``, the
-variables that a closure closes over, defaults and attributes.
+State that functions keep from one call to the next: the object that they are bound to, the arguments of a ``partial``,
+the variables of a closure, defaults and attributes.
 """
 
 import functools
@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-#: Callables, which do what the program says.
+#: Types of callables, whose behaviour the program defines.
 FUNCTIONS = (
     type, types.FunctionType, types.BuiltinFunctionType, types.MethodType, functools.partial,
     functools._lru_cache_wrapper, np.ufunc,
 )  # fmt: skip
-#: Kinds of ``__self__`` of a function of a library in C that is no method of an object.
+#: Types of ``__self__`` of a C function that is not a method of an object.
 _UNBOUND = (type(None), type, types.ModuleType)
 _CONSTANTS = (type(None), bool, int, float, complex, str, bytes)
 
@@ -36,7 +36,7 @@ def name_of(function: Any) -> str:
 def held(function: Any) -> dict[str, Any]:
     """
     :param function: one of :data:`FUNCTIONS`
-    :return: what it holds, by where; the same places for functions that were made in the same way
+    :return: the values that it holds, by place; functions made in the same way have the same places
     """
     if isinstance(function, functools.partial):
         keywords = {f"keyword {name}": value for name, value in function.keywords.items()}
@@ -67,9 +67,9 @@ def held(function: Any) -> dict[str, Any]:
 def holding(function: Any, values: dict[str, Any]) -> Any:
     """
     :param function: one of :data:`FUNCTIONS`
-    :param values: what it is to hold, by where, as of :func:`held`; it has the same places
-    :return: the function with these: itself, as far as what it holds can be exchanged
-    :raises OtherKind: what cannot be another thing in the course of a program is of another kind
+    :param values: the values that it is to hold, by place, as :func:`held` gives them; with the same places
+    :return: the function with these values: itself, as far as its values can be exchanged
+    :raises OtherKind: a value that cannot change in the course of a program is of another kind
     """
     before = held(function)
     for where, value in values.items():

@@ -1,4 +1,6 @@
-"""States of generators from files: NumPy draws from what it is given, be it beside its numbers."""
+"""
+Validate states of generators from files: NumPy draws from any position that it is given, even outside its numbers.
+"""
 
 import random
 from collections.abc import Callable
@@ -26,7 +28,7 @@ def _is_float(value: Any) -> bool:
 _128_BITS, _BIT, _32_BITS = _whole(2**128 - 1), _whole(1), _whole(2**32 - 1)
 _REST: dict[str, _Check] = {"has_uint32": _BIT, "uinteger": _32_BITS}
 _PCG = {"state": _128_BITS, "inc": lambda value: _128_BITS(value) and value % 2 == 1}
-#: By the bit generator, its own state, and what stands beside it. Positions count numbers that were drawn beforehand.
+#: By the bit generator: its own state, and the entries beside it. Positions count numbers that were drawn beforehand.
 _STATES: dict[str, tuple[dict[str, _Check], dict[str, _Check]]] = {
     "PCG64": (_PCG, _REST),
     "PCG64DXSM": (_PCG, _REST),

@@ -18,8 +18,8 @@ from sb3_sample.saving.schedules import ScheduleTable
 
 class _Comparable(Encoder):
     """
-    Describes what a program passes anew whenever it is started. Of what no file can hold, the import path is compared;
-    of generators, whose states a checkpoint holds, the kind.
+    Describes the values that a program passes anew whenever it is started. Values that no file can hold are compared by
+    their import path; generators, whose states a checkpoint holds, by their type.
     """
 
     def encode(self, value: Any, name: str, depth: int = 0, schedule: bool = False) -> Any:
@@ -42,7 +42,7 @@ class _Comparable(Encoder):
 def identity_of(model: BaseAlgorithm, env: VecEnv) -> dict[str, list[str]]:
     """
     :param model: the algorithm, before its training
-    :param env: in which it is trained
+    :param env: the environment in which it is trained
     :return: by the argument's name: a digest to compare, and the value to show
     """
     values = {**training_state.arguments_of(model), "env": vec_envs.fingerprint(env)}

@@ -18,20 +18,20 @@ from sb3_sample.saving import vec_envs
 
 class Interrupts:
     """
-    SIGINT and SIGTERM during a training: they are noted, so that the turn is finished and saved; a second one of them
-    ends the process at once. Handlers can be set in the main thread only; in another one signals stay as they are. What
-    the process ignores stays ignored: a shell's background jobs ignore SIGINT, so that a Ctrl-C meant for the job in
-    the foreground does not end them.
+    SIGINT and SIGTERM during a training: the first is noted, so that the turn is finished and saved; a second one ends
+    the process at once. Handlers can be set in the main thread only; in other threads signals stay as they are. Ignored
+    signals stay ignored: a shell's background jobs ignore SIGINT, so that a Ctrl-C meant for the job in the foreground
+    does not end them.
 
-    A handler runs in the midst of anything, so that the first signal raises nothing there, whatever the standard error
-    answers.
+    A handler may interrupt any code, so the first signal raises nothing there, even if writing to the standard error
+    fails.
 
-    A training in a group leaves with the others, after a signal that was noted for all of them, or when one of them has
-    failed.
+    A training in a group ends together with the others, after a signal that was noted for all of them, or when one of
+    them has failed.
 
-    :param envs: whose workers shall ignore the SIGINT that a terminal sends to all processes
+    :param envs: environments whose workers are to ignore the SIGINT that a terminal sends to all processes
     :param folder: for the message
-    :param seat: place of the training in a group; None of one alone, and of the group itself
+    :param seat: place of the training in a group; None for a single training, and for the group itself
     """
 
     def __init__(self, envs: list[VecEnv], folder: Path, seat: Seat | None = None):
@@ -43,7 +43,7 @@ class Interrupts:
             return
         try:
             for number in (signal.SIGINT, signal.SIGTERM) if seat is None else ():
-                # None: a handler that is not Python's, which could not be given back.
+                # None: a handler that is not Python's, which could not be restored.
                 if signal.getsignal(number) not in (signal.SIG_IGN, None):
                     self._before[number] = signal.signal(number, self._receive)
             for env in envs:
@@ -55,7 +55,7 @@ class Interrupts:
 
     def _receive(self, number: int, frame: types.FrameType | None) -> None:
         if os.getpid() != self._process:
-            # A process that was forked in the meantime: what it was asked to do is no business of the training.
+            # A process that was forked meanwhile: its signals do not concern the training.
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
             return
@@ -76,7 +76,7 @@ class Interrupts:
     def leave(self, orderly: bool = True, saved_at: int | None = None) -> None:
         """
         :param orderly: whether this is between two turns
-        :param saved_at: environment steps of the latest checkpoint, which is said; None: nothing is
+        :param saved_at: environment steps of the latest checkpoint, which a message tells; None for no message
         :raises KeyboardInterrupt: after SIGINT
         :raises SystemExit: after SIGTERM
         :raises LeftWithTheOthers: after the failure of another training in the group
@@ -99,14 +99,14 @@ class Interrupts:
         """
         Give the signals back.
 
-        :param orderly: whether nobody is in the midst of talking to the workers, so that they can be told too
+        :param orderly: whether no exchange with the workers is under way, so that they can be told too
         """
         for number, handler in self._before.items():
             signal.signal(number, handler)
         self._before = {}
         for env in self._envs if orderly else ():
             if not getattr(env.unwrapped, "closed", False):
-                # A worker that is dead has nothing to listen to.
+                # A dead worker cannot be told.
                 with contextlib.suppress(EnvironmentDied, EOFError, OSError):
                     vec_envs.set_sigint_ignored(env, False)
         self._envs = []

@@ -5,12 +5,13 @@ import enum
 
 class Kept(enum.Flag):
     """
-    Where an attribute is kept by itself. An algorithm declares it in the class attribute ``_kept``, by name, for its
-    own attributes. Others are kept everywhere, but arguments of the constructor only in a model's file:
-    the program that goes on from a checkpoint gives them anew.
+    Where an attribute is kept by itself. An algorithm declares this for its own attributes, by name, in the class
+    attribute ``_kept``. All others are kept everywhere, except arguments of the constructor, which are kept only in a
+    model's file: a program that resumes from a checkpoint passes them anew.
     """
 
-    #: It follows from the arguments, from what is kept besides, or from the present ``learn``; or has files of its own.
+    #: It follows from the arguments, from other kept attributes, or from the present ``learn``; or it has its own
+    #: files.
     NOWHERE = 0
     IN_FILES = enum.auto()
     IN_CHECKPOINTS = enum.auto()
@@ -20,6 +21,6 @@ class Kept(enum.Flag):
 def declared(cls: type) -> dict[str, Kept]:
     """
     :param cls: class of an algorithm
-    :return: what it and its bases declare, by attribute; the class nearest to it decides
+    :return: the declarations of the class and its bases, by attribute; the nearest class decides
     """
     return {name: where for base in reversed(cls.__mro__) for name, where in vars(base).get("_kept", {}).items()}

@@ -1,4 +1,6 @@
-"""Locks of files that this process holds: what it forks does not have them, and a process that is gone has none."""
+"""
+Locks of files that this process holds: its forked children do not have them, and a process that has ended has none.
+"""
 
 import contextlib
 import errno
@@ -34,7 +36,7 @@ class Lock:
 
     def write(self, text: str) -> None:
         """
-        :param text: who has the lock, for whoever looks at the file; it stays there
+        :param text: who has the lock, for readers of the file; it stays there
         """
         if self._descriptor is not None:
             os.ftruncate(self._descriptor, 0)
@@ -60,7 +62,8 @@ def _without_locks(path: Path) -> OSError:
 
 def is_taken(path: Path) -> bool:
     """
-    Whether a process has the lock of a file, which is only read: it may be in a folder that cannot be written to.
+    Whether a process has the lock of a file. The file is only read, since its folder may be one that cannot be written
+    to.
 
     :param path: of the file
     :return: whether it is there and locked
@@ -96,7 +99,7 @@ def take(path: Path) -> Lock | None:
                 raise _without_locks(path)
             if held is False:
                 return None
-            # Whoever removed the file since it was opened would lock another one by its name.
+            # If the file was removed since it was opened, others would lock another one of its name.
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(descriptor), os.stat(path)):
                     on_return.pop_all()

@@ -56,9 +56,9 @@ class SafeFiles(BaseAlgorithm):
         "start_time": Kept.IN_FILES,
         "_total_timesteps": Kept.IN_FILES,
     }
-    #: From which the policies of these algorithms are derived.
+    #: The class from which the policies of these algorithms are derived.
     policy_base: ClassVar[type] = BasePolicy
-    #: Modules that whoever loaded the model vouches for. A file never says so.
+    #: Modules that the caller who loaded the model vouches for. A file never sets them.
     _trusted_modules: tuple[str, ...] = ()
     #: Warnings given about the model's files.
     _told: frozenset[str] = frozenset()
@@ -77,18 +77,18 @@ class SafeFiles(BaseAlgorithm):
         trusted_modules: Sequence[str] = (),
     ) -> None:
         """
-        Save the model, as in Stable-Baselines3, but to a file that runs no code when it is loaded. A file that
-        is there is replaced at once, and only when the new one is complete.
+        Save the model, as in Stable-Baselines3, but to a file that runs no code when it is loaded. An existing file is
+        replaced in one step, and only when the new one is complete.
 
-        Classes and functions are written by their names, and a schedule that has none as a table. Attributes that no
+        Classes and functions are written by their names, and a schedule without a name as a table. Attributes that no
         file can hold are left out, with one warning for a model (``learn`` gives it when the training starts).
 
         :param path: path, to which ".zip" is added if it has no suffix, or a binary file open for writing
         :param exclude: attributes to leave out, besides those that always are
         :param include: attributes to save that would be left out
         :param allow_pickle: whether to write Stable-Baselines3's own, pickled format instead, which can hold anything
-        :param trusted_modules: modules, or packages of modules, that will be named when it is loaded, so that it needs
-            no warning
+        :param trusted_modules: modules, or packages of modules, that will be passed to ``load`` as trusted, so that no
+            warning is needed
         :raises ValueError: if a parameter is not finite
         :raises OSError: if the file cannot be written
         """
@@ -121,24 +121,24 @@ class SafeFiles(BaseAlgorithm):
         the transitions that they learn from.
 
         :param path: file, or where ``save`` wrote it
-        :param env: environment to go on with, or its id; none is needed for prediction
+        :param env: environment for further training, or its id; none is needed for prediction
         :param device: "auto", "cpu", "cuda", ...
         :param custom_objects: objects that replace what the file holds under their names
         :param print_system_info: whether to print the saved and the present versions
-        :param force_reset: whether the environment is reset before training goes on
+        :param force_reset: whether the environment is reset before training continues
         :param allow_pickle: whether a file in Stable-Baselines3's own, pickled format is loaded too, which can run any
             code that its author wanted
-        :param trusted_modules: modules, or packages of modules, whose classes and functions the file, and what the
-            model reads later, may name
-        :param kwargs: arguments of the constructor that take the place of the file's, which is not asked for them:
-            ``policy`` (a class), ``policy_kwargs``, ``action_noise``, ``learning_rate``, ... The initial value of
-            a learned number (``initial_...``, ``ent_coef="auto_..."``) counts from the next reset on: the file has its
-            value
+        :param trusted_modules: modules, or packages of modules, whose classes and functions may be named by the file,
+            and by files that the model reads later
+        :param kwargs: arguments of the constructor that replace the file's, which are then not read: ``policy`` (a
+            class), ``policy_kwargs``, ``action_noise``, ``learning_rate``, ... The initial value of a learned number
+            (``initial_...``, ``ent_coef="auto_..."``) applies from the next reset on: its present value comes from the
+            file
         :return: the model
-        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, of another class, or names what is
-            not trusted; or lacks what must be given
+        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, of another class, or names
+            something that is not trusted; or lacks something that must then be passed
         :raises ParametersDoNotFit: (a ``ValueError``) if its parameters are not those of the model that it describes
-        :raises ValueError: if ``kwargs`` holds something else, or values that are not allowed or with which the file's
+        :raises ValueError: if ``kwargs`` holds anything else, values that are not allowed, or values that the file's
             parameters do not fit
         """
         check_load(cls, SafeFiles, env, device, kwargs)
@@ -191,7 +191,7 @@ class SafeFiles(BaseAlgorithm):
     def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
         """
         :param kwargs: arguments that the caller of ``load`` has given
-        :return: attributes of the file that they take the place of besides, and by what
+        :return: further attributes of the file that these replace, with their values
         """
         return {}
 
@@ -200,8 +200,8 @@ class SafeFiles(BaseAlgorithm):
         """
         :param content: of the file
         :param kwargs: arguments that the caller of ``load`` has given
-        :return: the same, with what the file has to add to them
-        :raises ValueError: if they can be none of the model's in the file
+        :return: the same, completed from the file
+        :raises ValueError: if they cannot belong to the model in the file
         """
         return kwargs
 
@@ -228,7 +228,7 @@ class SafeFiles(BaseAlgorithm):
             check_environment(env, *spaces)
             noise = attributes.get("action_noise")
             if isinstance(noise, VectorizedActionNoise) and noise.n_envs != env.num_envs:
-                # ``learn`` makes one of each environment again.
+                # ``learn`` makes one for each environment again.
                 attributes["action_noise"] = noise.base_noise
             attributes["n_envs"] = env.num_envs
             if force_reset:
@@ -264,7 +264,7 @@ class SafeFiles(BaseAlgorithm):
             kind = BadFile if isinstance(error, BadFile) else ParametersDoNotFit
             raise kind(f"{lacks}{error}") from error
         except Exception as error:
-            # With arguments that the file does not have, its content need not be to blame; that of another class is.
+            # With the caller's arguments, the file's content need not be at fault; content of another class is.
             if given and not content.another_class():
                 raise
             why = f"{type(error).__name__}: {error}"
@@ -295,8 +295,8 @@ class SafeFiles(BaseAlgorithm):
         trusted_modules: Sequence[str] = (),
     ) -> None:
         """
-        Load parameters, as in Stable-Baselines3. The optimizers' moments are loaded, their settings (learning rate,
-        weight decay, ...) stay this model's, so that ``load`` with other ones has them in force.
+        Load parameters, as in Stable-Baselines3. The optimizers' moments are loaded, but their settings (learning rate,
+        weight decay, ...) stay this model's, so that other settings passed to ``load`` take effect.
 
         :param load_path_or_dict: a file, or parameters as ``get_parameters`` gives them
         :param exact_match: whether parameters for every module must be there, and no others
@@ -355,7 +355,10 @@ def class_of(path: str | pathlib.Path) -> str:
 
 
 def _forget_folder(attributes: dict[str, Any], say_so: bool) -> None:
-    """A file does not choose where this computer writes, nor does a loaded model write over the buffer of its run."""
+    """
+    Forget the buffer's folder: a file must not choose where this computer writes, and a loaded model must not overwrite
+    the buffer of its run.
+    """
     buffer_kwargs = attributes.get("replay_buffer_kwargs")
     folder = buffer_kwargs.pop("memory_map", None) if isinstance(buffer_kwargs, dict) else None
     if folder is not None and say_so:

@@ -1,4 +1,4 @@
-"""The tree of a model's file: what is written of a model, and what is read for one."""
+"""Write and read the tree of a model's file."""
 
 import collections.abc
 import functools
@@ -32,7 +32,7 @@ from sb3_sample.saving.moments import check_moments
 from sb3_sample.saving.training_state import argument_names
 
 KIND = "model"
-#: Attributes that follow from the rest, or say who loads.
+#: Attributes that follow from the rest, or that the caller of ``load`` decides.
 _NOT_READ = ("device", "lr_schedule")
 _SECTIONS = ("classes", "attributes", "parameters", "metadata")
 
@@ -48,14 +48,14 @@ class Description:
 
     def __init__(self, model: BaseAlgorithm, exclude: Iterable[str] = (), include: Iterable[str] = ()):
         self._model = model
-        #: Has the tensors, and what is to be said of the file.
+        #: Holds the tensors, and the notes for warnings about the file.
         self.encoder = Lenient({})
         included, always = set(include), set(model._excluded_save_params())
         modules = {name.split(".")[0] for names in model._get_torch_save_params() for name in names}
         skipped = (always | set(exclude)) - included | modules
         schedules = schedule_names(library_class(type(model)))
         values = {name: value for name, value in vars(model).items() if name not in skipped}
-        #: Modules and the like of a subclass's own, which are written by their states.
+        #: A subclass's own modules and the like, which are written by their states.
         self._own = {name: value for name, value in values.items() if name not in always and has_state(type(value))}
         self.attributes: dict[str, Any] = {}
         self._tensors: dict[str, list[str]] = {}
@@ -77,7 +77,7 @@ class Description:
         return self.encoder.attempt(value, name, is_schedule)
 
     def _keep_small(self) -> None:
-        """Leave out the largest attributes of a model that would be more than a reader takes."""
+        """Leave out the largest attributes of a model that a reader would otherwise refuse as too large."""
         texts = {name: json.dumps(tree).encode() for name, tree in self.attributes.items()}
         for most, measure in (
             (container.MAX_JSON_OF[KIND], lambda name: len(texts[name])),
@@ -113,14 +113,14 @@ class Description:
             "classes": [path_of(cls) for cls in type(model).__mro__ if issubclass(cls, family)],
             "attributes": self.attributes,
             "parameters": {name: self._state(state, name) for name, state in parameters.items()},
-            # Versions that torch's modules have of their own parameters.
+            # Versions that torch's modules record for their parameters.
             "metadata": {name: self.encoder.attempt(value, name) for name, value in metadata.items()},
         }
-        # Attributes of a subclass besides: files of this package's own classes have no such section.
+        # Further attributes of a subclass: files of this package's own classes have no such section.
         return tree | ({"own": {name: self.encoder.attempt(state, name) for name, state in own.items()}} if own else {})
 
     def _state(self, state: Any, name: str) -> Any:
-        """A state entry by entry, so that what cannot be written costs nothing of the rest."""
+        """Write a state entry by entry, so that an entry that cannot be written does not cost the rest."""
         if type(state) not in (dict, OrderedDict) or not all(type(key) is str for key in state):
             return self.encoder.attempt(state, name)
         entries = {key: self.encoder.attempt(value, f"{name}.{key}") for key, value in state.items()}
@@ -142,7 +142,7 @@ class Content:
         self.name = str(getattr(file, "name", "the file"))
         self._cls, self._trusted = cls, trusted
         self.tree, self._stored, self.versions = container.read_with_versions(file, KIND)
-        #: Of which the budget is made.
+        #: Tensors to which the budget is proportional.
         self.tensors = dict(self._stored)
         tree = self.tree
         if not isinstance(tree, dict) or tree.keys() - {"own"} != set(_SECTIONS):
@@ -153,12 +153,12 @@ class Content:
         if not all(isinstance(tree.get(key, {}), dict) for key in ("attributes", "parameters", "metadata", "own")):
             raise BadFile(f"{self.name} is damaged: it does not hold what a model consists of")
         self._check_class([path_of(base) for base in cls.__mro__ if issubclass(base, family)])
-        #: Attributes that the file was written without, and nobody has given, with the reason.
+        #: Attributes that the file was written without, and that the caller has not given, with the reason.
         self.left_out: dict[str, str] = {}
         self._parameters: dict[str, Any] | None = None
 
     def _check_class(self, ours: list[str]) -> None:
-        """The class, or what it is of this package where a program has moved its own."""
+        """Check the class; if a program has moved its own class, the nearest class of this package above it counts."""
         theirs = self.tree["classes"]
         starts = {classes[0] for classes in (ours, theirs)}
         starts |= {next((path for path in classes if within(path, PACKAGES)), classes[0]) for classes in (ours, theirs)}
@@ -170,8 +170,8 @@ class Content:
 
     def another_class(self) -> str:
         """
-        :return: what to say if the file turns out not to fit, since it is of another class than is loaded; empty if it
-            is of that one
+        :return: text for the message if the file turns out not to fit because it is of another class than is loaded;
+            empty if it is of the same class
         """
         theirs = self.tree["classes"][0]
         if theirs == path_of(self._cls):
@@ -181,8 +181,8 @@ class Content:
 
     def without_place(self) -> list[str]:
         """
-        :return: of a file of a class below the one that is loaded, the arguments that it has in addition; where this
-            program does not have that class, the attributes that the methods of the loaded one make no use of
+        :return: for a file of a subclass of the loaded class, the arguments that the subclass adds; if this program
+            does not have the subclass, the attributes that the methods of the loaded class do not use
         """
         path = self.tree["classes"][0]
         if path_of(self._cls) not in self.tree["classes"][1:]:
@@ -196,10 +196,10 @@ class Content:
 
     def attributes(self, given: Collection[str], custom_objects: dict[str, Any]) -> dict[str, Any]:
         """
-        :param given: attributes that the caller has for it, so that the file's are not read
-        :param custom_objects: what replaces the file's
+        :param given: attributes that the caller passes, so that the file's are not read
+        :param custom_objects: values that replace the file's
         :return: the values of the others
-        :raises BadFile: if one is damaged, names what is not trusted, or is left out and needed
+        :raises BadFile: if one is damaged, names something that is not trusted, or is left out and needed
         """
         attributes, refused = {}, []
         for name, tree in self.tree["attributes"].items():
@@ -234,11 +234,11 @@ class Content:
 
     def classes_in(self, name: str) -> list[tuple[str, Callable[[], Any]]] | None:
         """
-        Read a sequence of classes, or pairs of one and its arguments, without asking for trust in the classes.
+        Read a sequence of classes, or of pairs of a class and its arguments, without requiring trust in the classes.
 
         :param name: the attribute
         :return: the qualified names of the classes, with functions that read their arguments (and raise ``BadFile`` if
-            they are damaged, or name what is not trusted); None if the file has no such thing
+            they are damaged, or name something that is not trusted); None if the file has no such sequence
         """
         listed = _items(self.tree["attributes"].get(name))
         entries = [_items(each) or [each] for each in listed or ()]
@@ -249,7 +249,7 @@ class Content:
         return [(str(path).rpartition(":")[2], read) for path, read in zip(paths, reads, strict=True)]
 
     def _arguments(self, entry: list[Any], name: str) -> Any:
-        """Arguments in a pair of a class and them."""
+        """Arguments in a pair of a class and its arguments."""
         try:
             return self._decoded(entry[1], name) if len(entry) == 2 else {}
         except NotTrusted as error:
@@ -258,7 +258,7 @@ class Content:
     def check_policy_kwargs(self, given: Any) -> None:
         """
         :param given: policy_kwargs that take the place of the file's
-        :raises ValueError: if they are others, as far as that can be said without asking for trust
+        :raises ValueError: if they differ, as far as can be decided without requiring trust
         """
         theirs = self.tree["attributes"].get("policy_kwargs")
         if theirs is None or is_left_out(theirs) or _agree(theirs, given, "policy_kwargs"):
@@ -277,7 +277,7 @@ class Content:
         )
 
     def _shown(self, tree: Any, name: str) -> str:
-        """A value of the file in words, for a message; a class that is not trusted by its path."""
+        """A value of the file in words, for a message; a class that is not trusted is shown by its path."""
         try:
             return repr(self._decoded(tree, name))
         except NotTrusted as error:
@@ -285,8 +285,8 @@ class Content:
 
     def parameters(self, model: BaseAlgorithm) -> dict[str, Any]:
         """
-        :param model: for which they are, and whose own stand for what the file was written without
-        :return: what ``get_parameters`` gave, once
+        :param model: the model that they are for, whose own parameters replace those that the file was written without
+        :return: the parameters that ``get_parameters`` gave when the file was written
         :raises BadFile: if they are damaged
         """
         if self._parameters is None:
@@ -321,10 +321,10 @@ class Content:
 
     def check_shapes(self, model: BaseAlgorithm) -> None:
         """
-        Before the file is asked whether it fits in every other respect: with arguments of the caller's own it is not to
-        blame if it does not.
+        Check shapes before everything else in which the file must fit: with arguments of the caller's own, a mismatch
+        is not the file's fault.
 
-        :param model: for which the parameters are
+        :param model: the model that the parameters are for
         :raises ParametersDoNotFit: if a tensor has another shape there
         """
         for name in model._get_torch_save_params()[0]:
@@ -340,8 +340,8 @@ class Content:
 
     def check_parameters(self, model: BaseAlgorithm) -> None:
         """
-        :param model: for which they are
-        :raises BadFile: if one is not finite, or what an optimizer keeps of one is not of its shape
+        :param model: the model that they are for
+        :raises BadFile: if one is not finite, or an optimizer's state for one is not of its shape
         """
         known = model._get_torch_save_params()[0]
         for name, state in self.parameters(model).items():
@@ -355,13 +355,13 @@ class Content:
 
     def set_own(self, model: BaseAlgorithm, given: Collection[str] = (), only_variables: bool = False) -> None:
         """
-        Give a model what its subclass has besides parameters: tensors without a module, as Stable-Baselines3's ``load``
-        does, and the states of modules and the like that nobody names as parameters.
+        Restore the state that a subclass has besides parameters: tensors without a module, as Stable-Baselines3's
+        ``load`` does, and the states of modules and the like that are not named as parameters.
 
         :param model: the model, set up
-        :param given: what the caller has for it
+        :param given: names of the values that the caller passes
         :param only_variables: whether to leave the latter alone
-        :raises BadFile: if something is not of the model, or not finite
+        :raises BadFile: if something does not belong to the model, or is not finite
         """
         names, variables = model._get_torch_save_params()
         taken = {name.split(".")[0] for name in names} | set(model._excluded_save_params())
@@ -391,8 +391,8 @@ class Content:
     def lacking(self, model: BaseAlgorithm, given: Collection[str]) -> str:
         """
         :param model: an algorithm with the defaults of its constructor
-        :param given: what the caller has for it
-        :return: what to say if the file turns out not to fit: the arguments that it does not have, if any
+        :param given: names of the values that the caller passes
+        :return: text for the message if the file turns out not to fit: the arguments that it lacks, if any
         """
         names = (argument_names(type(model)) & vars(model).keys()) - self.tree["attributes"].keys()
         names -= {"env", "device", *given, *model._excluded_save_params()}
@@ -412,13 +412,13 @@ def _below(cls: type) -> Iterator[type]:
 
 
 def _items(tree: Any) -> list[Any] | None:
-    """Entries of a list or a tuple in a file; None if it is none."""
+    """Entries of a list or a tuple in a file; None if it is neither."""
     inside = tree.get("tuple") if isinstance(tree, dict) else tree
     return inside if isinstance(inside, list) else None
 
 
 def _agree(theirs: Any, given: Any, name: str) -> bool:
-    """Whether a value can be what a file describes: of what asks for trust, anything can."""
+    """Whether a value can be the one that a file describes; any value matches a description that requires trust."""
     tag, inside = next(iter(theirs.items())) if isinstance(theirs, dict) and theirs else ("", theirs)
     if tag == "dict":
         alike = isinstance(inside, dict) and isinstance(given, dict) and inside.keys() == given.keys()

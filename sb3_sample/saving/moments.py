@@ -6,15 +6,15 @@ import torch
 
 from sb3_sample.saving.untrusted import BadFile
 
-#: State that the common optimizers keep of each parameter, in its shape. torch's fused kernels do not check it.
+#: State that the common optimizers keep for each parameter, in its shape. torch's fused kernels do not check it.
 _MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq", "momentum_buffer", "square_avg", "grad_avg")
 
 
 def check_moments(optimizer: torch.optim.Optimizer, state: Any, name: str) -> None:
     """
-    :param optimizer: which is to have the state
+    :param optimizer: the optimizer that is to take the state
     :param state: from a file
-    :param name: of what it is, for messages
+    :param name: what it is, for messages
     :raises BadFile: if it is no state of an optimizer of these parameters
     """
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
@@ -38,6 +38,6 @@ def check_moments(optimizer: torch.optim.Optimizer, state: Any, name: str) -> No
             wanted = shape if key in _MOMENTS else torch.Size(()) if key == "step" else None
             if wanted is not None and (not isinstance(value, torch.Tensor) or value.shape != wanted):
                 raise BadFile(f"{name}: {key} of parameter {index} must be a tensor of shape {tuple(wanted)}")
-        # An optimizer may keep something else of vectors than of matrices, but the same of all matrices.
+        # An optimizer may keep other values for vectors than for matrices, but the same for all matrices.
         if kinds.setdefault((group_of[index], len(shape)), set(kept)) != set(kept):
             raise BadFile(f"{name} keeps {sorted(map(str, kept))} of parameter {index}, but others of other parameters")

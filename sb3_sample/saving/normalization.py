@@ -18,9 +18,9 @@ KIND = "VecNormalize"
 def lacks_vec_normalize(model: BaseAlgorithm) -> bool:
     """
     :param model: an algorithm
-    :return: whether it has learned in a ``VecNormalize`` and has none around its environment, or no environment, now
+    :return: whether it has learned in a ``VecNormalize``, but now has none around its environment, or no environment
     """
-    # Where there is one, Stable-Baselines3 keeps, and saves, the last observation as it was before.
+    # With a ``VecNormalize``, Stable-Baselines3 keeps, and saves, the last unnormalised observation too.
     return model.get_vec_normalize_env() is None and model._last_original_obs is not None
 
 
@@ -38,7 +38,7 @@ def save_vec_normalize(venv: VecEnv, path: str | pathlib.Path) -> None:
         raise ValueError(f"venv must be a VecNormalize, not a {type(venv).__name__}")
     tensors: dict[str, torch.Tensor] = {}
     state = {name: getattr(venv, name) for name in ARGUMENTS}
-    # There are statistics of observations, too, where these are not normalised any more.
+    # Statistics of observations exist even if observations are no longer normalised.
     state.update(obs_rms=getattr(venv, "obs_rms", None), ret_rms=venv.ret_rms)
     check_normalization(state, "venv")
     tree = encode(state, "VecNormalize", tensors)

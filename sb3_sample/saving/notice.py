@@ -1,4 +1,4 @@
-"""The one warning of what a model's files lack, and what reading them needs."""
+"""The one warning about what a model's files lack, and what reading them needs."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +13,7 @@ def argument_for(cls: type, name: str) -> str | None:
     """
     :param cls: class of an algorithm
     :param name: an attribute, or something in one: ``policy_kwargs.activation_fn``
-    :return: the argument of ``load`` that stands for what a file has there; None of what is in the replay buffer's file
+    :return: the argument of ``load`` that replaces the file's value; None for values in the replay buffer's file
     """
     attribute = name.split(".")[0].split("[")[0]
     others = {"policy_class": "policy=", "observation_space": "env=", "action_space": "env=", "replay_buffer": None}
@@ -25,14 +25,14 @@ def argument_for(cls: type, name: str) -> str | None:
 def need(cls: type, name: str, path: str, trusted: Sequence[str] = ()) -> str:
     """
     :param cls: class of an algorithm
-    :param name: what of it is a class or function, or an object of one, that not everybody knows
+    :param name: the part that is a class or function, or an object of a class, that other programs may not know
     :param path: of the class or function
-    :param trusted: modules that somebody vouches for, so that it is not trust that is missing
-    :return: what reading its file needs for that
+    :param trusted: modules that somebody vouches for, so that trust is not what is missing
+    :return: what reading the file needs for this part
     """
     argument = argument_for(cls, name)
     module = path.partition(":")[0]
-    # Of a script another program has another one, or none.
+    # Another program has another ``__main__``, or none with this name.
     is_named = "<locals>" not in path and module != "__main__"
     wanted = [f"trusted_modules=[{module!r:.200}]"] if is_named and not within(module, trusted) else []
     if argument is None:
@@ -42,17 +42,18 @@ def need(cls: type, name: str, path: str, trusted: Sequence[str] = ()) -> str:
 
 def say_once(model: Any, encoder: Lenient, trusted: Sequence[str] = ()) -> None:
     """
-    Warn of what was not named before.
+    Warn about everything that no earlier warning has named.
 
     :param model: an algorithm
-    :param encoder: by which its file is written, or would be
+    :param encoder: the encoder that writes its file, or would
     :param trusted: modules that the caller vouches for anyway
     """
     cls, vouched = type(model), (*model._trusted_modules, *trusted)
     said: dict[str, str] = {}
     for name, path in encoder.foreign.items():
         if "<locals>" in path or not within(path.partition(":")[0], vouched):
-            # Several objects of one argument, such as the noise of each environment, need the same: it is said once.
+            # Several objects of one argument, such as the noise of each environment, need the same, which is named
+            # once.
             wanted = need(cls, name, path)
             said.setdefault(f"{path} {wanted}", f"{name} is {path}, for which {wanted}")
     for name, reason in encoder.left_out.items():

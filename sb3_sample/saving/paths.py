@@ -20,7 +20,7 @@ def to_write(path: PathOrFile, suffix: str, *only: str) -> Any:
     """
     :param path: a path, to which the suffix is added if it has none, or a binary file open for writing
     :param suffix: without its dot
-    :param only: if given, what else counts as a suffix: a name with a dot in it, "lr0.001", may be a model's as well,
+    :param only: if given, the only suffixes that count: a name with a dot in it, "lr0.001", may be the model's file,
         which is not to be overwritten
     :return: the path, in a folder that was made if it was not there, or the file
     :raises ValueError: if a file is not open for writing
@@ -42,7 +42,7 @@ def find(path: PathOrFile, *suffixes: str, first: bool = False) -> Any:
     """
     :param path: a path, with or without a suffix, or a binary file open for reading
     :param suffixes: those that may have been added to it, without their dots, the likeliest first
-    :param first: whether a file with one of them is likelier than one of the path alone
+    :param first: whether a file with one of the suffixes is likelier than one at the path itself
     :return: the path of the file that is there, or the file
     :raises FileNotFoundError: if there is none
     :raises ValueError: if a file is not open for reading
@@ -63,8 +63,8 @@ def find(path: PathOrFile, *suffixes: str, first: bool = False) -> Any:
 @contextlib.contextmanager
 def opened(path: PathOrFile, *suffixes: str) -> Iterator[IO[bytes]]:
     """
-    :param path: as of :func:`find`
-    :param suffixes: as of :func:`find`
+    :param path: as in :func:`find`
+    :param suffixes: as in :func:`find`
     :return: the file, which is closed afterwards if it was opened here
     :raises FileNotFoundError: if there is none
     :raises BadFile: if it is a pipe or a device

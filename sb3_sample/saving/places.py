@@ -1,6 +1,6 @@
 """
-Names of files among restored values. Where a program writes is said by the program: a file must not say it, since a
-checkpoint is passed around, and what it names would be overwritten.
+Names of files among restored values. The program alone decides where it writes: checkpoints are passed around, and any
+file that one names would be overwritten.
 """
 
 import collections
@@ -9,17 +9,17 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-#: Words of the names of attributes that hold names of files, in whatever words.
+#: Words in an attribute's name that tell that its value names files, whatever the value is.
 _WORDS = {"path", "paths", "dir", "directory", "folder", "file", "files", "filename", "prefix", "root"}
 _SEPARATOR = re.compile(r"[/\\]")
-#: Levels of containers that are looked into; what a program has may refer to itself.
+#: Levels of containers that are searched; a program's values may refer to themselves.
 _DEPTH = 20
 
 
 def names_place(attribute: str) -> bool:
     """
     :param attribute: name of an attribute
-    :return: whether a text in it is the name of a file by what it is called
+    :return: whether the attribute's name tells that a text in it is the name of a file
     """
     return not _WORDS.isdisjoint(word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", attribute))
 
@@ -27,7 +27,7 @@ def names_place(attribute: str) -> bool:
 def brings_text(node: dict[str, Any], present: Any) -> bool:
     """
     :param node: the description of a value in a checkpoint
-    :param present: what the program has there
+    :param present: the program's value
     :return: whether the checkpoint has a text there that the program does not
     """
     texts = set(_described(node))
@@ -38,7 +38,7 @@ def is_elsewhere(attribute: str, node: dict[str, Any], present: Any) -> bool:
     """
     :param attribute: name of an attribute
     :param node: the description of its value in a checkpoint
-    :param present: what the program has there
+    :param present: the program's value
     :return: whether the checkpoint names a file that the program does not
     """
     if not brings_text(node, present):
@@ -49,9 +49,9 @@ def is_elsewhere(attribute: str, node: dict[str, Any], present: Any) -> bool:
 
 def is_moved(node: dict[str, Any], present: Any) -> bool:
     """
-    :param node: as of :func:`is_elsewhere`
-    :param present: as there
-    :return: whether the files have the same names and lie elsewhere only, as those of a package on another machine
+    :param node: as in :func:`is_elsewhere`
+    :param present: as in :func:`is_elsewhere`
+    :return: whether the files have the same names and only lie elsewhere, like those of a package on another machine
     """
     return {_last(text) for text in _described(node)} == {_last(text) for text in _texts(present)}
 
@@ -62,8 +62,8 @@ def _last(text: str) -> str:
 
 def _described(node: dict[str, Any]) -> Iterator[str]:
     """
-    The texts of a value by its description; not those of an object's attributes, which are looked at by name, nor the
-    keys of a dict, which are names of what was measured (``eval/mean_reward``) more often than of files.
+    The texts in a described value; not those of an object's attributes, which are checked by name, nor the keys of a
+    dict, which name measurements (``eval/mean_reward``) more often than files.
     """
     if "value" in node:
         yield from _texts(node["value"])

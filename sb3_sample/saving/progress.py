@@ -15,17 +15,17 @@ from sb3_sample.saving.folders import Folder
 from sb3_sample.saving.run_folder import LOG
 from sb3_sample.warn import warn
 
-#: Characters of the lines that are kept while they cannot be written.
+#: Largest number of characters in the lines that are kept while they cannot be written.
 MAX_PENDING = 2**20
 
 
 class ProgressFile(KVWriter):
     """
     Appends a line of JSON for each time the log is written: ``{"step": ..., "train/critic_loss": ..., ...}``. Numbers
-    are written so that they are read back bit by bit.
+    are written so that they can be read back exactly.
 
-    Whatever the file answers, the training goes on: lines that cannot be written are kept for the next time, and a
-    warning says so.
+    The training continues whether or not the file can be written: lines that cannot be written are kept for the next
+    time, with a warning.
 
     :param folder: the run's folder; the file is opened by :meth:`restore`
     """
@@ -41,8 +41,8 @@ class ProgressFile(KVWriter):
 
     def state(self) -> dict[str, Any]:
         """
-        :return: how much of the file belongs to the run so far, which is on the disk when this returns, and the lines
-            that are not in it
+        :return: how many bytes of the file belong to the run so far, which are on the disk when this returns, and the
+            lines that are not in the file
         """
         self._flush()
         try:
@@ -54,7 +54,7 @@ class ProgressFile(KVWriter):
 
     def restore(self, state: dict[str, Any]) -> None:
         """
-        Cut back what was written after the checkpoint, since it will be written once more.
+        Cut off the lines written after the checkpoint, since they will be written again.
 
         :param state: from :meth:`state`
         :raises ValueError: it is something else
@@ -81,7 +81,7 @@ class ProgressFile(KVWriter):
             os.ftruncate(self._file, self._size)
 
     def _fail(self, error: OSError) -> None:
-        """Say, once until it works again, that it does not. The next attempt opens the file anew."""
+        """Warn that writing fails, once until it works again. The next attempt opens the file anew."""
         file, self._file = self._file, -1
         if file >= 0:
             # Half a line is cut off where that is possible; opening the file does it in any case.
@@ -99,7 +99,7 @@ class ProgressFile(KVWriter):
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
         """
         :param key_values: the log, by name
-        :param key_excluded: formats that shall not have it, by name; ours is called "json"
+        :param key_excluded: formats that exclude a value, by its name; ours is called "json"
         :param step: environment steps
         """
         kept = filter_excluded_keys(key_values, key_excluded, "json")
@@ -139,7 +139,7 @@ class ProgressFile(KVWriter):
 
 
 def _plain(value: Any) -> Any:
-    """A number or string; None for what has no place in a line: pictures, videos, arrays."""
+    """A number or string; None for values that a line cannot hold: pictures, videos, arrays."""
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu().numpy()
     if isinstance(value, (np.ndarray, np.generic)):

@@ -23,18 +23,18 @@ from sb3_sample.saving.rings import check_episodes, check_values
 from sb3_sample.saving.untrusted import MAX_MESSAGE
 
 KIND = "replay buffer"
-#: Suffix added to a path that is written, and the one that those who expect a pickle may have added.
+#: Suffix added to a path on writing, and the one that callers who expect a pickle may have added.
 SUFFIX, PICKLES_SUFFIX = "buffer.zip", "pkl"
-#: The suffixes of a name that stays as it is.
+#: Suffixes with which a path stays as it is.
 OWN_SUFFIXES = ("zip", PICKLES_SUFFIX)
-#: Transitions that a model's file can ask memory for, which is not touched before they come; and of a HerReplayBuffer,
-#: which makes an object for each.
+#: Largest number of transitions for which a model's file can ask memory, which is not touched before they come; and the
+#: same for a HerReplayBuffer, which makes an object for each.
 MAX_TRANSITIONS, MAX_HER_TRANSITIONS = 100_000_000, 5_000_000
-#: The same of a replay buffer's file, if it is larger than the model's own.
+#: The same for a replay buffer's file, if it is larger than the model's own buffer.
 MAX_OTHER, MAX_OTHER_HER = 20_000_000, 1_000_000
 #: Attributes that belong to the model and its environment, and those that follow from the rows.
 _NOT_SAVED = ("device", "env", "_training_side", "_validation_side")
-#: Arguments with which a buffer is made again that gives and takes its own state.
+#: Arguments for making anew a buffer that saves and loads its own state.
 _ARGUMENTS = (
     "buffer_size", "n_envs", "handle_timeout_termination", "validation_proportion", "horizon", "frame_stack", "n_steps",
     "gamma",
@@ -56,14 +56,14 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
         trusted_modules: Sequence[str] = (),
     ) -> None:
         """
-        Save the replay buffer, as in Stable-Baselines3, but to a file that runs no code when it is loaded. The rows
-        that were never filled take no space. Attributes that no file can hold are left out, with a warning.
+        Save the replay buffer, as in Stable-Baselines3, but to a file that runs no code when it is loaded. Rows that
+        were never filled take no space. Attributes that no file can hold are left out, with a warning.
 
         :param path: path, to which ".buffer.zip" is added unless it ends in ".zip" or ".pkl", or a binary file open for
             writing
         :param allow_pickle: whether to write Stable-Baselines3's own, pickled format instead (".pkl")
-        :param trusted_modules: modules, or packages of modules, that will be named when it is loaded, so that it needs
-            no warning
+        :param trusted_modules: modules, or packages of modules, that will be passed as trusted when it is loaded, so
+            that no warning is needed
         :raises ValueError: if there is no replay buffer
         :raises OSError: if the file cannot be written
         """
@@ -90,15 +90,16 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
         """
         Load a replay buffer, as in Stable-Baselines3. Nothing in the file is run, whoever wrote it.
 
-        :param path: file, or where ``save_replay_buffer`` wrote it; what it holds, and not its name, says what it is
+        :param path: file, or where ``save_replay_buffer`` wrote it; its content, not its name, decides how it is read
         :param truncate_last_traj: with ``HerReplayBuffer``, whether the last episode counts as ended; with every
-            buffer, whether the next ``learn`` begins with a reset of the environment if that is elsewhere than where
-            the buffer's last transitions led
+            buffer, whether the next ``learn`` begins with a reset of the environment if its state is not the one to
+            which the buffer's last transitions led
         :param allow_pickle: whether a file in Stable-Baselines3's own, pickled format is loaded too, which can run any
             code that its author wanted
         :param trusted_modules: modules, or packages of modules, whose classes the file may name, besides those that the
             model was loaded with
-        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile or pickled, or names what is not trusted
+        :raises BadFile: (a ``ValueError``) if the file is damaged, hostile or pickled, or names something that is not
+            trusted
         :raises ValueError: if it is the buffer of other spaces or of another number of environments, or holds out
             another share of its transitions than ``validation_proportion``
         """
@@ -145,8 +146,8 @@ class SafeReplayBuffers(OffPolicyAlgorithm):
 
     def _check_replay_buffer(self, buffer: ReplayBuffer, path: Any) -> None:
         """
-        :param buffer: what was loaded
-        :param path: where from
+        :param buffer: the loaded buffer
+        :param path: where it was loaded from
         :raises ValueError: if the algorithm cannot learn from it
         """
 
@@ -155,7 +156,7 @@ def encode_buffer(buffer: ReplayBuffer, encoder: Lenient, only_small: bool = Fal
     """
     :param buffer: a replay buffer
     :param encoder: takes its arrays, without copying them
-    :param only_small: whether to go without the rows, as if there were none
+    :param only_small: whether to leave out the rows, as if there were none
     :return: its tree of JSON
     """
     tree: dict[str, Any] = {"class": encoder.attempt(type(buffer), "replay_buffer").get("import")}
@@ -181,7 +182,7 @@ def _encode_attribute(buffer: ReplayBuffer, value: Any, name: str, encoder: Leni
     if not isinstance(value, _ARRAYS) or value.ndim == 0:
         return {"whole": encoder.attempt(value, name)}
     if isinstance(value, np.ndarray) and value.dtype == object and all(isinstance(info, dict) for info in value.flat):
-        # HerReplayBuffer's: of the environments if copy_info_dict, else empty.
+        # HerReplayBuffer's infos: the environments' if copy_info_dict, else empty.
         infos = [list(row) for row in value]
         while infos and not any(infos[-1]):
             infos.pop()
@@ -191,7 +192,7 @@ def _encode_attribute(buffer: ReplayBuffer, value: Any, name: str, encoder: Leni
         text, n_bytes = json.dumps(first).encode(), sum(tensor.nbytes for tensor in encoder.tensors.values())
         too_large = len(text) > container.MAX_JSON // 2 or len(new) > container.MAX_TENSORS // 2
         if too_large or container.n_values(text) > container.most_values(n_bytes) // 2:
-            # More than a reader takes: the transitions are worth more than what was said of them.
+            # More than a reader accepts: the transitions are worth more than their infos.
             encoder.leave_out(name, f"they take {len(text)} bytes of JSON and {len(new)} arrays")
             first = []
             for key in new:
@@ -210,7 +211,7 @@ def _encode_info(info: dict[Any, Any], name: str, encoder: Lenient) -> Any:
 
 
 def _filled(buffer: ReplayBuffer, n_rows: int) -> int:
-    """Up to where an array can have been written to; one more row than are filled, for the next observation."""
+    """How many rows of an array can have been written: one more than are filled, for the next observation."""
     if buffer.full:
         return n_rows
     steps = min(buffer.pos + 1, buffer.buffer_size)
@@ -225,14 +226,14 @@ def decode_buffer(
     :param tensors: its arrays
     :param model: the model that it is for. If the file's state fits into the model's buffer, it is loaded there
     :param name: the file, for messages
-    :param trusted: modules whose classes it may be of
+    :param trusted: modules whose classes it may have
     :return: the buffer, without an environment
     :raises BadFile: if it is no tree of a buffer
     :raises ValueError: if it is the buffer of other spaces
     """
     try:
         path, classes = tree["class"], [type(getattr(model, "replay_buffer", None)), model.replay_buffer_class]
-        # The program's own classes need no trust, nor to be found where a path leads: one may be made in a function.
+        # The program's own classes need neither trust nor a path that leads to them: one may be defined in a function.
         own = next((cls for cls in classes if cls is not None and path == path_of(cls)), None)
         cls = decode({"import": path}, {}, "replay_buffer", trusted) if own is None else own
         if not (isinstance(cls, type) and issubclass(cls, ReplayBuffer)):
@@ -345,8 +346,8 @@ def _check_n_envs(n_envs: int, model: OffPolicyAlgorithm) -> None:
 
 def _check_alike(buffer: Any, own: Any) -> None:
     """
-    A class that does not look at its state itself: a buffer must have what another has, of the same kinds; what a class
-    of the user's own adds can be anything.
+    Check a buffer whose class does not check its state itself: it must have the attributes of another, of the same
+    types; attributes that a user's own class adds can be anything.
     """
     is_known = within(type(own).__module__, PACKAGES)
     for name, value in vars(own).items():
@@ -399,7 +400,7 @@ def _decode_attribute(
     if n_rows not in (size, size * n_envs) or len(first) > n_rows:
         raise BadFile(f"{name} has {n_rows!r:.50} rows, of which {len(first)} are filled")
     if len(first) < filled * (n_rows // size):
-        # In the place of the others would be zeros, which nobody has seen.
+        # The missing rows would be zeros, which no environment gave.
         raise BadFile(f"{name} has {len(first)} rows in the file, but {filled * (n_rows // size)} count as filled")
     rows: Any
     if isinstance(first, torch.Tensor):

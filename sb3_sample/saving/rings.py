@@ -1,9 +1,9 @@
 """
-Replay buffers as rings of rows: what was added since the last checkpoint, and how it is put back.
+Replay buffers as rings of rows: find the rows added since the last checkpoint, and put them back.
 
 A row is one step of all environments. Rows are counted over the whole run: row ``i`` lies at place ``i % capacity``, so
-that rows ``first`` to ``last`` are a piece of the run that never changes once it is written, and of which only the last
-``capacity`` rows are needed.
+that rows ``first`` to ``last`` are a piece of the run that never changes once it is written. Only the last ``capacity``
+rows of the run are needed.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -18,11 +18,11 @@ from sb3_sample.replay.compact import CompactReplay
 from sb3_sample.replay.endings import end_episodes
 from sb3_sample.saving.untrusted import BadFile
 
-#: Attributes that hindsight keeps of each row besides the columns.
+#: Attributes that hindsight keeps for each row besides the columns.
 _OF_HINDSIGHT = ("ep_start",)
-#: Attributes that change in rows that are there already, or are no rows; written anew each time.
+#: Attributes that change in existing rows, or are not rows; written anew each time.
 _SMALL = ("ep_length", "_current_ep_start")
-#: Never used (infos, without copy_info_dict), or never changes; and what follows from the rows.
+#: Attributes that are never used (infos, without copy_info_dict), never change, or follow from the rows.
 _DERIVED = (
     "infos", "obs_shape", "device", "observation_space", "action_space", "env", "slot", "_ring", "_drawable",
     "_next_row",
@@ -31,13 +31,13 @@ _DERIVED = (
 
 def check_values(columns: Mapping[str, Any], name: str, buffer: Any) -> None:
     """
-    Look at the rows of a replay buffer, whatever else is among them.
+    Check the rows of a replay buffer; entries that are not its columns are ignored.
 
     :param columns: arrays or tensors by the column's name
     :param name: where they are from, for messages
     :param buffer: the replay buffer that they are for, or its class, which knows its columns
-    :raises BadFile: if observations, actions or rewards are not finite, or flags are neither 0 nor 1: none are stored
-        in a training
+    :raises BadFile: if observations, actions or rewards are not finite, or flags are neither 0 nor 1: no training
+        stores such values
     """
     known = columns_of(buffer)
     for column, values in columns.items():
@@ -49,7 +49,7 @@ def check_values(columns: Mapping[str, Any], name: str, buffer: Any) -> None:
         elif declared is None or values.size == 0:
             continue
         elif not declared.is_flag and values.dtype.kind == "f":
-            # A number that is not finite is the smallest or the largest of them: no copy is made.
+            # If a number is not finite, the smallest or the largest is not: no copy is made.
             low, high = values.min(), values.max()
             if not (np.isfinite(low) and np.isfinite(high)):
                 bad = low if not np.isfinite(low) else high
@@ -62,7 +62,7 @@ def check_episodes(buffer: ReplayBuffer, name: str) -> None:
     """
     :param buffer: a replay buffer of any class
     :param name: where its content is from, for messages
-    :raises BadFile: if it keeps where episodes begin and how long they are, as hindsight does, and one is not in it
+    :raises BadFile: if it keeps where episodes begin and how long they are, as hindsight does, and one lies outside it
     """
     for key, most in (
         ("ep_start", buffer.buffer_size - 1), ("_current_ep_start", buffer.buffer_size - 1),
@@ -80,8 +80,8 @@ class Ring:
     A replay buffer of Stable-Baselines3, or of this package, as a ring of rows.
 
     :param buffer: the buffer
-    :param counter: gives how many rows were ever added to it, from any start
-    :raises ValueError: it keeps something of which nothing is known here
+    :param counter: returns the number of rows ever added to it, counted from any start
+    :raises ValueError: it keeps an attribute that is not known here
     """
 
     def __init__(self, buffer: ReplayBuffer, counter: Callable[[], int]):
@@ -113,14 +113,14 @@ class Ring:
 
     def advance(self) -> tuple[int, int]:
         """
-        Count what was added since the last call.
+        Count the rows added since the last call.
 
         :return: first and last row (exclusive) that the files lack
         """
         count = self._counter()
         self.n_rows, self._count = self.n_rows + count - self._count, count
         if self.n_rows % self.capacity != self.buffer.pos or self.n_rows < self.size():
-            # Somebody emptied or filled it otherwise: all of it is new.
+            # The buffer was emptied or filled in another way: all of its rows are new.
             self.n_rows += self.capacity + (int(self.buffer.pos) - self.n_rows) % self.capacity
         return max(self.n_written, self.n_rows - self.size()), self.n_rows
 
@@ -140,7 +140,7 @@ class Ring:
         }
 
     def _columns(self) -> dict[str, Any]:
-        """The arrays (or tensors) whose first axis is that of the rows, by name."""
+        """The arrays (or tensors) whose first axis counts the rows, by name."""
         found: dict[str, Any] = {}
         for name in (*columns_of(self.buffer), *_OF_HINDSIGHT):
             value = getattr(self.buffer, name, None)
@@ -161,13 +161,13 @@ class Ring:
         own = vars(self.buffer)
         small["numbers"] = {name: value for name, value in own.items() if isinstance(value, (bool, int, float))}
         small["arrays"] = {name: own[name] for name in _SMALL if name in own}
-        # The last next observation, which lies where the next row comes.
+        # The last next observation, which lies at the place of the next row.
         small["head"] = self.buffer.observations[self.buffer.pos] if self.buffer.optimize_memory_usage else None
         return small
 
     def restore(self, small: dict[str, Any], pieces: Iterable[tuple[int, dict[str, np.ndarray]]]) -> None:
         """
-        Put rows back into a buffer made as the saved one.
+        Put rows back into a buffer made like the saved one.
 
         :param small: from :meth:`small`
         :param pieces: first row and rows, oldest first
@@ -232,7 +232,7 @@ class Ring:
 
     def interrupt(self) -> None:
         """
-        The episodes in progress end here, without their environments' saying so: nothing that follows belongs to them.
+        End the episodes in progress, without a signal from their environments: no later row belongs to them.
         """
         if self.size() == 0:
             return
@@ -243,7 +243,7 @@ class Ring:
 
 class _Followed:
     """
-    Pieces, with where the first begins and the last ends.
+    Pieces, and the rows at which the first begins and the last ends.
 
     :param pieces: first row and rows, oldest first
     :param buffer: the replay buffer that they are for

@@ -1,11 +1,11 @@
 """
-The folder of a run on disk: complete checkpoints, each in a folder of its own, and the rows of replay buffers that they
+The folder of a run on disk: complete checkpoints, each in its own folder, and the rows of replay buffers that they
 share.
 
-Nothing that is complete is ever written to again. A checkpoint is made in a hidden folder and renamed when all of it is
-on the disk and was read back; the rows are files that are renamed in the same way, and that a checkpoint names with
-their checksums. The program may be killed at any moment: what a checkpoint's ``manifest.json`` names is there. Once it
-is renamed a checkpoint counts, whatever fails afterwards.
+A complete file is never written to again. A checkpoint is made in a hidden folder and renamed when all of it is on the
+disk and has been read back; files of rows are renamed in the same way, and a checkpoint names them with their
+checksums. Whenever the program is killed, every file that a checkpoint's ``manifest.json`` names is there. Once
+renamed, a checkpoint counts, whatever fails afterwards.
 
 A folder may come from somebody else, and may hold files of the user's: see :mod:`sb3_sample.saving.folders`, and
 :meth:`RunFolder._check`.
@@ -32,33 +32,34 @@ MODEL, STATE, MANIFEST = "model.zip", "state.zip", "manifest.json"
 SEGMENTS, LOG = "replay", "progress.jsonl"
 _LOCK, _WRITING, _REMOVED = ".lock", ".writing", ".removed"
 _CHECKPOINT = re.compile(r"checkpoint-(\d{12,})")
-#: Folders that are made to be renamed, or were renamed to be removed; a number drawn anew each time, so that what
-#: cannot be removed is in nobody's way.
+#: Folders that will be renamed when complete, or were renamed to be removed. Their number is drawn anew each time, so
+#: that a folder that cannot be removed is not in the way.
 _HIDDEN = re.compile(rf"({re.escape(_WRITING)}|{re.escape(_REMOVED)})-[0-9a-f]{{12}}")
 _SEGMENT = re.compile(r"[^\W\d]\w*-\d{12,}-\d{12,}\.zip")
-#: Files that are made to be renamed.
+#: Files that will be renamed when complete.
 _HIDDEN_FILE = re.compile(rf"\.({_SEGMENT.pattern}|{re.escape(LOG)}|{re.escape(_LOCK)})\.[0-9a-f]{{12}}")
-#: Names used here, which must be no links; and names that only a run of ours may have for what is not empty.
+#: Names used here, which must not be links; and names that only a run of ours may give to a file or folder that is not
+#: empty.
 _USED = re.compile(rf"{SEGMENTS}|{re.escape(LOG)}|{re.escape(_LOCK)}|{_CHECKPOINT.pattern}|{_HIDDEN.pattern}")
 _CLAIMED = re.compile(
     rf"{SEGMENTS}|{re.escape(LOG)}|{re.escape(_LOCK)}|checkpoint-.*|({re.escape(_WRITING)}|{re.escape(_REMOVED)})(-.*)?",
     re.DOTALL,
 )
-#: Content of the first file of a run, by which its folder is known before it has a checkpoint.
+#: Content of the first file of a run, which identifies its folder before it has a checkpoint.
 _MARK = b"The folder of one run of sb3_sample, made by learn(checkpoint=...). See docs/saving.md.\n"
 #: Complete checkpoints that are kept.
 KEPT = 2
-#: Pieces that the rows of one buffer may be in.
+#: Largest number of pieces for the rows of one buffer.
 MAX_SEGMENTS = 10_000
-#: Bytes of a manifest, of which a piece of rows takes about 250; and for each value in it, as objects of Python take
-#: more.
+#: Largest size of a manifest in bytes, of which a piece of rows takes about 250; and smallest number of bytes for each
+#: value in it, as Python objects take more.
 MAX_MANIFEST, MIN_BYTES_PER_VALUE = 8 * 2**20, 24
-#: Reasons that a message names.
+#: Largest number of reasons that a message names.
 _SHOWN = 3
 
 
 class Damaged(ValueError):
-    """A checkpoint that is not what was written."""
+    """A checkpoint that is not as it was written."""
 
 
 class Segment(NamedTuple):
@@ -91,17 +92,17 @@ class RunFolder:
 
     :param path: the folder; it is made if it is not there
     :raises OSError: it cannot be made or written to
-    :raises ValueError: another process has it, it is a file, or what is in it is of no run of ours
+    :raises ValueError: another process uses it, it is a file, or its content belongs to no run of ours
     """
 
     def __init__(self, path: str | Path):
-        # Where it was when the training began, wherever the program goes to.
+        # Absolute, since the program may change its working directory during the training.
         self.path = Path(os.path.abspath(path))
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"checkpoint must name a folder, but {self.path} is a file")
         self.path.mkdir(parents=True, exist_ok=True)
-        #: Tells the folders of runs that go on from the same step as this one, so that a checkpoint is kept until all
-        #: of them have a newer one.
+        #: Returns the folders of runs that resume from the same step as this one, so that a checkpoint is kept until
+        #: all of them have a newer one.
         self.beside: Callable[[], Sequence[Path]] = tuple
         #: Warnings given.
         self._told: set[str] = set()
@@ -120,8 +121,8 @@ class RunFolder:
 
     def _check(self, root: Folder) -> None:
         """
-        :raises ValueError: the folder has something of a name that runs write to, and is the folder of no run of ours;
-            or there is a link in such a place
+        :raises ValueError: the folder has an entry with a name that runs write to, and is the folder of no run of ours;
+            or an entry with such a name is a link
         """
         ours = _is_ours(root)
         for name in root.names():
@@ -143,7 +144,7 @@ class RunFolder:
             held = temporary.lock(lock)
             if held is False:
                 raise ValueError(f"checkpoint={str(self.path)!r} is in use: another process trains in this folder")
-            # The first thing that a run leaves, before anything of which it could be asked whose it is.
+            # A run writes its mark first, before any file whose origin could be in question.
             said = os.pread(lock, len(_MARK) + 1, 0) if hasattr(os, "pread") else _MARK
             if said != _MARK and _MARK.startswith(said):
                 os.ftruncate(lock, 0)
@@ -158,13 +159,13 @@ class RunFolder:
         return Lock(lock)
 
     def close(self) -> None:
-        """Let others have the folder."""
+        """Release the folder for others."""
         lock, self._lock = self._lock, None
         if lock is not None:
             lock.release()
 
     def _warn(self, message: str) -> None:
-        """Once: the same is found again at each checkpoint."""
+        """Warn once: the same problem is found again at each checkpoint."""
         if message not in self._told:
             self._told.add(message)
             warn(f"{message}. Nothing of the run is lost by it.")
@@ -173,13 +174,13 @@ class RunFolder:
 
     def checkpoints(self) -> list[tuple[int, Path]]:
         """
-        :return: steps and folder of each checkpoint, the newest first, looked at from outside only
+        :return: steps and folder of each checkpoint, the newest first; the checkpoints are not opened
         """
         return _paths(self.path)
 
     def newest_good(self) -> tuple[Path, dict[str, Any]] | None:
         """
-        :return: the newest checkpoint that is as it was written, and its manifest; None if the folder has none at all
+        :return: the newest checkpoint that is as it was written, and its manifest; None if the folder has no checkpoint
         :raises Damaged: it has checkpoints, and all of them are damaged
         """
         reasons = []
@@ -201,7 +202,7 @@ class RunFolder:
         return None
 
     def _put_damaged_aside(self, good: Path) -> None:
-        """Damaged checkpoints that are newer get another name, so that theirs is free."""
+        """Rename damaged checkpoints that are newer than a good one, so that their names are free."""
         with Folder.at(self.path) as root:
             for _, name in _checkpoints(root):
                 if name == good.name:
@@ -215,7 +216,7 @@ class RunFolder:
         """
         :param path: folder of a checkpoint that was found to be whole
         :return: its manifest
-        :raises Damaged: it is not what it was
+        :raises Damaged: it is no longer whole
         :raises OSError: it cannot be read
         """
         with Folder.at(self.path) as root, root.inside(path.name) as folder:
@@ -223,9 +224,9 @@ class RunFolder:
 
     def go_back_to(self, steps: int) -> None:
         """
-        Remove checkpoints that are newer than the one that the run goes on from: it will come to their steps again.
+        Remove checkpoints that are newer than the one from which the run resumes: it will reach their steps again.
 
-        :param steps: environment steps of that one
+        :param steps: environment steps of the one from which it resumes
         :raises OSError: one cannot be removed
         """
         with Folder.at(self.path) as root:
@@ -236,7 +237,7 @@ class RunFolder:
     @staticmethod
     def verify(path: Path) -> dict[str, Any]:
         """
-        :param path: folder of a checkpoint, in its run's
+        :param path: folder of a checkpoint, inside its run's folder
         :return: its manifest
         :raises Damaged: a file is missing or not as it was written; the message names it
         :raises OSError: it cannot be read
@@ -279,7 +280,7 @@ class RunFolder:
 
         :param segment: which rows
         :param write: writes them to a file
-        :return: what the manifest says of the file
+        :return: the manifest's entry for the file
         :raises OSError: they cannot be written
         """
         hidden = f".{segment.name}.{secrets.token_hex(6)}"
@@ -296,7 +297,7 @@ class RunFolder:
 
     def remove_segments(self, paths: Iterable[str]) -> None:
         """
-        :param paths: in the run's folder, of rows whose checkpoint was not written. Those that a checkpoint names
+        :param paths: paths in the run's folder, of rows whose checkpoint was not written. Rows that a checkpoint names
             nevertheless stay
         """
         with contextlib.suppress(OSError), Folder.at(self.path) as root, root.inside(SEGMENTS) as rows:
@@ -308,13 +309,14 @@ class RunFolder:
         self, steps: int, files: dict[str, Callable[[IO[bytes]], Any]], segments: dict[str, Any], about: dict[str, Any]
     ) -> Path:
         """
-        Write a checkpoint, and remove what is not needed any more when it is whole. Files that cannot be removed are
-        named in a warning.
+        Write a checkpoint and, once it is whole, remove files that are no longer needed. Files that cannot be removed
+        are named in a warning.
 
         :param steps: environment steps, by which it is named
-        :param files: by name, what writes it to a file
-        :param segments: the rows that it needs, by their path in the run's folder, with what :meth:`write_segment` said
-        :param about: what else the manifest says
+        :param files: functions that write the files, by name
+        :param segments: the rows that it needs, by their path in the run's folder, with their entries from
+            :meth:`write_segment`
+        :param about: further entries of the manifest
         :return: the checkpoint's folder
         :raises OSError: it cannot be written; nothing of it is left
         """
@@ -332,7 +334,7 @@ class RunFolder:
                 with contextlib.suppress(OSError):
                     _empty(root, hidden)
                 raise
-            # From here on it counts.
+            # From here on the checkpoint counts.
             try:
                 sync_folder(self.path)
                 self._prune(root, steps)
@@ -342,10 +344,10 @@ class RunFolder:
 
     def _rename(self, folder: Folder, hidden: str, name: str) -> None:
         """
-        Give what is complete its name. A file that has it, of a program that was killed, is replaced; what else has it
-        may hold files of the user's, and gets another name.
+        Give a complete file or folder its name. A file of that name, left by a program that was killed, is replaced;
+        anything else of that name may hold files of the user's, and is renamed.
 
-        :raises OSError: it cannot be renamed, or what is in its way cannot be
+        :raises OSError: it, or an entry in its way, cannot be renamed
         """
         found = folder.look(name)
         if found is not None and not (_SEGMENT.fullmatch(name) and stat.S_ISREG(found.st_mode)):
@@ -355,8 +357,8 @@ class RunFolder:
 
     def _remove(self, root: Folder, name: str) -> None:
         """
-        Remove a checkpoint, which is whole or not there at every moment. Files in it that are not ours stay, in the
-        folder's new place.
+        Remove a checkpoint, which at every moment is whole or gone. Files in it that are not ours stay in the renamed
+        folder.
         """
         hidden = f"{_REMOVED}-{secrets.token_hex(6)}"
         root.rename(name, hidden)
@@ -369,7 +371,7 @@ class RunFolder:
             self._warn(f"{self.path / hidden}, the rest of {name}, cannot be removed ({error})")
 
     def _clear(self, root: Folder) -> None:
-        """Remove what a program that was killed has left half done."""
+        """Remove incomplete files and folders left by a program that was killed."""
         for name in root.names():
             if _HIDDEN.fullmatch(name):
                 self._clear_one(root, name, "a checkpoint")
@@ -380,8 +382,8 @@ class RunFolder:
 
     def _prune(self, root: Folder, steps: int) -> None:
         """
-        Remove all but the newest checkpoints up to that of ``steps`` and those from which the runs beside this one may
-        go on, and rows that no checkpoint needs.
+        Of the checkpoints up to that of ``steps``, keep only the newest and those from which the runs beside this one
+        may resume; remove rows that no checkpoint needs.
         """
         made = _checkpoints(root)
         kept = [name for there, name in made if there <= steps][:KEPT]
@@ -408,7 +410,7 @@ class RunFolder:
 
 class Starts(NamedTuple):
     """
-    Where runs go on that are made together.
+    Where runs that are made together resume.
 
     :param steps: environment steps of the checkpoints; 0 if there is none
     :param paths: folder of each run's checkpoint, by the run's folder
@@ -420,12 +422,12 @@ class Starts(NamedTuple):
 
 def common_starts(folders: Iterable[Path]) -> Starts:
     """
-    Find where runs go on that are made together: at the newest step of which every one has a checkpoint that is whole.
-    As long as they are made together there is one (:attr:`RunFolder.beside`), so that where there is none, the run that
-    is behind has left the others, and is none of them any more.
+    Find where runs that are made together resume: at the newest step of which every run has a whole checkpoint. As long
+    as they are made together, there is such a step (:attr:`RunFolder.beside`). If there is none, the run that is behind
+    has left the others and no longer counts among them.
 
-    :param folders: the runs'
-    :return: where they go on, without runs that have no checkpoint or have left the others
+    :param folders: folders of the runs
+    :return: where they resume, without runs that have no checkpoint or have left the others
     """
     there = {folder: dict(_paths(folder)) for folder in folders}
     there = {folder: made for folder, made in there.items() if made}
@@ -446,7 +448,7 @@ def common_starts(folders: Iterable[Path]) -> Starts:
 
 
 def _paths(folder: Path) -> list[tuple[int, Path]]:
-    """Steps and folder of each checkpoint of a run, the newest first; none of a folder that is not there."""
+    """Steps and folder of each checkpoint of a run, the newest first; empty if the folder is not there."""
     if not folder.is_dir():
         return []
     with Folder.at(folder) as root:
@@ -459,7 +461,7 @@ def _some(reasons: list[str]) -> str:
 
 
 def _is_ours(root: Folder) -> bool:
-    """Whether a folder is that of a run of ours: it says so itself, or has a checkpoint, as a copy without the rest."""
+    """Whether a folder belongs to a run of ours: it has our mark, or a checkpoint, as a partial copy may."""
     with contextlib.suppress(OSError), root.read(_LOCK) as file:
         if file.read(len(_MARK) + 1) == _MARK:
             return True
@@ -480,21 +482,22 @@ def _is_empty(root: Folder, name: str) -> bool:
     if not stat.S_ISREG(found.st_mode):
         return False
     if name == _LOCK and found.st_size < len(_MARK):
-        # A run that was killed, or whose disk was full, in the midst of its first write.
+        # Left by a run that was killed, or whose disk was full, during its first write.
         with root.read(name) as file:
             return _MARK.startswith(file.read())
     return found.st_size == 0
 
 
 def _checkpoints(root: Folder) -> list[tuple[int, str]]:
-    """Steps and names of what has the name of a checkpoint, the newest first."""
+    """Steps and names of the entries that are named like a checkpoint, the newest first."""
     found = [(int(m[1]), name) for name in root.names() if (m := _CHECKPOINT.fullmatch(name))]
     return sorted(found, reverse=True)
 
 
 def _needed(root: Folder) -> dict[str, Any]:
     """
-    Rows that the checkpoints need, by their manifests. A damaged one needs none: its rows would be found missing.
+    Rows that the checkpoints need according to their manifests. A damaged one needs none: its rows would count as
+    missing.
 
     :raises OSError: a manifest is there and cannot be read at present
     """
@@ -507,7 +510,7 @@ def _needed(root: Folder) -> dict[str, Any]:
 
 def _put_aside(folder: Folder, name: str) -> str:
     """
-    Rename what is not what a run has written, and hold on to it.
+    Rename, but keep, an entry that is not as a run wrote it.
 
     :return: its new name
     :raises OSError: it cannot be renamed
@@ -531,7 +534,7 @@ def _write_file(folder: Folder, name: str, write: Callable[[IO[bytes]], Any]) ->
     """
     Write a file and read it back.
 
-    :return: its size and checksum; it is on the disk then
+    :return: its size and checksum; the file is on the disk when this returns
     """
     with folder.create(name) as file:
         write(file)
@@ -583,7 +586,7 @@ def _manifest_text(manifest: dict[str, Any]) -> bytes:
 def _read_manifest(folder: Folder) -> dict[str, Any]:
     """
     :param folder: of a checkpoint
-    :return: its manifest, of which everything is of the kind that it must be
+    :return: its manifest, all of whose entries are of the right kind
     :raises Damaged: it is missing or damaged
     :raises OSError: it cannot be read
     """

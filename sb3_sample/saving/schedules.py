@@ -5,10 +5,10 @@ from itertools import pairwise
 
 import numpy as np
 
-#: Cells of equal width that [0, 1] is divided into at first.
+#: Number of cells of equal width into which [0, 1] is divided at first.
 CELLS = 1000
-#: A cell is halved where the value in its middle is further than this from the line through its ends, in units of the
-#: table's largest absolute value; as long as there are fewer points than that.
+#: A cell is halved if the value in its middle is further than TOLERANCE from the line through its ends, in units of the
+#: table's largest absolute value, and there are fewer than MAX_POINTS points.
 TOLERANCE, MAX_POINTS = 1e-6, 20_000
 
 
@@ -32,8 +32,8 @@ class ScheduleTable:
     @classmethod
     def of(cls, schedule: Callable[[float], float]) -> "ScheduleTable":
         """
-        A table of 1,001 points of equal distance, with more of them where the schedule bends or jumps in between:
-        linear pieces are met exactly, and a jump lies between two neighbouring floating-point numbers.
+        Tabulate a schedule at 1,001 equidistant points, and at more where it bends or jumps in between: linear pieces
+        are reproduced exactly, and a jump lies between two neighbouring floating-point numbers.
 
         :param schedule: a function of the remaining progress
         :return: its table

@@ -1,6 +1,6 @@
 """
-Arrays that share memory, as a view does with what it is a view of: one block of bytes, and where in it each of them
-lies, so that they share memory again afterwards.
+Arrays that share memory, as a view and its base do: one block of bytes, and the place of each array in it, so that they
+share memory again afterwards.
 """
 
 from typing import Any
@@ -8,21 +8,21 @@ from typing import Any
 import numpy as np
 import torch
 
-#: Kinds of NumPy's types whose bytes may be any.
+#: Kinds of NumPy dtypes for which any bytes are valid.
 _KINDS = "biufc"
-#: Types of torch's that NumPy has.
+#: Dtypes of torch that NumPy has.
 _TORCH = (
     torch.bool, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.float16, torch.float32,
     torch.float64, torch.complex64, torch.complex128,
 )  # fmt: skip
-#: Bytes; every number of these kinds lies at a multiple of its size up to this.
+#: Bytes; numbers of these kinds are aligned to their size, up to this.
 _ALIGNMENT = 16
 
 
 def as_array(value: Any) -> np.ndarray | None:
     """
     :param value: any value
-    :return: an array with its memory, if it is a NumPy array or one of torch's in the computer's memory
+    :return: an array with its memory, if it is a NumPy array or a CPU tensor
     """
     if isinstance(value, np.ndarray):
         return value
@@ -35,7 +35,7 @@ def as_array(value: Any) -> np.ndarray | None:
 
 
 def _bounds(array: np.ndarray) -> tuple[int, int]:
-    """The addresses of the first byte of an array that is not empty, and of the one behind its last."""
+    """Addresses of the first byte of a non-empty array, and of the byte after its last."""
     steps = [(n - 1) * stride for n, stride in zip(array.shape, array.strides, strict=True)]
     address = array.__array_interface__["data"][0]
     return address + sum(s for s in steps if s < 0), address + sum(s for s in steps if s > 0) + array.itemsize
@@ -44,7 +44,7 @@ def _bounds(array: np.ndarray) -> tuple[int, int]:
 def group(arrays: list[np.ndarray]) -> list[list[int]]:
     """
     :param arrays: arrays
-    :return: the indices of those that lie in the same stretch of memory, of each stretch with more than one, in order
+    :return: for each stretch of memory with more than one array, the indices of these arrays, in order
     """
     bounds = [_bounds(array) for array in arrays]
     groups: list[list[int]] = []
@@ -62,8 +62,8 @@ def group(arrays: list[np.ndarray]) -> list[list[int]]:
 def block_of(arrays: list[np.ndarray]) -> tuple[np.ndarray, list[list[Any]]] | None:
     """
     :param arrays: arrays in one stretch of memory
-    :return: bytes, and the place of each array in them: offset, shape, strides and type; None where an array is more
-        than its memory (a broadcast one), has other things than numbers, or is of a subclass
+    :return: bytes, and the place of each array in them: offset, shape, strides and type; None if an array is larger
+        than its memory (a broadcast one), holds anything but numbers, or is of a subclass
     """
     bounds = [_bounds(array) for array in arrays]
     first = min(low for low, _ in bounds) // _ALIGNMENT * _ALIGNMENT

@@ -1,4 +1,4 @@
-"""Settings and running statistics of Stable-Baselines3's VecNormalize from files, and what they can be."""
+"""Validate settings and running statistics of Stable-Baselines3's VecNormalize from files."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -45,14 +45,14 @@ def check_normalization(values: Mapping[str, Any], name: str) -> None:
     """
     :param values: the arguments of a ``VecNormalize``, and its statistics as far as it has some, by name
     :param name: where they are from, for messages
-    :raises BadFile: if with one of them nothing would be normalised as it ever is in a training
+    :raises BadFile: if one of them cannot occur in the normalisation of a training
     """
     for key, (fits, words) in _ALLOWED.items():
         if not fits(values[key]):
             raise BadFile(f"{name}: {key} of a VecNormalize must be {words}, not {values[key]!r:.100}")
     for key in ("obs_rms", "ret_rms"):
         shapes_of(values.get(key), f"{name}: {key}")
-    # The discounted sum of the rewards of each environment's episode, and what the last step gave.
+    # The discounted sum of the rewards of each environment's episode, and the results of the last step.
     for key in ("returns", "old_reward", "old_obs"):
         check_finite_numbers(values.get(key), f"{name}: {key} of a VecNormalize")
 
@@ -74,7 +74,7 @@ def shapes_of(statistics: Any, name: str) -> Any:
     :param statistics: a ``RunningMeanStd``, a dict of them, or None
     :param name: where they are from, for messages
     :return: the shape of their means, None for None
-    :raises BadFile: if they are something else, or no statistics of anything
+    :raises BadFile: if they are something else, or not possible as statistics
     """
     if statistics is None:
         return None

@@ -1,8 +1,8 @@
 """
-Files that become others when they are complete, and those that a program left which was killed before that.
+Temporary files that replace others when complete, and those left by a program that was killed before that.
 
-Who writes one has it locked, and the system unlocks what a process had that is gone: so a file that can be locked is
-one that nobody writes any more, on this machine or on another that shares the folder.
+A writer locks its temporary file, and the system releases the locks of a process that has ended: a file that can be
+locked has no writer any more, on this machine or on another that shares the folder.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ _NAME = re.compile(r"\..+\.[0-9a-f]{12}\.tmp", re.DOTALL)
 @contextlib.contextmanager
 def becoming(path: Path) -> Iterator[IO[bytes]]:
     """
-    A file beside another, whose place it takes at the end, when all of it is on the disk.
+    A file beside another, which it replaces at the end, when all of it is on the disk.
 
     :param path: the other, which need not be there
     :return: the file, open for writing
@@ -34,7 +34,7 @@ def becoming(path: Path) -> Iterator[IO[bytes]]:
     while True:
         temporary = path.with_name(f".{path.name[:100]}.{secrets.token_hex(6)}.tmp")
         with temporary.open("xb") as file:
-            # Before it was locked, another program may have taken it for one that is abandoned.
+            # Before it was locked, another program may have taken it for abandoned.
             if lock(file.fileno()) is False or os.fstat(file.fileno()).st_nlink == 0:
                 continue
             try:
@@ -55,11 +55,11 @@ def becoming(path: Path) -> Iterator[IO[bytes]]:
 
 def lock(descriptor: int, shared: bool = False) -> bool | None:
     """
-    Lock a file, without waiting for whoever has it locked.
+    Lock a file, without waiting if another process has locked it.
 
     :param descriptor: of the open file
     :param shared: whether others may have a shared lock at the same time
-    :return: whether this process has the lock now; None where the system or the file system has none
+    :return: whether this process has the lock now; None if the system or the file system has no locks
     """
     if fcntl is None:
         return None

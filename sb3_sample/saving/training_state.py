@@ -1,6 +1,6 @@
 """
-State of a training run besides parameters, replay buffer, environments and callbacks: the algorithm's counters,
-random generators and logger; and what tells one run from another.
+State of a training run besides parameters, replay buffer, environments and callbacks: the algorithm's counters, random
+generators and logger; and the arguments and circumstances that tell runs apart.
 """
 
 import contextlib
@@ -30,8 +30,8 @@ from sb3_sample.saving.kept import Kept, declared
 from sb3_sample.version import __version__
 from sb3_sample.warn import warn
 
-#: Buffers of what Monitor tells of the last episodes. Their texts name tasks and levels ("metaworld/reach-v3"), and
-#: never say where a program writes.
+#: Buffers of Monitor's results for the last episodes. Their texts name tasks and levels ("metaworld/reach-v3"), never a
+#: place where a program writes.
 _OF_EPISODES = ("ep_info_buffer", "ep_success_buffer")
 #: Arguments that may differ between the parts of a run: where it computes, and what it prints.
 HARMLESS = ("verbose", "device", "tensorboard_log", "compile", "_init_setup_model")
@@ -47,7 +47,7 @@ def argument_names(cls: type) -> set[str]:
 
 
 def _not_saved(model: BaseAlgorithm) -> set[str]:
-    # The variables, too, are with the parameters.
+    # Variables, too, are saved with the parameters.
     modules = {name.split(".")[0] for names in model._get_torch_save_params() for name in names}
     where = declared(type(model))
     kept = {name for name, places in where.items() if Kept.IN_CHECKPOINTS in places}
@@ -68,11 +68,11 @@ def save_attributes(model: BaseAlgorithm) -> dict[str, Node]:
 
 def restore_attributes(model: BaseAlgorithm, described: dict[str, Node]) -> None:
     """
-    :param model: an algorithm made as the saved one
+    :param model: an algorithm made like the saved one
     :param described: from :func:`save_attributes`
     """
     if getattr(model, "compile", "auto") != "auto":
-        # How it is run is said by the present program; what "auto" once decided stays.
+        # The present program decides whether to compile; an earlier decision of "auto" stays.
         described = {name: node for name, node in described.items() if name != "compiled"}
     restorer = Restorer()
     restorer.attributes(model, described, _not_saved(model), anywhere=_OF_EPISODES)
@@ -111,8 +111,8 @@ def restore_generators(state: dict[str, Any], device: torch.device) -> None:
 
 def save_logger(logger: Logger) -> dict[str, Any]:
     """
-    :param logger: the algorithm's
-    :return: what was recorded since the log was last written; without pictures and the like
+    :param logger: the algorithm's logger
+    :return: the values recorded since the log was last written; without pictures and the like
     """
     values = {}
     describer = Describer()
@@ -130,7 +130,7 @@ def save_logger(logger: Logger) -> dict[str, Any]:
 
 def restore_logger(logger: Logger, state: dict[str, Any]) -> None:
     """
-    :param logger: the algorithm's
+    :param logger: the algorithm's logger
     :param state: from :func:`save_logger`
     """
     for own, saved in (
@@ -157,7 +157,7 @@ def arguments_of(model: BaseAlgorithm) -> dict[str, Any]:
         values[name] = without_generators(getattr(model, name))
     for name in sorted(argument_names(type(model)) - {"env", "policy", *HARMLESS}):
         if name in own and name not in values:
-            # Of a data set, what tells it from others.
+            # For a data set, the text that identifies it.
             values[name] = repr(own[name]) if isinstance(own[name], Dataset) else own[name]
     return values
 
@@ -165,7 +165,7 @@ def arguments_of(model: BaseAlgorithm) -> dict[str, Any]:
 def circumstances(device: torch.device) -> dict[str, str]:
     """
     :param device: where the algorithm computes
-    :return: what else the last bits of a result depend on, by name
+    :return: further circumstances on which the last bits of a result depend, by name
     """
     found = {
         "sb3_sample": __version__,
@@ -192,7 +192,7 @@ def commit() -> str:
     if not (root / ".git").exists():
         return ""
     command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
-    # A hook of git's has variables that name another checkout.
+    # In a git hook, variables may name another checkout.
     env = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     try:
         found = subprocess.run(command, env=env, capture_output=True, text=True, timeout=10, check=True)

@@ -1,4 +1,4 @@
-"""Plain attributes of parts and networks of the user's own, which no state has."""
+"""Plain attributes of a user's own parts and networks, which no ``state_dict`` holds."""
 
 import functools
 import hashlib
@@ -22,7 +22,7 @@ _OF_EVERY_MODULE = frozenset(vars(nn.Module()))
 
 def plain_attributes(model: Any) -> dict[str, str]:
     """
-    Take down the attributes of parts and networks of the user's own that are plain data, and that nobody saves.
+    Record the attributes of a user's own parts and networks that are plain data and are not saved.
 
     :param model: an algorithm, set up
     :return: a digest of each value, by the path of the module and the attribute's name
@@ -49,13 +49,13 @@ def changed(model: Any, before: dict[str, str]) -> dict[str, str]:
     """
     :param model: an algorithm
     :param before: its :func:`plain_attributes` when it was made
-    :return: what has changed since and is in no file, with the reason
+    :return: the attributes that have changed since and are in no file, with the reason
     """
     reasons, named = {}, set()
     for place, digest in plain_attributes(model).items():
         path, _, name = place.rpartition(".")
         what = f"{type(recursive_getattr(model, path)).__name__}.{name}"
-        # Networks and their targets have the same: it is said once.
+        # Networks and their targets have the same attribute, which is named once.
         if before.get(place) != digest and what not in named:
             named.add(what)
             reasons[place] = (
@@ -65,12 +65,12 @@ def changed(model: Any, before: dict[str, str]) -> dict[str, str]:
     return reasons
 
 
-#: Whose classes save what they keep.
+#: Libraries whose classes save their own state.
 _LIBRARIES = (*PACKAGES, "torch", "builtins", "abc", "typing")
 
 
 def _foreign_modules(model: Any) -> Iterator[tuple[str, nn.Module]]:
-    """Modules of classes from outside of the libraries that do not say themselves what is saved of them."""
+    """Modules of classes from outside the libraries that do not define themselves what is saved of them."""
     roots = [name for name in model._get_torch_save_params()[0] if "." not in name or name.startswith("transforms.")]
     for root in (*roots, "head"):
         module = recursive_getattr(model, root, None)
@@ -82,7 +82,7 @@ def _foreign_modules(model: Any) -> Iterator[tuple[str, nn.Module]]:
 
 @functools.cache
 def _of_libraries(cls: type) -> frozenset[str]:
-    """Names that the libraries' classes among a class's bases make use of, whose business they are."""
+    """Names that a class's bases from the libraries use; saving these attributes is up to the libraries."""
     return frozenset(
         name
         for base in cls.__mro__
@@ -94,7 +94,9 @@ def _of_libraries(cls: type) -> frozenset[str]:
 
 
 def _digest(value: Any) -> str | None:
-    """Of plain data: numbers, texts, arrays, tensors, generators, containers and objects of these; None of others."""
+    """
+    Digest of plain data: numbers, texts, arrays, tensors, generators, containers and objects of these; otherwise None.
+    """
     if isinstance(value, Optimizer):
         return str(bool(value.state))
     tensors: dict[str, torch.Tensor] = {}

@@ -1,4 +1,4 @@
-"""Files that anybody may have written: how they are opened, and the errors that say what is wrong with one."""
+"""Open files that anybody may have written, with errors that say what is wrong with one."""
 
 import json
 import os
@@ -6,9 +6,9 @@ import pathlib
 import stat
 from typing import IO, Any
 
-#: Characters of a message.
+#: Largest number of characters of a message.
 MAX_MESSAGE = 1000
-#: A pipe is not waited for, and a terminal does not become that of this process.
+#: A pipe does not block, and a terminal does not become this process's controlling one.
 _FLAGS = sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC"))
 
 
@@ -16,7 +16,7 @@ class BadFile(ValueError):
     """
     A file that is damaged, of another kind, or not made by this package.
 
-    :param message: what it is; cut where a file makes it longer than anybody reads
+    :param message: what is wrong; cut if a file makes it longer than anybody reads
     """
 
     def __init__(self, message: str):
@@ -48,7 +48,7 @@ def check_regular(path: str | pathlib.Path) -> None:
     """
     try:
         kind = os.stat(path).st_mode
-    except OSError:  # whoever opens it says so, as of a folder
+    except OSError:  # opening it will report the error, as for a folder
         return
     if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
         raise BadFile(f"{path} is no regular file")
@@ -57,8 +57,8 @@ def check_regular(path: str | pathlib.Path) -> None:
 def read_regular(path: str | pathlib.Path, limit: int) -> bytes:
     """
     :param path: of a regular file
-    :param limit: bytes that it may have
-    :return: what it holds
+    :param limit: largest size allowed, in bytes
+    :return: its content
     :raises BadFile: if it is no regular file, or longer
     :raises OSError: if it cannot be read
     """
@@ -72,8 +72,8 @@ def read_regular(path: str | pathlib.Path, limit: int) -> bytes:
 def parse_json(data: bytes, name: str) -> Any:
     """
     :param data: JSON, of a length that was limited
-    :param name: of what it is, for messages
-    :return: what it says
+    :param name: what it is, for messages
+    :return: the parsed value
     :raises BadFile: if it is no JSON, or nested too deeply
     """
     try:

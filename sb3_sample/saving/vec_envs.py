@@ -1,10 +1,10 @@
 """
-The state of vectorised environments: of their wrappers, and of each environment, in this process or in a worker's.
+The state of vectorised environments: of their wrappers, and of each environment, in this process or in a worker.
 
 Stable-Baselines3's workers answer a fixed set of questions. One of them, whether an environment is wrapped in a class,
-is put to each wrapper by ``isinstance``, which a class may answer itself (``__instancecheck__``): :class:`_Attach` gets
-hold of the environment in this way and puts a helper into it, whose methods ``env_method`` then calls. Between the
-processes values are pickled, as always there; in the files they are not.
+calls ``isinstance`` on each wrapper, which a class may answer itself (``__instancecheck__``): :class:`_Attach` reaches
+the environment in this way and puts a helper into it, whose methods ``env_method`` then calls. Between processes,
+values are pickled, as always in Stable-Baselines3; in files they are not.
 """
 
 import random
@@ -24,7 +24,8 @@ from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_
 from sb3_sample.saving.statistics import ARGUMENTS, check_normalization, shapes_of
 from sb3_sample.warn import warn
 
-#: Of each wrapper: what leads elsewhere, what is an argument, and clocks, which count from when it was made.
+#: Attributes of wrappers that are not saved: references to other objects, arguments, and clocks, which count from the
+#: creation of the wrapper.
 _SKIPPED = (
     "venv", "class_attributes", "observation_space", "action_space", "num_envs", "render_mode", "metadata",
     "reset_infos", "_seeds", "_options", "t_start",
@@ -44,14 +45,14 @@ class _Helper:
 
     def pack(self) -> tuple[dict[str, Any], list[str]]:
         state, opaque = pack(self._env)
-        # Of this process, in which nobody else saves them.
+        # The generators of this process, which nothing else saves.
         return {**state, "generators": _global_generators()}, opaque
 
     def unpack(self, state: dict[str, Any]) -> tuple[str, str] | None:
         # An exception would end the worker.
         try:
             unpack(self._env, state)
-            # Checkpoints of earlier versions, and of environments in the training's process, are without.
+            # Checkpoints of earlier versions, and of environments in the training's process, have none.
             if "generators" in state:
                 _restore_global_generators(state["generators"])
         except DoesNotFit as error:
@@ -64,7 +65,10 @@ class _Helper:
         return describe_spec(self._env)
 
     def ignore_sigint(self, ignored: bool) -> None:
-        """A terminal's Ctrl-C goes to every process; a worker that ends by it takes the training down."""
+        """
+        Ignore SIGINT, or stop ignoring it: a terminal's Ctrl-C goes to every process, and a worker that ends by it
+        takes the training down.
+        """
         if ignored and self._sigint is None:
             self._sigint = signal.signal(signal.SIGINT, signal.SIG_IGN)
         elif not ignored and self._sigint is not None:
@@ -103,13 +107,13 @@ class _AttachType(type):
 
 
 class _Attach(metaclass=_AttachType):
-    """Asked whether an environment is wrapped in this, the answer is that it has a helper."""
+    """Checking whether an environment is wrapped in this class puts a helper into it, and is always true."""
 
 
 def describe_spec(env: gym.Env) -> list[str]:
     """
     :param env: an environment
-    :return: its layers, outermost first, and what it was made with, where Gymnasium made it
+    :return: its layers, outermost first, and the id and arguments that it was made with, if Gymnasium made it
     """
     layers, inner = [], env
     while isinstance(inner, gym.Wrapper):
@@ -123,7 +127,7 @@ def describe_spec(env: gym.Env) -> list[str]:
 
 
 def _shown(value: Any) -> str:
-    """A value in words that are the same in every process: without addresses in the memory."""
+    """A value as a text that is the same in every process: without memory addresses."""
     if isinstance(value, dict):
         return str({str(key): _shown(item) for key, item in value.items()})
     if isinstance(value, (list, tuple)):
@@ -162,7 +166,7 @@ def fingerprint(venv: VecEnv) -> dict[str, Any]:
     """
     :param venv: a vectorised environment
     :return: what it is made of, as plain values by name
-    :raises ValueError: if a ``VecNormalize`` has settings with which nobody could go on
+    :raises ValueError: if a ``VecNormalize`` has settings with which no training could resume
     """
     made: dict[str, Any] = {"n_envs": venv.num_envs, "wrappers": [class_name(wrapper) for wrapper in _wrappers(venv)]}
     for wrapper in _wrappers(venv):
@@ -179,7 +183,7 @@ def fingerprint(venv: VecEnv) -> dict[str, Any]:
 def save(venv: VecEnv) -> tuple[dict[str, Any], list[str]]:
     """
     :param venv: a vectorised environment, between two steps
-    :return: its state, as plain values; and what keeps the episodes in progress out of it, if anything does
+    :return: its state, as plain values; and the reasons, if any, why it lacks the episodes in progress
     """
     innermost = venv.unwrapped
     missing: list[str] = []
@@ -197,7 +201,7 @@ def save(venv: VecEnv) -> tuple[dict[str, Any], list[str]]:
         "seeds": list(innermost._seeds),
         "options": list(innermost._options),
         "environments": None,
-        # Observations with which a worker's episode is cut off, should it die.
+        # Last observations, which end a worker's episode if it dies.
         "last": innermost.last_observations if isinstance(innermost, SupervisedSubprocVecEnv) else None,
     }
     packed, opaque = _pack(innermost)
@@ -223,7 +227,7 @@ def _pack(innermost: VecEnv) -> tuple[list[dict[str, Any]] | None, list[str]]:
 
 
 def _unpack(innermost: VecEnv, states: list[dict[str, Any]]) -> list[str]:
-    """Why they do not fit, if they do not."""
+    """Restore the environments; return the reasons why the states do not fit, if any."""
     if isinstance(innermost, DummyVecEnv):
         try:
             unpack_all(innermost.envs, states)
@@ -236,18 +240,18 @@ def _unpack(innermost: VecEnv, states: list[dict[str, Any]]) -> list[str]:
     for answer in answers:
         if answer is not None and answer[0] == "is damaged":
             raise ValueError(f"the state of an environment is none: {answer[1]}")
-    # Workers mostly have the same to say.
+    # Most workers give the same reason.
     return list(dict.fromkeys(answer[1] for answer in answers if answer is not None))
 
 
 def restore(venv: VecEnv, state: dict[str, Any]) -> list[str]:
     """
-    Go back to a saved state. Where the episodes in progress are not in it, or do not fit, the caller has to reset.
+    Restore a saved state. If it lacks the episodes in progress, or they do not fit, the caller has to reset.
 
-    :param venv: a vectorised environment made as the saved one
+    :param venv: a vectorised environment made like the saved one
     :param state: from :func:`save`
     :return: why the episodes in progress were not restored; nothing if they were
-    :raises DoesNotFit: the wrappers are others
+    :raises DoesNotFit: the wrappers differ
     """
     innermost = venv.unwrapped
     wrappers = list(_wrappers(venv))
@@ -274,7 +278,7 @@ def restore(venv: VecEnv, state: dict[str, Any]) -> list[str]:
 
 
 def _shapes(wrapper: VecEnvWrapper) -> list[Any]:
-    """The shapes of the statistics of a VecNormalize; none of another wrapper."""
+    """The shapes of the statistics of a VecNormalize; empty for another wrapper."""
     if not isinstance(wrapper, VecNormalize):
         return []
     return [shapes_of(getattr(wrapper, name, None), name) for name in ("obs_rms", "ret_rms")]
@@ -292,11 +296,11 @@ def _for_the_next_reset(state: dict[str, Any], n_envs: int) -> tuple[list[Any], 
 
 def set_sigint_ignored(venv: VecEnv, ignored: bool) -> None:
     """
-    Whether the workers of a vectorised environment ignore SIGINT. One without workers, or that cannot be reached,
-    stays as it is.
+    Set whether the workers of a vectorised environment ignore SIGINT. An environment without workers, or that cannot be
+    reached, stays as it is.
 
     :param venv: a vectorised environment
-    :param ignored: whether they do
+    :param ignored: whether they ignore it
     """
     if isinstance(venv.unwrapped, SubprocVecEnv):
         call(venv, "ignore_sigint", [ignored] * venv.num_envs)

@@ -57,7 +57,7 @@ HYPERPARAMS = Path(__file__).parents[1] / "hyperparams"
 
 
 #: Replay buffers of this package that a file of hyperparameters, ``-params`` or a plan may name as
-#: ``replay_buffer_class``, as the zoo has it for ``HerReplayBuffer``.
+#: ``replay_buffer_class``, as the zoo allows for ``HerReplayBuffer``.
 BUFFERS: dict[str, type[ReplayBuffer]] = {
     cls.__name__: cls
     for cls in (

@@ -1,5 +1,5 @@
 """
-The tables of runs that the stock zoo pickles, in a file by the same name that runs no code when it is read; and the
+The tables of runs that the stock zoo pickles, in a file of the same name that runs no code when it is read; and the
 errors and options of the commands that read a run's files.
 """
 
@@ -20,17 +20,17 @@ _PLOT_KIND = "plotted runs"
 
 class Refused(Exception):
     """
-    A refusal while the zoo runs, which would take a ``ValueError`` for a model to be got from a hub.
+    A refusal while the zoo runs. The zoo would answer a ``ValueError`` by downloading a model from a hub.
     """
 
 
 class RunError(ValueError):
-    """A run that cannot be started or go on as the command says."""
+    """A run that cannot be started or resumed as the command says."""
 
 
 def add_trust(parser: argparse._ActionsContainer) -> None:
     """
-    :param parser: gets the options for what a saved run may hold
+    :param parser: the parser, to which the options for the content of a saved run are added
     """
     parser.add_argument(
         "--allow-pickle",
@@ -52,7 +52,7 @@ def add_trust(parser: argparse._ActionsContainer) -> None:
 
 class PlottedRuns:
     """
-    Stands for ``pickle`` in the zoo's modules that save and draw tables of runs.
+    Replaces ``pickle`` in the zoo's modules that save and draw tables of runs.
 
     :param allow_pickle: whether pickled files are read too
     """
@@ -63,10 +63,10 @@ class PlottedRuns:
     @staticmethod
     def open(path: str, mode: str) -> IO[Any]:
         """
-        As the built-in function, but for pipes and devices, which are not read.
+        Open a file as the built-in function does, but refuse to read pipes and devices.
 
         :param path: of a file
-        :param mode: see there
+        :param mode: see the built-in function
         :return: the file
         """
         return open_regular(path) if mode == "rb" else open(path, mode)

@@ -1,6 +1,6 @@
 """
-Everything that takes the place of something in the zoo (``rl_zoo3``), or of another library for the zoo's sake. The
-patches of ``register`` stay; the others are context managers, in force while a command of ``sb3-sample`` runs.
+All patches of the zoo (``rl_zoo3``), and of other libraries for the zoo's sake. The patches of ``register`` stay; the
+others are context managers, in force while a command of ``sb3-sample`` runs.
 """
 
 import argparse
@@ -41,18 +41,18 @@ from sb3_sample.zoo.trials import check_storage, stored_params
 #: Environments whose ``info`` has ``is_success`` at every step.
 SUCCESS_PREFIXES = ("metaworld/", "myosuite/")
 
-#: Whether pickles are read: as ``reading`` says, and None outside of it, in the stock zoo's own commands.
+#: Whether pickles are read: set by ``reading``, and None outside it, in the stock zoo's own commands.
 _allow_pickle: bool | None = None
 
 
 @contextlib.contextmanager
 def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
     """
-    Put something else in the place of an attribute, for a while.
+    Replace an attribute, for a while.
 
-    :param owner: module or class whose own attribute it is, or, of a module, a built-in function that it uses
+    :param owner: module or class that has the attribute itself, or a module that uses a built-in function of that name
     :param name: its name
-    :param value: what takes its place
+    :param value: its replacement
     """
     is_own = name in vars(owner)
     before = vars(owner if is_own else builtins)[name]
@@ -66,7 +66,7 @@ def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
             delattr(owner, name)
 
 
-# ---------------------------------------------------------------- of register, to stay
+# ---------------------------------------------------------------- register: patches that stay
 
 
 def register() -> None:
@@ -82,9 +82,9 @@ def register() -> None:
         rl_zoo3.utils.ALGOS[name] = entry.algorithm
         tables.HYPERPARAMS_SAMPLER[name] = sampler(entry.space, entry.convert)
         tables.HYPERPARAMS_CONVERTER[name] = entry.convert
-    # Not at the top: it imports custom_envs, and the custom_envs of this repository imports this module. If that is
-    # where the zoo is now, in the midst of importing this module of its, there is no manager yet. Of its commands only
-    # record_video starts there, which reads no hyperparameter file.
+    # Not imported at the top: it imports custom_envs, and the custom_envs of this repository imports this module. If
+    # this call comes from there, the zoo is still importing ``rl_zoo3.exp_manager``, which has no manager yet. Of the
+    # zoo's commands only record_video starts in this way, and it reads no hyperparameter file.
     module = importlib.import_module("rl_zoo3.exp_manager")
     if hasattr(module, "ExperimentManager") and not hasattr(module.ExperimentManager, "_adapted_by_sb3_sample"):
         module.ExperimentManager._adapted_by_sb3_sample = True
@@ -118,22 +118,23 @@ def _adapt_experiment_manager(module: Any) -> None:
                 )
         original_init(*given.args, **given.kwargs)
 
-    # ``load_trial`` takes anything stored for hyperparameters, some of which the zoo evaluates as Python or imports.
+    # ``load_trial`` accepts anything stored as hyperparameters, some of which the zoo evaluates as Python or imports.
     def load_trial(self: Any, storage: str, study_name: str, trial_id: int | None = None, convert: bool = True) -> Any:
         if self.algo not in ALGORITHMS:
             return original_load_trial(self, storage, study_name, trial_id, convert)
         params = stored_params(storage, study_name, trial_id)
         return stored_arguments(self.algo, params, f"trial {trial_id} of {storage}") if convert else params
 
-    # ``hyperparameters_optimization`` opens a storage without looking whether Optuna has written it.
+    # ``hyperparameters_optimization`` opens a storage without checking whether Optuna has written it.
     def optimize(self: Any) -> None:
         if self.algo in ALGORITHMS and self.storage is not None:
             check_storage(self.storage)
         original_optimize(self)
 
     # ``read_hyperparameters`` makes environments for evaluation with the ``env_kwargs`` of the command line only, not
-    # those of the file, and gives what a trial with HerReplayBuffer has stored to any other buffer. And the zoo makes a
-    # VecFrameStack of ``frame_stack``, stacks of stacks where an algorithm has an argument of that name.
+    # those of the file, and passes the parameters stored by a trial with HerReplayBuffer to any other buffer. The zoo
+    # also makes a VecFrameStack from ``frame_stack``, which gives stacks of stacks if an algorithm has an argument of
+    # that name.
     def read_hyperparameters(self: Any) -> Any:
         hyperparams, saved = original_read(self)
         ours: Any = ALGORITHMS[self.algo].algorithm if self.algo in ALGORITHMS else None
@@ -150,7 +151,7 @@ def _adapt_experiment_manager(module: Any) -> None:
             self.eval_env_kwargs = hyperparams["env_kwargs"]
         return hyperparams, saved
 
-    # ``is_robotics_env`` decides, and nothing else, whether Monitor records is_success, which ours report too.
+    # ``is_robotics_env`` only decides whether Monitor records is_success, which our environments report too.
     def is_robotics_env(env_id: str) -> bool:
         return env_id.startswith(SUCCESS_PREFIXES) or original_is_robotics_env(env_id)
 
@@ -162,7 +163,7 @@ def _adapt_experiment_manager(module: Any) -> None:
 
 
 class _VecNormalize:
-    """Stands in the zoo's modules for the class, which they call, and whose ``load`` they call."""
+    """Replaces the class in the zoo's modules, which call it and its ``load``."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> VecNormalize:
         return VecNormalize(*args, **kwargs)
@@ -176,15 +177,15 @@ class _VecNormalize:
 
 def _adapt_statistics(module: Any) -> None:
     """
-    Replace what ``rl_zoo3.exp_manager`` and ``rl_zoo3.utils`` write and read ``vecnormalize.pkl`` with, a pickle in the
-    stock zoo: that of our algorithms runs no code.
+    Replace the functions with which ``rl_zoo3.exp_manager`` and ``rl_zoo3.utils`` write and read ``vecnormalize.pkl``.
+    The stock zoo's is a pickle; that of our algorithms runs no code.
     """
     manager, callback = module.ExperimentManager, module.SaveVecNormalizeCallback
     normalize, save_model, on_step = manager._maybe_normalize, manager.save_trained_model, callback._on_step
 
     # ``_maybe_normalize`` reads the statistics of the agent that is trained on.
     def maybe_normalize(self: Any, env: VecEnv, eval_env: bool) -> VecEnv:
-        # A program that uses the manager has not said anything about pickles: they are refused then.
+        # A program that uses the manager has not allowed pickles, so they are refused.
         allowed = bool(_allow_pickle) if self.algo in ALGORITHMS else None
         with _replaced(sys.modules[__name__], "_allow_pickle", allowed):
             return normalize(self, env, eval_env)  # type: ignore[no-any-return]
@@ -216,10 +217,10 @@ def _safe_statistics(safe: bool) -> AbstractContextManager[None]:
 @contextlib.contextmanager
 def managed_by(manager: Callable[..., Any], module: ModuleType) -> Iterator[None]:
     """
-    Let the zoo's ``train`` make another manager than ``ExperimentManager``, and check its options: it has no argument
-    for runs with checkpoints, nor for the class.
+    Make the zoo's ``train`` use another manager than ``ExperimentManager``, and check its options: it has no argument
+    for runs with checkpoints, nor for the manager's class.
 
-    :param manager: makes it of the arguments of ``ExperimentManager``
+    :param manager: makes the manager from the arguments of ``ExperimentManager``
     :param module: ``rl_zoo3.train``
     """
     with _pairs_checked(module), _replaced(module, "ExperimentManager", manager):
@@ -228,8 +229,8 @@ def managed_by(manager: Callable[..., Any], module: ModuleType) -> Iterator[None
 
 def monitors_go_on(module: ModuleType) -> AbstractContextManager[None]:
     """
-    Let Monitors go on with the files that are there, in the place of the zoo's ``make_vec_env``: it has no argument for
-    how they are made.
+    Make Monitors append to existing files, by replacing the zoo's ``make_vec_env``: it has no argument for how they are
+    made.
 
     :param module: ``rl_zoo3.exp_manager``
     """
@@ -240,9 +241,9 @@ def monitors_go_on(module: ModuleType) -> AbstractContextManager[None]:
             if env.results_writer is not None:
                 writer, path = env.results_writer, env.results_writer.file_handler.name
                 if os.path.getsize(path):
-                    # Their times count from the beginning in the file's head.
+                    # Times count from the beginning recorded in the file's head.
                     env.t_start = monitor_head(path)["t_start"]
-                else:  # one of several that was removed
+                else:  # one of several files was removed
                     head = {"t_start": env.t_start, "env_id": str(env.spec and env.spec.id)}
                     writer.file_handler.write(f"#{json.dumps(head)}\n")
                     writer.logger.writeheader()
@@ -259,10 +260,10 @@ def monitors_go_on(module: ModuleType) -> AbstractContextManager[None]:
 
 def _pairs_checked(module: ModuleType) -> AbstractContextManager[None]:
     """
-    Let options that are names and values (``-params``, ``--env-kwargs``) refuse what is none of these, in the place of
-    the zoo's ``StoreDict``, which evaluates it as Python and shows a traceback.
+    Make options of names and values (``-params``, ``--env-kwargs``) refuse anything else, by replacing the zoo's
+    ``StoreDict``, which evaluates it as Python and shows a traceback.
 
-    :param module: the command's, which makes a dict of them
+    :param module: the command's module, which makes a dict of them
     """
 
     class Pairs(rl_zoo3.utils.StoreDict):
@@ -285,8 +286,8 @@ def _pairs_checked(module: ModuleType) -> AbstractContextManager[None]:
 @contextlib.contextmanager
 def reading(allow_pickle: bool = False, trusted_modules: Sequence[str] = ()) -> Iterator[None]:
     """
-    Say what the zoo may read meanwhile of our algorithms: it calls the methods of theirs that are replaced here, and
-    has no arguments for trust.
+    Set which files of our algorithms the zoo may read meanwhile: it calls their methods, which are replaced here,
+    without arguments for trust.
 
     :param allow_pickle: whether pickled files are read too, which can run any code that their author wanted
     :param trusted_modules: modules, or packages of modules, whose classes and functions a file may name
@@ -302,7 +303,7 @@ def reading(allow_pickle: bool = False, trusted_modules: Sequence[str] = ()) -> 
 
 
 def _with(method: Any, pickles: bool, trusted: tuple[str, ...]) -> Any:
-    """A method that trusts more than its caller says, since the zoo cannot say anything."""
+    """A method that trusts more than its caller says, since the zoo cannot pass such arguments."""
     function = method.__func__ if isinstance(method, classmethod) else method
 
     @functools.wraps(function)
@@ -323,12 +324,12 @@ def _with(method: Any, pickles: bool, trusted: tuple[str, ...]) -> Any:
 @contextlib.contextmanager
 def watched_with(find: Any, make_env: Any, *modules: ModuleType) -> Iterator[None]:
     """
-    Replace what ``enjoy`` and ``record_video`` look for a run and make its environments with: the zoo finds no run by
-    its folder, and trusts its settings. Their options are checked too.
+    Replace the functions with which ``enjoy`` and ``record_video`` look for a run and make its environments: the zoo
+    finds no run by its folder, and trusts its settings. Their options are checked too.
 
-    :param find: in the place of ``get_model_path``
-    :param make_env: in the place of ``create_test_env``
-    :param modules: those that call them
+    :param find: replaces ``get_model_path``
+    :param make_env: replaces ``create_test_env``
+    :param modules: the modules that call them
     """
     with contextlib.ExitStack() as stack:
         for module in modules:
@@ -340,10 +341,10 @@ def watched_with(find: Any, make_env: Any, *modules: ModuleType) -> Iterator[Non
 
 def models_checked(check: Callable[[Any], None]) -> AbstractContextManager[None]:
     """
-    Look at the models of our algorithms that are loaded: the zoo does not ask whether one fits the environment that it
-    has made, and its ``load`` is called without it.
+    Check the models of our algorithms that are loaded: the zoo does not check whether a model fits the environment that
+    it has made, and calls ``load`` without that environment.
 
-    :param check: raises what there is against a model
+    :param check: raises an error if a model does not fit
     """
     load = vars(SafeFiles)["load"].__func__
 
@@ -357,12 +358,12 @@ def models_checked(check: Callable[[Any], None]) -> AbstractContextManager[None]
 
 def make_answering_env(env_id: str, *args: Any, **kwargs: Any) -> VecEnv:
     """
-    Make environments with the zoo's ``create_test_env``, and wrap it and their methods: an error of an environment or
-    a wrapper, whose arguments are those of a run's file, is said to be theirs, where the zoo shows a traceback.
+    Make environments with the zoo's ``create_test_env``, and wrap it and their methods: errors of an environment or a
+    wrapper, whose arguments come from a run's file, are attributed to these settings, where the zoo shows a traceback.
 
-    :param env_id: see there, as for the rest
+    :param env_id: see ``create_test_env``, as for the rest
     :return: the environments
-    :raises Refused: if the run's settings make none that works; so do their methods later on
+    :raises Refused: if the run's settings make no environment that works; the methods raise it too, later on
     """
     env: VecEnv = _answering_for(env_id, create_test_env)(env_id, *args, **kwargs)
     for name in ("reset", "step_async", "step_wait", "render"):
@@ -386,8 +387,8 @@ def _answering_for(env_id: str, function: Any) -> Any:
 
 def reading_settings(trusted_modules: Sequence[str] = (), given: Sequence[str] = ()) -> AbstractContextManager[None]:
     """
-    Let the zoo read a run's settings with ``read_settings``, in the place of ``yaml.load`` with its ``UnsafeLoader``,
-    which makes whatever objects they name.
+    Make the zoo read a run's settings with ``read_settings`` instead of ``yaml.load`` with its ``UnsafeLoader``, which
+    makes any objects that they name.
 
     :param trusted_modules: see ``read_settings``
     :param given: see ``read_settings``
@@ -407,7 +408,7 @@ def reading_settings(trusted_modules: Sequence[str] = (), given: Sequence[str] =
 
 def reading_monitors(module: ModuleType) -> AbstractContextManager[None]:
     """
-    Read Monitor files, which anybody may have written, with ``read_monitors``, in the place of Stable-Baselines3's
+    Read Monitor files, which anybody may have written, with ``read_monitors`` instead of Stable-Baselines3's
     ``load_results``.
 
     :param module: ``rl_zoo3.plots.plot_train``
@@ -418,13 +419,13 @@ def reading_monitors(module: ModuleType) -> AbstractContextManager[None]:
 @contextlib.contextmanager
 def reading_tables(module: ModuleType, runs: PlottedRuns) -> Iterator[None]:
     """
-    Read evaluations, and write and read the tables that are made of them, without running code, in the place of
-    ``np.load``, ``pickle`` and ``open``.
+    Read evaluations, and write and read the tables that are made of them, without running code: replace ``np.load``,
+    ``pickle`` and ``open``.
 
     :param module: ``rl_zoo3.plots.all_plots`` or ``rl_zoo3.plots.plot_from_file``
-    :param runs: in the place of ``pickle``
+    :param runs: replaces ``pickle``
     """
-    # NumPy as the zoo uses it, but for what it opens files with.
+    # NumPy as the zoo uses it, with another function for opening files.
     numpy = SimpleNamespace(**{**vars(module.np), "load": read_evaluations})
     with _replaced(module, "np", numpy), _replaced(module, "pickle", runs), _replaced(module, "open", runs.open):
         yield

@@ -1,9 +1,10 @@
 """
-Runs of ``sb3-sample train`` that go on where they were interrupted (``--run-dir``, ``--checkpoint-freq``,
-``--resume``), and that learn from data (``--dataset``, ``--offline-steps``, ``--prior-data``).
+Runs of ``sb3-sample train`` that resume where they were interrupted (``--run-dir``, ``--checkpoint-freq``,
+``--resume``), and runs that learn from data (``--dataset``, ``--offline-steps``, ``--prior-data``).
 
-The folder of a run with checkpoints has, besides these and the zoo's files, a record ``run.json`` of how it was
-started. One that learns from data first and then in its environment has the checkpoints of the former in ``offline``.
+Besides the checkpoints and the zoo's files, the folder of a run with checkpoints has a record ``run.json`` of how it
+was started. A run that learns from data first and then in its environment has the checkpoints of the first part in
+``offline``.
 """
 
 import argparse
@@ -50,21 +51,21 @@ from sb3_sample.zoo.files import RunError, add_trust
 from sb3_sample.zoo.patches import managed_by, monitors_go_on
 
 RECORD = "run.json"
-#: Bytes of a record.
+#: Largest size of a record, in bytes.
 MAX_RECORD = 2**18
 #: Endings of the files that a run writes.
 SUFFIXES = (".csv", ".json", ".jsonl", ".npz", ".yml", ".zip")
 #: Environment steps between two checkpoints.
 CHECKPOINT_FREQ = 10_000
-#: Arguments of the zoo that make a run what it is, besides its hyperparameters. How long it is, where it computes, what
-#: it prints and which copies of the model it keeps may change.
+#: Arguments of the zoo that identify a run, besides its hyperparameters. Its length, its device and its output may
+#: change.
 COMPARED = (
     "algo", "env", "seed", "trained_agent", "truncate_last_trajectory", "vec_env", "env_kwargs", "eval_env_kwargs",
     "eval_freq", "eval_episodes", "n_eval_envs", "save_freq",
 )  # fmt: skip
-#: Hyperparameters that the zoo makes ``action_noise`` of.
+#: Hyperparameters from which the zoo makes ``action_noise``.
 _OF_NOISE = {"noise_type", "noise_std"}
-#: Arguments that the zoo's options give.
+#: Arguments that the zoo's options set.
 _OF_OPTIONS = {"env", "seed", "verbose", "device", "tensorboard_log"}
 
 
@@ -91,7 +92,7 @@ class Record(NamedTuple):
 
     def write(self, folder: Path) -> None:
         """
-        :param folder: the run's
+        :param folder: the run's folder
         """
         folder.mkdir(parents=True, exist_ok=True)
         beside = folder / f".{RECORD}"
@@ -101,7 +102,7 @@ class Record(NamedTuple):
     @classmethod
     def read(cls, folder: Path) -> "Record":
         """
-        :param folder: the run's
+        :param folder: the run's folder
         :return: its record
         :raises RunError: there is none, or it is no such record
         """
@@ -152,9 +153,9 @@ class Data(NamedTuple):
     """
     Data sets that a run learns from: paths or ids of Minari's, or HDF5 files.
 
-    :param dataset: of the gradient steps without an environment
-    :param offline_steps: how many of the run's steps are such; None: all
-    :param prior_data: of a share of every batch in the environment
+    :param dataset: for the gradient steps without an environment
+    :param offline_steps: how many of the run's steps are such gradient steps; None: all
+    :param prior_data: for a share of every batch while learning in the environment
     """
 
     dataset: str | None = None
@@ -165,8 +166,8 @@ class Data(NamedTuple):
     def of(cls, options: argparse.Namespace) -> "Data":
         """
         :param options: what ``train_parser`` has parsed
-        :return: what they say of data sets
-        :raises RunError: they say what cannot be
+        :return: the data sets that they name
+        :raises RunError: they do not fit together, or are out of range
         """
         data = cls(*(getattr(options, name) for name in cls._fields))
         if data.offline_steps is not None and data.dataset is None:
@@ -178,12 +179,12 @@ class Data(NamedTuple):
 
 class Start(NamedTuple):
     """
-    How a run starts or goes on.
+    How a run starts or resumes.
 
     :param arguments: command line for the zoo, without our options
     :param checkpoint_freq: environment steps between two checkpoints
-    :param folder: the run's; None for a new one where the zoo says
-    :param record: how the run was started, if it goes on
+    :param folder: the run's folder; None for a new one that the zoo chooses
+    :param record: how the run was started, if it resumes
     """
 
     arguments: list[str]
@@ -194,9 +195,9 @@ class Start(NamedTuple):
 
 def check_entries(folder: Path) -> None:
     """
-    :param folder: a run's
-    :raises RunError: something in it, or in a folder of it, is a link: what a run writes by such a name would be
-        written elsewhere; or a pipe or a device, which may never end; or a folder by the name of a file
+    :param folder: a run's folder
+    :raises RunError: an entry of it, or of a folder in it, is a link, by which the run would write elsewhere; or a pipe
+        or a device, which may never end; or a folder with the name of a file
     """
     for path in (*folder.glob("*"), *folder.glob("*/*")):
         if path.is_symlink():
@@ -211,8 +212,8 @@ def check_entries(folder: Path) -> None:
 
 def check_monitor_files(folder: Path) -> None:
     """
-    :param folder: of a run that goes on
-    :raises RunError: what it has for Monitor to append to is no file of Monitor's
+    :param folder: folder of a run that resumes
+    :raises RunError: a file that Monitor would append to is no file of Monitor's
     """
     for path in monitor_files(folder):
         try:
@@ -223,15 +224,15 @@ def check_monitor_files(folder: Path) -> None:
 
 def checkpoints(folder: Path) -> list[Path]:
     """
-    :param folder: a run's
-    :return: the folders of its checkpoints, oldest first, looked at from outside only
+    :param folder: a run's folder
+    :return: the folders of its checkpoints, oldest first; the checkpoints are not opened
     """
     return sorted(path for path in folder.glob("checkpoint-*") if re.fullmatch(r"checkpoint-\d{12,}", path.name))
 
 
 def all_checkpoints(folder: Path) -> list[Path]:
     """
-    :param folder: a run's
+    :param folder: a run's folder
     :return: as ``checkpoints``, those of the steps on a data set first
     """
     return [*checkpoints(folder / OFFLINE), *checkpoints(folder)]
@@ -239,7 +240,7 @@ def all_checkpoints(folder: Path) -> list[Path]:
 
 def train_parser() -> argparse.ArgumentParser:
     """
-    :return: parser of what ``train`` takes besides the zoo's options
+    :return: parser of the options that ``train`` takes besides the zoo's
     """
     parser = argparse.ArgumentParser("sb3-sample train", usage=argparse.SUPPRESS, add_help=False, allow_abbrev=False)
     group = parser.add_argument_group("runs that go on where they were interrupted (our algorithms)")
@@ -316,7 +317,7 @@ def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
     if not all_checkpoints(folder):
         if options.resume:
             raise RunError(f"--resume: {folder} has no checkpoint to go on from")
-        # A run that was interrupted before it had one has its record.
+        # A run that was interrupted before its first checkpoint has its record.
         if folder.exists() and not (folder.is_dir() and (not any(folder.iterdir()) or (folder / RECORD).exists())):
             raise RunError(
                 f"--run-dir {folder} holds files, but no run with checkpoints: it must be the folder of such a run, an "
@@ -339,7 +340,9 @@ def _check_agent(arguments: Sequence[str]) -> None:
 
 
 def _latest(arguments: Sequence[str]) -> Path:
-    """The run with the latest checkpoint of a command line's algorithm, environment and, if it has one, seed."""
+    """
+    The run with the latest checkpoint, among those of a command line's algorithm, environment and, if given, seed.
+    """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--algo")
     parser.add_argument("--env")
@@ -348,7 +351,7 @@ def _latest(arguments: Sequence[str]) -> Path:
     asked = parser.parse_known_args(arguments)[0]
     if asked.algo is None or asked.env is None:
         raise RunError("--resume needs --run-dir, or --algo and --env, to know which run to go on with")
-    is_given = asked.seed >= 0  # the zoo draws one else
+    is_given = asked.seed >= 0  # otherwise the zoo draws one
     found = []
     for file in asked.log_folder.rglob(RECORD):
         made = all_checkpoints(file.parent)
@@ -369,10 +372,11 @@ def _latest(arguments: Sequence[str]) -> Path:
 @contextlib.contextmanager
 def training() -> Iterator[Callable[[Start | None, Sequence[str], Data], None]]:
     """
-    Have the zoo's ``train`` make our runs.
+    Let the zoo's ``train`` make our runs.
 
-    :return: makes a run of how it starts, None for one without checkpoints, the command line for the zoo, without our
-        options, and the data sets that it learns from. Trainings in lockstep call it at the same time
+    :return: a function that makes a run. Its arguments are how the run starts (None for one without checkpoints), the
+        command line for the zoo, without our options, and the data sets that it learns from. Trainings in lockstep call
+        it at the same time
     """
     starts: dict[Seat | None, tuple[Start | None, Data]] = {}
 
@@ -397,8 +401,8 @@ def train(start: Start | None, arguments: Sequence[str], data: Data = Data()) ->
     :param start: how a run with checkpoints starts; None for one without
     :param arguments: command line for the zoo, without our options, of a run without checkpoints
     :param data: data sets that it learns from
-    :raises RunError: if it cannot start or go on so
-    :raises Refused: if an argument is no Python
+    :raises RunError: if it cannot start or resume in this way
+    :raises Refused: if an argument is not valid Python
     :raises KeyboardInterrupt: after Ctrl-C, when the zoo has saved the model
     """
     with training() as make:
@@ -407,11 +411,11 @@ def train(start: Start | None, arguments: Sequence[str], data: Data = Data()) ->
 
 def train_seeds(options: argparse.Namespace, arguments: Sequence[str]) -> None:
     """
-    Make a run of each seed, all in this process, as so many commands would.
+    Make a run for each seed, all in this process, as separate commands would.
 
     :param options: what ``train_parser`` has parsed, with ``seeds``
     :param arguments: the rest of the command line
-    :raises RunError: if they cannot start or go on so
+    :raises RunError: if they cannot start or resume in this way
     :raises KeyboardInterrupt: after Ctrl-C, when the zoo has saved the models; a ``SystemExit`` after SIGTERM
     :raises SystemExit: if a run has failed, after the end of the others
     """
@@ -453,7 +457,7 @@ def train_seeds(options: argparse.Namespace, arguments: Sequence[str]) -> None:
 
 
 def _seeds(given: Sequence[int], arguments: Sequence[str]) -> list[int]:
-    """The seeds that ``--seeds`` asks for, of a command line that can be one of many."""
+    """The seeds that ``--seeds`` asks for; refuses a command line that cannot be one of many."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--algo", default="ppo")
     for option in ("--seed", "-optimize", "--optimize-hyperparameters", "--progress", "-P", "--track"):
@@ -486,13 +490,13 @@ def can_train_together(algo: str) -> bool:
 
 class Manager(ExperimentManager):
     """
-    The zoo's manager, which names hyperparameters that there are not, does not take an interrupted run for a finished
-    one, learns from data too, and evaluates whole games of Atari.
+    The zoo's manager, extended: it names unknown hyperparameters, does not take an interrupted run for a finished one,
+    can learn from data, and evaluates whole games of Atari.
 
     :param data: data sets to learn from
-    :param args: what the zoo has parsed of the command line
-    :param positional: the zoo's
-    :param named: the zoo's
+    :param args: the command line, as parsed by the zoo
+    :param positional: further arguments of the zoo's manager
+    :param named: further arguments of the zoo's manager
     :raises RunError: if the run cannot learn from such data
     """
 
@@ -574,7 +578,7 @@ class Manager(ExperimentManager):
             self.env_wrapper = wrapper
 
     def _train(self, model: Any, total_timesteps: int, **arguments: Any) -> BaseAlgorithm:
-        """As the zoo has it, ``learn``; or what takes its place."""
+        """Call ``learn``, as the zoo does, or its replacement."""
         if self._dataset is None:
             return model.learn(total_timesteps, **arguments)  # type: ignore[no-any-return]
         n_offline = self._data.offline_steps
@@ -586,7 +590,7 @@ class Manager(ExperimentManager):
         return model.learn(total_timesteps - n_offline, reset_num_timesteps=False, **arguments)  # type: ignore[no-any-return]
 
     def _learn_first(self, model: Any, dataset: Dataset, gradient_steps: int, **arguments: Any) -> None:
-        """Learn from data before others follow."""
+        """Learn from data, before the steps in the environment."""
         model.learn_offline(dataset, gradient_steps, **arguments)
 
     def learn(self, model: BaseAlgorithm) -> None:
@@ -606,9 +610,9 @@ class RunManager(Manager):
 
     :param start: how the run starts
     :param data: data sets to learn from
-    :param args: what the zoo has parsed of the command line
-    :param positional: the zoo's
-    :param named: the zoo's
+    :param args: the command line, as parsed by the zoo
+    :param positional: further arguments of the zoo's manager
+    :param named: further arguments of the zoo's manager
     :raises RunError: if there can be no checkpoints of such a run
     """
 
@@ -628,7 +632,8 @@ class RunManager(Manager):
             self.save_path = str(start.folder)
             self.params_path = f"{self.save_path}/{self.env_name}"
         self._start, self._folder = start, Path(self.save_path)
-        # Of our learn, which leaves it out of the state of the callbacks: it may come and go.
+        # Our ``learn`` shows the progress bar, and leaves it out of the callbacks' state: a run's parts may or may not
+        # have it.
         self._progress_bar, self.show_progress = self.show_progress, False
         self._record: Record
 
@@ -668,14 +673,14 @@ class RunManager(Manager):
             )
 
     def _tensorboard_folder(self) -> str:
-        """That of the run's beginning if it lies where the command says, or a new one."""
+        """The folder from the run's beginning if it lies where the command says, or a new one."""
         before = self._start.record and self._start.record.tensorboard
         name = ALGORITHMS[self.algo].algorithm.__name__
         is_ours = before and re.fullmatch(rf"{name}_\d+", Path(before).name)
         if before and is_ours and Path(before).parent == Path(str(self.tensorboard_log)):
             return before
         new = f"{self.tensorboard_log}/{name}_{get_latest_run_id(str(self.tensorboard_log), name) + 1}"
-        # At once: another run that is made beside this one gets another.
+        # Made at once, so that a run that is made beside this one gets another folder.
         os.makedirs(new, exist_ok=True)
         return new
 
@@ -705,17 +710,17 @@ class RunManager(Manager):
 
     def _learn_first(self, model: Any, dataset: Dataset, gradient_steps: int, **arguments: Any) -> None:
         if checkpoints(self._folder):
-            # The checkpoint that follows has all that was learned.
+            # The checkpoint that is restored next has all that was learned.
             model.num_timesteps = gradient_steps
             return
         with warnings.catch_warnings():
-            # Of a run that was interrupted between the two.
+            # This warning comes if a run was interrupted between the two parts.
             warnings.filterwarnings("ignore", "Nothing is left to train")
             super()._learn_first(model, dataset, gradient_steps, **{**arguments, "checkpoint": self._folder / OFFLINE})
 
 
 def _for_evaluation(wrapper: Any) -> Any:
-    """Adapt ``env_wrapper`` to evaluation: Atari's games are whole ones there, their rewards as they are."""
+    """Adapt ``env_wrapper`` to evaluation: whole games of Atari, with rewards as they are."""
     if isinstance(wrapper, list):
         return [_for_evaluation(each) for each in wrapper]
     path, arguments = next(iter(wrapper.items())) if isinstance(wrapper, dict) and len(wrapper) == 1 else (wrapper, {})
@@ -725,7 +730,7 @@ def _for_evaluation(wrapper: Any) -> Any:
 
 
 def _check_data(data: Data, args: argparse.Namespace) -> None:
-    """Whether an algorithm learns from such data."""
+    """Check that an algorithm learns from such data."""
     entry = ALGORITHMS.get(args.algo)
     algorithm: Any = None if entry is None else entry.algorithm
     needs_data = getattr(algorithm, "learns_from_data_only", False)
@@ -747,7 +752,7 @@ def _check_data(data: Data, args: argparse.Namespace) -> None:
 
 class _Watched:
     """
-    A model whose ``learn`` is another function, and tells whether it was interrupted, which the zoo keeps to itself.
+    A model whose ``learn`` is another function, and which tells whether it was interrupted, since the zoo does not.
 
     :param model: the model
     :param train: trains it, given the model and the zoo's arguments of ``learn``
@@ -770,10 +775,10 @@ class _Watched:
 
 class RunFiles(BaseCallback):
     """
-    Cuts the Monitor files and the TensorBoard log back to the checkpoint that a run goes on from, since what came after
-    it comes once more.
+    Cuts the Monitor files and the TensorBoard log back to the checkpoint from which a run resumes, since later entries
+    will be written again.
 
-    :param folder: the run's
+    :param folder: the run's folder
     """
 
     def __init__(self, folder: Path):
@@ -797,7 +802,7 @@ class RunFiles(BaseCallback):
         for each in self.model.logger.output_formats:
             if isinstance(each, TensorBoardOutputFormat):
                 each.writer.close()
-                # The class of it, which is in another package where tensorboardX stands for it.
+                # Its own class, which is from another package if tensorboardX replaces TensorBoard.
                 each.writer = type(each.writer)(
                     log_dir=self.model.logger.get_dir(), purge_step=self.model.num_timesteps + 1
                 )

@@ -1,6 +1,6 @@
 """
 Normalised scores for ``plot_from_file --rliable``, which averages over tasks and draws them as "Normalized Score". The
-stock zoo has reference scores for six tasks and draws those of all others as they are, under the same name.
+stock zoo has reference scores for six tasks and draws the scores of all others unnormalised, under the same name.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from sb3_sample.zoo.files import PlottedRuns, RunError
 
 #: Tasks, by their names in the zoo's tables, that its command normalises itself.
 ZOO_REFERENCES = frozenset({"LunarLanderContinuous", "BipedalWalker"})
-#: Parts of names that it normalises by the scores of PyBullet's tasks, whosever runs they are.
+#: Parts of names that the zoo normalises by the scores of PyBullet's tasks, whichever task the runs are of.
 PYBULLET = frozenset({"Half", "Ant", "Hopper", "Walker"})
 #: Command that averages other tasks.
 _OURS = "sb3-sample study aggregate averages runs of any tasks (--score TASK=HIGH)"
@@ -37,7 +37,7 @@ def rliable_options(arguments: Sequence[str]) -> tuple[bool, list[str], list[str
 
 class NormalizedRuns(PlottedRuns):
     """
-    The same with scores between 0 and 1.
+    Tables of runs with scores between 0 and 1.
 
     :param allow_pickle: whether pickled files are read too
     :param skip: tasks that are not drawn
@@ -51,7 +51,7 @@ class NormalizedRuns(PlottedRuns):
     def load(self, file: IO[bytes]) -> Any:
         """
         :param file: file to read
-        :return: what ``all_plots`` gathered, the scores of the tasks that are drawn normalised
+        :return: what ``all_plots`` gathered, with the scores of the drawn tasks normalised
         :raises BadFile: if it is damaged, or pickled and not allowed to be
         :raises RunError: if a task has no scale to normalise by
         """
@@ -101,7 +101,10 @@ def _env_id(task: str) -> str:
 
 @contextlib.contextmanager
 def saying_so() -> Iterator[None]:
-    """Around the zoo's command, which warns that it does not know the scale of tasks that are normalised already."""
+    """
+    Print how scores are normalised, and suppress the zoo's warning that it does not know the scale of tasks that are
+    normalised already.
+    """
     print(
         "Scores are normalised: returns of DeepMind Control over 1,000, success rates as they are, returns of MuJoCo's "
         "HalfCheetah, Walker2d, Ant and Humanoid over 8,500, 4,500, 6,625 and 6,125, those of the games of "

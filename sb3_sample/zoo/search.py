@@ -1,9 +1,9 @@
 """
-Search spaces of the algorithms, and what turns suggested parameters into arguments.
+Search spaces of the algorithms, and the functions that turn suggested parameters into arguments.
 
-How the zoo searches: its sampler suggests a trial's parameters and turns them into constructor arguments, Optuna stores
-what was suggested, and ``--trial-id`` sends the stored parameters through the converter. Here both decode with
-``decode``, so that a stored trial gives the arguments it was run with.
+In a search, the zoo's sampler suggests a trial's parameters and turns them into constructor arguments, Optuna stores
+the suggested parameters, and ``--trial-id`` sends the stored ones through the converter. Here both use the same
+function, so that a stored trial gives the arguments it was run with.
 """
 
 import itertools
@@ -19,7 +19,7 @@ from sb3_sample.zoo.trials import check_params
 Suggest = Callable[[optuna.Trial, str], Any]
 #: A search space: parameters, by the name under which Optuna stores them.
 Space = Mapping[str, Suggest]
-#: (trial, number of actions, number of environments, what the zoo knows of the replay buffer) to arguments.
+#: (trial, number of actions, number of environments, the zoo's facts about the replay buffer) to arguments.
 Sampler = Callable[[optuna.Trial, int, int, dict[str, Any]], dict[str, Any]]
 #: A stored trial's parameters to arguments.
 Converter = Callable[[dict[str, Any]], dict[str, Any]]
@@ -45,12 +45,12 @@ def _mixture(*group: str) -> Suggest:
 
 
 # ---------------------------------------------------------------- search spaces
-# ``one_minus_<x>`` and ``<x>_pow`` are 1 - x and log2(x): the scales on which a change by the same amount means as much
-# anywhere in the range. ``final_share_of_<rate>`` is ``final_<rate>`` as a share of the rate, so that none rises. The
-# ranges contain the defaults of the classes.
+# ``one_minus_<x>`` and ``<x>_pow`` are 1 - x and log2(x): scales on which equal changes mean the same anywhere in the
+# range. ``final_share_of_<rate>`` is ``final_<rate>`` as a share of the rate, so that no rate rises. The ranges contain
+# the defaults of the classes.
 
 _FINAL_SHARE = "final_share_of_"
-#: With ``HerReplayBuffer``, in addition.
+#: Additional parameters with ``HerReplayBuffer``.
 HER_SPACE: Space = {
     "n_sampled_goal": _int(1, 5),
     "goal_selection_strategy": _choice("final", "episode", "future"),
@@ -73,7 +73,7 @@ BRO_FAMILY_SPACE: Space = {
 }
 BRO_SPACE: Space = {**BRO_FAMILY_SPACE, "replay_ratio": _int(1, 16, log=True)}
 BRO_FAST_SPACE: Space = {**BRO_FAMILY_SPACE, "replay_ratio": _int(1, 4)}
-#: With TD3 the noise has numbers of its own, so that no multiplier is needed.
+#: With TD3 the noise has its own parameters, so that no multiplier is needed.
 BRO_TD3_SPACE: Space = {
     **{name: suggest for name, suggest in BRO_FAMILY_SPACE.items() if name != "std_multiplier"},
     "exploration_noise": _float(0.03, 0.4, log=True),
@@ -81,10 +81,10 @@ BRO_TD3_SPACE: Space = {
     "policy_delay": _int(1, 4),
     "replay_ratio": _int(1, 16, log=True),
 }
-# The replay ratio and the resets of the agents below are a regime that the papers compare them in: not searched, so
-# that a search stays in the one that it was started in.
+# The replay ratio and the resets of the agents below are the regime in which the papers compare them. They are not
+# searched, so that a search stays in the regime in which it was started.
 SAC_SPACE: Space = {**OFF_POLICY_SPACE, "pessimism": _float(0.0, 1.0)}
-#: Replay ratio and resets are what makes this agent.
+#: Replay ratio and resets define this agent.
 SR_SAC_SPACE: Space = {
     **SAC_SPACE,
     "replay_ratio": _int(4, 32, log=True),
@@ -113,7 +113,7 @@ OPL_SPACE: Space = {
     "one_minus_td_lambda": _float(0.01, 0.3, log=True),
 }
 VPL_SPACE: Space = {**GPL_SPACE, "validation_proportion": _float(1 / 128, 1 / 4, log=True)}
-#: The successors of BRO, in their published regime. Widths are not searched: they are what a trial's time goes into.
+#: The successors of BRO, in their published regime. Widths are not searched, since they determine a trial's time.
 SIMBA_SPACE: Space = {
     **OFF_POLICY_SPACE,
     "n_critics": _int(1, 2),
@@ -163,7 +163,7 @@ DR_Q_SPACE: Space = {
     "infonce_weight": _float(0.01, 1.0, log=True),
     "weight_decay": _float(1e-4, 1e-1, log=True),
 }
-#: From pixels. The replay ratio is what a trial's time goes into.
+#: From pixels. The replay ratio, which determines a trial's time, is not searched.
 DRQ_SPACE: Space = {**OFF_POLICY_SPACE, "pessimism": _float(0.0, 1.0), "policy_delay": _int(1, 4)}
 DRQV2_SPACE: Space = {
     **OFF_POLICY_SPACE,
@@ -172,7 +172,7 @@ DRQV2_SPACE: Space = {
     "noise_clip": _float(0.1, 1.0, log=True),
 }
 #: Agents that learn from data. A search learns in the environment, with ``--prior-data`` if given; BC, which does not
-#: learn there, is not searched, and has a space for whoever samples of it.
+#: learn there, is not searched; its space is for other callers that sample from it.
 BC_SPACE: Space = {name: OFF_POLICY_SPACE[name] for name in ("learning_rate", "batch_size_pow")}
 IQL_SPACE: Space = {
     **OFF_POLICY_SPACE,
@@ -195,9 +195,9 @@ TD3BC_SPACE: Space = {
     "policy_delay": _int(1, 4),
     "replay_ratio": _int(1, 8, log=True),
 }
-#: PPO with simulated samples. The share of the training in which there are some is not searched: a trial is shorter
-#: than the training that its parameters are for. A trial has to be longer than an iteration, of n_steps times the
-#: environments, since nothing is simulated in the first one.
+#: PPO with simulated samples. The share of the training that has simulated samples is not searched: a trial is shorter
+#: than the training that its parameters are for. A trial must be longer than an iteration, which is n_steps times the
+#: number of environments, since nothing is simulated in the first one.
 ON_POLICY_SPACE: Space = {
     "learning_rate": _float(1e-5, 2e-3, log=True),
     "one_minus_gamma": _float(1e-4, 0.03, log=True),
@@ -211,7 +211,7 @@ ON_POLICY_SPACE: Space = {
 MBMA_SPACE: Space = {**ON_POLICY_SPACE, "simulation_horizon": _int(1, 24)}
 #: Its horizon lies above the number of simulated states: one rollout from each real state.
 MBPO_SPACE: Space = {**ON_POLICY_SPACE, "n_simulated": _int(1, 11, log=True), "simulation_horizon": _int(12, 24)}
-#: The horizon of its further actions is the hyperparameter file's.
+#: The horizon of its further actions comes from the hyperparameter file.
 REWOUND_SPACE: Space = {
     **{name: suggest for name, suggest in ON_POLICY_SPACE.items() if name != "n_simulated"},
     "n_actions": _int(2, 9, log=True),
@@ -223,7 +223,8 @@ REGULARIZATION_SETTINGS: dict[str, tuple[str, str, Suggest]] = {
     "resets": ("plasticity_regularization", "resets", _int(10_000, 320_000, log=True)),
     "redo_period": ("plasticity_regularization", "redo", _int(100, 10_000, log=True)),
 }
-#: The settings are always suggested, so that all trials have the same parameters; only what is chosen uses them.
+#: The settings are always suggested, so that all trials have the same parameters; only the settings of chosen
+#: regularizations are used.
 REGULARIZED_SPACE: Space = {
     **OFF_POLICY_SPACE,
     "critic_regularization": _choice(*CRITIC_REGULARIZATIONS),
@@ -275,7 +276,7 @@ def decode_regularized(params: dict[str, Any]) -> dict[str, Any]:
 def sampler(space: Space, convert: Converter = decode) -> Sampler:
     """
     :param space: search space of an algorithm
-    :param convert: what turns its parameters into arguments
+    :param convert: turns its parameters into arguments
     :return: the zoo's sampler of it
     """
 
@@ -283,7 +284,7 @@ def sampler(space: Space, convert: Converter = decode) -> Sampler:
         uses_her = additional_args["using_her_replay_buffer"]
         whole = {**space, **(HER_SPACE if uses_her else {})}
         params = {name: suggest(trial, name) for name, suggest in whole.items()}
-        # A trial that waits in a storage is not held to the space by Optuna.
+        # Optuna does not hold a trial that waits in a storage to the space.
         check_params(params, whole, f"trial {trial.number}")
         arguments = convert(params)
         for name in arguments.keys() - params.keys() - {"replay_buffer_kwargs"}:

@@ -1,6 +1,6 @@
 """
-Settings of a run (``args.yml``, ``config.yml``), of which the stock zoo makes whatever objects they name, evaluates
-texts as Python, imports modules and calls what is in them with what the file says. Here they are plain values, known
+Settings of a run (``args.yml``, ``config.yml``). The stock zoo makes any objects that these files name, evaluates texts
+as Python, imports modules, and calls their content with arguments from the file. Here settings are plain values, known
 classes of networks, and wrappers from a list.
 """
 
@@ -25,14 +25,14 @@ from sb3_sample.saving.classes import resolve, within
 from sb3_sample.saving.untrusted import BadFile, read_regular
 from sb3_sample.shallow_yaml import ShallowLoader
 
-#: Bytes of a file, and values in it, where an alias counts as what it stands for: some hundred times what the zoo
-#: writes, and what is read in a moment.
+#: Largest size of a file in bytes, and number of values in it, where an alias counts as the values that it stands for:
+#: some hundred times the size that the zoo writes, and still read in a moment.
 MAX_BYTES, MAX_VALUES = 2**15, 5000
 #: Largest count in a run's file: frames that are stacked, steps that an action is repeated, ...
 MAX_COUNT = 1000
 #: The largest whole number among the arguments of an environment that a file gives.
 MAX_NUMBER = 10_000
-#: Characters of a text that is Python.
+#: Largest number of characters of a text that is Python.
 _MAX_TEXT = 1000
 _YAML = "tag:yaml.org,2002:"
 _NAME, _ORDERED = f"{_YAML}python/name:", f"{_YAML}python/object/apply:collections.OrderedDict"
@@ -51,7 +51,7 @@ class _Loader(ShallowLoader):
     Makes plain values, tuples, and classes that a file may name.
 
     :param text: YAML
-    :param trusted_modules: whose classes may be named besides
+    :param trusted_modules: further modules whose classes may be named
     """
 
     def __init__(self, text: str, trusted_modules: Sequence[str]):
@@ -60,8 +60,8 @@ class _Loader(ShallowLoader):
 
     def read(self) -> Any:
         """
-        :return: what the text says
-        :raises BadFile: if it says more than plain values
+        :return: the value that the text describes
+        :raises BadFile: if it holds more than plain values
         """
         node = self.get_single_node()
         if node is None:
@@ -91,9 +91,9 @@ _Loader.add_constructor(_ORDERED, _Loader._ordered)
 
 def _count(node: Any, counted: dict[int, int]) -> int:
     """
-    Look at a value and all that it holds, before anything is made of them.
+    Check a value and all that it holds, before anything is made of them.
 
-    :return: how many values that are, where an alias counts as all that it stands for
+    :return: the number of values, where an alias counts as all values that it stands for
     """
     if id(node) in counted:
         if not counted[id(node)]:
@@ -120,7 +120,7 @@ def _read(path: Path, trusted_modules: Sequence[str]) -> dict[str, Any]:
         settings = _Loader(text, trusted_modules).read()
     except BadFile as error:
         raise BadFile(f"{path}: {error}") from error
-    except Exception as error:  # PyYAML's constructors raise whatever they meet
+    except Exception as error:  # PyYAML's constructors can raise any error
         raise BadFile(f"{path} is no YAML file of the zoo: {type(error).__name__}: {error}") from error
     if not isinstance(settings, dict) or not all(isinstance(name, str) for name in settings):
         raise BadFile(f"{path} does not hold settings by name")
@@ -176,8 +176,8 @@ def _is_nothing(value: Any) -> bool:
 Arguments = Mapping[str, Check]
 _SKIP: Arguments = {"skip": _is_count}
 _EXTREMES: Arguments = {"noop_max": _is_count, "frame_skip": _is_count, "terminal_on_life_loss": _is_flag}
-#: The wrappers that a run's file may name, and their arguments: those that compute only. Those that write files,
-#: open windows, call functions or collect without end are not among them.
+#: The wrappers that a run's file may name, and their arguments: only wrappers that just compute. Wrappers that write
+#: files, open windows, call functions or collect without end are not among them.
 WRAPPERS: dict[type, Arguments] = {
     wrappers.AddRenderObservation: {"render_only": _is_flag, "render_key": _is_word, "obs_key": _is_word},
     wrappers.AtariPreprocessing: {
@@ -235,7 +235,7 @@ WRAPPERS: dict[type, Arguments] = {
     rl_zoo3.wrappers.TruncatedOnSuccessWrapper: {"reward_offset": _is_number, "n_successes": _is_count},
     rl_zoo3.wrappers.YAMLCompatResizeObservation: {"shape": _is_shape},
 }  # fmt: skip
-#: The same of vectorised environments.
+#: The same for vectorised environments.
 VEC_WRAPPERS: dict[type, Arguments] = {
     vec_env.VecCheckNan: {"raise_exception": _is_flag, "warn_once": _is_flag, "check_inf": _is_flag},
     vec_env.VecExtractDictObs: {"key": _is_word},
@@ -252,9 +252,9 @@ VEC_WRAPPERS: dict[type, Arguments] = {
 def _check_wrapper(entry: Any, known: Mapping[type, Arguments], where: str, trusted_modules: Sequence[str]) -> None:
     """
     :param entry: path of a wrapper, or a dict of it and its arguments
-    :param known: those that may be named, whatever the module that holds them
+    :param known: wrappers that may be named, whichever module holds them
     :param where: file and name of the setting
-    :param trusted_modules: whose wrappers may be named besides, with any arguments
+    :param trusted_modules: further modules whose wrappers may be named, with any arguments
     """
     if isinstance(entry, dict) and len(entry) == 1:
         ((path, arguments),) = entry.items()
@@ -265,7 +265,7 @@ def _check_wrapper(entry: Any, known: Mapping[type, Arguments], where: str, trus
     module, _, name = path.rpartition(".")
     if within(module, trusted_modules):
         return
-    # Of modules that are there: to import one can do anything.
+    # Only modules that are imported already: importing one could do anything.
     found = getattr(sys.modules.get(module), "__dict__", {}).get(name)
     if not isinstance(found, type) or found not in known:
         raise BadFile(
@@ -311,7 +311,7 @@ def read_settings(path: Path, trusted_modules: Sequence[str] = (), given: Sequen
     if "normalize" in settings:
         settings["normalize"] = _normalize(settings["normalize"], path)
     for key, known in (("env_wrapper", WRAPPERS), ("vec_env_wrapper", VEC_WRAPPERS)):
-        # The zoo takes nothing for an error in one of the two.
+        # The zoo treats None as an error in one of the two.
         if settings.get(key) is None:
             settings.pop(key, None)
             continue
@@ -331,9 +331,9 @@ def read_settings(path: Path, trusted_modules: Sequence[str] = (), given: Sequen
 
 def check_settings(folder: Path, trusted_modules: Sequence[str] = (), given: Sequence[str] = ()) -> None:
     """
-    Look at a run's ``args.yml`` and ``config.yml`` before the zoo does.
+    Check a run's ``args.yml`` and ``config.yml`` before the zoo reads them.
 
-    :param folder: where they are
+    :param folder: the folder that holds them
     :param trusted_modules: modules, or packages of modules, whose classes they may name
     :param given: arguments of the environment that the command line gives
     :raises BadFile: see ``read_settings``
@@ -370,7 +370,7 @@ def _is_plain(value: Any) -> bool:
 
 
 def _normalize(value: Any, path: Path) -> Any:
-    """Whether there is a ``VecNormalize``, or its arguments, of which the zoo's text is Python to evaluate."""
+    """Whether there is a ``VecNormalize``, or its arguments, which the zoo writes as Python to be evaluated."""
     if isinstance(value, str):
         try:
             value = _literal(value)

@@ -1,5 +1,5 @@
 """
-Stored trials of a search (``--storage``, ``--trial-id``). The zoo takes whatever is stored for hyperparameters, some of
+Stored trials of a search (``--storage``, ``--trial-id``). The zoo accepts anything stored as hyperparameters, some of
 which it evaluates as Python or imports. Here a trial has parameters of the algorithm's search space, with values that
 could have been suggested, and nothing else.
 """
@@ -19,9 +19,9 @@ from optuna.storages.journal import JournalFileBackend
 
 from sb3_sample.saving.untrusted import BadFile, open_regular
 
-#: Bytes of a line of a journal.
+#: Largest size of a line of a journal, in bytes.
 MAX_LINE = 2**20
-#: Words in the definition of a table that computes something when it is read, as none of Optuna's does.
+#: Words in the definition of a table that computes something when it is read; none of Optuna's tables does.
 _COMPUTES = re.compile(r"\b(virtual|generated|as)\b", re.IGNORECASE)
 
 
@@ -41,8 +41,8 @@ def stored_params(storage: str, study_name: str, trial_id: int | None) -> dict[s
 
 def check_storage(storage: str) -> None:
     """
-    :param storage: as of :func:`stored_params`
-    :raises BadFile: (a ``ValueError``) if it is a file that is there, and not one that Optuna has written
+    :param storage: as in :func:`stored_params`
+    :raises BadFile: (a ``ValueError``) if it is an existing file that Optuna has not written
     """
     file = _file_of(storage)
     if file is None or not file.exists():
@@ -63,7 +63,7 @@ def _opened(storage: str) -> Any:
 
 
 def _file_of(storage: str) -> Path | None:
-    """Where it is stored, if that is one file of this machine."""
+    """The file of the storage, if it is one file of this machine."""
     if storage.endswith(".log"):
         return Path(storage)
     with _reading(storage, "this address"):
@@ -78,12 +78,12 @@ def _reading(storage: str, what: str) -> Iterator[None]:
         yield
     except BadFile:
         raise
-    except Exception as error:  # Optuna and the database raise whatever they meet
+    except Exception as error:  # Optuna and the database can raise any error
         raise BadFile(f"--storage {storage}: {what} cannot be read: {type(error).__name__}: {error}") from error
 
 
 def _check_lines(file: Path) -> None:
-    """Optuna takes a line of any length into memory."""
+    """Limit the length of lines: Optuna takes a line of any length into memory."""
     with open_regular(file) as lines:
         while line := lines.readline(MAX_LINE + 1):
             if len(line) > MAX_LINE:
@@ -91,7 +91,7 @@ def _check_lines(file: Path) -> None:
 
 
 def _check_tables(file: Path) -> None:
-    """A view or a computed column could make the database compute for ever."""
+    """Refuse views and computed columns, which could make the database compute for ever."""
     address = f"file:{urllib.parse.quote(str(file.resolve()))}?mode=ro"
     with contextlib.closing(sqlite3.connect(address, uri=True)) as database:
         for kind, name, text in database.execute("SELECT type, name, sql FROM sqlite_master"):
@@ -101,25 +101,25 @@ def _check_tables(file: Path) -> None:
 
 class _Stored:
     """
-    Stands for the trial that a search space suggests parameters to: says whether a stored value is one of them.
+    Replaces the trial of a search space, to check whether a stored value is one that the space could suggest.
 
     :param value: the stored value
-    :param what: which it is, for messages
+    :param what: its name, for messages
     """
 
     def __init__(self, value: Any, what: str):
         self._value, self._what = value, what
 
     def suggest_float(self, name: str, low: float, high: float, *, log: bool = False) -> None:
-        """As of ``optuna.Trial``."""
+        """As in ``optuna.Trial``."""
         self._check(type(self._value) in (int, float) and low <= self._value <= high, f"a number of {low} to {high}")
 
     def suggest_int(self, name: str, low: int, high: int, *, log: bool = False) -> None:
-        """As of ``optuna.Trial``."""
+        """As in ``optuna.Trial``."""
         self._check(type(self._value) is int and low <= self._value <= high, f"a whole number of {low} to {high}")
 
     def suggest_categorical(self, name: str, choices: Any) -> None:
-        """As of ``optuna.Trial``."""
+        """As in ``optuna.Trial``."""
         fits = any(type(choice) is type(self._value) and choice == self._value for choice in choices)
         self._check(fits, f"one of {', '.join(map(str, choices))}")
 

@@ -23,7 +23,7 @@ from sb3_sample.zoo.settings import check_settings
 def watch_parser(command: str) -> argparse.ArgumentParser:
     """
     :param command: ``enjoy`` or ``record_video``
-    :return: parser of what it takes besides the zoo's options
+    :return: parser of the options that it takes besides the zoo's
     """
     parser = argparse.ArgumentParser(
         f"sb3-sample {command}", usage=argparse.SUPPRESS, add_help=False, allow_abbrev=False
@@ -47,9 +47,10 @@ def watching(options: argparse.Namespace, arguments: Sequence[str], *modules: An
 
     :param options: what ``watch_parser`` has parsed
     :param arguments: the rest of the command line
-    :param modules: those that look for a run with ``get_model_path`` and make environments with ``create_test_env``
+    :param modules: the modules that look for a run with ``get_model_path`` and make environments with
+        ``create_test_env``
     :return: command line for the zoo
-    :raises RunError: if ``--run-dir`` is no run's, or of another algorithm than ours
+    :raises RunError: if ``--run-dir`` is not the folder of a run, or the run is of another algorithm than ours
     """
     given = _given(arguments)
     with contextlib.ExitStack() as stack:
@@ -63,7 +64,7 @@ def _given(arguments: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo")
     parser.add_argument("--env-kwargs", nargs="+", default=[])
-    # Before these, abbreviations are ambiguous, as for the zoo.
+    # With these options, abbreviations are as ambiguous as for the zoo.
     parser.add_argument("--env")
     parser.add_argument("--exp-id")
     return parser.parse_known_args(arguments)[0]
@@ -71,8 +72,8 @@ def _given(arguments: Sequence[str]) -> argparse.Namespace:
 
 def _of_record(options: argparse.Namespace, given: argparse.Namespace) -> list[str]:
     """
-    Algorithm and environment of the run, which the command line replaces. The run's own file does not say whether it
-    is read as one of ours, or as the stock zoo reads its own, whose files can run code.
+    Algorithm and environment of the run, which the command line can replace. The run's own file must not decide whether
+    it is read as one of ours, or as the stock zoo reads its own, whose files can run code.
     """
     record = Record.read(options.run_dir)
     if record.algo not in ALGORITHMS and given.algo is None and not options.allow_pickle:
@@ -81,17 +82,17 @@ def _of_record(options: argparse.Namespace, given: argparse.Namespace) -> list[s
             f"wanted, and which is none of this package ({', '.join(ALGORITHMS)}). If you trust its author: "
             f"--algo {record.algo}, or --allow-pickle"
         )
-    # In one word: what follows an option could be taken for another one.
+    # As one word: a value after an option could be taken for another option.
     return [f"--env={record.env}", *([] if given.algo is not None else [f"--algo={record.algo}"])]
 
 
 class _Watch:
     """
-    Stands before two functions of the zoo.
+    Wraps two functions of the zoo.
 
     :param options: what ``watch_parser`` has parsed
     :param given: what ``_given`` has found
-    :param stack: what is in force until the command ends
+    :param stack: holds the patches in force until the command ends
     """
 
     def __init__(self, options: argparse.Namespace, given: argparse.Namespace, stack: contextlib.ExitStack):
@@ -103,9 +104,9 @@ class _Watch:
 
     def find(self, exp_id: int, folder: str, algo: str, env_name: Any, *which: Any) -> tuple[str, str, str]:
         """
-        As ``get_model_path``. The zoo has parsed the path that it is about to read.
+        Find the model as ``get_model_path`` does, and check the settings that the zoo is about to read.
 
-        :raises Refused: if the run is refused, which is no ``ValueError`` that the zoo answers by a download
+        :raises Refused: if the run is refused; it is no ``ValueError``, which the zoo would answer by a download
         """
         options, is_ours = self._options, algo in ALGORITHMS
         if not is_ours and not options.allow_pickle:
@@ -138,7 +139,7 @@ class _Watch:
         """
         As ``create_test_env``.
 
-        :raises Refused: if the run's settings make none that works
+        :raises Refused: if the run's settings make no environment that works
         """
         self._env = (make_answering_env if self._is_safe else create_test_env)(env_id, *args, **kwargs)
         return self._env
@@ -171,9 +172,9 @@ def model_path(
     :param run_dir: the folder
     :param algo: name of the algorithm
     :param env_name: name of the environment
-    :param load_best: whether the best model is asked for
-    :param load_checkpoint: steps of the zoo's checkpoint that is asked for
-    :param load_last_checkpoint: whether the last checkpoint is asked for
+    :param load_best: whether to load the best model
+    :param load_checkpoint: steps of the zoo's checkpoint to load
+    :param load_last_checkpoint: whether to load the last checkpoint
     :return: name for a video, the model's file, the run's folder
     :raises Refusal: (a ``SystemExit``) if there is no model yet
     """

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
@@ -498,12 +499,17 @@ def test_compiled_models_do_not_share() -> None:
 # ---------------------------------------------------------------- when
 
 
+def set_threshold(monkeypatch: pytest.MonkeyPatch, n_updates: int) -> None:
+    for name in ("PAYS_FROM", "PAYS_FROM_IMAGES"):
+        monkeypatch.setattr(compiling, name, n_updates)
+
+
 @COMPILES
 @pytest.mark.parametrize("maker", ["SAC", pytest.param("SRSPR", marks=pytest.mark.slow)])
 def test_auto_compiles_where_it_pays_and_the_file_remembers(
     maker: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compiling, "PAYS_FROM", 50)
+    set_threshold(monkeypatch, 50)
     model, other = (OFF_POLICY[maker](learning_starts=20, replay_ratio=1, compile="auto") for _ in range(2))
     assert model.compiled is None
     assert other.learn(69).compiled is False
@@ -534,7 +540,7 @@ def test_counts_the_gradient_steps_to_come(
     kwargs: dict[str, Any], n_updates: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for threshold, expected in ((n_updates, True), (n_updates + 1, False)):
-        monkeypatch.setattr(compiling, "PAYS_FROM", threshold)
+        set_threshold(monkeypatch, threshold)
         model = sac(learning_starts=20, **kwargs)
         model._total_timesteps = 100
         model._before_turns()
@@ -542,7 +548,7 @@ def test_counts_the_gradient_steps_to_come(
 
 
 def test_episodes_of_unknown_length_stay_uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiling, "PAYS_FROM", 1)
+    set_threshold(monkeypatch, 1)
     model = sac(learning_starts=20, train_freq=(1, "episode"), gradient_steps=2)
     model._total_timesteps = 100
     model._before_turns()
@@ -555,7 +561,7 @@ def test_episodes_of_unknown_length_stay_uncompiled(monkeypatch: pytest.MonkeyPa
 def test_without_a_compiler_training_goes_on_uncompiled(
     compile: Any, maker: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compiling, "PAYS_FROM", 5)
+    set_threshold(monkeypatch, 5)
     model = OFF_POLICY[maker](compile=compile)
     without = torch._inductor.config.patch({"cpp.cxx": ("/nonexistent/c++",)})
     with without, warnings.catch_warnings(record=True) as caught:
@@ -571,7 +577,7 @@ def test_without_a_compiler_training_goes_on_uncompiled(
 @pytest.mark.parametrize("version", sampled(["2.10.0+cu130", "2.4.1", "1.13.1"], ("2.10.0+cu130",)))
 def test_an_old_torch_is_told_of_once(compile: Any, version: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over several models, calls of ``learn`` and a file that says to go on compiled; and the numbers are eager's."""
-    monkeypatch.setattr(compiling, "PAYS_FROM", 5)
+    set_threshold(monkeypatch, 5)
     eager = sac(compile=False).learn(30)
     monkeypatch.setattr(torch, "__version__", version)
     monkeypatch.setattr(execution, "_told", set())
@@ -618,7 +624,7 @@ class Peeking(BaseFeaturesExtractor):
 
 @COMPILES
 def test_what_cannot_be_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiling, "PAYS_FROM", 5)
+    set_threshold(monkeypatch, 5)
     kwargs = {"policy_kwargs": {"net_arch": [8], "features_extractor_class": Peeking}}
     model = sac(compile="auto", **kwargs)
     with pytest.warns(UserWarning, match="not compiled, as it cannot be"):
@@ -643,7 +649,7 @@ def test_parts_of_ones_own_are_compiled_when_asked_for(monkeypatch: pytest.Monke
         def before_updates(self, agent: SAC) -> None:
             self.constant += 0.01
 
-    monkeypatch.setattr(compiling, "PAYS_FROM", 5)
+    set_threshold(monkeypatch, 5)
     monkeypatch.setitem(PESSIMISMS, "own", Own)
     monkeypatch.setitem(PESSIMISMS, "counting", Counting)
     assert sac(pessimism="own").learn(20).compiled is False
@@ -655,7 +661,7 @@ def test_parts_of_ones_own_are_compiled_when_asked_for(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("maker", ["SAC", "SRSPR"])
 def test_foreign_optimizers_stay_uncompiled(maker: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiling, "PAYS_FROM", 5)
+    set_threshold(monkeypatch, 5)
     make = OFF_POLICY[maker]
     small: dict[str, Any] = TINY if maker == "SRSPR" else {"net_arch": [8]}
     kwargs = {"policy_kwargs": {**small, "optimizer_class": torch.optim.RMSprop}}
@@ -669,7 +675,7 @@ def test_a_network_of_ones_own_is_compiled_when_asked_for(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Where the networks are one, in a policy of one's own."""
-    monkeypatch.setattr(compiling, "PAYS_FROM", 5)
+    set_threshold(monkeypatch, 5)
     kwargs: dict[str, Any] = {"learning_starts": 10, "policy_kwargs": TINY, "verbose": 1}
     model = SRSPR(OwnSPRPolicy, env_of("SRSPR"), buffer_size=100, batch_size=4, n_steps=3, n_predictions=2, **kwargs)
     assert model.learn(16).compiled is False
@@ -766,7 +772,17 @@ def test_compile_is_checked(value: Any) -> None:
 
 def test_pays_from_is_documented() -> None:
     text = (Path(__file__).parents[2] / "docs" / "performance.md").read_text()
-    assert f"{execution.PAYS_FROM:,}" in text
+    assert f"{execution.PAYS_FROM:,}" in text and f"{execution.PAYS_FROM_IMAGES:,} from images on a CPU" in text
+
+
+def test_gradient_steps_on_images_pay_sooner() -> None:
+    images, numbers = spaces.Box(0, 255, (3, 64, 64), np.uint8), spaces.Box(-1, 1, (3,), np.float32)
+    cpu, gpu = torch.device("cpu"), torch.device("cuda")
+    for space in (images, spaces.Dict({"camera": images, "joints": numbers})):
+        assert compiling.pays_from(space, cpu) == execution.PAYS_FROM_IMAGES
+        assert compiling.pays_from(space, gpu) == execution.PAYS_FROM
+    for space in (numbers, spaces.Dict({"joints": numbers})):
+        assert compiling.pays_from(space, cpu) == execution.PAYS_FROM
 
 
 def test_device_buffer_gives_what_the_plain_one_gives() -> None:
