@@ -2,9 +2,9 @@
 BRO from top to bottom in one file: configuration, networks, optimizer, update, replay buffer, training loop.
 
 "Bigger, Regularized, Optimistic: scaling for compute and sample-efficient continuous control" (Nauman et al. 2024,
-https://arxiv.org/abs/2405.16158). This is the algorithm to read and to change by hand; ``sb3_sample.BRO`` is the same
-one to use: faster, resumable, with Stable-Baselines3's interface. Each reproduces updates recorded from the authors'
-code, and the other's updates (``tests/test_bro_in_one_file.py``).
+https://arxiv.org/abs/2405.16158). This version is for reading and for changing by hand; ``sb3_sample.BRO`` is the same
+algorithm for use: faster, resumable, with Stable-Baselines3's interface. Each reproduces updates recorded from the
+authors' code, and the other's updates (``tests/test_bro_in_one_file.py``).
 
     python examples/bro_in_one_file.py --env dmc/cheetah-run-v0 --steps 100000 --seed 0
     python examples/bro_in_one_file.py --env Pendulum-v1 --steps 6000 --model-size 0.55M --fast
@@ -27,13 +27,13 @@ from torch import nn
 
 # ------------------------------------------------------------------------------------------------- configuration
 
-#: Residual blocks and width of the critics, by the parameters of all networks together (BRO, table 7).
+#: Residual blocks and width of the critics, by the total number of parameters of all networks (BRO, table 7).
 MODEL_SIZES = {"0.55M": (1, 128), "1.05M": (1, 256), "2.83M": (1, 512), "4.92M": (2, 512), "26.31M": (3, 1024)}
 
 
 @dataclass(frozen=True)
 class Config:
-    """BRO's published numbers (BRO, table 5; the authors' code where it says something else)."""
+    """BRO's published numbers (BRO, table 5; the authors' code where it differs)."""
 
     # Bigger
     critic_blocks: int = 2
@@ -41,19 +41,19 @@ class Config:
     actor_blocks: int = 1
     actor_width: int = 256
     n_quantiles: int = 100
-    replay_ratio: int = 10  # gradient steps an environment step
+    replay_ratio: int = 10  # gradient steps per environment step
 
     # Regularized, besides the layer norms in the networks
     weight_decay: float = 1e-4
     resets: tuple[int, ...] = (15_000, 50_000, 250_000, 500_000, 750_000, 1_000_000, 1_500_000, 2_000_000)
 
     # Optimistic
-    pessimism: float = 0.0  # times the critics' disagreement off every value that is learned from; 1: their minimum
+    pessimism: float = 0.0  # values learned from: mean minus this times the critics' disagreement; 1: their minimum
     initial_optimism: float = 1.0
     initial_kl_weight: float = 0.25
     kl_target: float = 0.05  # divergence of the two actors per action dimension
-    std_multiplier: float = 0.75  # on the standard deviation while exploring
-    adjustment_learning_rate: float = 3e-5  # of optimism and KL weight
+    std_multiplier: float = 0.75  # factor on the standard deviation while exploring
+    adjustment_learning_rate: float = 3e-5  # for optimism and KL weight
 
     # Soft actor-critic
     learning_rate: float = 3e-4
@@ -113,7 +113,7 @@ class Critics(nn.Module):
 
 
 class Actor(nn.Module):
-    """Tanh-Gaussian actor, the pessimistic one of the paper: TD targets are made, and evaluations played, with it."""
+    """Tanh-Gaussian actor, the pessimistic one of the paper, used for TD targets and evaluations."""
 
     def __init__(self, obs_dim: int, act_dim: int, config: Config):
         super().__init__()
@@ -130,14 +130,14 @@ class Actor(nn.Module):
         """(B, O) and standard normal noise, (B, A), to actions, (B, A), and their log-probability, (B, 1)."""
         mean, log_std = self(observations)
         x = mean + log_std.exp() * noise
-        # From x and the noise, not from the action: where that rounds to 1, its atanh is infinite.
+        # From x and the noise, not from the action: if the action rounds to 1, its atanh is infinite.
         gaussian = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
         log_derivative = 2 * (math.log(2) - x - F.softplus(-2 * x))  # log(1 - tanh(x)^2)
         return torch.tanh(x), (gaussian - log_derivative).sum(dim=1, keepdim=True)
 
 
 class OptimisticShift(nn.Module):
-    """Optimistic actor, as a shift of the actor's mean; it only explores (BRO, section B.7)."""
+    """Optimistic actor, as a shift of the actor's mean; used for exploration only (BRO, section B.7)."""
 
     def __init__(self, obs_dim: int, act_dim: int, config: Config):
         super().__init__()
@@ -150,7 +150,7 @@ class OptimisticShift(nn.Module):
 
 
 class BoundedScalar(nn.Module):
-    """Learned number between exp(-10) and exp(7.5), as the authors' code has optimism and KL weight."""
+    """Learned number between exp(-10) and exp(7.5), as for optimism and KL weight in the authors' code."""
 
     def __init__(self, initial: float):
         super().__init__()
@@ -165,7 +165,7 @@ class BoundedScalar(nn.Module):
 
 class AdamW:
     """
-    Adam with decoupled weight decay (Loshchilov and Hutter 2019), the decay added to Adam's direction.
+    Adam with decoupled weight decay (Loshchilov and Hutter 2019), with the decay added to Adam's direction.
 
     ``torch.optim.AdamW`` first multiplies the parameters by ``1 - learning_rate * weight_decay``, here 1 - 3e-8. The
     nearest number in float32 is 1 - 6e-8, and the product is rounded again, so that the decay comes out 2.6 times as
@@ -181,7 +181,7 @@ class AdamW:
         self.n_steps = 0
 
     def minimize(self, loss: torch.Tensor) -> None:
-        """One step down a loss. Only these parameters get a gradient, whatever else the loss passed through."""
+        """Take one step down a loss. Only these parameters get a gradient, whatever else the loss depends on."""
         for p in self.parameters:
             p.grad = None
         loss.backward(inputs=self.parameters)
@@ -203,7 +203,7 @@ class Batch(NamedTuple):
     observations: torch.Tensor
     actions: torch.Tensor
     rewards: torch.Tensor
-    terminated: torch.Tensor  # 1 where the episode terminated, not at a time limit, behind which the return goes on
+    terminated: torch.Tensor  # 1 if the episode terminated, 0 at a time limit, after which the return continues
     next_observations: torch.Tensor
 
 
@@ -230,7 +230,7 @@ def quantile_huber(q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 
 class Agent:
-    """Networks, learned numbers and optimizers, which a full-parameter reset makes anew; how to act, and the update."""
+    """Networks, learned numbers and optimizers, all re-created by a full-parameter reset; actions, and the update."""
 
     def __init__(self, obs_dim: int, act_dim: int, config: Config):
         self.config, self.act_dim = config, act_dim
@@ -242,7 +242,7 @@ class Agent:
         self.optimism = BoundedScalar(config.initial_optimism)
         self.kl_weight = BoundedScalar(config.initial_kl_weight)
 
-        # Networks decay in every parameter, biases and layer norms too; the learned numbers do not.
+        # Weight decay applies to all network parameters, biases and layer norms too, but not to the learned numbers.
         lr, adjustment_lr, decay = config.learning_rate, config.adjustment_learning_rate, config.weight_decay
         self.actor_optimizer = AdamW(self.actor.parameters(), lr, weight_decay=decay)
         self.optimist_optimizer = AdamW(self.optimist.parameters(), lr, weight_decay=decay)
@@ -252,7 +252,7 @@ class Agent:
 
     @torch.no_grad()
     def explore(self, observation: np.ndarray) -> np.ndarray:
-        """Sample of the optimistic actor, (O,) to (A,) (BRO, algorithm 2, line 3)."""
+        """Sample an action of the optimistic actor, (O,) to (A,) (BRO, algorithm 2, line 3)."""
         observations = torch.as_tensor(observation, dtype=torch.float32)[None]
         mean, log_std = self.actor(observations)
         noise = self.config.std_multiplier * log_std.exp() * torch.randn_like(mean)
@@ -266,11 +266,11 @@ class Agent:
 
     def update(self, batch: Batch, noise: torch.Tensor) -> dict[str, torch.Tensor]:
         """
-        One gradient step (BRO, algorithm 2, lines 7 to 15), with everything random passed in.
+        Take one gradient step (BRO, algorithm 2, lines 7 to 15), with everything random passed in.
 
         :param batch: transitions
         :param noise: standard normal noise of the three sampled actions, (3, B, A)
-        :return: numbers to log, by name, from before the update of the module in question
+        :return: numbers to log, by name, each from before the update of its module
         """
         alpha = self.log_temperature.exp()
         metrics = self._update_critics(batch, alpha.detach(), noise[0])
@@ -281,23 +281,23 @@ class Agent:
         return {name: value.detach() for name, value in metrics.items()}
 
     def _update_critics(self, batch: Batch, alpha: torch.Tensor, noise: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Lines 7 and 8: the mean of the target critics, where clipped double Q-learning has their minimum."""
+        """Lines 7 and 8: targets from the mean of the target critics, not from their minimum as in clipped double Q."""
         with torch.no_grad():
             next_actions, log_prob = self.actor.sample(batch.next_observations, noise)
             next_q = self.target_critics(batch.next_observations, next_actions)
-            # Line 8 prints the entropy bonus outside of the discount: a misprint, which the authors' code has not.
+            # Line 8 prints the entropy bonus outside the discount: a misprint that the authors' code does not share.
             soft_value = ensemble_value(next_q, -self.config.pessimism) - alpha * log_prob
             target = batch.rewards + self.config.discount * (1 - batch.terminated) * soft_value
         q = self.critics(batch.observations, batch.actions)
         loss = quantile_huber(q, target)
         self.critic_optimizer.minimize(loss)
-        with torch.no_grad():  # Polyak average, directly after the critics (the authors' code).
+        with torch.no_grad():  # Polyak average, directly after the critics' update (the authors' code).
             for old, new in zip(self.target_critics.parameters(), self.critics.parameters(), strict=True):
                 old.lerp_(new, self.config.tau)
         return {"train/critic_loss": loss, "train/q_mean": q.mean()}
 
     def _update_actor(self, batch: Batch, alpha: torch.Tensor, noise: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Lines 9 and 10, on the new critics."""
+        """Lines 9 and 10, with the new critics."""
         actions, log_prob = self.actor.sample(batch.observations, noise)
         value = ensemble_value(self.critics(batch.observations, actions), -self.config.pessimism)
         loss = (alpha * log_prob).mean() - value.mean()
@@ -305,16 +305,16 @@ class Agent:
         return {"train/actor_loss": loss, "train/entropy": -log_prob.mean()}
 
     def _update_optimist(self, batch: Batch, noise: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Lines 11 and 12, on the new critics and the new actor."""
+        """Lines 11 and 12, with the new critics and the new actor."""
         with torch.no_grad():
             mean, log_std = self.actor(batch.observations)
             optimism, kl_weight, std = self.optimism(), self.kl_weight(), log_std.exp()
         shift = self.optimist(batch.observations, mean)
         q = self.critics(batch.observations, torch.tanh(mean + shift + self.config.std_multiplier * std * noise))
-        # From the optimistic to the pessimistic Gaussian, the former without its multiplier (the authors' code; line 12
-        # prints the other order): as the standard deviations are equal, only the shift is left of the divergence.
+        # KL from the optimistic to the pessimistic Gaussian, the former without its multiplier (the authors' code; line
+        # 12 prints the other order): as the standard deviations are equal, only the term of the shift remains.
         kl = (shift.square() / (2 * std.square())).sum(dim=1).mean()
-        # Optimism counts once: line 12 prints it again beside the value of line 11, which holds it already.
+        # Optimism counts once: line 12 prints it again, but the value of line 11 already contains it.
         loss = kl_weight * kl - ensemble_value(q, optimism).mean()
         self.optimist_optimizer.minimize(loss)
         metrics = {"actor_loss": loss, "kl": kl / self.act_dim, "q_mean": q.mean(), "q_std": disagreement(q).mean()}
@@ -327,7 +327,7 @@ class Agent:
         return {"train/ent_coef": alpha, "train/ent_coef_loss": loss}
 
     def _update_adjustments(self, kl: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Lines 14 and 15: where the two actors are too far apart, optimism falls and the divergence weighs more."""
+        """Lines 14 and 15: if the two actors are too far apart, optimism falls and the divergence weighs more."""
         gap, optimism, kl_weight = kl - self.config.kl_target, self.optimism(), self.kl_weight()
         losses = {"optimism_loss": (optimism - self.config.pessimism) * gap, "kl_weight_loss": -kl_weight * gap}
         self.adjustment_optimizer.minimize(sum(losses.values()))
@@ -339,7 +339,7 @@ class Agent:
 
 
 class ReplayBuffer:
-    """The latest transitions, in one ring for each entry of ``Batch``."""
+    """The latest transitions, in one ring buffer for each entry of ``Batch``."""
 
     def __init__(self, capacity: int, obs_dim: int, act_dim: int):
         widths = (obs_dim, act_dim, 1, 1, obs_dim)
@@ -358,7 +358,7 @@ class ReplayBuffer:
 
 
 def make_env(env_id: str) -> gym.Env:
-    """Make an environment, with flat observations and actions in [-1, 1]; ValueError if its actions are not bounded."""
+    """Make an environment with flat observations and actions in [-1, 1]; ValueError if its actions are unbounded."""
     env = gym.make(env_id)
     space = env.action_space
     if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1 or not space.is_bounded():
@@ -367,7 +367,7 @@ def make_env(env_id: str) -> gym.Env:
 
 
 def evaluate(agent: Agent, env: gym.Env, n_episodes: int = 5) -> float:
-    """Mean return of episodes with the actor's mean action."""
+    """Mean return over episodes with the actor's mean action."""
     total = 0.0
     for _ in range(n_episodes):
         observation, done = env.reset()[0], False
@@ -378,7 +378,7 @@ def evaluate(agent: Agent, env: gym.Env, n_episodes: int = 5) -> float:
 
 
 def check_numbers(n_steps: int, seed: int, eval_every: int, config: Config) -> None:
-    """ValueError if there are too few steps to learn in, or to an evaluation, or the seed is none."""
+    """ValueError if there are too few steps for learning or between evaluations, or the seed is negative."""
     if n_steps <= config.learning_starts:
         raise ValueError(f"n_steps must be more than learning_starts={config.learning_starts}, not {n_steps}")
     if seed < 0:
@@ -389,7 +389,7 @@ def check_numbers(n_steps: int, seed: int, eval_every: int, config: Config) -> N
 
 def train(env_id: str, config: Config, n_steps: int, seed: int, eval_every: int) -> tuple[Agent, list[float]]:
     """
-    :param env_id: of an environment that ``make_env`` takes
+    :param env_id: id of an environment that ``make_env`` accepts
     :param config: hyperparameters
     :param n_steps: environment steps, more than ``learning_starts``
     :param seed: of everything random
@@ -412,7 +412,7 @@ def train(env_id: str, config: Config, n_steps: int, seed: int, eval_every: int)
         buffer.add(observation, action, float(reward), float(terminated), next_observation)
         observation = env.reset()[0] if terminated or truncated else next_observation
         if step in config.resets:  # Full-parameter reset: everything but the replay buffer (BRO, section 2.2).
-            with torch.random.fork_rng(devices=[]):  # As published: the first parameters again.
+            with torch.random.fork_rng(devices=[]):  # As published: back to the initial parameters.
                 torch.manual_seed(seed)
                 agent = Agent(*sizes, config)
         for _ in range(0 if warm_up else config.replay_ratio):

@@ -1,13 +1,13 @@
 """
-The demo of ``make demo``: BRO learns a DeepMind Control task from scratch while you watch, to balance a pole on a cart.
+Demo of ``make demo``: BRO learns a DeepMind Control task, balancing a pole on a cart, from scratch while you watch.
 
-The reward is 1 while the pole stands upright and the cart is near the middle of its rail, and else 0: random actions
-lose it within a fraction of the episode.
+The reward is 1 while the pole stands upright and the cart is near the middle of its rail, else 0: random actions lose
+it within a fraction of the episode.
 
     python examples/demo.py [--folder demo] [--seed 0]
 
-It prints what random actions and what the learned policy reach, and leaves the model, a picture of the learning curve
-and, where the machine can render without a screen, a GIF of the learned behaviour.
+It prints the returns of random actions and of the learned policy, and writes the model, a picture of the learning curve
+and, if the machine can render without a screen, a GIF of the learned behaviour.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from sb3_sample import BRO, make_env
 from sb3_sample.plots import Curve, Run, draw, summarize
 
 ENV, ENV_ARGUMENTS = "dmc/cartpole-balance_sparse-v0", {"action_repeat": 4}  # an episode is 250 decisions
-STEPS, EVERY = 10_000, 500  # decisions at most, and between two evaluations
+STEPS, EVERY = 10_000, 500  # decisions: in total at most, and between two evaluations
 SOLVED = 900  # mean return, of at most 1,000
 # The smallest critics, larger steps and no resets: enough for this task, and quick on a laptop.
 AGENT: dict[str, Any] = dict(model_size="0.55M", replay_ratio=4, learning_rate=1e-3, learning_starts=1_000, resets=())
@@ -39,9 +39,9 @@ def fresh_env(**kwargs: Any) -> gym.Env:
 
 def fresh_returns(policy: Any, seed: int) -> np.ndarray:
     """
-    :param policy: a model, or anything with ``predict``
+    :param policy: a model, or any object with ``predict``
     :param seed: of the environment
-    :return: returns of ten episodes in an environment of their own, (10,)
+    :return: returns of ten episodes in a fresh environment, (10,)
     """
     env = fresh_env()
     env.reset(seed=seed)
@@ -64,9 +64,9 @@ class RandomActions:
 
 class Evaluation(EvalCallback):
     """
-    Evaluates every ``EVERY`` steps and shows the latest return: in a progress bar, or in lines where there is no
-    terminal. One good evaluation may be luck, and the next update may undo it: training ends when ten fresh episodes
-    of the policy that passed are as good.
+    Evaluates every ``EVERY`` steps and shows the latest return: in a progress bar, or in lines if there is no terminal.
+    One good evaluation may be luck, and the next update may undo it: training ends when a policy that passes an
+    evaluation is as good in ten fresh episodes.
     """
 
     solved = False
@@ -94,7 +94,7 @@ class Evaluation(EvalCallback):
                 self.show(f"evaluation return {self.last_mean_reward:.0f} of 1000, ten fresh episodes {again:.0f}")
                 self.solved = bool(again >= SOLVED)
         if self.num_timesteps == AGENT["learning_starts"] and self.model.compiled:
-            # The first gradient step comes next, and nothing else is printed meanwhile.
+            # The first gradient step, which compiles the update, comes next; nothing else is printed meanwhile.
             tqdm.write("Compiling the update: a minute on free cores, several on busy ones ...")
             sys.stdout.flush()
         return not self.solved
@@ -104,7 +104,7 @@ class Evaluation(EvalCallback):
 
 
 def save_gif(model: BRO, path: Path) -> None:
-    """One episode of the learned policy."""
+    """Save one episode of the learned policy."""
     from PIL import Image
 
     env = make_env(ENV, **ENV_ARGUMENTS, render_mode="rgb_array", width=240, height=240)
@@ -153,7 +153,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         save_gif(model, folder / "behaviour.gif")
         print(f"Saved {folder / 'behaviour.gif'}.")
-    except Exception as error:  # whatever the graphics stack lacks, the demo has done its work
+    except Exception as error:  # the demo is complete even if the graphics stack is not
         print(f"No GIF, since this machine cannot render ({error}): install libegl1 or libosmesa6.")
     print(
         "\nNext: README.md, and `.venv/bin/sb3-sample train --help` once `make test` or the [zoo] extra is installed."

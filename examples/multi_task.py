@@ -1,12 +1,12 @@
 """
 Train BRC on several tasks at once, MT10 of Meta-World by default, and evaluate each task; or BRO Fast or SAC with all
-widths doubled, as in BRO's figure 19. Interrupted and started again, it goes on where it was.
+widths doubled, as in BRO's figure 19. If interrupted and started again, it resumes where it stopped.
 
     python examples/multi_task.py --steps 10000 --seed 0
     python examples/multi_task.py --steps 10000 --seed 0 --agent bro_fast --folder runs/multi_task_bro_fast
 
-With critics 512 wide, the default, MT10 takes two gradient steps of 28 GFLOP for each step of its ten tasks: hours on a
-core of a CPU. The published width is 4096.
+With critics of width 512, the default, MT10 takes two gradient steps of 28 GFLOP for each step of its ten tasks: hours
+on one CPU core. The published width is 4096.
 """
 
 import argparse

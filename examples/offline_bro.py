@@ -8,7 +8,7 @@ rng = np.random.default_rng(0)
 observations = rng.normal(size=(10_000, 3)).astype(np.float32)
 actions = rng.uniform(-1, 1, (10_000, 1)).astype(np.float32)
 rewards = -np.square(actions[:, 0] - np.tanh(observations[:, 0]))  # the best action is known: tanh of the first number
-ends = np.ones(10_000, bool)  # every step is an episode of its own
+ends = np.ones(10_000, bool)  # every step is a separate episode
 
 data = Dataset.from_arrays(observations, actions, rewards, ends, np.zeros_like(ends))
 learner = BRO.learner(data.observation_space, data.action_space, seed=0, model_size="0.55M")

@@ -1,6 +1,6 @@
 """
-Train BRO Fast on a DeepMind Control task, with evaluations as the published curves have them: 5 episodes of the
-pessimistic actor's mean action. Interrupted and started again, it goes on where it was.
+Train BRO Fast on a DeepMind Control task, with evaluations as in the published curves: 5 episodes of the pessimistic
+actor's mean action. If interrupted and started again, it resumes where it stopped.
 
     python examples/train_dmc.py --env dmc/cartpole-swingup-v0 --steps 50000 --seed 0
 """

@@ -1,20 +1,21 @@
 """
-Makes the project's own evidence: the runs of the plans in studies/evidence and studies/small, in the order of the file
-QUEUE of the first.
+Make the project's own evidence: the runs of the plans in studies/evidence and studies/small, in the order of the file
+studies/evidence/QUEUE.
 
     make evidence [WORKERS=2] [THREADS=1]
 
-A run that is begun is made from the last commit, in a git worktree and an environment of its own, never from the files
-of the checkout; one that was interrupted goes on under the commit that it began with. All this lies in
-``~/.cache/sb3_sample/evidence``, which may be removed: runs that have not ended then begin anew. Those that have are
-written to ``docs/evidence`` of the checkout: evaluations as a table (``<plan>.csv``, as ``sb3-sample study table`` has
-it), and settings, commit, versions and machine of each run (``<plan>.json``).
+A new run is made from the last commit, in a separate git worktree and environment, never from the files of the
+checkout; an interrupted run resumes under the commit that it began with. All this lies in
+``~/.cache/sb3_sample/evidence``, which may be removed: unfinished runs then start again. Finished runs are written to
+``docs/evidence`` of the checkout: evaluations as a table (``<plan>.csv``, in the format of ``sb3-sample study table``),
+and settings, commit, versions and machine of each run (``<plan>.json``).
 
-A program of a plan's name, ``<plan>.py`` beside it, makes what its runs read, such as data sets; it is called before
-each of them, and makes what is not there.
+A program ``<plan>.py`` beside the plan makes the files that its runs read, such as data sets; it is called before each
+run, and makes the files that are missing.
 
-Runs have a low priority and one thread each, unless THREADS says otherwise. Ctrl-C and SIGTERM have them save and end;
-after ``kill -9`` they do so by themselves. To pause one, ``kill -STOP`` its number, which is said when a run begins.
+Runs have a low priority and one thread each, unless THREADS says otherwise. On Ctrl-C and SIGTERM they save and end;
+after ``kill -9`` of this program they do so by themselves. To pause a run, ``kill -STOP`` its process number, which is
+printed when the run begins.
 """
 
 import argparse
@@ -37,25 +38,25 @@ from typing import Any, NamedTuple
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 PLANS = Path(__file__).with_name("evidence")
-#: In the folder of the evidence: worktrees by commit, environments by lock file, studies by plan and commit.
+#: Folders in the folder of the evidence: worktrees by commit, environments by lock file, studies by plan and commit.
 TREES, ENVIRONMENTS, STUDIES = "trees", "environments", "studies"
-#: In a worktree that is whole.
+#: File that marks a complete worktree.
 COMPLETE = ".complete"
-#: How often a run is tried that fails.
+#: How often a failing run is tried.
 ATTEMPTS = 2
 #: Variable of the environment that tells a run how many threads it has.
 THREADS = "OMP_NUM_THREADS"
-#: Settings of a run that change no result.
+#: Settings of a run that do not change its result.
 FREE = {"checkpoint_freq", "gym_packages", "measure", "diagnostics"}
 
 
-# ---------------------------------------------------------------- with the standard library: what runs where
+# ---------------------------------------------------------------- with the standard library: where runs are made
 
 
 class Order(NamedTuple):
     """
     :param plan: name of the plan
-    :param commit: of which the run is made
+    :param commit: commit from which the run is made
     :param folder: of the study
     :param name: of the run in it
     :param title: the run in words
@@ -72,7 +73,7 @@ class Evidence:
     """
     :param root: folder of worktrees, environments and studies
     :param results: folder of the results
-    :param python: interpreter of all runs, which has what they need; None: an environment of their own
+    :param python: interpreter of all runs, with all packages that they need; None: a separate environment
     :param threads: of each run
     """
 
@@ -99,7 +100,7 @@ class Evidence:
     def python(self, tree: Path) -> str:
         """
         :param tree: a worktree
-        :return: an interpreter with all that it needs
+        :return: an interpreter with all packages that it needs
         """
         if self._python is not None:
             return self._python
@@ -122,14 +123,14 @@ class Evidence:
         """
         tree = self.tree(commit)
         threads = dict.fromkeys((THREADS, "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(self._threads))
-        # The checkout's own variables are not the worktree's.
+        # The checkout's variables do not apply to the worktree.
         inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "MAKE"))}
         environment = {**inherited, **threads, "PYTHONPATH": str(tree)}
         return subprocess.Popen((self.python(tree), *command), cwd=tree, env=environment, text=True, **options)
 
     def next(self, left_out: list[str]) -> Order | None:
         """
-        Write down what has ended, and choose what is next, by the last commit's plans and package.
+        Record the runs that have ended and choose the next one, with the last commit's plans and package.
 
         :param left_out: runs that are not to be chosen, ``<plan>/<name>``
         :return: the next run; None if all are done or in progress
@@ -181,7 +182,7 @@ class Evidence:
         return [name for name, times in failures.items() if times >= ATTEMPTS]
 
     def _start(self, order: Order) -> "subprocess.Popen[str]":
-        # The pipe's end tells it that this process is gone; the terminal's Ctrl-C is this process's to answer.
+        # The end of the pipe tells the run that this process is gone; only this process handles the terminal's Ctrl-C.
         return self.process(
             order.commit,
             script(self.tree(order.commit)),
@@ -196,7 +197,7 @@ class Evidence:
 @contextlib.contextmanager
 def alone(root: Path) -> Iterator[None]:
     """
-    While no other process is in this block with the same folder.
+    Exclude other processes from this block with the same folder.
 
     :param root: folder of the evidence
     """
@@ -216,7 +217,7 @@ def script(tree: Path) -> str:
 def ended(processes: "list[subprocess.Popen[str]]") -> "subprocess.Popen[str]":
     """
     :param processes: at least one
-    :return: the first that has ended, when one has
+    :return: the first that has ended; waits until one has
     """
     while True:
         for process in processes:
@@ -227,7 +228,7 @@ def ended(processes: "list[subprocess.Popen[str]]") -> "subprocess.Popen[str]":
 
 def leave(processes: "list[subprocess.Popen[str]]") -> None:
     """
-    Have processes save and end; at once if this is interrupted again.
+    Make processes save and end; end them at once if interrupted again.
 
     :param processes: that make runs
     """
@@ -245,21 +246,21 @@ def leave(processes: "list[subprocess.Popen[str]]") -> None:
 
 def git(*words: str) -> str:
     """
-    :param words: of a command of git, in the checkout
-    :return: what it prints
+    :param words: of a git command, which runs in the checkout
+    :return: its output
     :raises CalledProcessError: it fails
     """
     return subprocess.run(["git", *words], cwd=CHECKOUT, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
-# ---------------------------------------------------------------- with the package of a worktree: what is done and next
+# ---------------------------------------------------------------- with the package of a worktree: done and next runs
 
 
 class Found(NamedTuple):
     """
-    A run of a plan, where there is something of it.
+    A run of a plan that has been begun.
 
-    :param commit: that it was begun with
+    :param commit: commit with which it was begun
     :param folder: of the study
     :param done: whether it has ended
     """
@@ -295,13 +296,13 @@ def found(root: Path, plan: str, run: Any) -> Found | None:
     :param root: folder of the evidence
     :param plan: name of a plan
     :param run: one of its runs
-    :return: the one that has ended, else the one that is farthest; None if there is nothing of it
+    :return: the attempt that has ended, else the one with the most steps; None if it was never begun
     """
     from sb3_sample.study.runs import LIST, StudyFolder
 
     places = []
     for path in sorted((root / STUDIES / plan).glob("*")):
-        if not (path / LIST).exists():  # a process was killed that was about to make the folder
+        if not (path / LIST).exists():  # a process was killed while making the folder
             continue
         folder = StudyFolder(path)
         listed = {each.name: each.as_json() for each in folder.runs()}
@@ -316,7 +317,7 @@ def recorded(results: Path, plan: str) -> list[dict[str, Any]]:
     """
     :param results: folder of the results
     :param plan: name of a plan
-    :return: what is written of its runs that have ended
+    :return: the records of its finished runs
     """
     path = results / f"{plan}.json"
     return json.loads(path.read_text()) if path.exists() else []
@@ -324,7 +325,7 @@ def recorded(results: Path, plan: str) -> list[dict[str, Any]]:
 
 def queue() -> list[tuple[str, int]]:
     """
-    :return: names of plans, and how many of their seeds are to be made, in the order in which they are
+    :return: names of plans, and how many of their seeds to run, in the order of the file
     :raises ValueError: a line is something else
     """
     lines = [line.split() for line in (PLANS / "QUEUE").read_text().splitlines() if not line.startswith("#")]
@@ -381,7 +382,7 @@ def choose(root: Path, results: Path, left_out: list[str]) -> Order | None:
 
 def collect(root: Path, results: Path) -> None:
     """
-    Write down the runs that have ended and are not written down yet.
+    Record the runs that have ended and are not recorded yet.
 
     :param root: folder of the evidence
     :param results: folder of the results
@@ -416,12 +417,12 @@ def collect(root: Path, results: Path) -> None:
             )
             rows = study.read(f"{run.agent}={here.folder.place(run)}")
             if table is not None:
-                # Rows of a run that is not among the records: the table was written, and then the process killed.
+                # Rows of a run without a record: the process was killed after writing the table.
                 table = table[~table.set_index(RUN).index.isin(rows.set_index(RUN).index)]
             table = rows if table is None else pd.concat([table, rows], ignore_index=True)
         if table is not None and len(records) > before:
             results.mkdir(parents=True, exist_ok=True)
-            # The records last: a run that they have is in the table.
+            # The records come last, so that every recorded run is in the table.
             with becoming(path) as file:
                 file.write(table.to_csv(index=False).encode())
             with becoming(results / f"{name}.json") as file:
@@ -430,7 +431,8 @@ def collect(root: Path, results: Path) -> None:
 
 def prepare(plan: str) -> None:
     """
-    Make what the runs of a plan read, such as data sets, by the program of its name beside it, if there is one.
+    Make the files that the runs of a plan read, such as data sets, by the program of the same name beside it, if there
+    is one.
 
     :param plan: its name
     """
@@ -441,7 +443,7 @@ def prepare(plan: str) -> None:
 
 def run(folder: str, name: str) -> None:
     """
-    Make a run, or go on with it, until this process is told to end or its standard input does.
+    Make or resume a run, until this process gets a signal to end or its standard input ends.
 
     :param folder: of the study
     :param name: of the run in it
@@ -450,7 +452,7 @@ def run(folder: str, name: str) -> None:
     from sb3_sample.study.worker import attempt
 
     def listen() -> None:
-        while os.read(0, 1):  # not sys.stdin, which could not be closed while a thread reads it
+        while os.read(0, 1):  # not sys.stdin, which cannot be closed while a thread reads it
             pass
         os.kill(os.getpid(), signal.SIGTERM)
 
@@ -467,12 +469,12 @@ def run(folder: str, name: str) -> None:
 
 
 def main() -> None:
-    """Answer the question of another process, or make the evidence."""
+    """Answer a request of another process, or make the evidence."""
     if sys.argv[1:2] == ["run"]:
         return run(*sys.argv[2:])
     if sys.argv[1:2] == ["next"]:
         root, results = map(Path, sys.argv[2:4])
-        with alone(root):  # results are read, added to and written
+        with alone(root):  # results are read, extended and written
             collect(root, results)
             order = choose(root, results, sys.argv[4:])
         return print(json.dumps(None if order is None else order._asdict()))

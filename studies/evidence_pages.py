@@ -1,14 +1,14 @@
 """
 Write a report of each plan of studies/evidence/QUEUE that has finished runs into its page of ``docs``, between the two
-marker lines with the report's title (``sb3-sample study report --markdown``); and of results whose page says by what
-program they are made.
+marker lines with the report's title (``sb3-sample study report --markdown``); likewise for results whose page names the
+program that made them.
 
     make evidence-pages
     python studies/evidence_pages.py [PLAN ...] [--grid bro_grid.npz]
 
-The published runs of BRO Fast with critics of 0.55M parameters, which stand beside ours, are read from ``bro_grid.npz``
-(see ``published_grid.py``): ``--grid``, else in the folder that ``SB3_SAMPLE_REFERENCE`` names, or in
-``../shared/reference``. Without this file the pages of ``bro_fast`` and ``bro_fast_seeds`` stay as they are, and the
+The published runs of BRO Fast with critics of 0.55M parameters, which are shown beside ours, are read from
+``bro_grid.npz`` (see ``published_grid.py``): ``--grid``, else in the folder that ``SB3_SAMPLE_REFERENCE`` names, or in
+``../shared/reference``. Without this file the pages of ``bro_fast`` and ``bro_fast_seeds`` stay unchanged, and the
 program says so.
 """
 
@@ -77,13 +77,13 @@ def by_task(ours: pd.DataFrame, others: pd.DataFrame | None) -> str:
 
 class Page(NamedTuple):
     """
-    Where a plan's report stands.
+    Place of a plan's report.
 
     :param page: file in ``docs``
     :param title: of the report
     :param options: of ``study report``
-    :param beside_grid: whether the published runs of ``GRID`` stand beside it
-    :param table: makes a further table in Markdown for the page (see ``put``) of our runs and those beside them
+    :param beside_grid: whether the published runs of ``GRID`` are shown beside it
+    :param table: makes a further Markdown table for the page (see ``put``) from our runs and those beside them
     """
 
     page: str
@@ -127,13 +127,13 @@ PAGES = {
 }
 #: Results without a plan.
 BY_PROGRAM = ["brc_mt10"]
-#: Plans whose page takes more than a report, and where it says so.
+#: Plans whose page needs more than a report, and where this is described.
 ELSEWHERE = {"scaling": "docs/scaling.md has the commands, which fit its laws first"}
 
 
 def grid() -> Path | None:
     """
-    :return: ``bro_grid.npz`` of the reference data, where it is there
+    :return: ``bro_grid.npz`` of the reference data, if it exists
     """
     folder = os.environ.get("SB3_SAMPLE_REFERENCE") or CHECKOUT.parent / "shared" / "reference"
     path = Path(folder) / "bro_grid.npz"
@@ -158,8 +158,8 @@ def write(plan: str, docs: Path, path: Path | None) -> str | None:
     :param plan: name of the plan
     :param docs: folder of the pages; tables and pictures are in ``evidence`` there
     :param path: ``bro_grid.npz``
-    :return: why there is nothing to write; None if it is written
-    :raises CalledProcessError: the report cannot be made, which it has said
+    :return: the reason why nothing was written; None if it is written
+    :raises CalledProcessError: the report cannot be made; its process has printed the reason
     """
     results, page = docs / "evidence" / f"{plan}.csv", PAGES[plan]
     if not results.exists():
@@ -168,7 +168,7 @@ def write(plan: str, docs: Path, path: Path | None) -> str | None:
         return "bro_grid.npz is not here: --grid FILE"
     others = published(plan, path) if page.beside_grid and path is not None else None
     with tempfile.TemporaryDirectory() as folder:
-        # The report names files as they are given: as in the checkout, wherever this runs.
+        # The report names files by the paths it is given: those of the checkout, wherever this runs.
         here = Path(folder)
         (here / "docs").symlink_to(docs.resolve())
         (here / "studies").symlink_to(CHECKOUT / "studies")
@@ -191,7 +191,7 @@ def put(page: Path, title: str, text: str) -> None:
 
     :param page: file with these lines
     :param title: of the report that the table belongs to
-    :param text: what is to stand there
+    :param text: the table
     :raises ValueError: the file does not have each of these lines once, in this order
     """
     begin, end = (f"<!-- {side}: table: {title} -->" for side in ("begin", "end"))
@@ -220,7 +220,7 @@ def main(given: list[str] | None = None) -> None:
         try:
             reason = ELSEWHERE.get(plan) or write(plan, CHECKOUT / "docs", options.grid or grid())
         except (ValueError, subprocess.CalledProcessError) as error:
-            # The other pages are written all the same.
+            # The other pages are still written.
             reason, failed = f"not written: {error}", True
         print(f"{plan}: {reason or f'docs/{PAGES[plan].page}'}", flush=True)
     if failed:

@@ -1,5 +1,5 @@
 """
-A table of the published runs of BRO at five replay ratios and five sizes, as ``sb3-sample study`` takes it.
+Make a table of the published runs of BRO at five replay ratios and five sizes, in the format of ``sb3-sample study``.
 
     python studies/published_grid.py bro_grid.npz grid.csv
     sb3-sample study heatmap grid.csv -x model_size -y replay_ratio --step 500k --group dmc
@@ -9,9 +9,10 @@ A table of the published runs of BRO at five replay ratios and five sizes, as ``
 
 The runs are of "Compute-Optimal Scaling for Value-Based Deep RL" (value-scaling.github.io, ``dmc_bro_ablations.zip``),
 gathered in one file: ``returns`` [replay ratio, size, task, seed, evaluation], labels of the axes, and ``n_runs``, how
-many of the seeds are runs and not copies. The site gives no licence: the table stays where it was made, statistics over
-the seeds may be shown with their source named. With ``--statistics`` the file has these instead, those that
-``sb3-sample advise`` reads: by suite, replay ratio, size and evaluation the interquartile mean with its 95% interval.
+many of the seeds are runs and not copies. The site gives no licence: the table stays where it was made; statistics over
+seeds may be shown if the source is named. With ``--statistics`` the file contains the statistics that
+``sb3-sample advise`` reads instead: the interquartile mean with its 95% interval by suite, replay ratio, size and
+evaluation.
 """
 
 import argparse

@@ -4,8 +4,8 @@ Do two sets of runs differ at a step? The Mann-Whitney test on each task, and al
     python studies/published_grid.py bro_grid.npz published.csv --ratios 2 --sizes 0.55M
     python studies/rank_tests.py docs/evidence/bro_fast_seeds.csv published.csv --step 25k 50k
 
-Both tables are as ``sb3-sample study table`` writes them, with one agent each. Printed: seeds, means and ranges of
-both, and p of the first table's returns being lower (one-sided) and of the two being unlike (two-sided), exact where no
+Both tables are as ``sb3-sample study table`` writes them, with one agent each. Printed are seeds, means and ranges of
+both, and p-values that the first table's returns are lower (one-sided) and that the two differ (two-sided), exact if no
 returns are equal. Tasks that only one table has are left out, and named. ``evidence_pages.py`` puts such into pages.
 """
 
@@ -25,9 +25,9 @@ def rank_tests(ours: pd.DataFrame, others: pd.DataFrame, step: int, metric: str 
     :param ours: a table of runs of one agent
     :param others: the same of another
     :param step: of the simulator, at which both were evaluated
-    :param metric: what is compared
-    :return: a row a task and one of all, ``task`` then being "all": ``n``, ``mean``, ``low``, ``high`` (range) of the
-        first and with ``_others`` of the second, ``p_lower`` (one-sided: the first is lower) and ``p`` (two-sided)
+    :param metric: the metric compared
+    :return: a row for each task and one for all, where ``task`` is "all": ``n``, ``mean``, ``low``, ``high`` (range) of
+        the first and with ``_others`` of the second, ``p_lower`` (one-sided: the first is lower) and ``p`` (two-sided)
     :raises ValueError: a table has more than one agent, or no task was evaluated in both at that step
     """
     values = []

@@ -1,6 +1,6 @@
 """
-The callback that measures overestimation, overfitting and plasticity in a run of the off-policy family, and leaves the
-training as it is.
+Callback that measures overestimation, overfitting and plasticity in a run of the off-policy family without changing the
+training.
 """
 
 import math
@@ -39,49 +39,50 @@ class DiagnosticsCallback(PeriodicMeasurement):
 
     Each measurement takes ``n_start_states`` rollouts of at most ``rollout_length`` steps in ``eval_env``, each from a
     reset, with samples of the actor, whose value the critics estimate (not with its mean action, and not with an
-    optimistic actor). All that the networks are asked, they are asked in evaluation mode.
+    optimistic actor). The networks are evaluated in evaluation mode throughout.
 
     *Overestimation* is the critics' value minus a Monte-Carlo reference, averaged over the start pairs; the critics'
     value is the mean over ensemble and quantiles. An arbitrary environment cannot be put into a state of the replay
-    buffer. Hence the start pair is a visited state and action of the rollout itself: that of a step which is drawn
-    before the rollout begins, uniformly from the first half of ``rollout_length`` (of the time limit, if episodes were
-    seen to be cut earlier), and counted over the ends of episodes. So how long an episode happens to last says nothing
-    about which of its states is taken. The rest of the episode is the reference: it is unbiased also where
-    episodes end at random. ``overestimation`` compares with the discounted return (Overestimation, Overfitting and
-    Plasticity); ``overestimation_soft`` with VPL's equation 22, which also counts the entropy that a soft critic
-    contains. The paper writes the entropy target for the policy's entropy; here it is the one measured in the rollout,
-    which is also right where the temperature is fixed or has not reached its target. As printed in the paper, the first
+    buffer. Hence the start pair is a visited state and action of the rollout itself. Its step is drawn before the
+    rollout begins, uniformly from the first half of ``rollout_length`` (of the time limit, if episodes were seen to be
+    cut earlier), and counted across the ends of episodes, so that the choice of the state does not depend on the length
+    of its episode. The rest of the episode is the reference, which is unbiased even where episodes end at random.
+    ``overestimation`` compares with the discounted return (Overestimation, Overfitting and Plasticity);
+    ``overestimation_soft`` with VPL's equation 22, which also counts the entropy that a soft critic contains. The paper
+    writes the entropy target for the policy's entropy; here the entropy is measured in the rollout, which is also right
+    where the temperature is fixed or the entropy has not reached its target. As printed in the paper, the first
     action's own log-probability counts too. Without entropy (temperature 0, deterministic actor) that part vanishes.
 
-    *Overfitting* is VPL's equation 23: the mean squared TD error, of the critics' mean to the target under the
-    pessimism in force, on transitions of the rollouts that were never trained on, divided by that on transitions of
-    the replay buffer. Both are single steps as they were experienced, also if the algorithm learns from n-step returns
-    or relabelled goals; transitions that the buffer holds out for validation are left out.
+    *Overfitting* is VPL's equation 23: the mean squared TD error, of the critics' mean to the target under the current
+    pessimism, on transitions of the rollouts, which are never trained on, divided by the error on transitions of the
+    replay buffer. Both are single steps as they were experienced, even if the algorithm learns from n-step returns or
+    relabelled goals; transitions that the buffer holds out for validation are left out.
 
-    All in the units in which the critics learn: with ``VecNormalize`` around the training environment, observations
-    and rewards of ``eval_env`` are normalised by the training environment's statistics of the moment; the statistics
-    of a ``VecNormalize`` around ``eval_env`` are neither used nor changed.
+    All quantities are in the units in which the critics learn: with ``VecNormalize`` around the training environment,
+    observations and rewards of ``eval_env`` are normalised by the training environment's current statistics; the
+    statistics of a ``VecNormalize`` around ``eval_env`` are neither used nor changed.
 
-    Training is bit for bit the same with the callback and without: its random numbers are its own, the global
-    generators, which an environment may use, are put back, and so are the modules' modes.
+    Training is bit for bit the same with the callback and without: it has its own random numbers, and restores the
+    modules' modes and the global generators, which an environment may use.
 
     Nothing is measured while the algorithm still acts at random (``learning_starts``).
 
     :param eval_env: environment for the rollouts, a single one, not the training environment; its normalisation, if
-        any, has to be as that of the training environment. None, the default, is for ``sb3-sample train`` and plans of
-        studies, which make one as for their evaluations
+        any, has to be the same as the training environment's. None, the default, is for ``sb3-sample train`` and plans
+        of studies, which make one in the same way as for their evaluations
     :param every: environment steps between two measurements, taken at the first step at or after each multiple
     :param n_start_states: rollouts a measurement, each with one start pair (5 in VPL's paper)
-    :param rollout_length: most steps of a rollout, over several episodes if they are short. Choose it well above the
-        length of episodes that terminate, since a rollout that is cut counts as one that never ends. With the default
-        a measurement adds up to 5,000 validation transitions, as in VPL's paper
+    :param rollout_length: maximum number of steps in a rollout, over several episodes if they are short. Choose it well
+        above the length of episodes that terminate, since a rollout that is cut counts as one that never ends. With the
+        default a measurement adds up to 5,000 validation transitions, as in VPL's paper
     :param soft: whether to log ``overestimation_soft``
-    :param batch_size: transitions from each side, training and validation; fewer if there are not as many
-    :param dormant_threshold: up to which score a neuron is called dormant
-    :param validation_size: validation transitions kept; the oldest give way
+    :param batch_size: transitions from each side, training and validation; fewer if fewer are stored
+    :param dormant_threshold: score up to which a neuron counts as dormant
+    :param validation_size: validation transitions kept; the oldest are dropped first
     :param seed: of the rollouts' noise and of ``eval_env``; the model's if None
     :param verbose: 0 nothing, 1 a line for each measurement
-    :raises TypeError: if ``eval_env`` is no environment, or, when training starts, the model no ``SAC`` of this package
+    :raises TypeError: if ``eval_env`` is not an environment, or, when training starts, the model is not a ``SAC`` of
+        this package
     :raises ValueError: if an argument is out of range, or, when training starts, ``eval_env`` is missing or does not
         fit the model
     """
@@ -147,7 +148,7 @@ class DiagnosticsCallback(PeriodicMeasurement):
         seed = model.seed if self.seed is None else self.seed
         self._rng = np.random.default_rng(seed)
         if seed is not None:
-            # Not the model's own seed: the episodes would start as those of the training.
+            # Not the model's own seed, with which the episodes would start like those of the training.
             self._env.seed(int(self._rng.integers(2**31)))
         store: Any = DictReplayBuffer if isinstance(model.observation_space, spaces.Dict) else ReplayBuffer
         self._store = store(self.validation_size, model.observation_space, model.action_space, device=model.device)
@@ -170,7 +171,7 @@ class DiagnosticsCallback(PeriodicMeasurement):
                 raise ValueError(f"eval_env has the {name} {theirs}, but the model has {ours}")
         return env
 
-    # ---------------------------------------------------------------- when
+    # ---------------------------------------------------------------- schedule
 
     def _on_step(self) -> bool:
         # The gradient step after this call may be the last before a measurement, which then finds its gradients.
@@ -179,7 +180,7 @@ class DiagnosticsCallback(PeriodicMeasurement):
         return super()._on_step()
 
     def _steps_between_updates(self) -> int:
-        """Steps of all environments from one gradient step to the next, at most; 1 where only episodes tell."""
+        """Upper bound on steps (of all environments) between two gradient steps; 1 if episodes set the schedule."""
         model = self.model
         if model.replay_ratio is None:
             assert isinstance(model.train_freq, TrainFreq)
@@ -190,8 +191,8 @@ class DiagnosticsCallback(PeriodicMeasurement):
 
     def state_dict(self) -> dict[str, Any]:
         """
-        :return: what the coming measurements depend on, beside ``eval_env`` and the validation transitions, which a
-            checkpoint has as well
+        :return: state that the coming measurements depend on, besides ``eval_env`` and the validation transitions,
+            which a checkpoint also holds
         """
         return {
             "next": self._next,
@@ -216,25 +217,25 @@ class DiagnosticsCallback(PeriodicMeasurement):
         return [*self.model.critic.parameters(), *self.model.actor.parameters()]
 
     def _gradients(self) -> list[torch.Tensor | None] | None:
-        """Those of the last gradient step, if the next environment step measures their norms before new ones."""
+        """Gradients of the last gradient step, if the next environment step measures their norms before new ones."""
         if self.model.gradients_are_stale or self.model.num_timesteps + self.model.n_envs < self._next:
             return None
         return [parameter.grad for parameter in self._measured_parameters()]
 
     def checkpoint_rings(self) -> dict[str, Ring]:
         """
-        :return: the validation transitions, for checkpoints, which write what is new of them only
+        :return: the validation transitions, for checkpoints, which write only the new ones
         """
         return {} if self._store is None else {"store": Ring(self._store, lambda: self._n_stored)}
 
-    # ---------------------------------------------------------------- what
+    # ---------------------------------------------------------------- measurements
 
     def measure(self) -> dict[str, float]:
         """
         Measure now. Outside of ``learn`` call ``init_callback(model)`` first.
 
-        :return: the quantities by name; without those that there is nothing to measure by (an empty replay buffer, no
-            gradient step yet, a single critic)
+        :return: the quantities by name, without those that cannot be measured (an empty replay buffer, no gradient step
+            yet, a single critic)
         """
         if self._store is None:
             raise ValueError("the callback knows no model yet: call init_callback(model) first")
@@ -263,12 +264,12 @@ class DiagnosticsCallback(PeriodicMeasurement):
 
     def _rollout(self) -> Rollout:
         """
-        Follow the actor from a reset over as many episodes as the step of the start pair is away, and from there to the
-        end of the episode; keep the transitions.
+        Follow the actor from a reset, over as many episodes as it takes to reach the step of the start pair, and from
+        there to the end of the episode; keep the transitions.
         """
         assert self._store is not None and isinstance(self.model.action_space, spaces.Box)
-        # Drawn before anything is known of the episodes: what is drawn from an episode of known length is a state after
-        # which less, or more, is to come than after one that the policy happens to visit.
+        # Drawn before anything is known of the episodes: a state drawn from an episode of known length has fewer, or
+        # more, steps ahead of it than a state that the policy happens to visit.
         longest = min(self.rollout_length, self._time_limit or self.rollout_length)
         start = int(self._rng.integers((longest + 1) // 2))
         value, terminated = math.nan, False
@@ -367,7 +368,7 @@ class DiagnosticsCallback(PeriodicMeasurement):
         return self.model.policy.obs_to_tensor(observation)[0]
 
     def _training_batch(self) -> Batch | None:
-        """Transitions that the algorithm trains on, none twice; None if there are none yet."""
+        """Transitions that the algorithm trains on, without repeats; None if there are none yet."""
         buffer = self.model.replay_buffer
         assert buffer is not None
         places = training_places(buffer)
@@ -377,7 +378,7 @@ class DiagnosticsCallback(PeriodicMeasurement):
 
 
 def _environments(env: GymEnv) -> set[int]:
-    """The identities of the environments in an environment, below all wrappers that can be looked through."""
+    """Identities of the environments in an environment, below all wrappers that can be unwrapped."""
     innermost = env.unwrapped
     inside = [e.unwrapped for e in innermost.envs] if isinstance(innermost, DummyVecEnv) else []
     return {id(e) for e in [innermost, *inside]}

@@ -1,4 +1,4 @@
-"""The callback that measures which batch size the critics' gradient is worth, and how much the critics overfit."""
+"""Callback that measures the critical batch size of the critics' gradient, and how much the critics overfit."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from sb3_sample.diagnostics.periodic import PeriodicMeasurement
 from sb3_sample.diagnostics.reading import batch_at, newest_overfitting, td_loss, training_places, untouched
 from sb3_sample.sac import SAC
 
-#: Transitions of the small gradients, and how many of these make the large one.
+#: Transitions in a small batch, and the number of small batches that make the large one.
 SMALL, PARTS = 64, 16
 LARGE = SMALL * PARTS
 
@@ -25,11 +25,11 @@ class NoiseScaleCallback(PeriodicMeasurement):
     buffer, ``gradient_square_64`` and ``gradient_square_1024``. Their means over the last ``window`` measurements give
     the critical batch size, tr(covariance of one transition's gradient) / (squared norm of the true gradient)
     (McCandlish et al. 2018): well below it a batch twice as large is worth twice as many gradient steps, well above it
-    no more. ``critical_batch_size`` is not logged where the means leave no gradient beside the noise. The large batch
-    is 16 small ones, so that both norms are of the same transitions and the first is a mean of 16.
+    no more. ``critical_batch_size`` is not logged where the means show only noise and no gradient. The large batch is
+    16 small ones, so that both norms are of the same transitions and the first is a mean of 16.
 
     *Overfitting*: ``overfitting_newest``, the TD loss on the 16 newest transitions (``td_loss_newest``) minus that on a
-    batch of the replay buffer (``td_loss_replay``). Besides ``parameter_norm_critic``.
+    batch of the replay buffer (``td_loss_replay``). ``parameter_norm_critic`` is logged too.
 
     Transitions are drawn uniformly and with replacement, single steps as they were experienced, without those that are
     held out for validation, whatever the algorithm itself does (priorities, n-step returns); all networks are in
@@ -43,7 +43,7 @@ class NoiseScaleCallback(PeriodicMeasurement):
     :param batch_size: transitions of the replay buffer in ``td_loss_replay``
     :param seed: of the draws; the model's if None
     :param verbose: 0 nothing, 1 a line for each measurement
-    :raises TypeError: when training starts, if the model is no ``SAC`` of this package
+    :raises TypeError: when training starts, if the model is not a ``SAC`` of this package
     :raises ValueError: if an argument is out of range, or the model has several tasks
     """
 
@@ -71,7 +71,7 @@ class NoiseScaleCallback(PeriodicMeasurement):
 
     def state_dict(self) -> dict[str, Any]:
         """
-        :return: what the coming measurements depend on
+        :return: state that the coming measurements depend on
         """
         return {"next": self._next, "squares": self._squares, "rng": self._rng, "last_results": self.last_results}
 
@@ -86,7 +86,7 @@ class NoiseScaleCallback(PeriodicMeasurement):
         """
         Measure now. Outside of ``learn`` call ``init_callback(model)`` first.
 
-        :return: the quantities by name; nothing but the norm of the parameters before there are transitions
+        :return: the quantities by name; only the norm of the parameters before there are transitions
         """
         if self._measured_model is None:
             raise ValueError("the callback knows no model yet: call init_callback(model) first")
@@ -107,7 +107,7 @@ class NoiseScaleCallback(PeriodicMeasurement):
         return results
 
     def _gradient_squares(self, places: np.ndarray) -> tuple[float, float]:
-        """Squared norms of the critics' gradients: the mean of those of the parts, and that of their mean."""
+        """Squared norms of the critics' gradients: mean over the small batches, and that of their mean gradient."""
         parameters = [parameter for parameter in self.model.critic.parameters() if parameter.requires_grad]
         assert self.model.replay_buffer is not None
         total, squares = [torch.zeros_like(parameter) for parameter in parameters], 0.0

@@ -1,6 +1,6 @@
 """
 Quantities of the papers (Overestimation, Overfitting and Plasticity, section 3; VPL, appendix E.2; Value-Based Deep RL
-Scales Predictably, appendix F) from the numbers that they are made of: no model, no environment.
+Scales Predictably, appendix F), computed from plain numbers, without model or environment.
 
 Shapes use the letters E critics, B batch, N neurons.
 """
@@ -12,11 +12,11 @@ import torch
 
 
 class Rollout(NamedTuple):
-    """The n steps of the policy that followed a state and action, in the critic's units."""
+    """The n steps of the policy from a state and action on, in the critic's units."""
 
     #: the critics' mean at the first state and action
     value: float
-    #: (n,), the first one that of the first state and action
+    #: (n,), from the first state and action on
     rewards: np.ndarray
     #: (n,), of the actions taken
     log_probs: np.ndarray
@@ -26,8 +26,8 @@ class Rollout(NamedTuple):
 
 def discounted_return(rewards: np.ndarray, gamma: float, terminated: bool) -> float:
     """
-    The discounted return of a rollout. After a termination nothing follows. Where a rollout was merely cut (by a time
-    limit, or by its own length) its mean reward goes on for ever, with the weight ``gamma ** n / (1 - gamma)``.
+    Discounted return of a rollout. After a termination nothing follows. If the rollout was merely cut (by a time limit,
+    or by its own length), its mean reward is taken to continue for ever, with the weight ``gamma ** n / (1 - gamma)``.
 
     :param rewards: (n,)
     :param gamma: discount factor, below 1
@@ -79,8 +79,8 @@ def dormant_shares(scores: dict[str, torch.Tensor], threshold: float) -> dict[st
     Share of the neurons whose score is at most the threshold (Sokar et al. 2023), copies taken together.
 
     :param scores: scores of a network by layer, (E, N) or (N,)
-    :param threshold: up to which score a neuron is dormant
-    :return: the share by layer, and under "" that of all neurons together; nothing if there is no layer
+    :param threshold: score up to which a neuron is dormant
+    :return: the share by layer, and under "" the share of all neurons together; empty if there is no layer
     """
     dormant = {name: (layer <= threshold).double().flatten() for name, layer in scores.items()}
     if dormant:
@@ -100,13 +100,13 @@ def noise_scale(
     small: float, large: float, small_batch: int = 64, large_batch: int = 1024
 ) -> tuple[float, float, float]:
     """
-    Critical batch size by the norms of gradients of two batch sizes ("Value-Based Deep RL Scales
-    Predictably", Rybkin et al. 2025, appendix F; McCandlish et al. 2018).
+    Critical batch size from the gradient norms at two batch sizes ("Value-Based Deep RL Scales Predictably", Rybkin et
+    al. 2025, appendix F; McCandlish et al. 2018).
 
     :param small: squared norm of the gradient of the small batch, averaged over batches first
-    :param large: of the large batch
-    :param small_batch: rows
-    :param large_batch: rows
+    :param large: squared norm of the gradient of the large batch
+    :param small_batch: rows of the small batch
+    :param large_batch: rows of the large batch
     :return: squared norm of the true gradient, trace of the covariance of one row's, and their ratio, the critical
         batch size (inf where the first is not above 0)
     :raises ValueError: the batch sizes do not ascend

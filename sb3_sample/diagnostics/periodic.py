@@ -15,13 +15,13 @@ class PeriodicMeasurement(BaseCallback):
 
     :param every: environment steps between two measurements, taken at the first step at or after each multiple
     :param verbose: 0 nothing, 1 a line for each measurement
-    :raises TypeError: when training starts, if the model is no ``SAC`` of this package
+    :raises TypeError: when training starts, if the model is not a ``SAC`` of this package
     :raises ValueError: when training starts, if the model has several tasks
     """
 
     model: SAC
 
-    #: Beginning of a measurement's line, and the quantities in it, those that there are.
+    #: Beginning of a measurement's line, and the quantities that it shows if they were measured.
     TITLE: ClassVar[str]
     SHOWN: ClassVar[tuple[str, ...]]
 
@@ -46,13 +46,13 @@ class PeriodicMeasurement(BaseCallback):
         if self.num_timesteps < self._next:
             return True
         self._next = (self.num_timesteps // self.every + 1) * self.every
-        # The transitions of the present step are stored after this call.
+        # The transitions of the current step are stored after this call.
         if self.model.num_transitions + self.model.n_envs < self.model.learning_starts:
             return True
         results = self.measure()
         for name, value in results.items():
             self.logger.record(f"diagnostics/{name}", value)
-        # Written at once, as by EvalCallback, so that the values stand at the step at which they were measured.
+        # Written at once, as by EvalCallback, so that the values are logged at the step at which they were measured.
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
         if self.verbose >= 1:

@@ -1,4 +1,4 @@
-"""Access of diagnostics to a model: its transitions and TD targets, without leaving a trace in it."""
+"""Access of diagnostics to a model's transitions and TD targets, without side effects on the model."""
 
 import contextlib
 import random
@@ -20,7 +20,7 @@ NEWEST = 16
 @contextlib.contextmanager
 def untouched(model: SAC) -> Iterator[None]:
     """
-    The model's networks in evaluation mode; afterwards their modes and the global generators are as before.
+    Put the model's networks into evaluation mode; afterwards their modes and the global generators are as before.
 
     :param model: the model
     """
@@ -83,11 +83,11 @@ def noise(model: SAC, rng: np.random.Generator, n: int) -> torch.Tensor:
 
 def targets(model: SAC, batch: Batch, rng: np.random.Generator) -> tuple[Batch, torch.Tensor]:
     """
-    Make the TD targets of transitions, as the critics are trained towards.
+    Make the TD targets of transitions, as in the critics' training.
 
     :param model: the model
     :param batch: transitions
-    :param rng: draws the next actions, and the critics of a target of some
+    :param rng: draws the next actions, and the subset of critics if targets use one
     :return: the transitions in the critics' scale of rewards, and the targets, (B, K)
     """
     if model.reward_scaler is not None:
@@ -102,11 +102,11 @@ def targets(model: SAC, batch: Batch, rng: np.random.Generator) -> tuple[Batch, 
 
 def td_loss(model: SAC, batch: Batch, rng: np.random.Generator) -> torch.Tensor:
     """
-    Compute the loss that the critics are trained by.
+    Compute the critics' training loss.
 
     :param model: the model
     :param batch: transitions
-    :param rng: draws what the targets need
+    :param rng: draws the random numbers of the targets
     :return: scalar
     """
     batch, target = targets(model, batch, rng)
@@ -120,9 +120,9 @@ def newest_overfitting(model: SAC, batch_size: int, rng: np.random.Generator) ->
     transitions, which have hardly been trained on, minus that on a batch of the replay buffer.
 
     :param model: the model
-    :param batch_size: transitions of the replay buffer, fewer if there are not as many
+    :param batch_size: transitions of the replay buffer, fewer if fewer are stored
     :param rng: draws
-    :return: "td_loss_newest", "td_loss_replay" and their difference "overfitting_newest"; nothing before there are 17
+    :return: "td_loss_newest", "td_loss_replay" and their difference "overfitting_newest"; empty before there are 17
         transitions
     """
     buffer = model.replay_buffer

@@ -1,4 +1,4 @@
-"""The on-policy family: PPO whose policy gradient also sees further samples (MBMA, 2210.13011)."""
+"""The on-policy family: PPO whose policy gradient also uses further samples (MBMA, 2210.13011)."""
 
 from sb3_sample.ppo.mbma import MBMAPPO
 from sb3_sample.ppo.mbpo import MBPOPPO

@@ -1,4 +1,4 @@
-"""Arguments of the on-policy family: what each is, what it may be, and what does not go together."""
+"""Arguments of the on-policy family: their meanings, allowed values and forbidden combinations."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -33,10 +33,10 @@ _CLIPPING = ABOVE_0.otherwise("a schedule", callable)
 
 
 class PPOArguments(Resumable):
-    """Arguments that every on-policy algorithm has, those of Stable-Baselines3 first and by position too."""
+    """Arguments of every on-policy algorithm; those of Stable-Baselines3 come first and may be given by position."""
 
     _policy: str | type[ActorCriticPolicy] = argument(alias="policy", kw_only=False)
-    """"MlpPolicy", "MultiInputPolicy" or a policy class; without further samples any that PPO takes"""
+    """"MlpPolicy", "MultiInputPolicy" or a policy class; without further samples any policy that PPO accepts"""
     _env: gym.Env[Any, Any] | VecEnv | str | None = argument(alias="env", kw_only=False)
     """the environment, an id, or a vectorised environment"""
     learning_rate: float | Schedule = argument(default=3e-4, kind=LEARNING_RATE, kw_only=False)
@@ -44,7 +44,7 @@ class PPOArguments(Resumable):
     n_steps: int = argument(default=2048, kind=integer(1), kw_only=False)
     """T, steps of each environment between two updates"""
     batch_size: int = argument(default=64, kind=integer(1), kw_only=False)
-    """real samples a minibatch"""
+    """real samples per minibatch"""
     n_epochs: int = argument(default=10, kind=integer(1), kw_only=False)
     """passes over the rollout"""
     gamma: float = argument(default=0.99, kind=UNIT, kw_only=False)
@@ -54,10 +54,10 @@ class PPOArguments(Resumable):
     clip_range: float | Schedule = argument(default=0.2, kind=_CLIPPING, kw_only=False)
     """PPO's clipping of the probability ratio, of real and simulated samples; also a schedule"""
     clip_range_vf: float | Schedule | None = argument(default=None, kind=_CLIPPING.or_none(), kw_only=False)
-    """clipping of the value's change; None for none"""
+    """clipping of the value's change; None for no clipping"""
     normalize_advantage: bool = argument(default=False, kind=TRUE_OR_FALSE, kw_only=False)
-    """whether advantages are normalised, in each minibatch, real and simulated samples together. MBMA, section 5.1,
-    has it off: "it has no grounding in SPG theory", it says"""
+    """whether advantages are normalised, in each minibatch, real and simulated samples together. MBMA turns it off:
+    "it has no grounding in SPG theory" (section 5.1)"""
     ent_coef: float = argument(default=0.0, kind=FINITE, kw_only=False)
     """weight of the entropy at the real states"""
     vf_coef: float = argument(default=0.5, kind=AT_LEAST_0, kw_only=False)
@@ -65,9 +65,9 @@ class PPOArguments(Resumable):
     max_grad_norm: float = argument(
         default=0.5, kind=number("be above 0 (float('inf') for no limit)", lambda value: value > 0), kw_only=False
     )
-    """of the gradient of actor and critic together"""
+    """maximum norm of the gradient of actor and critic together"""
     use_sde: bool = argument(default=False, kw_only=False)
-    """refused with simulated actions, since actions at one state share their noise"""
+    """not allowed with simulated actions, since all actions at a state would share their noise"""
     sde_sample_freq: int = argument(default=-1, kind=integer(-1), kw_only=False)
     """as in Stable-Baselines3"""
     rollout_buffer_class: type[RolloutBuffer] | None = argument(
@@ -81,8 +81,8 @@ class PPOArguments(Resumable):
     target_kl: float | None = argument(
         default=None, kind=number("be above 0", lambda value: value > 0).or_none("no limit"), kw_only=False
     )
-    """the updates of an iteration end above 1.5 times this divergence, taken over all samples of the policy loss; None
-    for no limit"""
+    """an iteration's updates end when the divergence over all samples of the policy loss exceeds 1.5 times this value;
+    None for no limit"""
     _policy_kwargs: dict[str, Any] | None = argument(alias="policy_kwargs", default=None)
     """arguments of the policy. Without ``net_arch``, "MlpPolicy" and "MultiInputPolicy" have the paper's two hidden
     layers of 512 (actor) and 1024 (critic)"""
@@ -93,9 +93,9 @@ class PPOArguments(Resumable):
             lambda value: value is None or (is_number(value) and 0 < value <= 1),
         ),
     )
-    """share of the training, of ``total_timesteps``, from which on nothing is simulated any more: at an iteration whose
+    """share of the training, of ``total_timesteps``, after which nothing is simulated any more: in an iteration whose
     rollout began at the share p of the training, X = ceil(``n_simulated`` (1 - p / ``anneal_until``)). None: X does not
-    decline. A second ``learn`` counts anew, or goes on with ``reset_num_timesteps=False``"""
+    decline. A second ``learn`` starts counting from 0, or continues with ``reset_num_timesteps=False``"""
     warm_up_until: float | None = argument(
         default=None,
         kind=Kind(
@@ -105,8 +105,8 @@ class PPOArguments(Resumable):
     """share of the training over which X rises linearly from 0 to ``n_simulated`` while the models learn, rounded up
     too; 0 for no rise. None: 0.15, or 0 if ``anneal_until`` is given. With both, the two factors are multiplied. MBMA,
     section 5.1: "We anneal the number of additional samples until 15% step of the training for all methods". The
-    default reads it as a rise that ends at 15%; ``anneal_until=0.15`` is the other reading, a decline to none that ends
-    there, with which nothing is left of the gain over PPO (docs/many_actions.md)"""
+    default reads it as a rise that ends at 15%; ``anneal_until=0.15`` is the other reading, a decline to 0 that ends at
+    15%, which leaves no gain over PPO (docs/many_actions.md)"""
 
 
 def check(agent: Any) -> None:
@@ -128,7 +128,7 @@ def check(agent: Any) -> None:
 
 def check_counts(cls: type[PPOArguments], given: Mapping[str, Any]) -> None:
     """
-    Check what ``PPO.__init__`` divides by and asserts.
+    Check the arguments that ``PPO.__init__`` divides by or makes assertions about.
 
     :param cls: class of an algorithm
     :param given: its arguments by name
@@ -148,7 +148,7 @@ def _check_minibatches(batch_size: int, normalize_advantage: bool) -> None:
 
 def _check_net_arch(net_arch: Any) -> None:
     if isinstance(net_arch, list) and len(net_arch) == 1 and isinstance(net_arch[0], dict):
-        net_arch = net_arch[0]  # As of old; Stable-Baselines3 warns of it.
+        net_arch = net_arch[0]  # The old form; Stable-Baselines3 warns about it.
     check_net_arch(net_arch, ("pi", "vf"), both=False)
 
 
@@ -163,7 +163,7 @@ def _check_buffer_class(agent: Any) -> None:
 
 
 def _check_schedule(agent: Any) -> None:
-    """When there are how many simulated samples."""
+    """Check the schedule of the number of simulated samples."""
     anneal, warm_up = agent.anneal_until, agent.warm_up_until
     if anneal is not None and (warm_up or 0) >= anneal:
         raise ValueError(f"warm_up_until must be below anneal_until={anneal}, not {warm_up}")
@@ -196,9 +196,9 @@ def check_network_kwargs(name: str, kwargs: dict[str, Any] | None, allowed: Mapp
     """
     :param name: name of the argument
     :param kwargs: its value: width, depth, learning rate, epochs, and switches; None for none
-    :param allowed: what it may hold, with the defaults
+    :param allowed: its allowed entries, with the defaults
     :return: the value with the defaults filled in
-    :raises ValueError: if there is something else in it, or a value is out of range
+    :raises ValueError: if it has another entry, or a value is out of range
     """
     if kwargs is None:
         return dict(allowed)

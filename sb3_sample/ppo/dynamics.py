@@ -1,4 +1,4 @@
-"""The learned model of the environment: a transition and a reward network (MBMA, appendix E), and their transitions."""
+"""Learned model of the environment: a transition and a reward network (MBMA, appendix E), and their transitions."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -21,8 +21,9 @@ class Transitions(NamedTuple):
     Transitions, as arrays in the buffer and as tensors in a batch.
 
     :param observations: (B, O)
-    :param actions: as the models see them, (B, D)
-    :param next_observations: (B, O), of the same episode: the last one of an episode is not the next one's first
+    :param actions: in the form of the models' input, (B, D)
+    :param next_observations: (B, O), of the same episode: after the last step, the episode's last observation, not the
+        next episode's first
     :param rewards: (B,)
     :param terminations: (B,), 1 where the episode terminated; a time limit is 0
     """
@@ -36,14 +37,14 @@ class Transitions(NamedTuple):
     def take(self, rows: Any) -> "Transitions":
         """
         :param rows: indices, or a slice
-        :return: these transitions; copies, but for a slice
+        :return: these transitions; copies, except for a slice
         """
         return Transitions(*(column[rows] for column in self))
 
 
 class TransitionBuffer:
     """
-    The most recent transitions of all environments, in arrays that are filled round and round.
+    The most recent transitions of all environments, in ring buffers.
 
     :param capacity: transitions kept
     :param observation_size: O
@@ -64,7 +65,7 @@ class TransitionBuffer:
 
     def add(self, new: Transitions) -> None:
         """
-        :param new: transitions, oldest first; of more than the capacity the most recent stay
+        :param new: transitions, oldest first; if they exceed the capacity, the most recent are kept
         """
         n = min(len(new.rewards), self.capacity)
         rows = (self._next + np.arange(n)) % self.capacity
@@ -74,34 +75,34 @@ class TransitionBuffer:
         self.size = min(self.size + n, self.capacity)
 
     def _by_age(self, newest: int) -> np.ndarray:
-        """Rows of the most recent transitions, oldest of them first."""
+        """Rows of the most recent transitions, oldest first."""
         return (self._next - newest + np.arange(newest)) % self.capacity
 
     def recent(self, n: int) -> Transitions:
         """
         :param n: how many
-        :return: the most recent transitions, fewer if there are not so many
+        :return: the most recent transitions, fewer if fewer are stored
         """
         return self.data.take(self._by_age(min(n, self.size)))
 
     def stored(self) -> Transitions:
         """
-        :return: all transitions, in no order of their age; no copies
+        :return: all transitions, not ordered by age; no copies
         """
         return self.data.take(slice(self.size))
 
     def draw(self, n_batches: int, batch_size: int) -> np.ndarray:
         """
         :param n_batches: how many batches
-        :param batch_size: transitions a batch
+        :param batch_size: transitions per batch
         :return: rows of ``stored``, drawn uniformly by NumPy's global generator, (n_batches, batch_size)
         """
-        # Stable-Baselines3 seeds this one.
+        # Stable-Baselines3 seeds this generator.
         return np.random.randint(self.size, size=(n_batches, batch_size))  # noqa: NPY002
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """
-        :return: the transitions by name, oldest first; and the row that comes next, since ``draw`` draws rows
+        :return: the transitions by name, oldest first; and the next row to be written, since ``draw`` draws rows
         """
         kept = self.recent(self.size)
         named = {name: torch.from_numpy(values) for name, values in kept._asdict().items()}
@@ -109,15 +110,15 @@ class TransitionBuffer:
 
     def load_state_dict(self, state: Mapping[str, torch.Tensor], strict: bool = True) -> None:
         """
-        :param state: transitions as ``state_dict`` gives them; of more than the capacity the most recent are taken
-        :param strict: there for Stable-Baselines3, which passes it
-        :raises ValueError: if they are no transitions of this buffer, or none that an environment gives
+        :param state: transitions as ``state_dict`` gives them; if they exceed the capacity, the most recent are taken
+        :param strict: ignored; Stable-Baselines3 passes it
+        :raises ValueError: if they do not fit this buffer, or have values that no environment gives
         """
         self._check(state)
         self.size = 0
         n = len(state["rewards"])
-        # Full arrays are turned as they were, so that the same rows are drawn; others fill up from the first row on,
-        # which drawing relies on. Files of earlier versions are without "next".
+        # Full arrays are rotated as they were when saved, so that the same rows are drawn; others are filled from the
+        # first row on, which drawing relies on. Files of earlier versions lack "next".
         self._next = (int(state.get("next", 0)) - n) % self.capacity if n >= self.capacity else 0
         self.add(Transitions(*(state[name].cpu().numpy() for name in Transitions._fields)))
 
@@ -133,7 +134,8 @@ class TransitionBuffer:
 
 class Standardizer(nn.Module):
     """
-    Shifts and scales numbers by the mean and standard deviation of what it was fitted to; at first it does nothing.
+    Shifts and scales numbers by the mean and standard deviation of the data that it was fitted to; before, it does
+    nothing.
 
     :param size: length of the vectors
     """
@@ -164,8 +166,8 @@ class Standardizer(nn.Module):
 
     def inverse(self, x: torch.Tensor) -> torch.Tensor:
         """
-        :param x: what ``forward`` gave, (..., size)
-        :return: what ``forward`` got, (..., size)
+        :param x: an output of ``forward``, (..., size)
+        :return: the corresponding input of ``forward``, (..., size)
         """
         return torch.addcmul(self.mean, x, self.std)
 
@@ -186,7 +188,7 @@ class Prediction(NamedTuple):
 
 class Dynamics(nn.Module):
     """
-    The model of MBMA, appendix E: "Transition model inputs concatenated state-action and outputs a state vector [...]
+    Model of MBMA, appendix E: "Transition model inputs concatenated state-action and outputs a state vector [...]
     trained using MSE loss function with future state used as a target", and likewise the reward model. Two networks
     without shared layers, hidden layers with ReLU.
 
@@ -197,7 +199,7 @@ class Dynamics(nn.Module):
     :param learning_rate: of Adam, whose epsilon is 1e-5
     :param normalize: whether observations and rewards are shifted and scaled by the mean and standard deviation of the
         transitions that the model is trained on, at the input and in the errors. MBMA's paper does not mention it;
-        without it, entries of large numbers are learned at the cost of all others
+        without it, entries with large values are learned at the cost of all others
     :param terminations: whether a second output of the reward network predicts that the episode terminates, by its
         cross-entropy
     """
@@ -239,7 +241,7 @@ class Dynamics(nn.Module):
         """
         :param observations: (B, O)
         :param actions: (B, D)
-        :return: the next observations, rewards, and probabilities of going on
+        :return: the next observations, rewards, and probabilities that the episode continues
         """
         next_observations, outputs = self(observations, actions)
         rewards = outputs[:, :1]
@@ -278,14 +280,14 @@ class Dynamics(nn.Module):
 
     def fit(self, transitions: Transitions, batches: torch.Tensor) -> dict[str, torch.Tensor]:
         """
-        One step of Adam for each batch, in the given order.
+        Take one step of Adam for each batch, in the given order.
 
-        :param transitions: transitions, as tensors; those that inputs and errors are scaled by
-        :param batches: their rows that each step learns from, (steps, B)
-        :return: losses before each step, their mean, by name
+        :param transitions: transitions, as tensors, which also determine the scales of inputs and errors
+        :param batches: rows of the transitions for each step, (steps, B)
+        :return: means of the losses before each step, by name
         """
         self.scale_by(transitions)
-        # Gathered one by one: all together they can be many times as large as the buffer.
+        # Batches are gathered one by one: together they can be many times as large as the buffer.
         return fit(self, self.optimizer, (self.losses(transitions.take(rows)) for rows in batches))
 
 
@@ -295,9 +297,9 @@ def fit(
     """
     Minimise the sum of the losses, one step of the optimizer for each element.
 
-    :param module: what is trained
+    :param module: the module to train
     :param optimizer: of its parameters
-    :param steps: computes the next batch's losses by name when it is asked for them
+    :param steps: yields each batch's losses by name, computed only when needed
     :return: the means of the losses, by name
     """
     parameters = list(module.parameters())
@@ -317,7 +319,7 @@ def fit(
 def minibatches(tensors: Any, batch_size: int) -> Iterator[tuple[torch.Tensor, ...]]:
     """
     :param tensors: contiguous tensors of the same length
-    :param batch_size: rows a batch; the last one may have fewer
+    :param batch_size: rows per batch; the last batch may have fewer
     :return: slices of them, without a copy
     """
     for first in range(0, len(tensors[0]), batch_size):

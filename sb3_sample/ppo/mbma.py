@@ -20,13 +20,13 @@ class MBMAPPO(ModelBasedPPO):
     """
 
     n_simulated: int = argument(default=8)
-    """X, extra actions at each real state; 0 for PPO. Actions of a Discrete space are not drawn but all taken, weighted
-    as X draws count in expectation"""
+    """X, extra actions at each real state; 0 for PPO. Actions of a Discrete space are not drawn: all are taken, with
+    the weights that X draws have in expectation"""
 
     def _simulate(
         self, observations: torch.Tensor, values: torch.Tensor, n_simulated: int, noise: torch.Tensor | None
     ) -> SimulatedSamples:
-        """Noise: (H, N, X, A), the first of the extra actions, the others of the actions in the rollouts."""
+        """Noise: (H, N, X, A), the first entry for the extra actions, the others for the actions in the rollouts."""
         actions, log_probs, weights = self._many_actions(observations, n_simulated, None if noise is None else noise[0])
         n_columns = actions.shape[1]
         flat_actions = actions.flatten(0, 1)

@@ -9,17 +9,18 @@ from sb3_sample.ppo.samples import SimulatedSamples
 
 class MBPOPPO(ModelBasedPPO):
     """
-    PPO with simulated states, the rival of :class:`MBMAPPO` (MBMA, section 5.1; MBPO by Janner et al. 2019): from each
-    real state the learned model is rolled for ``simulation_horizon`` steps under the policy, and the policy gradient
-    is also taken at its first ``n_simulated`` states, which makes the trajectory ``n_simulated`` + 1 times as long.
+    PPO with simulated states, a baseline for :class:`MBMAPPO` (MBMA, section 5.1; MBPO by Janner et al. 2019): from
+    each real state the learned model is rolled out for ``simulation_horizon`` steps under the policy, and the policy
+    gradient is also taken at the first ``n_simulated`` states, which makes the trajectory ``n_simulated`` + 1 times as
+    long.
 
-    The many-actions paper has 8 states and a horizon of 12. Read here: a rollout begins with a fresh action of the
-    policy at the real state; simulated states 1 to X are the samples, each with the TD(lambda) return from it to the
-    end of the rollout, where the critic's value stands. A rollout of H steps so has H - 1 states with a return. Where X
-    is more than that, as in appendix D's ablation (N = 8, 16, 32, 64 at H = 12), as many rollouts branch from each real
-    state as are needed, ``ceil(X / (H - 1))``, each with actions of its own and equally many states (to one): no state
-    lies further than H - 1 steps of the model from a real one. With ``predict_termination`` a sample counts as much as
-    the rollout is likely to have come so far.
+    The many-actions paper uses 8 states and a horizon of 12. This implementation reads it as follows: a rollout begins
+    with a fresh action of the policy at the real state; simulated states 1 to X are the samples, each with the
+    TD(lambda) return from there to the end of the rollout, which is bootstrapped with the critic's value. A rollout of
+    H steps thus has H - 1 states with a return. If X is larger, as in appendix D's ablation (N = 8, 16, 32, 64 at H =
+    12), as many rollouts branch from each real state as are needed, ``ceil(X / (H - 1))``, each with its own actions
+    and the same number of states (to within one): no state is more than H - 1 model steps from a real one. With
+    ``predict_termination`` a sample is weighted by the probability that the rollout reaches it.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -40,7 +41,9 @@ class MBPOPPO(ModelBasedPPO):
     def _simulate(
         self, observations: torch.Tensor, values: torch.Tensor, n_simulated: int, noise: torch.Tensor | None
     ) -> SimulatedSamples:
-        """Noise: (H, R N, A), of the actions in the R rollouts from each state, all states' first ones first."""
+        """
+        Noise: (H, R N, A), of the actions in R rollouts from each state; all states' first rollouts come first.
+        """
         n_rollouts = -(-n_simulated // (self.simulation_horizon - 1))
         n_kept = -(-n_simulated // n_rollouts)
         pieces, ends = [], False
@@ -61,7 +64,7 @@ class MBPOPPO(ModelBasedPPO):
             columns = (rolled.observations, rolled.actions, rolled.log_probs, q_values, advantages, reached)
             pieces.append([column.transpose(0, 1) for column in columns])
         joined = [torch.cat(column).unflatten(0, (n_rollouts, -1)) for column in zip(*pieces, strict=True)]
-        # By state, then by step, then by rollout: what is too much are last steps.
+        # By state, then by step, then by rollout, so that only last steps are cut off.
         joined = [column.movedim(0, 2).flatten(1, 2)[:, :n_simulated] for column in joined]
         self._check_finite("returns", joined[3])
         samples = SimulatedSamples(*joined)

@@ -1,4 +1,6 @@
-"""PPO with a learned model of the environment: what MBMA and MBPO share, which is all but where the rollouts go."""
+"""
+PPO with a learned model of the environment, the base of MBMA and MBPO, which differ only in where the rollouts go.
+"""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -25,7 +27,7 @@ DYNAMICS_DEFAULTS: dict[str, Any] = {
     "epochs": None,
     "normalize": True,
 }
-#: Numbers in the widest hidden layer of one piece of a simulation. On a CPU a piece's layers stay in the cache.
+#: Numbers in the widest hidden layer of one chunk of a simulation. On a CPU a chunk's layers stay in the cache.
 FLOATS_AT_ONCE = {"cpu": 2**22, "cuda": 2**27}
 #: Real trajectories on which the error of the simulated return is measured.
 N_COMPARED = 256
@@ -33,14 +35,14 @@ N_COMPARED = 256
 
 class Simulation(NamedTuple):
     """
-    Rollouts of the model, of H steps from B states: what ``roll_out`` has kept of them.
+    Rollouts of the model, of H steps from B states, as kept by ``roll_out``.
 
     :param q_values: TD(lambda) return from each step on, (H, B)
     :param values: the critic's value of the state after each step, (H, B)
     :param continues: probability that the step does not end the episode, (H, B); None if no episode terminates
     :param observations: states after each of the first n steps, (n, B, O)
-    :param actions: the policy's at those states, (n, B, A) or (n, B)
-    :param log_probs: of those actions, (n, B)
+    :param actions: the policy's actions at those states, (n, B, A) or (n, B)
+    :param log_probs: log-probabilities of those actions, (n, B)
     """
 
     q_values: torch.Tensor
@@ -64,7 +66,7 @@ def lambda_returns(
 
     :param rewards: (H, B)
     :param next_values: the critic's values of the states after each step, (H, B)
-    :param continues: probabilities c of going on, (H, B), or None for 1
+    :param continues: probabilities c that the episode continues, (H, B), or None for 1
     :param gamma: discount factor
     :param gae_lambda: lambda
     :return: (H, B)
@@ -81,7 +83,7 @@ def lambda_returns(
 class ModelBasedPPO(SimulatedPPO):
     """
     :class:`SimulatedPPO` with a learned model of the environment (MBMA, appendix E), the base of :class:`MBMAPPO` and
-    :class:`MBPOPPO`. Each iteration the model is trained on the most recent transitions, before the policy.
+    :class:`MBPOPPO`. In each iteration the model is trained on the most recent transitions, before the policy.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -97,20 +99,20 @@ class ModelBasedPPO(SimulatedPPO):
     )
 
     simulation_horizon: int = argument(default=12, kind=integer(1))
-    """H, steps of a rollout of the model, at whose end the critic's value stands"""
+    """H, steps of a rollout of the model, which is bootstrapped with the critic's value"""
     dynamics_buffer_size: int = argument(default=25_000, kind=integer(1))
-    """transitions, of all environments together, that the model learns from"""
+    """number of transitions, of all environments together, that the model learns from"""
     dynamics_batch_size: int = argument(default=128, kind=integer(1))
-    """transitions in a batch of the model"""
+    """transitions per batch of the model"""
     dynamics_kwargs: dict[str, Any] | None = argument(default=None)
     """the model: ``width`` (1024) and ``depth`` (2) of the hidden layers of each of its two networks, ``learning_rate``
     (3e-4), ``epochs`` (None: ``n_epochs``; an iteration trains it for ``epochs`` times PPO's minibatches), and
     ``normalize`` (True): whether observations and rewards are standardised, at the input and in the errors, by the
-    transitions that it learns from"""
+    transitions that the model learns from"""
     predict_termination: bool | None = argument(
         default=None, kind=Kind("be True, False or None", lambda value: value is None or isinstance(value, bool))
     )
-    """whether the model predicts that episodes terminate: off suits tasks whose episodes end by time limits only. None:
+    """whether the model predicts that episodes terminate: off suits tasks whose episodes end only by time limits. None:
     off for the tasks of the DeepMind Control suite, ``dmc/...``, none of which terminates (MBMA's setting), and for
     other environments with a true attribute ``never_terminates``; else on"""
 
@@ -133,15 +135,15 @@ class ModelBasedPPO(SimulatedPPO):
         self._model_kwargs = check_network_kwargs("dynamics_kwargs", self.dynamics_kwargs, DYNAMICS_DEFAULTS)
         network = {name: value for name, value in self._model_kwargs.items() if name != "epochs"}
         sizes = self.flat_observations.size, self.model_actions.size
-        #: The model. Anything with its ``predict`` can take its place in ``simulate``, a subclass everywhere.
+        #: The model. For ``simulate`` any object with its ``predict`` can replace it, elsewhere only a subclass.
         self.dynamics = Dynamics(*sizes, **network, terminations=self.predict_termination).to(self.device)
-        #: The transitions that it learns from, as the environments gave them, not normalised by ``VecNormalize``.
+        #: The model's training transitions, as the environments gave them, not normalised by ``VecNormalize``.
         self.transitions = TransitionBuffer(self.dynamics_buffer_size, *sizes)
-        # Transitions that are in the buffer but that the model has not been trained on.
+        # Number of transitions in the buffer that the model has not been trained on.
         self._n_new = 0
 
     def _never_terminates(self) -> bool:
-        # Asked first, since a worker of SubprocVecEnv does not survive the question for what is not there.
+        # has_attr first, since get_attr of a missing attribute kills a worker of SubprocVecEnv.
         env = self.env
         return env is not None and env.has_attr("never_terminates") and all(env.get_attr("never_terminates"))
 
@@ -157,7 +159,7 @@ class ModelBasedPPO(SimulatedPPO):
             return super()._collect(env, callback, rollout_buffer, n_rollout_steps)
         recorder = _Recorder(self, callback)
         goes_on = super()._collect(env, recorder, rollout_buffer, n_rollout_steps)
-        # A callback that ends the training ends the rollout without its end.
+        # If a callback ends the training, on_rollout_end is not called.
         recorder.store()
         return goes_on
 
@@ -174,7 +176,7 @@ class ModelBasedPPO(SimulatedPPO):
         self._check_has_rollout()
         stored = self._as_tensors(self.transitions.stored())
         if not self.dynamics.optimizer.state:
-            # A model that was never trained has no scale to measure its losses by.
+            # A model that was never trained has no scales for its losses.
             self.dynamics.scale_by(stored)
         n_new, self._n_new = min(self._n_new, self.transitions.size), 0
         if n_new > 0:
@@ -190,7 +192,7 @@ class ModelBasedPPO(SimulatedPPO):
         self.logger.record("dynamics/buffer_size", self.transitions.size)
 
     def _as_tensors(self, transitions: Transitions) -> Transitions:
-        """Transitions of the buffer as the policy sees them: by the present statistics of VecNormalize."""
+        """Transitions of the buffer as the policy sees them: normalised by the current statistics of VecNormalize."""
         if self._vec_normalize_env is not None:
             venv, codec = self._vec_normalize_env, self.flat_observations
             transitions = transitions._replace(
@@ -204,15 +206,15 @@ class ModelBasedPPO(SimulatedPPO):
     def _compare_returns(self) -> None:
         """
         Log the root mean squared error of the simulated h-step return, bootstrapped with the critic, against the real
-        one (``simulation/return_error_<h>``). The model is given the real states and all real actions of the rollout,
-        of which it has seen none.
+        return (``simulation/return_error_<h>``). The model is given the real states and all real actions of the
+        rollout, which it has not been trained on.
         """
         buffer = self.rollout_buffer
-        if buffer.generator_ready:  # flattened by somebody: the order of the steps is lost
+        if buffer.generator_ready:  # already flattened: the order of the steps is lost
             return
         horizons = sorted({*(2**i for i in range(10) if 2**i < self.simulation_horizon), self.simulation_horizon})
         horizons = [h for h in horizons if h < buffer.buffer_size]
-        # Steps from t on that stay in its episode, without the step that ends it, since rewards there hold values.
+        # Steps from t on in the same episode, without the step that ends it, since its reward may contain a value.
         steps = np.zeros((buffer.buffer_size, self.n_envs), np.int64)
         for t in reversed(range(buffer.buffer_size - 1)):
             steps[t] = np.where(buffer.episode_starts[t + 1] > 0, 0, steps[t + 1] + 1)
@@ -256,15 +258,15 @@ class ModelBasedPPO(SimulatedPPO):
         self, observations: torch.Tensor, actions: torch.Tensor, noise: torch.Tensor | None = None, n_kept: int = 0
     ) -> Simulation:
         """
-        Roll the model for ``simulation_horizon`` steps under the present policy: the given actions first, then the
-        policy's. All B states go through a step in one batch.
+        Roll the model out for ``simulation_horizon`` steps under the current policy: the given actions first, then the
+        policy's. Each step of all B states is one batch.
 
         :param observations: states to start from, (B, O)
-        :param actions: the first actions, the policy's (not clipped), (B, A), or (B,) integers
-        :param noise: standard Gaussian noise of the later actions, (H - 1, B, A); drawn if None. Without a meaning for
-            Discrete actions
-        :param n_kept: of how many steps the states are kept
-        :return: TD(lambda) returns from each step on, values, and what is kept
+        :param actions: the first actions, as the policy gives them (not clipped), (B, A), or (B,) integers
+        :param noise: standard Gaussian noise of the later actions, (H - 1, B, A); drawn if None. Ignored for Discrete
+            actions
+        :param n_kept: number of steps whose states are kept
+        :return: TD(lambda) returns from each step on, values, and the kept states
         """
         rewards, continues, values = [], [], []
         kept: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor]] = []
@@ -279,7 +281,7 @@ class ModelBasedPPO(SimulatedPPO):
                 try:
                     distribution = self.distribution_at(observations)
                 except ValueError:
-                    # torch's distributions refuse NaN, and do not say where it comes from.
+                    # torch's distributions reject NaN, but do not say where it comes from.
                     self._check_finite("states", observations)
                     raise
                 actions = draw(distribution, None if noise is None else noise[k])
@@ -292,7 +294,7 @@ class ModelBasedPPO(SimulatedPPO):
         return Simulation(q_values, next_values, c, *states)
 
     def _rows_at_once(self) -> int:
-        """How many rollouts make a piece of a simulation."""
+        """Number of rollouts in a chunk of a simulation."""
         floats = FLOATS_AT_ONCE.get(self.device.type, FLOATS_AT_ONCE["cuda"])
         return max(1, floats // self._model_kwargs["width"])
 
@@ -308,7 +310,7 @@ class ModelBasedPPO(SimulatedPPO):
 def draw(distribution: Distribution, noise: torch.Tensor | None) -> torch.Tensor:
     """
     :param distribution: of the actions at B states
-    :param noise: standard Gaussian noise, (B, A), or None; without a meaning for Discrete actions
+    :param noise: standard Gaussian noise, (B, A), or None; ignored for Discrete actions
     :return: one action for each state, (B, A) or (B,)
     """
     if noise is None or isinstance(distribution, CategoricalDistribution):
@@ -319,11 +321,11 @@ def draw(distribution: Distribution, noise: torch.Tensor | None) -> torch.Tensor
 
 class _Recorder(BaseCallback):
     """
-    Stands between the collecting of a rollout and the user's callback, and notes the transitions: what the rollout
-    buffer has not is the last observation of an episode, the termination, and what ``VecNormalize`` started from.
+    Wraps the user's callback during a rollout and records the transitions: the rollout buffer lacks the last
+    observation of an episode, the termination, and the numbers before ``VecNormalize``.
 
-    :param agent: whose rollout it is
-    :param callback: the user's
+    :param agent: the agent that collects the rollout
+    :param callback: the user's callback
     """
 
     def __init__(self, agent: ModelBasedPPO, callback: BaseCallback):
@@ -372,7 +374,7 @@ class _Recorder(BaseCallback):
         return self.callback.on_step()
 
     def store(self) -> None:
-        """Put what was noted into the model's buffer."""
+        """Put the recorded transitions into the model's buffer."""
         if not self.noted:
             return
         columns = [np.concatenate(column) for column in zip(*self.noted, strict=True)]

@@ -16,13 +16,13 @@ from sb3_sample.ppo.samples import Rollout, SimulatedSamples, check_parameters_o
 
 
 class PolicyUpdate:
-    """Part of an on-policy algorithm: its policy at flat observations, and the epochs of an iteration."""
+    """Mixin of an on-policy algorithm: its policy at flat observations, and the epochs of an iteration."""
 
     def distribution_at(self: Any, observations: torch.Tensor) -> Distribution:
         """
         :param observations: flat, (B, O)
         :return: the policy's distribution of the actions
-        :raises ValueError: its parameters are not finite, or it is of another kind than can be simulated with
+        :raises ValueError: its parameters are not finite, or its kind is not supported in simulation
         """
         distribution = self.policy.get_distribution(self.flat_observations.restore(observations))
         if not isinstance(distribution, (DiagGaussianDistribution, CategoricalDistribution)):
@@ -42,7 +42,7 @@ class PolicyUpdate:
 
     def _update_policy(self: Any, rollout: Rollout, samples: SimulatedSamples) -> None:
         """
-        PPO's epochs over the rollout and the samples that belong to it (MBMA, algorithm 1, lines 10 to 13).
+        Run PPO's epochs over the rollout and its simulated samples (MBMA, algorithm 1, lines 10 to 13).
 
         :param rollout: the real samples
         :param samples: the simulated ones
@@ -54,7 +54,7 @@ class PolicyUpdate:
         if self.clip_range_vf is not None:
             clip_range_vf = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
 
-        # The real sample of a row first, then its simulated ones.
+        # Each row has its real sample first, then its simulated ones.
         real_weights = torch.ones_like(rollout.log_probs)[:, None]
         weights = torch.ones_like(samples.log_probs) if samples.weights is None else samples.weights
         columns: dict[str, torch.Tensor] = {
@@ -74,14 +74,14 @@ class PolicyUpdate:
         goes_on = True
         for epoch in range(self.n_epochs):
             divergences = []
-            # The same numbers as Stable-Baselines3 draws, and one copy an epoch instead of one a minibatch.
+            # Draws the same numbers as Stable-Baselines3, with one copy per epoch instead of one per minibatch.
             order = torch.as_tensor(np.random.permutation(len(rollout.values)), device=self.device)  # noqa: NPY002
             shuffled = {name: values[order] for name, values in columns.items()}
             for batch in minibatches(list(shuffled.values()), self.batch_size):
                 try:
                     loss, step = self._losses(dict(zip(shuffled, batch, strict=True)), clip_range, clip_range_vf)
                 except ValueError:
-                    # The error of torch's distributions at a mean that is not finite comes one minibatch late.
+                    # torch's distributions raise at a mean that is not finite, which is one minibatch late.
                     self._stop_if_diverged(metrics)
                     raise
                 metrics.append({name: value.detach() for name, value in step.items()})
@@ -116,7 +116,7 @@ class PolicyUpdate:
             self.logger.record("train/clip_range_vf", clip_range_vf)
 
     def _stop_if_diverged(self: Any, metrics: list[dict[str, torch.Tensor]]) -> None:
-        """Name the first of the present iteration's minibatches whose metrics are not finite, if there is one."""
+        """Raise, naming the first minibatch of this iteration whose metrics are not finite, if there is one."""
         for i, step in enumerate(metrics, 1):
             bad = not_finite({f"train/{name}": value.item() for name, value in step.items()})
             if bad:
@@ -126,13 +126,13 @@ class PolicyUpdate:
         self: Any, batch: dict[str, torch.Tensor], clip_range: float, clip_range_vf: float | None
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """
-        PPO's loss of a minibatch of B real samples with X simulated ones each.
+        Compute PPO's loss of a minibatch of B real samples with X simulated ones each.
 
         :param batch: ``observations`` (B, O), ``values`` and ``returns`` (B,); with the real sample in the first column
-            ``actions`` (B, 1 + X, A), ``log_probs``, ``advantages`` and ``weights`` (B, 1 + X); and perhaps
+            ``actions`` (B, 1 + X, A), ``log_probs``, ``advantages`` and ``weights`` (B, 1 + X); optionally
             ``simulated_observations`` (B, X, O)
-        :param clip_range: of the probability ratio
-        :param clip_range_vf: of the value's change, or None
+        :param clip_range: clipping of the probability ratio
+        :param clip_range_vf: clipping of the value's change, or None
         :return: the loss, and scalars to log by name
         """
         observations, actions = batch["observations"], batch["actions"]
@@ -154,7 +154,7 @@ class PolicyUpdate:
         advantages = batch["advantages"]
         if self.normalize_advantage:
             centred = advantages - (weights * advantages).sum()
-            # With equal weights torch.std's estimate, which Stable-Baselines3 divides by.
+            # With equal weights this is torch.std's estimate, which Stable-Baselines3 divides by.
             variance = (weights * centred.square()).sum() * advantages.numel() / (advantages.numel() - 1)
             advantages = centred / (variance.sqrt() + 1e-8)
         log_ratio = log_probs - batch["log_probs"]

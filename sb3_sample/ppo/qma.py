@@ -22,14 +22,14 @@ Q_DEFAULTS: dict[str, Any] = {"width": 1024, "depth": 2, "learning_rate": 3e-4, 
 
 class QNetworks(nn.Module):
     """
-    Two Q-networks, as copies along a leading axis, hidden layers with ReLU.
+    Two Q-networks, stacked along a leading axis, hidden layers with ReLU.
 
     :param observation_size: O
     :param action_size: D
     :param width: width of the hidden layers (MBMA: 1024)
     :param depth: hidden layers (MBMA: 2)
     :param learning_rate: of Adam, whose epsilon is 1e-5
-    :param normalize: whether observations are standardised by those that the networks are trained on
+    :param normalize: whether observations are standardised by the training observations
     """
 
     def __init__(
@@ -69,9 +69,10 @@ class QNetworks(nn.Module):
 
 class QMAPPO(SimulatedPPO):
     """
-    PPO with many actions by Q-networks, the rival of :class:`MBMAPPO` (MBMA, section 5.1; Asadi et al. 2017, Petit et
-    al. 2019): ``n_simulated`` extra actions at each real state, their Q-values the smaller of two Q-networks' that are
-    trained on the TD(lambda) returns of each rollout before the policy, by PPO's minibatches and epochs.
+    PPO with many actions by Q-networks, a baseline for :class:`MBMAPPO` (MBMA, section 5.1; Asadi et al. 2017, Petit et
+    al. 2019): ``n_simulated`` extra actions at each real state. Their Q-values are the smaller outputs of two
+    Q-networks, which are trained on the TD(lambda) returns of each rollout before the policy, with PPO's minibatches
+    and epochs.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -80,12 +81,12 @@ class QMAPPO(SimulatedPPO):
     simulation_arguments: ClassVar[tuple[str, ...]] = (*SimulatedPPO.simulation_arguments, "q_kwargs")
 
     n_simulated: int = argument(default=8)
-    """X, extra actions at each real state; 0 for PPO. Actions of a Discrete space are not drawn but all taken, weighted
-    as X draws count in expectation"""
+    """X, extra actions at each real state; 0 for PPO. Actions of a Discrete space are not drawn: all are taken, with
+    the weights that X draws have in expectation"""
     q_kwargs: dict[str, Any] | None = argument(default=None)
     """the Q-networks: ``width`` (1024) and ``depth`` (2) of the hidden layers, ``learning_rate`` (3e-4), ``epochs``
-    over each rollout (None: ``n_epochs``), and ``normalize`` (True): whether observations are standardised by the
-    rollout"""
+    over each rollout (None: ``n_epochs``), and ``normalize`` (True): whether observations are standardised by those of
+    the rollout"""
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
@@ -102,7 +103,7 @@ class QMAPPO(SimulatedPPO):
 
     def fit_models(self) -> None:
         """
-        Train the Q-networks on the TD(lambda) returns of the present rollout, and log their loss: before the training,
+        Train the Q-networks on the TD(lambda) returns of the current rollout, and log their loss: before the training,
         on samples that they have not seen (``dynamics/heldout_q_loss``), and during it (``dynamics/train_q_loss``).
 
         :raises ValueError: if there is no rollout
@@ -126,7 +127,7 @@ class QMAPPO(SimulatedPPO):
     def _simulate(
         self, observations: torch.Tensor, values: torch.Tensor, n_simulated: int, noise: torch.Tensor | None
     ) -> SimulatedSamples:
-        """Noise: (N, X, A), of the extra actions."""
+        """Noise: (N, X, A), for the extra actions."""
         actions, log_probs, weights = self._many_actions(observations, n_simulated, noise)
         n_columns = actions.shape[1]
         model_actions = self.model_actions(actions.flatten(0, 1))

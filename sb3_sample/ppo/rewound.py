@@ -1,4 +1,4 @@
-"""Extra actions at the real states, their Q-values from the environment itself, which goes back to each state."""
+"""Extra actions at the real states, with Q-values from the environment itself, which is rewound to each state."""
 
 from typing import Any, ClassVar
 
@@ -29,7 +29,7 @@ from sb3_sample.ppo.simulated_ppo import ExtraSamplesPPO
 from sb3_sample.ppo.spaces import FlatObservations
 from sb3_sample.saving.kept import Kept
 
-#: Vectorised wrappers that leave observations, rewards and actions as they are.
+#: Vectorised wrappers that leave observations, rewards and actions unchanged.
 _TRANSPARENT = (VecCheckNan, VecMonitor)
 
 
@@ -37,25 +37,25 @@ class RewoundPPO(ExtraSamplesPPO):
     """
     PPO with many actions by the environment itself (MBMA, Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011,
     equation 3, figure 1 and table 1's last columns): at each real state ``n_actions - 1`` further actions are taken in
-    copies of the environment, which go back to that state, and the policy is followed from there. The first action
-    alone leads to the next state, and the environment's own stream is as if there were no others.
+    copies of the environment that are rewound to that state, and the policy is followed from there. Only the first
+    action leads to the next state, and the real environment runs as if there were no further actions.
 
-    The return of a further action is the taken one's: TD(``gae_lambda``), to the rollout's end, a termination or a time
-    limit, bootstrapped with the critic. ``gae_lambda=1`` is the paper's equation.
+    A further action has the same kind of return as the action taken: TD(``gae_lambda``), to the rollout's end, a
+    termination or a time limit, bootstrapped with the critic. ``gae_lambda=1`` is the paper's equation.
 
     With ``n_epochs=1`` and ``batch_size`` of the whole rollout it is the plain actor-critic of figure 1: the only
-    gradient step of a rollout is at the ratio 1, where PPO's clipping does nothing.
+    gradient step of a rollout is at probability ratio 1, where PPO's clipping does nothing.
 
-    What the further actions cost is logged apart, ``rewound/steps`` of the iteration and ``rewound/total_steps``; no
-    real step is counted for them.
+    The steps of the further actions are logged separately, as ``rewound/steps`` of the iteration and
+    ``rewound/total_steps``; they do not count as real steps.
 
     :raises ValueError: if an argument is out of range or contradicts another, or the environment cannot be rewound
     """
 
     _kept: ClassVar[dict[str, Kept]] = {
-        # Of the present rollout.
+        # Belongs to the current rollout.
         "_states": Kept.NOWHERE,
-        # Made of the environment.
+        # Made from the environment.
         "_siblings": Kept.NOWHERE,
     }
     plain: ClassVar[str] = "n_actions=1"
@@ -67,26 +67,26 @@ class RewoundPPO(ExtraSamplesPPO):
     )
 
     n_actions: int = argument(default=2, kind=integer(1))
-    """N, actions at each state of a rollout, the one that is carried out among them; 1 for plain PPO"""
+    """N, actions at each state of a rollout, including the one carried out; 1 for plain PPO"""
     horizon: int | None = argument(default=None, kind=integer(1).or_none("the rollout's end"))
-    """steps after which the return of a further action is bootstrapped, also beyond the rollout's end; None: at the
-    rollout's end, as that of the action taken"""
+    """steps after which the return of a further action is bootstrapped, even beyond the rollout's end; None: at the
+    rollout's end, as for the action taken"""
     sample_actions: str = argument(
         default="draw", kind=Kind("be 'draw' or 'all'", lambda value: value in ("draw", "all"))
     )
-    """"draw": ``n_actions - 1`` actions of the policy. "all": with a Discrete space every action, each with its
-    probability times ``n_actions - 1`` for a weight"""
+    """"draw": ``n_actions - 1`` actions of the policy. "all": with a Discrete space every action, weighted by its
+    probability times ``n_actions - 1``"""
     copies: int = argument(default=16, kind=integer(1))
     """environments made like the real one, in which the further actions are taken side by side"""
     warm_up_until: float | None = argument(default=0.0)
     """share of the training over which the further actions rise linearly from 0 to ``n_actions - 1``; None: 0.15"""
     anneal_until: float | None = argument(default=None)
-    """share of the training, of ``total_timesteps``, from which on there are no further actions; None for never"""
+    """share of the training, of ``total_timesteps``, after which there are no further actions; None for never"""
 
     def _construct(self, given: Given) -> None:
         #: Steps taken in the copies over the model's life.
         self.num_rewound_steps = 0
-        # By step and environment, the states of the present rollout.
+        # By step and environment, the states of the current rollout.
         self._states: list[list[EnvState]] = []
         self._siblings: list[gym.Env] = []
         super()._construct(given)
@@ -97,7 +97,7 @@ class RewoundPPO(ExtraSamplesPPO):
 
     def _check_arguments(self) -> None:
         if self.n_actions == 1 and self.horizon is not None:
-            # It is in hyperparams/rewound_ppo.yml, and no user's own.
+            # It may come from hyperparams/rewound_ppo.yml instead of the user.
             raise ValueError(
                 f"horizon={self.horizon!r} means nothing with {self.plain}: leave it out, or at None (in the zoo, "
                 "whose file has one, -params n_actions:1 horizon:None; horizon: null in a plan)"
@@ -126,8 +126,8 @@ class RewoundPPO(ExtraSamplesPPO):
         """
         Set another environment, as in Stable-Baselines3.
 
-        :param env: the environment, of the same spaces and as many as the model was made with
-        :param force_reset: whether it is reset before training goes on
+        :param env: the environment, with the same spaces and number of environments as the model was made with
+        :param force_reset: whether it is reset before training continues
         :raises ValueError: if its spaces or its number of environments differ, or it cannot be rewound
         """
         super().set_env(env, force_reset)
@@ -137,7 +137,7 @@ class RewoundPPO(ExtraSamplesPPO):
 
     def _make_siblings(self) -> None:
         """
-        Make the copies, and try whether a state can be saved in one and restored in another.
+        Make the copies, and check that a state can be saved in one and restored in another.
 
         :raises ValueError: if it cannot
         """
@@ -145,9 +145,9 @@ class RewoundPPO(ExtraSamplesPPO):
         if base.envs[0].render_mode == "human":
             raise ValueError("env has render_mode='human', and its copies would be shown too: train without")
         try:
-            # The others are made when they are needed.
+            # The other copies are made when they are needed.
             self._siblings = [sibling_of(base.envs[0]) for _ in range(min(self.copies, 2))]
-        except Exception as error:  # whatever the constructors of an environment and its wrappers raise
+        except Exception as error:  # constructors of environments and wrappers may raise anything
             raise ValueError(
                 f"env must be one that can be made once more, to go back to its states, and {base.envs[0]} cannot "
                 f"({error!r}): register it and pass its id, or pass {self.plain} for plain PPO"
@@ -158,7 +158,7 @@ class RewoundPPO(ExtraSamplesPPO):
             raise ValueError(f"{error}. Pass {self.plain} for plain PPO") from error
         for index, env in enumerate(base.envs[1:], 1):
             try:
-                # Few steps: what another constructor or function does differs from the first.
+                # Few steps suffice: another constructor or function differs from the first step on.
                 check_restorable(sibling_of(env), self._siblings[0], n_steps=5)
             except Exception as error:
                 raise ValueError(
@@ -168,7 +168,7 @@ class RewoundPPO(ExtraSamplesPPO):
                 ) from error
 
     def _venv(self, venv: Any) -> DummyVecEnv:
-        """The environments in this process, below wrappers that are known."""
+        """The environments in this process, below the known wrappers."""
         while isinstance(venv, VecEnvWrapper):
             if not isinstance(venv, (*_TRANSPARENT, VecNormalize, VecTransposeImage)):
                 raise ValueError(
@@ -195,7 +195,7 @@ class RewoundPPO(ExtraSamplesPPO):
         return super()._collect(env, _Saver(self, callback, n_rollout_steps), rollout_buffer, n_rollout_steps)
 
     def fit_models(self) -> None:
-        """Do nothing: the environment is no model."""
+        """Do nothing: there is no model to fit."""
 
     def _train(self) -> None:
         before = self.num_rewound_steps
@@ -209,7 +209,7 @@ class RewoundPPO(ExtraSamplesPPO):
     ) -> SimulatedSamples:
         """
         Noise: (N, X, A), of the further actions, or with a Discrete space (N, X), uniform in [0, 1). The observations
-        are those of the present rollout, whose states are at hand.
+        have to be those of the current rollout, whose states are saved.
         """
         n_envs = self.n_envs
         if len(self._states) * n_envs != len(observations) or not torch.equal(
@@ -221,7 +221,7 @@ class RewoundPPO(ExtraSamplesPPO):
             )
         actions, log_probs, weights = self._further_actions(observations, n_simulated, noise)
         n_steps, n_columns = len(self._states), actions.shape[1]
-        # As the buffer's rows: the steps of one environment after those of another.
+        # In the order of the buffer's rows: the steps of one environment after those of another.
         states = [self._states[t][index] for index in range(n_envs) for t in range(n_steps)]
         left = [n_steps - t if self.horizon is None else self.horizon for _ in range(n_envs) for t in range(n_steps)]
         base = self._venv(self.env).envs[0]
@@ -229,7 +229,8 @@ class RewoundPPO(ExtraSamplesPPO):
         flat_actions = actions.flatten(0, 1).cpu().numpy()
         if isinstance(self.action_space, spaces.Box):
             flat_actions = flat_actions.reshape(-1, *self.action_space.shape)
-        # From the generator that checkpoints keep. Its own noise would make the continuations of a state the same.
+        # From the generator that checkpoints keep. With the random state saved in a state, all its continuations would
+        # be equal.
         rng = np.random.default_rng(np.random.randint(2**31))  # noqa: NPY002
         returns, taken = rewound_returns(
             _Follower(self),
@@ -265,10 +266,10 @@ class RewoundPPO(ExtraSamplesPPO):
 
 class _Saver(BaseCallback):
     """
-    Stands between the collecting of a rollout and the user's callback, and saves the states that actions are taken in.
+    Wraps the user's callback during a rollout and saves the states in which actions are taken.
 
-    :param agent: whose rollout it is
-    :param callback: the user's
+    :param agent: the agent that collects the rollout
+    :param callback: the user's callback
     :param n_steps: steps of the rollout
     """
 
@@ -288,7 +289,7 @@ class _Saver(BaseCallback):
         self.callback.update_locals(locals_)
 
     def on_step(self) -> bool:
-        # First the callback, which may change the environment that the next action is taken in.
+        # The callback first, since it may change the environment in which the next action is taken.
         goes_on = self.callback.on_step()
         if goes_on and len(self.agent._states) < self.n_steps:
             self._save()
@@ -303,7 +304,7 @@ class _Saver(BaseCallback):
 
 class _Follower:
     """
-    Policy and critic in the environment's own units, with the statistics of ``VecNormalize`` as they are.
+    Policy and critic in the environment's own units, with the statistics of ``VecNormalize`` frozen.
 
     :param agent: the algorithm
     """

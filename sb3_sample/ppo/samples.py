@@ -9,14 +9,14 @@ from stable_baselines3.common.distributions import CategoricalDistribution, Diag
 
 class Rollout(NamedTuple):
     """
-    The real samples of an iteration. N is their number, steps times environments.
+    The N real samples of an iteration, N being steps times environments.
 
     :param observations: (N, O)
-    :param actions: the policy's, (N, A), or (N,) integers of a Discrete space
-    :param log_probs: of the actions under the policy that took them, (N,)
-    :param values: the critic's of the observations, before the update, (N,)
-    :param advantages: by GAE(lambda), (N,)
-    :param returns: TD(lambda), (N,)
+    :param actions: the policy's actions, (N, A), or (N,) integers of a Discrete space
+    :param log_probs: log-probabilities of the actions under the policy that took them, (N,)
+    :param values: the critic's values of the observations before the update, (N,)
+    :param advantages: GAE(lambda) advantages, (N,)
+    :param returns: TD(lambda) returns, (N,)
     """
 
     observations: torch.Tensor
@@ -29,14 +29,14 @@ class Rollout(NamedTuple):
 
 class SimulatedSamples(NamedTuple):
     """
-    Samples of the policy that no environment has seen: X for each of N real observations.
+    Samples of the policy that were not taken in the real environment: X for each of N real observations.
 
     :param observations: the simulated states, (N, X, O); None if the actions are for the N real observations
-    :param actions: the policy's, (N, X, A), or (N, X) integers of a Discrete space
-    :param log_probs: of the actions under the policy that drew them, (N, X)
+    :param actions: the policy's actions, (N, X, A), or (N, X) integers of a Discrete space
+    :param log_probs: log-probabilities of the actions under the policy that drew them, (N, X)
     :param q_values: estimates of Q(s, a), (N, X)
     :param advantages: q_values minus the critic's values of the states, (N, X)
-    :param weights: how much each sample counts, a real one counting 1, (N, X); None if each counts 1
+    :param weights: weight of each sample, where a real one has weight 1, (N, X); None if all have weight 1
     """
 
     observations: torch.Tensor | None
@@ -49,8 +49,8 @@ class SimulatedSamples(NamedTuple):
 
 def check_parameters_of(distribution: torch.distributions.Distribution) -> None:
     """
-    Check the parameters of a distribution as torch does unless it was told not to: the first ``torch.compile`` of a
-    process, of an off-policy model for one, tells all distributions that are made after it not to.
+    Check the parameters of a distribution as torch does by default: the first ``torch.compile`` of a process, for
+    example of an off-policy model, disables the check for all distributions made later.
 
     :param distribution: a distribution
     :raises ValueError: they are out of range or NaN
@@ -71,7 +71,7 @@ def log_prob_of_many(distribution: Distribution, actions: torch.Tensor) -> torch
     assert isinstance(distribution, DiagGaussianDistribution)
     normal: Any = distribution.distribution
     mean, std = normal.mean[:, None], normal.stddev[:, None]
-    # torch's own formula, without its checks of every argument.
+    # torch's formula without its checks of every argument.
     squares = ((actions - mean) / std).square().sum(dim=2)
     constant = normal.stddev.log().sum(dim=1, keepdim=True) + mean.shape[2] * 0.5 * math.log(2 * math.pi)
     return -0.5 * squares - constant

@@ -1,8 +1,8 @@
 """
-The on-policy family: PPO whose policy gradient also sees further samples, and the one class that carries the work.
+The on-policy family: PPO whose policy gradient also uses further samples, and the class that does the work.
 
-``ExtraSamplesPPO.train`` is the whole iteration after the rollout, in the order of MBMA, algorithm 1. Where the extra
-samples come from is the business of its subclasses, in ``fit_models`` and ``_simulate``.
+``ExtraSamplesPPO.train`` is the whole iteration after the rollout, in the order of MBMA, algorithm 1. Subclasses
+provide the extra samples in ``fit_models`` and ``_simulate``.
 """
 
 import math
@@ -38,7 +38,7 @@ from sb3_sample.warn import warn
 
 Self = TypeVar("Self", bound="ExtraSamplesPPO")
 
-#: Hidden widths of actor and critic (MBMA, appendix B.2), of the policies that are given by these names.
+#: Hidden widths of actor and critic (MBMA, appendix B.2) of policies given by name.
 NET_ARCH: dict[str, list[int]] = {"pi": [512, 512], "vf": [1024, 1024]}
 #: Share of the training over which the number of samples rises (MBMA, section 5.1).
 WARM_UP = 0.15
@@ -47,12 +47,12 @@ NAMED_POLICIES = ("MlpPolicy", "MultiInputPolicy")
 
 class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
     """
-    PPO whose policy loss also sees further samples (MBMA, Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011,
-    algorithm 1): what :class:`SimulatedPPO` and :class:`RewoundPPO` share. The critic learns from the real samples
-    alone.
+    PPO whose policy loss also uses further samples (MBMA, Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011,
+    algorithm 1): the common base of :class:`SimulatedPPO` and :class:`RewoundPPO`. The critic learns from the real
+    samples only.
 
-    The number of updates is PPO's: each takes ``batch_size`` real samples with the further ones that belong to them
-    for the policy, and the real ones for the value. Without further samples it *is* Stable-Baselines3's PPO.
+    The number of updates is PPO's: each uses ``batch_size`` real samples and their further samples for the policy, and
+    only the real ones for the value. Without further samples it *is* Stable-Baselines3's PPO.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -75,11 +75,11 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         is_set_up = given.pop("_init_setup_model")
         theirs = self._store(given, PPO)
         PPO.__init__(self, **theirs, _init_setup_model=False)
-        # A policy class has its own widths. A loaded model's class is known, the name it was given by is not.
+        # A policy class has its own widths. Of a loaded model's policy only the class is known, not the name.
         self._has_named_policy = theirs["policy"] in NAMED_POLICIES
-        # Share of the training at which the present rollout began.
+        # Share of the training at which the current rollout began.
         self._progress = 0.0
-        # Of the present or last learn.
+        # Counted within the current or last call of learn.
         self._iteration = 0
         self._seconds: dict[str, float] = {}
         if is_set_up:
@@ -87,7 +87,7 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
 
     @property
     def _n_extra(self) -> int:
-        """Further samples for each real one, at the height of the schedule; 0 for PPO."""
+        """Further samples for each real one, at the maximum of the schedule; 0 for PPO."""
         raise NotImplementedError
 
     # ---------------------------------------------------------------- construction
@@ -97,7 +97,7 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         if self._n_extra > 0:
             self.flat_observations = self._make_flat_observations()
             self.model_actions = ModelActions(self.action_space, self.device)
-            # After the policy, whose initial weights are thereby Stable-Baselines3's of the same seed.
+            # After the policy, so that its initial weights equal Stable-Baselines3's with the same seed.
             self._setup_models()
 
     def _make_flat_observations(self) -> FlatObservations:
@@ -108,7 +108,7 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         if self._has_named_policy:
             kwargs.setdefault("net_arch", {name: list(widths) for name, widths in NET_ARCH.items()})
         optimizer_class = kwargs.get("optimizer_class", torch.optim.Adam)
-        # Without any, Stable-Baselines3's own, whose epsilon is the paper's too.
+        # By default Stable-Baselines3's, whose epsilon is also the paper's.
         given = kwargs.get("optimizer_kwargs") or {"eps": 1e-5}
         fusible = optimizer_class is torch.optim.Adam and self.device.type in ("cpu", "cuda")
         if self._n_extra > 0 and fusible and not {"foreach", "differentiable"} & given.keys():
@@ -120,7 +120,7 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         arguments.check(self)
 
     def _setup_models(self) -> None:
-        """Build what the simulated samples come from."""
+        """Build the models behind the simulated samples."""
         raise NotImplementedError
 
     def _model_names(self) -> list[str]:
@@ -130,7 +130,7 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         raise NotImplementedError
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = "ActorCriticPolicy") -> None:
-        # Simulation is what a GPU is for.
+        # Simulation benefits from a GPU.
         if self._n_extra == 0:
             super()._maybe_recommend_cpu(mlp_class_name)
 
@@ -161,9 +161,9 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         checkpoint_freq: int = CHECKPOINT_FREQ,
     ) -> Self:
         """
-        Train, as in Stable-Baselines3; with ``checkpoint``, so that nothing is lost when the program ends before it is
-        done: the same program, started again, goes on where the folder's last checkpoint is, and the result is the same
-        bit by bit (docs/saving.md).
+        Train, as in Stable-Baselines3; with ``checkpoint``, so that nothing is lost if the program ends early: started
+        again, the same program resumes from the folder's last checkpoint, and the result is the same bit by bit
+        (docs/saving.md).
 
         :param total_timesteps: environment steps to take
         :param callback: called at every step
@@ -171,7 +171,7 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         :param tb_log_name: name of the run in the TensorBoard log; the class's name if None
         :param reset_num_timesteps: whether ``num_timesteps`` starts at zero again
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
-        :param checkpoint: folder of the run; None for no checkpoints. Each call of ``learn`` needs a folder of its own
+        :param checkpoint: folder of the run; None for no checkpoints. Each call of ``learn`` needs its own folder
         :param checkpoint_freq: environment steps between two checkpoints, each at the end of an iteration
         :return: the trained model
         :raises ValueError: if an argument is out of range, or the folder is of another run (the message names what
@@ -218,9 +218,9 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
 
         :param env: the environments
         :param callback: called at every step
-        :param rollout_buffer: what is filled
+        :param rollout_buffer: the buffer to fill
         :param n_rollout_steps: steps of each environment
-        :return: whether the callback lets the training go on
+        :return: whether the callback lets the training continue
         """
         self._progress = self.num_timesteps / max(self._total_timesteps, 1)
         with self._phase("collect"):
@@ -240,7 +240,7 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
 
     def current_n_simulated(self) -> int:
         """
-        :return: X of the present iteration, by ``n_simulated``, ``anneal_until`` and ``warm_up_until``
+        :return: X of the current iteration, from ``n_simulated``, ``anneal_until`` and ``warm_up_until``
         """
         share = 1.0
         if self.anneal_until is not None:
@@ -252,7 +252,7 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
 
     def train(self) -> None:
         """
-        Update models, policy and value with the present rollout (MBMA, algorithm 1, lines 5 to 13).
+        Update models, policy and value with the current rollout (MBMA, algorithm 1, lines 5 to 13).
 
         :raises TrainingDiverged: if a loss or a parameter is NaN or infinite
         """
@@ -261,18 +261,18 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         except TrainingDiverged:
             raise
         except ValueError:
-            # As torch's distributions raise where a mean is not finite: say what it comes from.
+            # Possibly from torch's distributions at a mean that is not finite: name the cause.
             self._check_parameters()
             raise
         self._check_losses()
         self._check_parameters()
 
     def _check_losses(self) -> None:
-        """Those that the present iteration has logged."""
+        """Check the losses that this iteration has logged."""
         logged = {
             name: value
             for name, value in self.logger.name_to_value.items()
-            # The share that is explained is NaN where all returns are equal.
+            # The explained variance is NaN if all returns are equal.
             if name.startswith(("train/", "dynamics/")) and name != "train/explained_variance"
         }
         bad = not_finite(logged)
@@ -280,7 +280,7 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
             raise diverged(self, bad)
 
     def _check_parameters(self) -> None:
-        """All of them, and the standard deviation: the exponential of a finite one can be 0 or infinite."""
+        """Check all parameters, and the standard deviation: the exponential of a finite one can be 0 or infinite."""
         check_finite_parameters(self)
         if not hasattr(self.policy, "log_std") or self.use_sde:
             return
@@ -291,7 +291,7 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
 
     def _train(self) -> None:
         n_simulated = self.current_n_simulated()
-        # While X is still rising from 0 the models learn already.
+        # The models already learn while X is still 0.
         if self._n_extra > 0 and (self.anneal_until is None or self._progress < self.anneal_until):
             with self._phase("dynamics"):
                 self.fit_models()
@@ -314,14 +314,14 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
     def current_rollout(self) -> Rollout:
         """
         :return: the rollout buffer's samples as tensors, the steps of one environment after those of another
-        :raises ValueError: if there is none yet, as after ``load``; with ``n_simulated=0``, which allows for
-            observations that are no vectors
+        :raises ValueError: if there is no rollout yet, as after ``load``; with ``n_simulated=0``, which allows
+            observations that are not vectors
         """
         self._check_has_rollout()
         buffer = self.rollout_buffer
 
         def tensor(values: np.ndarray) -> torch.Tensor:
-            # The buffer's own generator flattens in place what it is asked for first.
+            # The buffer's own generator flattens the arrays in place when first used.
             values = values if buffer.generator_ready else buffer.swap_and_flatten(values)
             return torch.as_tensor(values, dtype=torch.float32, device=self.device)
 
@@ -351,7 +351,7 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
 
     def fit_models(self) -> None:
         """
-        Train what the simulated samples come from on the real ones so far, and log its errors.
+        Train the models behind the simulated samples on the real samples so far, and log their errors.
         """
         raise NotImplementedError
 
@@ -363,18 +363,17 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         noise: torch.Tensor | None = None,
     ) -> SimulatedSamples:
         """
-        Draw extra samples of the present policy and estimate their Q-values. Nothing is changed by it, but for the
-        random generators; ``model.simulate(rollout.observations)`` with ``rollout = model.current_rollout()`` is what
-        ``train`` does.
+        Draw extra samples of the current policy and estimate their Q-values. Nothing but the random generators changes;
+        ``train`` calls ``model.simulate(rollout.observations)`` with ``rollout = model.current_rollout()``.
 
-        Actions of a Discrete space are not drawn where they are for the real states: all of them are given, each with
-        the weight X pi(a|s), which is what X draws count in expectation.
+        At the real states, actions of a Discrete space are not drawn: all of them are returned, each with the weight X
+        pi(a|s), which X draws have in expectation.
 
-        :param observations: real ones, flat, as the policy sees them (normalised by ``VecNormalize``), (N, O)
-        :param values: the critic's of the observations, (N,); computed if None
-        :param n_simulated: X, at least 1; that of the present iteration if None
-        :param noise: standard Gaussian noise of the simulated actions, of the algorithm's own shape; drawn if None. A
-            given noise reproduces the samples exactly
+        :param observations: real observations, flat, as the policy sees them (normalised by ``VecNormalize``), (N, O)
+        :param values: the critic's values of the observations, (N,); computed if None
+        :param n_simulated: X, at least 1; the current iteration's if None
+        :param noise: standard Gaussian noise of the simulated actions, in the algorithm's own shape; drawn if None. The
+            same noise reproduces the samples exactly
         :return: N times X samples
         """
         self._check_simulates()
@@ -397,7 +396,7 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         self, observations: torch.Tensor, n_simulated: int, noise: torch.Tensor | None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
         """
-        Extra actions at real observations, their log-probabilities and their weights.
+        Draw extra actions at real observations, with their log-probabilities and weights.
 
         :param observations: (N, O)
         :param n_simulated: X
@@ -418,7 +417,7 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
 
     @contextmanager
     def _phase(self, name: str) -> Iterator[None]:
-        """Measure what a phase of the iteration takes, to be logged."""
+        """Measure the duration of a phase of the iteration, for the log."""
         self._synchronize()
         start = time.perf_counter()
         yield
@@ -432,7 +431,7 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
 
 class SimulatedPPO(ExtraSamplesPPO):
     """
-    PPO with simulated samples: what :class:`MBMAPPO`, :class:`QMAPPO` and :class:`MBPOPPO` share.
+    PPO with simulated samples: the common base of :class:`MBMAPPO`, :class:`QMAPPO` and :class:`MBPOPPO`.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -440,7 +439,7 @@ class SimulatedPPO(ExtraSamplesPPO):
     plain: ClassVar[str] = "n_simulated=0"
 
     n_simulated: int = argument(default=8, kind=integer(0))
-    """X, simulated samples for each real one, at the height of the schedule of ``warm_up_until`` and ``anneal_until``;
+    """X, simulated samples for each real one, at the maximum of the schedule of ``warm_up_until`` and ``anneal_until``;
     0 for PPO. With a Discrete space: see ``simulate``"""
 
     @property

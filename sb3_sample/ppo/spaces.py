@@ -13,11 +13,11 @@ Array = TypeVar("Array", np.ndarray, torch.Tensor)
 
 class FlatObservations:
     """
-    Observations as vectors and back. The entries of a Dict follow one another in the order of its keys.
+    Convert observations to vectors and back. The entries of a Dict are concatenated in the order of its keys.
 
     :param space: a Box of floats, or a Dict of such Boxes
-    :param images: whether Boxes of integers, as images are, do too
-    :param plain: how plain PPO is asked for, for the error
+    :param images: whether Boxes of integers, such as images, are also allowed
+    :param plain: the argument that gives plain PPO, for the error message
     :raises ValueError: for any other space
     """
 
@@ -65,8 +65,8 @@ class FlatObservations:
 
 class ModelActions:
     """
-    Actions as the models see them. Those of a Box are clipped to its bounds, as the environment receives them, and
-    scaled to [-1, 1]; those of a Discrete space are one-hot vectors.
+    Actions in the form of the models' input. Actions of a Box are clipped to its bounds, as the environment receives
+    them, and scaled to [-1, 1]; actions of a Discrete space are one-hot vectors.
 
     :param space: a bounded Box or a Discrete space
     :param device: where the models are
@@ -91,7 +91,7 @@ class ModelActions:
 
     def __call__(self, actions: torch.Tensor) -> torch.Tensor:
         """
-        :param actions: the policy's, (..., A), or (...) integers of a Discrete space
+        :param actions: the policy's actions, (..., A), or (...) integers of a Discrete space
         :return: (..., D)
         """
         if self.is_discrete:

@@ -1,4 +1,4 @@
-"""Value learning from pictures: SR-SPR."""
+"""Value learning from images: SR-SPR."""
 
 from sb3_sample.srspr.algorithm import SRSPR
 

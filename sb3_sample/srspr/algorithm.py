@@ -1,4 +1,4 @@
-"""SR-SPR as Stable-Baselines3's ``DQN``: acting, storing, when and how often to learn, logging, files."""
+"""SR-SPR with the interface of Stable-Baselines3's ``DQN``: acting, storing, update schedule, logging, files."""
 
 import pathlib
 from typing import Any, ClassVar, TypeVar
@@ -39,7 +39,7 @@ from sb3_sample.warn import warn
 
 Self = TypeVar("Self", bound="SRSPR")
 
-#: Added to a loss before its root becomes a priority.
+#: Added to a loss before its square root becomes a priority.
 _SMALL = 1e-10
 
 
@@ -51,7 +51,7 @@ class SRSPR(  # type: ignore[misc]
     2021), with the regular Q-network or BroNet (BRO, appendix E): Rainbow's value learning (C51, dueling, double,
     n-step returns, prioritised replay), the prediction of future latent states, and shrink and perturb. docs/srspr.md.
 
-    :raises ValueError: if an argument is out of range or contradicts another, or the environment's observations are no
+    :raises ValueError: if an argument is out of range or contradicts another, or the environment's observations are not
         stacks of uint8 frames
     """
 
@@ -62,7 +62,7 @@ class SRSPR(  # type: ignore[misc]
         "learner": Kept.NOWHERE,
         "_watch": Kept.NOWHERE,
         "_plain_attributes": Kept.NOWHERE,
-        # For the log of a run that goes on.
+        # For the log of a resumed run.
         "_metrics": Kept.IN_CHECKPOINTS,
     }
 
@@ -70,20 +70,20 @@ class SRSPR(  # type: ignore[misc]
         check_program(type(self), given)
         given["env"] = _made(given["env"])
         if given["train_freq"] is not None or given["gradient_steps"] is not None:
-            # Stable-Baselines3's two arguments are in force.
+            # Stable-Baselines3's two arguments replace it.
             given["replay_ratio"] = None
         for name in "train_freq", "gradient_steps":
             given[name] = 1 if given[name] is None else given[name]
         is_set_up = given.pop("_init_setup_model")
         theirs = self._store(given, OffPolicyAlgorithm)
         OffPolicyAlgorithm.__init__(self, **theirs, sde_support=False, support_multi_env=True)
-        #: Whether the gradient step is compiled; None while that is not decided. Saved: a loaded model goes on with it.
+        #: Whether the gradient step is compiled; None while undecided. Saved: a loaded model keeps it.
         self.compiled: bool | None = None
-        #: Transitions stored over the model's life; unlike ``num_timesteps`` never zeroed by ``learn``.
+        #: Transitions stored over the model's life; unlike ``num_timesteps`` never reset by ``learn``.
         self.num_transitions = 0
         #: Resets over the model's life.
         self.n_resets = 0
-        # Gradient steps owed but not yet taken, the fraction that a replay ratio leaves over.
+        # Fraction of a gradient step that the replay ratio has left over so far.
         self._updates_owed = 0.0
         self._metrics: dict[str, torch.Tensor] = {}
         if is_set_up:
@@ -138,7 +138,7 @@ class SRSPR(  # type: ignore[misc]
             )
         self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, **own}
         self.optimize_memory_usage = False
-        # Stable-Baselines3 would take it for an argument of a buffer of its own.
+        # Stable-Baselines3 would read it as an argument for its n-step buffer.
         self.n_steps = 1
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
@@ -204,7 +204,7 @@ class SRSPR(  # type: ignore[misc]
 
     @property
     def exploration_rate(self) -> float:
-        """Rate of random decisions in training, by the decisions so far."""
+        """Rate of random decisions in training, given the decisions so far."""
         past = self.num_transitions - self.learning_starts
         left = 1.0 if past < 0 else max(0.0, 1 - past / self.exploration_steps) if self.exploration_steps else 0.0
         return self.exploration_final_eps + left * (self.exploration_initial_eps - self.exploration_final_eps)
@@ -217,12 +217,12 @@ class SRSPR(  # type: ignore[misc]
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
-        Choose actions by the target network, as in evaluation.
+        Choose actions with the target network, as in evaluation.
 
         :param observation: as the environment gives it, one or a batch
-        :param state: as in Stable-Baselines3, without meaning here
+        :param state: as in Stable-Baselines3, ignored here
         :param episode_start: likewise
-        :param deterministic: the best actions, instead of random ones at the rate ``evaluation_eps``
+        :param deterministic: whether to always take the best action, without random ones at the rate ``evaluation_eps``
         :return: actions, and ``state``
         :raises ValueError: if the observation is not one of the observation space
         """
@@ -230,7 +230,7 @@ class SRSPR(  # type: ignore[misc]
         return (actions if deterministic else self._with_random(actions, self.evaluation_eps)), state
 
     def _with_random(self, actions: np.ndarray, rate: float) -> np.ndarray:
-        """Put random actions in the place of some."""
+        """Replace actions by random ones at a rate."""
         chosen = np.random.random(actions.shape) < rate  # noqa: NPY002  # the generator that Stable-Baselines3 seeds
         if not chosen.any():
             return actions
@@ -245,7 +245,7 @@ class SRSPR(  # type: ignore[misc]
             policy: Any = self.policy
             for layer in policy.q_net_target.noisy_layers():
                 layer.draw()
-            # Not by the policy's predict, which computes without noise.
+            # Not with the policy's predict, which computes without noise.
             with torch.no_grad():
                 actions = policy(policy.obs_to_tensor(self._last_obs)[0]).cpu().numpy()
         else:
@@ -256,7 +256,7 @@ class SRSPR(  # type: ignore[misc]
     def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any, **kwargs: Any) -> None:
         super()._store_transition(replay_buffer, *args, **kwargs)
         if self._vec_normalize_env is None:
-            # Set by it all the same; saved, it says that there was a VecNormalize.
+            # The base class sets it anyway; in a file it would mean that there was a VecNormalize.
             self._last_original_obs = None
         self.num_transitions += self.n_envs
 
@@ -281,9 +281,9 @@ class SRSPR(  # type: ignore[misc]
         checkpoint_freq: int = CHECKPOINT_FREQ,
     ) -> Self:
         """
-        Train, as in Stable-Baselines3; with ``checkpoint``, so that nothing is lost when the program ends before it is
-        done: the same program, started again, goes on where the folder's last checkpoint is, and the result is the same
-        bit by bit (docs/saving.md).
+        Train, as in Stable-Baselines3; with ``checkpoint``, so that nothing is lost if the program ends early: started
+        again, the same program resumes from the folder's last checkpoint, and the result is the same bit by bit
+        (docs/saving.md).
 
         :param total_timesteps: decisions to take
         :param callback: called at every step
@@ -291,7 +291,7 @@ class SRSPR(  # type: ignore[misc]
         :param tb_log_name: name of the run in the TensorBoard log; the class's name if None
         :param reset_num_timesteps: whether ``num_timesteps`` starts at zero again
         :param progress_bar: whether to show a progress bar (needs tqdm and rich)
-        :param checkpoint: folder of the run; None for no checkpoints. Each call of ``learn`` needs a folder of its own
+        :param checkpoint: folder of the run; None for no checkpoints. Each call of ``learn`` needs its own folder
         :param checkpoint_freq: decisions between two checkpoints
         :return: the trained model
         :raises ValueError: if an argument is out of range, or the folder is of another run (the message names what
@@ -333,10 +333,10 @@ class SRSPR(  # type: ignore[misc]
         return rollout.continue_training
 
     def _updates_due(self, n_collected: int) -> int:
-        """Gradient steps to take now."""
+        """Number of gradient steps to take now."""
         buffer = self.replay_buffer
         assert isinstance(buffer, SPRReplayBuffer)
-        # A model that was loaded without its buffer fills it first, acting with what it has learned.
+        # A model that was loaded without its buffer fills it first, acting with the learned policy.
         n_needed = min(self.learning_starts, buffer.buffer_size * buffer.n_envs)
         if self.num_transitions <= self.learning_starts or buffer.size() * buffer.n_envs < n_needed:
             return 0
@@ -345,7 +345,7 @@ class SRSPR(  # type: ignore[misc]
         return self._updates_for(n_collected)
 
     def _reset_if_due(self, before: int) -> None:
-        """Reset where the last decisions have reached a multiple of the interval, and a whole one is left."""
+        """Reset if the last decisions have reached a multiple of the interval, and a whole interval is left."""
         every, now = self.reset_interval, self.num_transitions
         left = self._total_timesteps - self.num_timesteps
         if every is None or before // every == now // every or left < every:
@@ -356,7 +356,7 @@ class SRSPR(  # type: ignore[misc]
             say(f"Reset at {now} decisions")
 
     def _after_turns(self) -> None:
-        """Say if nothing was learned for want of steps."""
+        """Warn if no gradient step was taken because there were too few steps."""
         wanted = self.gradient_steps if self.replay_ratio is None else self.replay_ratio
         if self._n_updates == 0 and wanted != 0 and 0 < self.num_transitions <= self.learning_starts:
             warn(
@@ -370,9 +370,9 @@ class SRSPR(  # type: ignore[misc]
         Take gradient steps on windows from the replay buffer, and record the metrics of the last one.
 
         :param gradient_steps: how many
-        :param batch_size: windows a step; None: the model's own ``batch_size``
-        :raises TrainingDiverged: if a metric is NaN or infinite; on a GPU that may be noticed later, at the latest when
-            the log is written
+        :param batch_size: windows per step; None: the model's ``batch_size``
+        :raises TrainingDiverged: if a metric is NaN or infinite; on a GPU this may be detected later, at the latest
+            when the log is written
         """
         buffer = self.replay_buffer
         assert isinstance(buffer, SPRReplayBuffer)
@@ -385,7 +385,7 @@ class SRSPR(  # type: ignore[misc]
             slots = buffer.draw(self.batch_size if batch_size is None else batch_size)
             windows = buffer.states_of(slots, self.n_steps, self.n_predictions, self._vec_normalize_env)
             metrics, td_losses = self.learner.step(windows)
-            # Each step renews the priorities of which the next one's batch is drawn.
+            # Each step updates the priorities with which the next batch is drawn.
             buffer.weights.renew(slots, td_losses.cpu().numpy() + _SMALL)
             self._watch.note(metrics, self._n_updates, self.num_timesteps)
             self._metrics.update(metrics)
@@ -399,5 +399,5 @@ class SRSPR(  # type: ignore[misc]
 
 
 def _made(env: Any) -> Any:
-    """The environment of an id of an Atari game, with its wrappers; anything else as it is."""
+    """The environment for the id of an Atari game, with its wrappers; anything else unchanged."""
     return make_atari_env(env) if is_atari_id(env) else env

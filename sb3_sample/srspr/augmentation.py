@@ -4,7 +4,7 @@ import torch
 
 from sb3_sample.learner.augmentation import shifted
 
-#: Pixels by which pictures are shifted at most, and spread of their brightness.
+#: Largest shift in pixels, and spread of the brightness.
 SHIFT, BRIGHTNESS = 4, 0.05
 
 
@@ -15,7 +15,7 @@ def augmented(pictures: torch.Tensor, offsets: torch.Tensor, brightness: torch.T
     :param pictures: uint8, (N, C, height, width)
     :param offsets: in [0, 8], see :func:`~sb3_sample.learner.augmentation.shifted`, (N, 2)
     :param brightness: standard normal numbers, (N,)
-    :return: floats, of [0, 1] before the brightness, (N, C, height, width)
+    :return: floats, in [0, 1] before the brightness, (N, C, height, width)
     """
     factors = (1 + BRIGHTNESS * brightness.clamp(-2, 2)) / 255
     return shifted(pictures, offsets, SHIFT).float() * factors[:, None, None, None]

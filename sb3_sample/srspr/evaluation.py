@@ -10,9 +10,9 @@ from sb3_sample.envs.atari import make_atari_env
 from sb3_sample.envs.scores import score_of
 from sb3_sample.kinds import check_value, integer
 
-#: Decisions of an episode, at most: 108,000 frames.
+#: Most decisions of an episode: 108,000 frames.
 MAX_DECISIONS = 27_000
-#: Decisions without an action at its start are drawn below this.
+#: Exclusive upper bound of the number of no-ops drawn for the start of an episode.
 MAX_NOOPS = 30
 
 
@@ -21,7 +21,7 @@ def evaluation_env(env_id: str) -> gym.Env:
     Make a game for :func:`evaluate_atari`.
 
     :param env_id: ``"ALE/<Game>-v5"``
-    :return: the game without no-ops of its own, lives that end episodes and clipped rewards
+    :return: the game, without its own no-ops, without episodes that end with a life, and without clipped rewards
     """
     return make_atari_env(env_id, training=False, noop_max=None)
 
@@ -35,15 +35,16 @@ def evaluate_atari(
     noops: list[int] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Evaluate as the scores of SPR and SR-SPR were: whole games, rewards as they are, one action in a thousand random
-    (``evaluation_eps``), after 0 to 29 decisions without an action. Random numbers are of a generator of its own.
+    Evaluate by the protocol of SPR's and SR-SPR's scores: whole games, unclipped rewards, one action in a thousand
+    random (``evaluation_eps``), after 0 to 29 no-ops. The function uses its own random generator.
 
-    :param model: an ``SRSPR``, or another of Stable-Baselines3's models for such observations, without random actions
+    :param model: an ``SRSPR``, or another of Stable-Baselines3's models for such observations, which then acts without
+        random actions
     :param env_id: ``"ALE/<Game>-v5"``
     :param n_episodes: how many games
     :param seed: of everything random
-    :param max_decisions: after which a game is broken off
-    :param noops: if given, gets the number of decisions without an action of each game
+    :param max_decisions: decisions after which a game is cut off
+    :param noops: list to which the number of no-ops of each game is appended, if given
     :return: returns, and numbers of decisions, (n_episodes,) each
     :raises ValueError: if an argument is out of range
     """
@@ -76,13 +77,13 @@ def evaluate_atari(
 
 class AtariEvaluation(BaseCallback):
     """
-    Evaluation by :func:`evaluate_atari` every so many decisions, recorded as ``eval/mean_reward`` and
+    Evaluates with :func:`evaluate_atari` every ``every`` decisions and records ``eval/mean_reward`` and
     ``eval/human_normalized``.
 
     :param env_id: ``"ALE/<Game>-v5"``
     :param every: decisions between two evaluations
-    :param n_episodes: games of each
-    :param verbose: as of every callback
+    :param n_episodes: games of each evaluation
+    :param verbose: as for every callback
     :raises ValueError: if an argument is out of range
     """
 
@@ -108,7 +109,7 @@ class AtariEvaluation(BaseCallback):
 
     def state_dict(self) -> dict[str, Any]:
         """
-        Collect what a run that goes on needs.
+        Collect the state that a resumed run needs.
 
         :return: the results so far
         """

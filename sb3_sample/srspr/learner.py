@@ -1,4 +1,4 @@
-"""Learner of SR-SPR: the gradient step, the target network that follows, and resets."""
+"""Learner of SR-SPR: the gradient step, the target network's update, and resets."""
 
 from typing import Any, NamedTuple
 
@@ -12,13 +12,13 @@ from sb3_sample.srspr.losses import alive_after, n_step_return, project, spr_los
 from sb3_sample.srspr.networks import FRESH, SPRNetwork
 from sb3_sample.srspr.replay import StateWindows
 
-#: Among a gradient step's results, the TD losses of the batch, which are no metric.
+#: Name of the batch's TD losses among a gradient step's results; they are not a metric.
 _TD_LOSSES = "td_losses"
 
 
 class AugmentationNoise(NamedTuple):
     """
-    What is random in a gradient step.
+    Random numbers of a gradient step.
 
     :param offsets: of the shifts, in [0, 8], (N, 2)
     :param brightness: standard normal, (N,)
@@ -33,7 +33,7 @@ class AugmentationNoise(NamedTuple):
         Draw the noise.
 
         :param n: N, observations
-        :param device: where
+        :param device: device of the noise
         :return: the noise
         """
         offsets = torch.randint(2 * SHIFT + 1, (n, 2), device=device)
@@ -43,16 +43,16 @@ class AugmentationNoise(NamedTuple):
 class SPRLearner(Executable):
     """
     Value learner with self-predictive representations (SPR, Schwarzer et al. 2021): C51's loss of n-step double
-    Q-learning, and the prediction of the latent states that follow.
+    Q-learning, and the prediction of the following latent states.
 
     :param policy: with ``q_net``, ``q_net_target``, ``atoms`` and ``optimizer``
     :param counts: object that holds the learner's counts, ``_n_updates`` and ``compiled``
     :param gamma: discount factor
-    :param tau: weight of the network in the average that the target is
+    :param tau: weight of the network in the target network's Polyak average
     :param n_steps: steps whose rewards are summed
-    :param n_predictions: steps whose latent states are predicted
-    :param spr_weight: weight of their loss
-    :param compile: whether the gradient step is compiled; "auto": as ``counts.compiled`` says, else not
+    :param n_predictions: number of future steps whose latent states are predicted
+    :param spr_weight: weight of the prediction loss
+    :param compile: whether the gradient step is compiled; "auto": if ``counts.compiled`` is true
     :param device: where the learner computes
     :param verbose: 0 nothing, 1 info
     """
@@ -78,16 +78,16 @@ class SPRLearner(Executable):
         self.gamma, self.tau, self.n_steps, self.n_predictions = gamma, tau, n_steps, n_predictions
         self.spr_weight, self.compile, self.device, self.verbose = spr_weight, compile, device, verbose
 
-    # ---------------------------------------------------------------- what it consists of
+    # ---------------------------------------------------------------- parts
 
     @property
     def online(self) -> SPRNetwork:
-        """Network that learns."""
+        """The network that learns."""
         return self.policy.q_net  # type: ignore[no-any-return]
 
     @property
     def target(self) -> SPRNetwork:
-        """Network that follows it, and acts."""
+        """The network that follows the online network and acts."""
         return self.policy.q_net_target  # type: ignore[no-any-return]
 
     def optimizers(self) -> dict[str, torch.optim.Optimizer]:
@@ -108,14 +108,14 @@ class SPRLearner(Executable):
 
     def identities(self) -> tuple[int, ...]:
         """
-        Identify what a compiled or captured gradient step is made for.
+        Identify the objects for which a compiled or captured gradient step is made.
 
         :return: identities of networks and optimizer
         """
         return tuple(map(id, (self.online, self.target, self.policy.optimizer)))
 
     def exchangeable(self) -> dict[str, Any]:
-        # A policy of one's own may have another network.
+        # A user's policy class may have another network.
         return {"policy": self.online}
 
     # ---------------------------------------------------------------- the update
@@ -127,8 +127,8 @@ class SPRLearner(Executable):
         Draw the noise, take one gradient step, and count it.
 
         :param windows: the batch
-        :param noise: of the augmentation; drawn where it is None
-        :return: what to log, by name, scalars on the learner's device; and the TD loss of each window, (B,)
+        :param noise: of the augmentation; drawn if None
+        :return: scalars to log by name, on the learner's device; and the TD loss of each window, (B,)
         """
         execution = self._execution or self.prepared_execution()
         if noise is None:
@@ -143,20 +143,20 @@ class SPRLearner(Executable):
 
     def gradient_step(self, windows: StateWindows, noise: AugmentationNoise) -> dict[str, torch.Tensor]:
         """
-        Compute the gradient step, on tensors only: this function is compiled or captured.
+        Compute the gradient step with tensors only, since this function is compiled or captured.
 
         :param windows: the batch
         :param noise: of the augmentation
-        :return: what to log, by name, scalars; and the TD loss of each window, (B,)
+        :return: scalars to log, by name; and the TD loss of each window, (B,)
         """
         online, target, atoms, n = self.online, self.target, self.policy.atoms, self.n_predictions
         n_windows = windows.actions.shape[0]
         states = augmented(windows.states.flatten(0, 1), noise.offsets, noise.brightness)
-        # Convolutions are quicker so.
+        # Convolutions are faster in this layout.
         states = states.contiguous(memory_format=torch.channels_last)
         now, later = states[:n_windows], states[n_windows:]
 
-        # Targets, of what follows: the latent states one by one, and the returns behind n steps.
+        # Targets: the following latent states one by one, and the returns after n steps.
         with torch.no_grad():
             projected = target.project(target.encoder(later))
             future = projected[: n * n_windows].view(n, n_windows, -1)
@@ -168,12 +168,12 @@ class SPRLearner(Executable):
             best = of_action(next_probabilities, next_values.argmax(dim=1))
             wanted = project(best, rewards + discounts * atoms, atoms)
 
-        # The distribution of the returns.
+        # Distribution of the returns.
         latent = online.encoder(now)
         log_probabilities = of_action(online.logits(latent), windows.actions[:, 0]).log_softmax(dim=-1)
         td_losses = -(wanted * log_probabilities).sum(dim=-1)
 
-        # The latent states that follow.
+        # Following latent states.
         predicted = []
         for k in range(n):
             latent = online.transition(latent, windows.actions[:, k])
@@ -194,13 +194,13 @@ class SPRLearner(Executable):
         }
         return {name: value.detach() for name, value in metrics.items()} | {_TD_LOSSES: td_losses.detach()}
 
-    # ---------------------------------------------------------------- starting anew
+    # ---------------------------------------------------------------- resets
 
     @torch.no_grad()
     def reset(self, shrink: float) -> None:
         """
-        Shrink and perturb: projection, predictor and heads start anew, of encoder and transition model stays a share.
-        The target network likewise, with a draw of its own; Adam starts anew.
+        Shrink and perturb: projection, predictor and head are reinitialised; encoder and transition model keep a share
+        of their parameters. The target network is reset likewise with a separate draw; Adam's state is cleared.
 
         :param shrink: share of the old parameters that stays
         """
@@ -216,10 +216,10 @@ class SPRLearner(Executable):
 
 def of_action(every: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
     """
-    Select what belongs to an action.
+    Select the entries of one action per row.
 
-    :param every: of all actions, (B, A, K)
+    :param every: entries of all actions, (B, A, K)
     :param actions: their numbers, (B,)
-    :return: that of the action, (B, K)
+    :return: entries of the given action, (B, K)
     """
     return every.gather(1, actions.view(-1, 1, 1).expand(-1, 1, every.shape[-1])).squeeze(1)

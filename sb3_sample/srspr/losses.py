@@ -6,16 +6,16 @@ from torch.nn import functional as F
 
 def project(probabilities: torch.Tensor, positions: torch.Tensor, atoms: torch.Tensor) -> torch.Tensor:
     """
-    Move probabilities back to the atoms of the support, each to the two nearest in the proportion of their nearness
-    (C51, Bellemare et al. 2017).
+    Project probabilities onto the atoms of the support, each onto the two nearest atoms in proportion to their
+    closeness (C51, Bellemare et al. 2017).
 
     :param probabilities: (B, K)
-    :param positions: where they lie, (B, K); those outside of the support count as at its ends
+    :param positions: their positions, (B, K); those outside the support are moved to its ends
     :param atoms: evenly spaced, rising, (K,)
     :return: probabilities of the atoms, (B, K)
     """
     spacing = (atoms[-1] - atoms[0]) / (len(atoms) - 1)
-    # In units of the spacing, where the shares of two neighbours add up to 1.
+    # In units of the spacing, so that the shares of two neighbours add up to 1.
     places = ((positions.clamp(atoms[0], atoms[-1]) - atoms[0]) / spacing).clamp(0, len(atoms) - 1)
     numbers = torch.arange(len(atoms), device=atoms.device, dtype=places.dtype)
     shares = (1 - (places.unsqueeze(-1) - numbers).abs()).clamp(min=0)
@@ -24,13 +24,13 @@ def project(probabilities: torch.Tensor, positions: torch.Tensor, atoms: torch.T
 
 def n_step_return(rewards: torch.Tensor, terminated: torch.Tensor, gamma: float) -> tuple[torch.Tensor, torch.Tensor]:
     """
-    Compute the discounted rewards up to the first terminal, and what the value after the last step counts.
+    Compute the discounted rewards up to the first terminal step, and the weight of the value after the last step.
 
     :param rewards: (B, n)
     :param terminated: 1 where a step ended the episode, (B, n)
     :param gamma: discount factor
-    :return: ``sum of gamma ** k * r_k`` up to and with the first terminal step, (B, 1); and ``gamma ** n``, or 0 where
-        one of all n steps was terminal, (B, 1)
+    :return: ``sum of gamma ** k * r_k`` up to and including the first terminal step, (B, 1); and ``gamma ** n``, or 0
+        if any of the n steps was terminal, (B, 1)
     """
     n = rewards.shape[1]
     alive = alive_after(terminated)
@@ -41,7 +41,7 @@ def n_step_return(rewards: torch.Tensor, terminated: torch.Tensor, gamma: float)
 
 def alive_after(terminated: torch.Tensor) -> torch.Tensor:
     """
-    Tell which states of a window are of the first one's episode.
+    Mark the states of a window that belong to the episode of its first state.
 
     :param terminated: 1 where a step ended the episode, (B, n)
     :return: for step k, 1 if none of the steps 0, ..., k was terminal, else 0, (B, n)
@@ -51,13 +51,13 @@ def alive_after(terminated: torch.Tensor) -> torch.Tensor:
 
 def spr_loss(predicted: torch.Tensor, targets: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """
-    Compute the loss of the predicted projections of future states: the squared distance of the unit vectors, ``2 - 2
-    cos``, averaged over the steps, those after a terminal counting nothing.
+    Compute the loss of the predicted projections of future states: the squared distance between the unit vectors,
+    ``2 - 2 cos``, averaged over the steps, where those after a terminal step count as 0.
 
     :param predicted: (B, K, D)
     :param targets: without gradient, (B, K, D)
     :param mask: 1 or 0, (B, K)
-    :return: of each window, in [0, 4], (B,)
+    :return: loss of each window, in [0, 4], (B,)
     """
     distance = (F.normalize(predicted, dim=-1) - F.normalize(targets, dim=-1)).square().sum(dim=-1)
     return (distance * mask).mean(dim=1)

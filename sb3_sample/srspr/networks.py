@@ -1,4 +1,4 @@
-"""Networks of SPR: encoder, transition model, projection, predictor and the distribution of returns of every action."""
+"""Networks of SPR: encoder, transition model, projection, predictor and return distributions of all actions."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -10,17 +10,17 @@ from torch.nn import functional as F
 from sb3_sample.networks.bronet import ResidualBlock
 from sb3_sample.networks.ensemble import layer_norm
 
-#: Layers between latent state and output layers, by the name that ``network`` takes. "nature": a Dense layer,
-#: which is SPR's projection too, and ReLU. "bronet": BroNet in its place, whose first Dense layer is the projection.
-#: "bronet_after_projection": the projection, and BroNet on it.
+#: Layers between latent state and output layers, by the value of ``network``. "nature": a Dense layer, which is also
+#: SPR's projection, and ReLU. "bronet": BroNet in its place, whose first Dense layer is the projection.
+#: "bronet_after_projection": the projection, followed by BroNet.
 NETWORKS = ("nature", "bronet", "bronet_after_projection")
-#: Modules that a reset makes anew; of the others it leaves a share.
+#: Modules that a reset reinitialises; the others keep a share of their parameters.
 FRESH = ("projection", "predictor", "head")
 
 
 def renormalize(latent: torch.Tensor) -> torch.Tensor:
     """
-    Scale each latent state to [0, 1] by its own extremes.
+    Scale each latent state to [0, 1] by its minimum and maximum.
 
     :param latent: (B, ...)
     :return: ``(x - min) / (max - min + 1e-5)``, of the same shape
@@ -33,8 +33,8 @@ def renormalize(latent: torch.Tensor) -> torch.Tensor:
 
 def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
     """
-    Compute the padding with which a convolution gives ``ceil(size / stride)`` numbers, as TensorFlow's and JAX's "SAME"
-    does.
+    Compute the padding with which a convolution outputs ``ceil(size / stride)`` numbers, as TensorFlow's and JAX's
+    "SAME".
 
     :param size: of the input
     :param kernel: of the convolution
@@ -62,7 +62,7 @@ class Encoder(nn.Module):
         convolutions = []
         for n_out, (kernel, stride) in zip(channels, self.LAYERS, strict=True):
             (top, bottom), (left, right) = (same_padding(size, kernel, stride) for size in sizes)
-            # Padding that is the same on all sides costs nothing inside of the convolution.
+            # Equal padding on all sides costs nothing inside the convolution.
             inside = (top, left) if (top, left) == (bottom, right) else (0, 0)
             self._paddings.append(() if inside == (top, left) else (left, right, top, bottom))
             convolutions.append(nn.Conv2d(n_in, n_out, kernel, stride, padding=inside))
@@ -84,8 +84,8 @@ class Encoder(nn.Module):
 
 class TransitionModel(nn.Module):
     """
-    Latent state after an action: two convolutions on the state and the action as constant planes, of which that of the
-    action is 1.
+    Latent state after an action: two convolutions on the state and one constant plane per action, 1 for the action
+    taken, else 0.
 
     :param n_channels: C of a latent state
     :param n_actions: number of actions
@@ -111,7 +111,7 @@ class TransitionModel(nn.Module):
 class NoisyLinear(nn.Module):
     """
     Dense layer whose weights have learned, factorised Gaussian noise (Fortunato et al. 2018). The two factors of each
-    draw are independent. The noise is drawn by :meth:`draw`; without it, the layer computes by its means.
+    draw are independent. The noise is drawn by :meth:`draw`; without it, the layer uses the means of its weights.
 
     :param n_in: width of the input
     :param n_out: width of the output
@@ -132,14 +132,14 @@ class NoisyLinear(nn.Module):
 
     @torch.no_grad()
     def draw(self) -> None:
-        """Draw noise for the computations from here on."""
+        """Draw noise for all following computations."""
         for noise in (self.noise_in, self.noise_out):
             x = torch.randn_like(noise)
             noise.copy_(x.sign() * x.abs().sqrt())
 
     @torch.no_grad()
     def silence(self) -> None:
-        """Compute by the means from here on."""
+        """Use the means in all following computations."""
         self.noise_in.zero_()
         self.noise_out.zero_()
 
@@ -154,8 +154,8 @@ class NoisyLinear(nn.Module):
 
 class Head(nn.Module):
     """
-    From projections to logits of the returns' distribution: what ``network`` names, and dueling output layers (Wang et
-    al. 2016).
+    From projections to logits of the return distribution: the layers named by ``network``, and dueling output layers
+    (Wang et al. 2016).
 
     :param network: one of :data:`NETWORKS`
     :param n_in: width of a projection
@@ -163,7 +163,7 @@ class Head(nn.Module):
     :param n_atoms: atoms of a distribution
     :param width: of BroNet
     :param n_blocks: of BroNet
-    :param dueling: whether logits are those of the state plus those of the action, less their mean over the actions
+    :param dueling: whether logits are the state's logits plus the action's, minus the mean over the actions
     :param dense: makes a Dense layer of two widths
     """
 
@@ -261,7 +261,7 @@ class SPRNetwork(nn.Module):
         :param latent: (B, C, height, width)
         :return: projections, (B, width)
         """
-        # The order of channels first, whatever lies in memory.
+        # In channels-first order, whatever the memory format.
         projected: torch.Tensor = self.projection(latent.flatten(1))
         return projected
 

@@ -22,15 +22,15 @@ _CHANNELS = Kind(
 
 class SPRPolicy(BasePolicy):
     """
-    Networks of SR-SPR. The target network acts, in training as in evaluation.
+    Networks of SR-SPR. The target network acts, in training and in evaluation.
 
-    :param observation_space: pictures, uint8, (C, height, width)
+    :param observation_space: images, uint8, (C, height, width)
     :param action_space: the actions
     :param lr_schedule: the learning rate
-    :param network: what stands between latent state and output layers, see ``SRSPR``
+    :param network: layers between latent state and output layers, see ``SRSPR``
     :param n_atoms: atoms of the distribution of returns
-    :param v_min: the lowest
-    :param v_max: the highest
+    :param v_min: the lowest atom
+    :param v_max: the highest atom
     :param noisy: whether projection and head have noisy layers
     :param dueling: whether the head is dueling
     :param channels: of the encoder's three layers
@@ -81,7 +81,7 @@ class SPRPolicy(BasePolicy):
         """
         Make a network.
 
-        :return: one like the policy's, with parameters of its own
+        :return: a network like the policy's, with separate parameters
         """
         shape = self.observation_space.shape
         assert shape is not None and isinstance(self.action_space, spaces.Discrete)
@@ -89,8 +89,8 @@ class SPRPolicy(BasePolicy):
 
     def set_training_mode(self, mode: bool) -> None:
         """
-        :param mode: whether to train; else noisy layers of the network that acts compute by their means, until noise is
-            drawn again
+        :param mode: whether to train; if not, noisy layers of the acting network use their means until noise is drawn
+            again
         """
         super().set_training_mode(mode)
         if not mode:
@@ -99,7 +99,7 @@ class SPRPolicy(BasePolicy):
 
     def q_values(self, observations: torch.Tensor) -> torch.Tensor:
         """
-        Compute the values of all actions by the target network.
+        Compute the values of all actions with the target network.
 
         :param observations: uint8, (B, C, height, width)
         :return: expected returns, (B, A)
@@ -110,7 +110,7 @@ class SPRPolicy(BasePolicy):
     def forward(self, observations: PyTorchObs, deterministic: bool = True) -> torch.Tensor:
         """
         :param observations: uint8, (B, C, height, width)
-        :param deterministic: without meaning here: exploration is the algorithm's
+        :param deterministic: ignored: the algorithm explores
         :return: the numbers of the best actions, (B,)
         """
         return self._predict(observations, deterministic)
@@ -127,6 +127,6 @@ class SPRPolicy(BasePolicy):
             "optimizer_class": self.optimizer_class,
             "optimizer_kwargs": self.optimizer_kwargs,
         }
-        # Of the base's, what this constructor takes.
+        # Only those of the base class's parameters that this constructor takes.
         data = super()._get_constructor_parameters()
         return {name: data[name] for name in ("observation_space", "action_space")} | own

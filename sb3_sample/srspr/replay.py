@@ -1,6 +1,6 @@
 """Replay of windows of stacked frames, drawn by priority."""
 
-# The generator that Stable-Baselines3 seeds and its buffers draw from:
+# NumPy's global generator, which Stable-Baselines3 seeds and its buffers use:
 # ruff: noqa: NPY002
 
 from typing import Any, NamedTuple
@@ -14,11 +14,11 @@ from sb3_sample.replay.compact import CompactReplayBuffer
 from sb3_sample.replay.next_observations import ONLY, taken
 from sb3_sample.replay.weighted import WindowReplay
 
-#: Added to a priority before its root is taken.
+#: Added to a priority before its square root is taken.
 _SMALL = 1e-10
 
 
-#: Settings of ``WindowReplay``: windows do not fade, and the priority of one is the root of its loss.
+#: Settings of ``WindowReplay``: windows do not fade, and the priority of a window is the square root of its loss.
 SETTINGS = {"fade": 1.0, "fade_floor": 0.1, "priority_exponent": 0.5, "smallest_error": 0.0}
 
 
@@ -26,9 +26,9 @@ class StateWindows(NamedTuple):
     """
     Windows of consecutive states.
 
-    :param states: s_t, ..., s_{t+K} and s_{t+n}, uint8, (K + 2, B, C, height, width). Those behind an episode's end
-        are anything
-    :param actions: a_t, ..., a_{t+K-1}, their numbers, (B, K)
+    :param states: s_t, ..., s_{t+K} and s_{t+n}, uint8, (K + 2, B, C, height, width). States after an episode's end are
+        arbitrary
+    :param actions: a_t, ..., a_{t+K-1}, as integers, (B, K)
     :param rewards: r_t, ..., r_{t+L-1}, L being the larger of n and K, (B, L)
     :param terminated: 1 where a step ended the episode, (B, L)
     :param weights: importance weights, the largest 1, (B,)
@@ -43,15 +43,15 @@ class StateWindows(NamedTuple):
 
 class SPRReplay(WindowReplay):
     """
-    Replay buffer of windows, drawn in proportion to the root of their loss, one from each of B equal shares of the
-    total (Schaul et al. 2016), with the importance weights that undo half of it. New windows have the largest priority
-    so far.
+    Replay buffer of windows, drawn in proportion to the square root of their loss, one from each of B equal shares of
+    the total (Schaul et al. 2016), with importance weights that undo half of this prioritisation. New windows have the
+    largest priority so far.
 
-    Where a window may start is what ``WindowReplay`` says: not where it would cross an episode's end that was no
-    terminal, or the newest steps. Where the total is cut is found by a binary search in the running sums.
+    A window may start where ``WindowReplay`` allows it: not where it would cross an episode's end without termination,
+    or the newest steps. A binary search in the cumulative sums finds the slots.
 
-    :param args: as of ``CompactReplayBuffer``
-    :param kwargs: as of ``CompactReplayBuffer``
+    :param args: as for ``CompactReplayBuffer``
+    :param kwargs: as for ``CompactReplayBuffer``
     :param horizon: steps of a window
     """
 
@@ -60,7 +60,7 @@ class SPRReplay(WindowReplay):
 
     def draw(self, n: int) -> np.ndarray:
         """
-        Draw slots by their weights, one from each of n equal shares of their sum.
+        Draw slots in proportion to their weights, one from each of n equal shares of the sum.
 
         :param n: how many
         :return: slots, (n,)
@@ -73,7 +73,7 @@ class SPRReplay(WindowReplay):
         Compute the weights of a batch's losses.
 
         :param slots: of the batch, (B,)
-        :return: the inverse roots of the priorities, over the largest of them, float32, (B,)
+        :return: the inverse square roots of the priorities, divided by the largest of them, float32, (B,)
         """
         weights = 1 / np.sqrt(self.weights.priority[slots].astype(np.float64) + _SMALL)
         return (weights / weights.max()).astype(np.float32)
@@ -84,7 +84,7 @@ class SPRReplay(WindowReplay):
         """
         Gather windows.
 
-        :param slots: where they start, (B,)
+        :param slots: slots where the windows start, (B,)
         :param n_steps: n
         :param n_predictions: K
         :param env: normalises rewards

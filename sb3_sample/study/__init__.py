@@ -1,6 +1,6 @@
 """
-Studies: a plan of many runs, made on as many cores as are free and on as many machines as share a folder; their table,
-its statistics, and the figures of the papers' studies.
+Studies: a plan of many runs, made on all free cores and on all machines that share a folder; their table, its
+statistics, and the figures of the papers' studies.
 """
 
 from sb3_sample.envs.scores import Score

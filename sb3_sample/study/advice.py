@@ -1,6 +1,6 @@
 """
-Size of BRO's critics and replay ratio for some hours of a machine, by published runs: 25 configurations of BRO on 40
-tasks ("Compute-Optimal Scaling for Value-Based Deep RL", Fu et al. 2025; ``data/README.md``).
+Choice of BRO's critic size and replay ratio for a number of hours on a machine, from published runs: 25 configurations
+of BRO on 40 tasks ("Compute-Optimal Scaling for Value-Based Deep RL", Fu et al. 2025; ``data/README.md``).
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from sb3_sample.study.plan import EPISODES, EVERY
 from sb3_sample.study.step_times import StepTimes
 
 GRID = Path(__file__).parents[1] / "data" / "bro_grid.csv.gz"
-#: Suites of the published runs: their names, and the task that stands for them where none is given.
+#: Suites of the published runs: their names, and their default tasks.
 SUITES = {
     "dmc": ("DeepMind Control", "dmc/cheetah-run-v0"),
     "metaworld": ("Meta-World", "metaworld/push-v3"),
@@ -30,7 +30,7 @@ _WARM_UP = BRO.constructor_arguments["learning_starts"].default
 @functools.cache
 def published_grid() -> pd.DataFrame:
     """
-    :return: statistics of the published runs, a row a suite, replay ratio, size and evaluation: ``suite``,
+    :return: statistics of the published runs, one row per suite, replay ratio, size and evaluation: ``suite``,
         ``replay_ratio``, ``model_size``, ``env_step``; ``iqm`` of the normalised returns or success rates with its 95%
         interval ``low`` and ``high``; ``tasks`` and ``runs``
     """
@@ -44,11 +44,11 @@ class Advice:
 
     :param suite: "dmc", "metaworld" or "myosuite"
     :param env: id of the environment of the command
-    :param hours: that there are
-    :param options: further ones of the command
-    :param table: a row a size and replay ratio, best first: ``model_size``, ``replay_ratio``, ``steps`` in these hours,
-        a million at most; ``hours`` of them; ``iqm``, ``low``, ``high``, NaN below the first published evaluation;
-        ``ends_early``, whether a million steps take less than the hours
+    :param hours: hours available
+    :param options: further options of the command
+    :param table: one row per size and replay ratio, best first: ``model_size``, ``replay_ratio``, ``steps`` in these
+        hours, a million at most; ``hours`` of these steps; ``iqm``, ``low``, ``high``, NaN before the first published
+        evaluation; ``ends_early``, whether a million steps take less than the hours
     """
 
     suite: str
@@ -64,15 +64,15 @@ class Advice:
 
     @property
     def equals(self) -> pd.DataFrame:
-        """Rows whose interval reaches into that of the best one, without it."""
+        """Other rows whose interval reaches that of the best row."""
         others = self.table.iloc[1:]
         return others[others["high"] >= self.best["low"]]
 
     @property
     def command(self) -> str:
-        """The command that trains the best one."""
+        """The command that trains the best configuration."""
         ratio, size = int(self.best["replay_ratio"]), self.best["model_size"]
-        # In the published code two gradient steps a step go with the first reset only, BRO Fast.
+        # In the published code two gradient steps per step go with the first reset only, which is BRO Fast.
         algo, params = ("bro_fast", "") if ratio == 2 else ("bro", f" replay_ratio:{ratio}")
         options = "".join(f"{option} " for option in self.options)
         return (
@@ -92,19 +92,20 @@ def advise(
     options: Sequence[str] = (),
 ) -> Advice:
     """
-    Find the size and replay ratio that get furthest in some hours: of each of the 25 published configurations the
-    environment steps that fit in, and its interquartile mean there, interpolated between published evaluations.
+    Find the size and replay ratio that get furthest in a number of hours: for each of the 25 published configurations,
+    the environment steps that fit into them, and its interquartile mean there, interpolated between published
+    evaluations.
 
-    The hours of n steps are those of compiling, of acting and the environment, with evaluations as ``sb3-sample train``
-    makes them, and of replay ratio times (n - 2,500) gradient steps.
+    The hours of n steps comprise compiling, acting and the environment, evaluations as in ``sb3-sample train``, and
+    replay ratio times (n - 2,500) gradient steps.
 
-    :param hours: of the training
-    :param times: of the machine's steps
-    :param environment: seconds of a step of the environment
+    :param hours: hours of training
+    :param times: step times of the machine
+    :param environment: seconds per step of the environment
     :param suite: of the published runs: "dmc", "metaworld" or "myosuite"
     :param env: id of the environment of the command; a task of the suite if None
     :param episode: steps of an episode
-    :param options: further ones of the command
+    :param options: further options of the command
     :return: the answer
     :raises ValueError: an argument is out of range, or no configuration makes the 25,000 steps of the first published
         evaluation in these hours
@@ -144,6 +145,6 @@ def advise(
             f"hours must be at least {shortest:.2g} here: the published runs were first evaluated after {first:,} "
             f"steps, and no number stands for fewer; in {hours:g} hours at most {table['steps'].max():,} are made"
         )
-    # Among equal returns the one that is there earlier.
+    # Among equal returns, the one that is reached earlier.
     table = table.sort_values(["iqm", "hours"], ascending=[False, True], ignore_index=True)
     return Advice(suite, env or SUITES[suite][1], float(hours), tuple(options), table)

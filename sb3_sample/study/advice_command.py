@@ -1,4 +1,4 @@
-"""``sb3-sample advise``: which size of BRO and replay ratio gets furthest in some hours of this machine."""
+"""``sb3-sample advise``: the BRO size and replay ratio that get furthest in a number of hours on this machine."""
 
 import argparse
 import itertools
@@ -18,9 +18,9 @@ from sb3_sample.study.analysis_command import markdown, refusing
 from sb3_sample.study.cores import idle_cores
 from sb3_sample.study.step_times import StepTimes
 
-#: Part of a core that others may use while steps are measured.
+#: Fraction of a core that other processes may use while steps are measured.
 BUSY = 0.3
-#: Where a suite's success rate takes the place of a return.
+#: Measure of each suite: return or success rate.
 _MEASURES = {"dmc": "return / 1,000", "metaworld": "success rate", "myosuite": "success rate"}
 
 
@@ -77,7 +77,7 @@ def _run(options: argparse.Namespace) -> None:
         environment = step_times.environment_seconds(env)
     episode = getattr(env.spec, "max_episode_steps", None) or 1_000
     times = _times(threads, options)
-    # Threads and device of the measured times, for the training to have too.
+    # The training uses the threads and the device of the measured times.
     given = [] if options.threads is None else [f"--num-threads {threads}"]
     given += [] if options.device == "auto" else [f"--device {options.device}"]
     found = advise(options.hours, times, environment, suite=suite, env=env_id, episode=episode, options=given)
@@ -100,7 +100,7 @@ def _suite_of(env_id: str | None) -> str:
 
 
 def _times(threads: int, options: argparse.Namespace) -> StepTimes:
-    """Those that are kept; else they are measured, and kept unless they are rough."""
+    """Stored step times; without them they are measured, and stored unless they are quick ones."""
 
     def say(text: str) -> None:
         print(text, file=sys.stderr)
@@ -109,7 +109,7 @@ def _times(threads: int, options: argparse.Namespace) -> StepTimes:
     if kept is not None:
         return kept
     if get_device(options.device).type == "cpu" and idle_cores() < threads - BUSY:
-        again = "" if options.quick else " (--again)"  # quick ones are not kept
+        again = "" if options.quick else " (--again)"  # quick measurements are not stored
         say(
             f"fewer cores are free than the {threads} that steps are measured on: they will seem too long. Measure "
             f"again{again} when nothing else runs"
@@ -123,9 +123,9 @@ def _times(threads: int, options: argparse.Namespace) -> StepTimes:
 def page(found: Advice, times: StepTimes, environment: float) -> str:
     """
     :param found: the answer
-    :param times: that it is by
+    :param times: step times behind it
     :param environment: seconds of a step of the environment
-    :return: it in words
+    :return: the answer in words
     """
     best, measure = found.best, _MEASURES[found.suite]
     grid = published_grid()

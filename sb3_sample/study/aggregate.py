@@ -20,13 +20,13 @@ from sb3_sample.extras import install
 from sb3_sample.study.table import RUN
 from sb3_sample.warn import warn
 
-#: Scores of tasks that have no common one, or another: ``score_of`` for the rest.
+#: Scores of tasks without a common score, or in place of it; the other tasks have ``score_of``.
 Scores = Mapping[str, Score | float]
-#: Groups of tasks: names of :data:`GROUPS`, or tasks by the group's name.
+#: Groups of tasks: names in :data:`GROUPS`, or tasks by the group's name.
 Groups = Sequence[str] | Mapping[str, Sequence[str]]
 
 _DOGS = tuple(task for task in DAC_NAMED if task.startswith("dmc/dog-"))
-#: The groups of tasks that have a name.
+#: Named groups of tasks.
 GROUPS: dict[str, Callable[[str], bool]] = {
     "all": lambda task: True,
     "dmc": lambda task: task.startswith("dmc/"),
@@ -36,7 +36,7 @@ GROUPS: dict[str, Callable[[str], bool]] = {
     "dogs": lambda task: task in _DOGS,
     "dmc without dogs": lambda task: task.startswith("dmc/") and task not in _DOGS,
 }
-#: Those of BRO's table 9, which are shown unless others are asked for.
+#: Groups of BRO's table 9, shown by default.
 DEFAULT_GROUPS = ("all", "dmc", "metaworld", "myosuite", "dog & humanoid")
 #: Bootstrap samples.
 REPS = 2_000
@@ -48,15 +48,15 @@ _STATISTICS = ("iqm", "mean", "median", "optimality_gap")
 
 def scored(table: pd.DataFrame, scores: Scores | None = None) -> pd.DataFrame:
     """
-    The scores of a table's runs: of each task the one metric that counts, on a scale on which tasks are averaged.
+    Scores of a table's runs: the one metric that counts for each task, on a common scale for averaging over tasks.
 
-    Returns of DeepMind Control over 1,000; success rates of Meta-World, MyoSuite and Fetch as they are; returns of
-    MuJoCo's HalfCheetah, Walker2d, Ant and Humanoid over 8,500, 4,500, 6,625 and 6,125. Nothing is clipped.
+    Returns of DeepMind Control divided by 1,000; success rates of Meta-World, MyoSuite and Fetch unchanged; returns of
+    MuJoCo's HalfCheetah, Walker2d, Ant and Humanoid divided by 8,500, 4,500, 6,625 and 6,125. Nothing is clipped.
 
     :param table: of :func:`~sb3_sample.study.read`
     :param scores: of other tasks, by their ids: a :class:`Score`, or the return whose score is 1
     :return: columns agent, arguments, task, seed, step, score, sorted by step within a run, the runs in their order
-    :raises ValueError: a task has no score, or its runs have not recorded what it is made of
+    :raises ValueError: a task has no score, or its runs have not recorded the score's metric
     """
     parts, reasons = _by_task(table, scores)
     if reasons:
@@ -85,7 +85,7 @@ def unscored(table: pd.DataFrame, scores: Scores | None = None) -> dict[str, str
     """
     :param table: of :func:`~sb3_sample.study.read`
     :param scores: see :func:`scored`
-    :return: the tasks that :func:`scored` refuses, and why
+    :return: the tasks that :func:`scored` rejects, with the reason
     """
     return _by_task(table, scores)[1]
 
@@ -94,7 +94,7 @@ def score_for(task: str, scores: Scores | None = None) -> Score | None:
     """
     :param task: id of an environment
     :param scores: see :func:`scored`
-    :return: how it is scored, if there is a way
+    :return: its score, if it has one
     """
     given = (scores or {}).get(task)
     if given is None:
@@ -103,7 +103,7 @@ def score_for(task: str, scores: Scores | None = None) -> Score | None:
 
 
 def _by_task(table: pd.DataFrame, scores: Scores | None) -> tuple[list[pd.DataFrame], dict[str, str]]:
-    """The rows of each task with their scores; and the tasks that have none, with the reason."""
+    """Rows of each task with their scores, and the tasks without a score, with the reason."""
     measured = table[~table["metric"].str.contains("/") & (table["metric"] != "hours")]
     parts, reasons = [], {}
     for task, rows in measured.groupby("task", sort=False):
@@ -115,7 +115,7 @@ def _by_task(table: pd.DataFrame, scores: Scores | None) -> tuple[list[pd.DataFr
                 f"(--score {task}=LOW:HIGH)"
             )
             continue
-        # With a negative return alone, -150 over a low of 0, the worst run would have the highest score.
+        # With a single negative return, such as -150 over a low of 0, the worst run would have the highest score.
         if not (math.isfinite(score.high) and math.isfinite(score.low) and score.high > score.low):
             raise ValueError(
                 f"scores must have a finite high above the low, not {score.low:g}:{score.high:g} of {task}: where "
@@ -138,7 +138,7 @@ def _by_task(table: pd.DataFrame, scores: Scores | None) -> tuple[list[pd.DataFr
 def named_apart(table: pd.DataFrame) -> pd.DataFrame:
     """
     :param table: columns agent, arguments, task and any others
-    :return: the same, where agents whose arguments differ on one and the same task have these in their names
+    :return: the same table, where agents whose arguments differ on the same task have these in their names
     """
     kinds = table[["agent", "task", "arguments"]].drop_duplicates()
     names: dict[tuple[str, str], str] = {}
@@ -158,7 +158,7 @@ def named_apart(table: pd.DataFrame) -> pd.DataFrame:
 def differing_arguments(runs: pd.DataFrame) -> list[str]:
     """
     :param runs: columns task and arguments
-    :return: the arguments that are not the same for all runs of one task, sorted
+    :return: the arguments that differ between runs of the same task, sorted
     """
     differing: set[str] = set()
     for _, texts in runs.groupby("task")["arguments"]:
@@ -176,7 +176,7 @@ def group_tasks(groups: Groups | None, tasks: Sequence[str]) -> dict[str, list[s
     """
     :param groups: names of :data:`GROUPS`, or tasks by name of the group; None for :data:`DEFAULT_GROUPS`
     :param tasks: of a table
-    :return: those of each group; groups without any are left out
+    :return: the tasks of each group; groups without tasks are left out
     :raises ValueError: there is no such group, a task is not in the table, or no group has a task
     """
     if isinstance(groups, Mapping):
@@ -202,10 +202,10 @@ def group_tasks(groups: Groups | None, tasks: Sequence[str]) -> dict[str, list[s
 def at_steps(scores: pd.DataFrame, steps: Sequence[int] | None) -> tuple[pd.DataFrame, list[int]]:
     """
     :param scores: of :func:`scored`
-    :param steps: simulator steps; None for those that all runs have or, where they have none in common, those of the
-        run with the fewest as far as all runs reach
-    :return: a row a run, indexed by agent and task; a column a step: the score there, by linear
-        interpolation between two evaluations of the run, NaN before its first and after its last; and the steps
+    :param steps: simulator steps; None for the evaluation steps that all runs share or, if they share none, those of
+        the run with the fewest, within the range that all runs cover
+    :return: one row per run, indexed by agent and task, and one column per step with the score there, linearly
+        interpolated between two evaluations of the run, NaN before its first and after its last; and the steps
     :raises ValueError: there are no such steps
     """
     numbers = scores.groupby(RUN, sort=False, dropna=False).ngroup().to_numpy()
@@ -238,7 +238,7 @@ def at_steps(scores: pd.DataFrame, steps: Sequence[int] | None) -> tuple[pd.Data
 
 
 def _warn_of_runs(matrix: pd.DataFrame) -> None:
-    """Say where an average is not over all runs."""
+    """Warn where an average is not over all runs."""
     for step in matrix:
         left_out = int(matrix[step].isna().sum())
         if left_out:
@@ -246,7 +246,7 @@ def _warn_of_runs(matrix: pd.DataFrame) -> None:
 
 
 def _warn_of_tasks(matrix: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> None:
-    """Say where an average is not over the same tasks for all agents."""
+    """Warn where an average is not over the same tasks for all agents."""
     by_agent = {agent: set(rows.index.get_level_values("task")) for agent, rows in matrix.groupby("agent", sort=False)}
     for name, members in groups.items():
         counts = {agent: len(tasks & set(members)) for agent, tasks in by_agent.items() if tasks & set(members)}
@@ -273,11 +273,12 @@ def compared(
     :param scores: of :func:`scored`, agents named apart
     :param steps: see :func:`at_steps`
     :param groups: see :func:`group_tasks`
-    :param common: at each step only the tasks that all agents have that reach it; a warning says what is left out
-    :return: what :func:`at_steps` gives, NaN also where it is left out, and the tasks of each group
+    :param common: whether to compare at each step only the tasks that all agents that reach it have in common; a
+        warning names what is left out
+    :return: the result of :func:`at_steps`, also NaN for tasks left out, and the tasks of each group
     :raises ValueError: there are no such steps, no run reaches one, or no task is left
     """
-    # Of all tasks: a group may well have some that not all agents have.
+    # From all tasks, since a group may contain tasks that not all agents have.
     members = group_tasks(groups, list(scores["task"].unique()))
     if common:
         scores = _common_tasks(scores)
@@ -298,7 +299,7 @@ def compared(
 
 
 def _common_at(values: pd.Series, step: int) -> pd.Series:
-    """The values of the tasks that all agents have which reach the step, NaN for the others."""
+    """Values of the tasks that all agents that reach the step have in common, NaN for other tasks."""
     there = values.dropna().index.to_frame(index=False).drop_duplicates()
     n_agents = there.groupby("task")["agent"].nunique()
     common = n_agents[n_agents == there["agent"].nunique()].index
@@ -314,8 +315,8 @@ def _common_at(values: pd.Series, step: int) -> pd.Series:
 
 def blocks_of(rows: pd.DataFrame) -> list[np.ndarray]:
     """
-    :param rows: of one agent, indexed by task; without NaN
-    :return: arrays (runs, tasks, steps), one for the tasks with the same number of runs
+    :param rows: rows of one agent, indexed by task; without NaN
+    :return: arrays (runs, tasks, steps), one for all tasks with the same number of runs
     """
     values = {task: group.to_numpy() for task, group in rows.groupby("task", sort=False)}
     by_runs: dict[int, list[np.ndarray]] = {}
@@ -326,10 +327,10 @@ def blocks_of(rows: pd.DataFrame) -> list[np.ndarray]:
 
 def iqm(*blocks: np.ndarray) -> np.ndarray:
     """
-    Interquartile mean over all runs of all tasks together: a quarter of them, rounded down, cut at both ends. Where
-    tasks have different numbers of runs, it is as if each run were there so often that all tasks have the same number.
+    Interquartile mean over all runs of all tasks together: a quarter of them, rounded down, is cut at both ends. If
+    tasks have different numbers of runs, runs are weighted as if repeated until all tasks have the same number.
 
-    :param blocks: scores (runs, tasks, steps), each of other tasks
+    :param blocks: scores (runs, tasks, steps), each of different tasks
     :return: (steps,)
     """
     if len(blocks) == 1:
@@ -354,7 +355,7 @@ def _of_tasks(*blocks: np.ndarray) -> np.ndarray:
 
 
 def _all_statistics(*blocks: np.ndarray) -> np.ndarray:
-    """``_STATISTICS`` by step, one after the other, as rliable takes what it draws intervals of."""
+    """``_STATISTICS`` by step, concatenated, as rliable expects for its intervals."""
     tasks = _of_tasks(*blocks)
     gap = 1 - _of_tasks(*(np.minimum(block, 1) for block in blocks)).mean(axis=0)
     return np.concatenate([iqm(*blocks), tasks.mean(axis=0), np.median(tasks, axis=0), gap])
@@ -362,7 +363,7 @@ def _all_statistics(*blocks: np.ndarray) -> np.ndarray:
 
 @contextlib.contextmanager
 def _seeded(seed: int) -> Iterator[None]:
-    """NumPy's global generator, which rliable draws from, seeded and afterwards as it was."""
+    """Seed NumPy's global generator, which rliable draws from, and restore it afterwards."""
     state = np.random.get_state()  # noqa: NPY002
     np.random.seed(seed)  # noqa: NPY002
     try:
@@ -375,18 +376,19 @@ def bootstrap(
     statistic: Callable[..., np.ndarray], blocks: Sequence[np.ndarray], reps: int, confidence: float, seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    A statistic and its percentile interval, by rliable's stratified bootstrap, which redraws the runs of each task.
+    Compute a statistic and its percentile interval with rliable's stratified bootstrap, which redraws the runs of each
+    task.
 
-    :param statistic: of arrays (runs, tasks, steps) gives (n,)
+    :param statistic: function of arrays (runs, tasks, steps) with values (n,)
     :param blocks: the arrays
     :param reps: bootstrap samples
     :param confidence: share of them in the interval
     :param seed: of the samples
-    :return: statistic, lower and upper end, (n,) each; the ends NaN where a task has one run only
+    :return: statistic, lower and upper bound, (n,) each; the bounds are NaN if a task has only one run
     :raises ImportError: rliable is not installed
     """
     point = statistic(*blocks)
-    # A single run is redrawn as itself: its task would add nothing to the interval, however noisy its runs are.
+    # A single run is always redrawn as itself: its task would add nothing to the interval, however noisy its runs are.
     if any(len(block) < 2 for block in blocks):
         return point, np.full_like(point, np.nan), np.full_like(point, np.nan)
     library = _rliable()
@@ -402,7 +404,7 @@ def bootstrap(
 def _rliable() -> Any:
     try:
         import rliable.library
-    except ImportError as error:  # also of what it imports itself, with another pandas
+    except ImportError as error:  # also from its own imports, with another pandas
         raise ImportError(f"intervals need rliable ({error}). Install it with: {install('study')}") from error
     return rliable.library
 
@@ -420,7 +422,7 @@ def check_samples(reps: int, confidence: float) -> None:
 
 
 def _complete(rows: pd.DataFrame) -> Iterator[tuple[list[int], pd.DataFrame]]:
-    """The runs of an agent by steps: those that have the same runs are together. Steps without any are left out."""
+    """Runs of an agent by steps, where steps with the same runs are grouped; steps without runs are left out."""
     there = rows.notna()
     for _, steps in itertools.groupby(
         sorted(rows, key=lambda step: there[step].to_numpy().tobytes()),
@@ -444,25 +446,26 @@ def aggregate(
     seed: int = 0,
 ) -> pd.DataFrame:
     """
-    Scores of agents over tasks and seeds, at some steps or along the training.
+    Aggregate scores of agents over tasks and seeds, at given steps or along the training.
 
-    Where the runs of an agent on one task were made with different arguments, they are several agents, named by those
-    that differ as well, e.g. "bro (replay_ratio=2)".
+    If the runs of an agent on one task have different arguments, they count as several agents, whose names include the
+    differing arguments, e.g. "bro (replay_ratio=2)".
 
     :param table: of :func:`~sb3_sample.study.read`
-    :param steps: simulator steps. A run's score at a step is its evaluation there, or between two evaluations the
-        linear interpolation; runs that do not reach it are left out there, with a warning. None: a curve, at the steps
-        that all runs have
+    :param steps: simulator steps. A run's score at a step is its evaluation there, or the linear interpolation between
+        two evaluations; runs that do not reach the step are left out there, with a warning. None: a curve, at the steps
+        that all runs share
     :param groups: names of :data:`GROUPS`, or tasks by name of the group; None for :data:`DEFAULT_GROUPS`. Groups
         without a task in the table are left out
     :param scores: see :func:`scored`
-    :param common: only the tasks that all agents have, at each step of those agents that reach it
+    :param common: whether to average only over the tasks that all agents have, at each step over those of the agents
+        that reach it
     :param reps: bootstrap samples
     :param confidence: of the intervals
     :param seed: of the bootstrap
-    :return: a row an agent, group and step: ``agent``, ``group``, ``step``; ``iqm`` with its interval ``low`` and
+    :return: one row per agent, group and step: ``agent``, ``group``, ``step``; ``iqm`` with its interval ``low`` and
         ``high``; ``mean``, ``median`` and ``optimality_gap`` with theirs (``mean_low``, ...); ``tasks`` and ``runs``,
-        how many it is over. Intervals are NaN where a task has one run only
+        the numbers averaged over. Intervals are NaN if a task has only one run
     :raises ValueError: a task has no score, an argument is out of range, or no run reaches a step
     :raises ImportError: rliable is not installed
     """
@@ -512,7 +515,7 @@ def performance_profiles(
     seed: int = 0,
 ) -> pd.DataFrame:
     """
-    The share of an agent's runs whose score is above a threshold, tasks weighing the same (rliable's score
+    Share of an agent's runs whose score is above a threshold, with equal weights of the tasks (rliable's score
     distribution).
 
     :param table: see :func:`aggregate`, also for the other arguments
@@ -548,19 +551,19 @@ def probability_of_improvement(
     seed: int = 0,
 ) -> pd.DataFrame:
     """
-    How likely a run of one agent scores more than a run of another on the same task, averaged over the tasks that both
-    have; a tie counts a half (rliable's ``probability_of_improvement``).
+    Probability that a run of one agent scores higher than a run of another on the same task, averaged over the tasks
+    that both have; a tie counts as a half (rliable's ``probability_of_improvement``).
 
-    The bootstrap's interval is too narrow where tasks have few runs: of n runs it has (n - 1) / n of the variance. So
-    there is a p besides, of a permutation test, which holds at any number of runs.
+    The bootstrap's interval is too narrow if tasks have few runs: with n runs it has (n - 1) / n of the variance. So
+    there is also the p of a permutation test, which is valid with any number of runs.
 
     :param table: see :func:`aggregate`, also for the other arguments
     :param step: simulator step
     :param pairs: agents x and y; every pair once, in the table's order, if None
-    :param reps: bootstrap samples, and permutations where not all are taken
-    :return: columns ``x``, ``y``, ``group``, ``step``, ``probability``, ``low``, ``high``, ``p`` (two-sided, of runs
-        exchanged between the two agents within each task) and ``tasks``. Intervals are NaN where a task has one run
-        only of either agent
+    :param reps: bootstrap samples, and permutations unless all are taken
+    :return: columns ``x``, ``y``, ``group``, ``step``, ``probability``, ``low``, ``high``, ``p`` (two-sided, from
+        exchanging runs between the two agents within each task) and ``tasks``. Intervals are NaN if a task has only one
+        run of either agent
     :raises ValueError: an agent of a pair is not in the table, or the two have no task in common
     """
     check_samples(reps, confidence)
@@ -584,7 +587,7 @@ def probability_of_improvement(
             tasks = [task for task in ours if task in theirs]
             if not tasks:
                 continue
-            # Tasks with the same numbers of runs together; the two agents are redrawn each by itself.
+            # Tasks with the same numbers of runs are grouped; the two agents are redrawn separately.
             alike: dict[tuple[int, int], list[str]] = {}
             for task in tasks:
                 alike.setdefault((len(ours[task]), len(theirs[task])), []).append(task)
@@ -617,14 +620,14 @@ def _improvement(*arrays: np.ndarray) -> np.ndarray:
 def _permutation_p(arrays: Sequence[np.ndarray], reps: int, seed: int) -> float:
     """
     :param arrays: see :func:`_improvement`
-    :param reps: permutations, where there are more than these and :data:`REPS`; otherwise all are taken
+    :param reps: permutations to draw if there are more than ``reps`` and :data:`REPS`; otherwise all are taken
     :param seed: of the permutations
-    :return: how likely the probability of improvement is as far from a half, either way, if the two agents are alike:
-        any run of a task may then be of either
+    :return: probability that the probability of improvement is at least as far from a half, in either direction, if the
+        two agents are equal, so that any run of a task could be either's
     """
     half = len(arrays) // 2
     pairs = [(np.concatenate([x, y]), len(x)) for x, y in zip(arrays[:half], arrays[half:], strict=True)]
-    # Mann and Whitney: a sum of ranks is the number of pairs won, ties a half, plus a constant.
+    # Mann and Whitney: a sum of ranks is the number of pairs won, with ties as a half, plus a constant.
     ranks = [(pd.DataFrame(values).rank().to_numpy(), n) for values, n in pairs]
     n_tasks = sum(values.shape[1] for values, _ in ranks)
     weights = [1 / (n * (len(values) - n) * n_tasks) for values, n in ranks]
@@ -645,7 +648,7 @@ def _permutation_p(arrays: Sequence[np.ndarray], reps: int, seed: int) -> float:
                 drawn = rng.permuted(np.tile(of_task, (reps, 1)), axis=1)[:, :n].sum(axis=1)
                 sums += weight * (drawn - mean)
     extreme = int((np.abs(sums) >= abs(observed) - 1e-9).sum())
-    # The labels as they are count as one of those that are drawn: p is never 0.
+    # The actual labels count as one of the permutations, so that p is never 0.
     return extreme / len(sums) if is_exact else (extreme + 1) / (reps + 1)
 
 
@@ -655,7 +658,7 @@ def _at_step(
     """
     The runs of each agent and group that reach a step.
 
-    :param common: None where the tasks are compared pair by pair
+    :param common: None if the tasks are compared pair by pair
     """
     matrix, _, members = compared(named_apart(scored(table, scores)), [step], groups, bool(common))
     _warn_of_tasks(matrix, {} if common is None else members)

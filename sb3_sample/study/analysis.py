@@ -1,6 +1,6 @@
 """
 The papers' studies as functions of one table: marginalisation and correlation (the regularization study, Nauman et al.
-2024, sections 4 and 5), two arguments against a score, and the score against the time (BRO, figure 13).
+2024, sections 4 and 5), a score over two arguments, and the score against the time (BRO, figure 13).
 """
 
 import fnmatch
@@ -38,7 +38,7 @@ from sb3_sample.warn import warn
 LAST = 10
 #: Bootstrap samples of the regularization study.
 STUDY_REPS = 500
-#: Variables of its correlations, beside the score.
+#: Variables of its correlations, besides the score.
 VARIABLES = (
     "diagnostics/overestimation",
     "diagnostics/overfitting",
@@ -47,9 +47,9 @@ VARIABLES = (
     "diagnostics/gradient_norm_critic",
     "diagnostics/parameter_norm_critic",
 )
-#: Patterns of the variables that its regressions take as they are; the logarithm of the others is taken.
+#: Patterns of the variables that its regressions use unchanged; the others enter as logarithms.
 LINEAR = ("*dormant*",)
-#: Value of an argument that a run was not given.
+#: Text for an argument that a run was not given.
 DEFAULT = "default"
 
 
@@ -57,14 +57,14 @@ def final(
     table: pd.DataFrame, metrics: Sequence[str] = (), *, last: int = LAST, scores: Scores | None = None
 ) -> pd.DataFrame:
     """
-    Each run at its end: the mean of its last values.
+    Summarise each run at its end, by the mean of its last values.
 
     :param table: of :func:`~sb3_sample.study.read`
-    :param metrics: to give besides the score
-    :param last: how many values of a run are averaged; all, if it has fewer
+    :param metrics: metrics to return besides the score
+    :param last: number of values averaged per run; all, if it has fewer
     :param scores: see :func:`~sb3_sample.study.aggregate.scored`
-    :return: a row a run: agent, arguments, task, seed, ``step`` of its last evaluation, ``score``, and a column a
-        metric, NaN where the run has not recorded it
+    :return: one row per run: agent, arguments, task, seed, ``step`` of its last evaluation, ``score``, and one column
+        per metric, NaN if the run has not recorded it
     :raises ValueError: no run has recorded a metric, or an argument is out of range
     """
     if type(last) is not int or last < 1:
@@ -86,7 +86,7 @@ def final(
 
 
 def _ends(rows: pd.DataFrame, column: str, last: int) -> pd.Series:
-    """The mean of each run's last rows."""
+    """Mean of each run's last rows."""
     ends = rows.groupby(RUN, sort=False, dropna=False).tail(last)
     return ends.groupby(RUN, sort=False, dropna=False)[column].mean()
 
@@ -94,8 +94,8 @@ def _ends(rows: pd.DataFrame, column: str, last: int) -> pd.Series:
 def argument(runs: pd.DataFrame, name: str) -> list[str]:
     """
     :param runs: with columns ``agent`` and ``arguments``
-    :param name: of an argument, a dot looks into a dict, ``policy_kwargs.net_arch``; or "agent"
-    :return: its value as text for each row, :data:`DEFAULT` where a run was not given it
+    :param name: of an argument, with a dot for an entry of a dict, ``policy_kwargs.net_arch``; or "agent"
+    :return: its value as text for each row, :data:`DEFAULT` if the run was not given it
     :raises ValueError: no run was given it
     """
     if name == "agent":
@@ -119,7 +119,7 @@ def argument(runs: pd.DataFrame, name: str) -> list[str]:
 
 
 def _natural(text: str) -> tuple[int, float, str]:
-    """Sorts numbers, also those with a unit ("0.55M"), by their size, and before words."""
+    """Sort key: numbers, also with a unit ("0.55M"), by their size, and before words."""
     number = re.match(r"-?\d+(\.\d+)?(e[-+]?\d+)?", text)
     return (0, float(number[0]), text) if number else (1, 0.0, text)
 
@@ -141,16 +141,16 @@ def marginalize(
     seed: int = 0,
 ) -> pd.DataFrame:
     """
-    What a choice does, whatever is chosen besides: scores at the end of training over all runs with the choice.
+    Marginal effect of a choice over all other choices: scores at the end of training over all runs with the choice.
 
     The runs are made with one choice for each of several factors, e.g. a critic regularization, a network
     regularization and a plasticity regularization. First order: all runs with a choice for one factor, over the choices
-    for the others. Second order: a pair of choices, over those for the rest. Of as many factors as there are: each
-    combination by itself.
+    for the others. Second order: a pair of choices, over those for the rest. If the order is the number of factors:
+    each combination separately.
 
     :param table: of :func:`~sb3_sample.study.read`
-    :param factors: arguments by name of the factor, of which "agent", the name, is one; None for those that are not the
-        same for all runs of one task, those of ``by`` apart, each a factor
+    :param factors: arguments by name of the factor; "agent", the agent's name, counts as an argument. None: every
+        argument that differs between runs of the same task is a factor, except those in ``by``
     :param order: how many factors are fixed, 1 to the number of factors
     :param by: arguments by which the runs are parted, e.g. ``["replay_ratio"]``
     :param groups: of tasks, see :func:`~sb3_sample.study.aggregate`
@@ -159,10 +159,10 @@ def marginalize(
     :param reps: bootstrap samples
     :param confidence: of the interval
     :param seed: of the bootstrap
-    :return: a row a group of tasks, value of ``by`` and combination of choices. Columns ``group``, those of ``by``, one
-        a factor with the choice, empty where the row is over all choices; ``mean`` (of the tasks' means) and
+    :return: one row per group of tasks, value of ``by`` and combination of choices. Columns ``group``, those of ``by``,
+        one per factor with the choice, empty if the row is over all choices; ``mean`` (of the tasks' means) and
         ``standard_error`` over the runs; ``iqm``, ``low``, ``high``; ``tasks``, ``runs``
-    :raises ValueError: an argument is none of the runs', or out of range
+    :raises ValueError: an argument is not one of the runs', or is out of range
     :raises ImportError: rliable is not installed
     """
     check_samples(reps, confidence)
@@ -202,7 +202,7 @@ def marginalize(
 
 
 def _parted(runs: pd.DataFrame, columns: list[str]) -> list[tuple[dict[str, str], pd.DataFrame]]:
-    """The runs by the values of columns, which are sorted."""
+    """Runs by the values of columns, sorted."""
     if not columns:
         return [({}, runs)]
     parts = [(dict(zip(columns, values, strict=True)), rows) for values, rows in runs.groupby(columns)]
@@ -264,19 +264,19 @@ def correlate(
     scores: Scores | None = None,
 ) -> pd.DataFrame:
     """
-    Spearman's rank correlation between the score at the end of training and what was measured then, and between these,
-    over all runs of all agents. A logarithm would change nothing of it.
+    Spearman's rank correlation between the score at the end of training and the metrics measured there, and between the
+    metrics, over all runs of all agents. A logarithm would not change it.
 
     :param table: of :func:`~sb3_sample.study.read`
-    :param metrics: variables beside "score"
+    :param metrics: variables besides "score"
     :param by: arguments by which the runs are parted, e.g. ``["replay_ratio"]``
     :param groups: of tasks, see :func:`~sb3_sample.study.aggregate`
-    :param level: correlations whose p is above it are blank, NaN
+    :param level: correlations with a p above it are NaN
     :param last: values at the end of a run that are averaged
     :param scores: see :func:`~sb3_sample.study.aggregate.scored`
     :return: columns ``group``, those of ``by``, ``x``, ``y``, ``spearman``, ``p``, ``runs``; both orders of each pair,
-        and a variable with itself. Runs without one of the two are left out; fewer than three, or a variable that is
-        the same for all, give NaN
+        and a variable with itself. Runs that lack one of the two are left out; fewer than three runs, or a variable
+        that is equal for all, give NaN
     :raises ValueError: no run has recorded a metric, or an argument is out of range
     """
     if not 0 <= level <= 1:
@@ -314,17 +314,17 @@ def regress(
     scores: Scores | None = None,
 ) -> pd.DataFrame:
     """
-    Ordinary least squares of the score on one metric at a time, task by task, over all runs of all agents. The
-    symmetric logarithm of a metric is taken (:func:`symlog`), but for those that are shares.
+    Ordinary least squares of the score on one metric at a time, task by task, over all runs of all agents. Metrics
+    enter as symmetric logarithms (:func:`symlog`), except shares.
 
     :param table: of :func:`~sb3_sample.study.read`
-    :param metrics: explaining variables
-    :param linear: patterns of the metrics that are taken as they are
+    :param metrics: explanatory variables
+    :param linear: patterns of the metrics that are used unchanged
     :param last: values at the end of a run that are averaged
     :param scores: see :func:`~sb3_sample.study.aggregate.scored`
-    :return: columns ``task``, ``metric``, ``log`` (whether it was taken), ``slope``, ``standard_error`` of the slope,
-        ``intercept``, ``r_squared``, ``p`` (of a slope of 0), ``spearman``, ``spearman_p``, ``runs``. NaN where there
-        are fewer than three runs, or all have the same value
+    :return: columns ``task``, ``metric``, ``log`` (whether the logarithm was taken), ``slope``, ``standard_error`` of
+        the slope, ``intercept``, ``r_squared``, ``p`` (of a slope of 0), ``spearman``, ``spearman_p``, ``runs``. NaN if
+        there are fewer than three runs, or all have the same value
     :raises ValueError: no run has recorded a metric, or an argument is out of range
     """
     from scipy.stats import linregress
@@ -361,18 +361,19 @@ def heatmap(
     scores: Scores | None = None,
 ) -> pd.DataFrame:
     """
-    A number over two arguments, e.g. of the model's size and the replay ratio.
+    Tabulate a value over two arguments, e.g. the model's size and the replay ratio.
 
     :param table: of :func:`~sb3_sample.study.read`
-    :param x: argument of the columns; a dot looks into a dict
+    :param x: argument of the columns; a dot stands for an entry of a dict
     :param y: argument of the rows
-    :param value: "score", whose interquartile mean over tasks and seeds is shown, or a metric, e.g. "hours", whose mean
-        of the tasks' means is
-    :param step: simulator step; None for the last that all runs reach
+    :param value: "score", shown as interquartile mean over tasks and seeds, or a metric, e.g. "hours", shown as mean of
+        the tasks' means
+    :param step: simulator step; None for the last one that all runs reach
     :param group: of tasks: a name, or the tasks
     :param scores: see :func:`~sb3_sample.study.aggregate.scored`
-    :return: values of ``y`` as index and of ``x`` as columns, both sorted; NaN where there is no run. The step is
-        its ``attrs["step"]``. Warnings say of which cells runs are left out, and whether all are of the same tasks
+    :return: values of ``y`` as index and of ``x`` as columns, both sorted; NaN where there is no run. The step is in
+        ``attrs["step"]``. Warnings name the cells from which runs are left out, and say if cells are not of the same
+        tasks
     :raises ValueError: no run was given an argument, has recorded the metric, or reaches the step
     """
     rows = scored(table, scores) if value == "score" else table[table["metric"] == value]
@@ -384,7 +385,7 @@ def heatmap(
     rows = rows[rows["task"].isin(tasks)]
     if not len(rows):
         raise ValueError(f"group must be one of the table's tasks, and there are none of {group!r}")
-    # A name for each cell, in which the runs of all agents are.
+    # A cell contains the runs of all agents.
     rows = rows.assign(x=argument(rows, x), y=argument(rows, y))
     step = int(rows.groupby(RUN, dropna=False)["step"].max().min()) if step is None else step
     cells: dict[tuple[str, str], float] = {}
@@ -408,7 +409,7 @@ def heatmap(
     if len({each for each in tasks_of.values() if each}) > 1:
         found_tasks = "; ".join(f"{name} {len(each)}" for name, each in tasks_of.items())
         warn(f"cells are not of the same tasks ({found_tasks} of {len(set().union(*tasks_of.values()))})")
-    found = pd.Series(cells).unstack(level=0)  # of two levels, not a table
+    found = pd.Series(cells).unstack(level=0)  # a series with two levels, not a table
     found.index.name, found.columns.name = y, x
     found.attrs["step"] = step
     return found.loc[sorted(found.index, key=_natural), sorted(found.columns, key=_natural)]
@@ -426,13 +427,13 @@ def cost(
     seed: int = 0,
 ) -> pd.DataFrame:
     """
-    The score against the time that the runs had taken. Times compare only where they were measured on one machine, with
-    as many threads and neighbours.
+    Score against the time that the runs took. Times are comparable only if measured on one machine, with the same
+    number of threads and of concurrent runs.
 
     :param table: of :func:`~sb3_sample.study.read`, with the metric "hours"; see
         :func:`~sb3_sample.study.aggregate` for the other arguments
-    :return: what :func:`~sb3_sample.study.aggregate` gives, and ``hours``, the mean of the tasks' means, NaN for agents
-        without, and ``steps_per_second``, simulator steps by that time
+    :return: the table of :func:`~sb3_sample.study.aggregate`, with ``hours``, the mean of the tasks' means, NaN for
+        agents without it, and ``steps_per_second``, simulator steps divided by that time
     :raises ValueError: no run has recorded its time; see :func:`~sb3_sample.study.aggregate`
     :raises ImportError: rliable is not installed
     """
@@ -441,7 +442,7 @@ def cost(
         raise ValueError("table must have the metric 'hours' of at least one run, and has it of none")
     found = aggregate(table, steps, groups, scores=scores, common=common, reps=reps, confidence=confidence, seed=seed)
     steps = list(dict.fromkeys(found["step"]))
-    with warnings.catch_warnings():  # aggregate has warned
+    with warnings.catch_warnings():  # aggregate has already warned
         warnings.simplefilter("ignore", UserWarning)
         averaged, _, members = compared(scored(table, scores), steps, groups, common)
     timed = table[table["metric"] == "hours"].rename(columns={"value": "score"})
@@ -453,7 +454,7 @@ def cost(
             hours.append(math.nan)
             continue
         of_agent = by_agent[row.agent].droplevel("agent")[row.step].dropna()
-        # The tasks of the score at that step, so that both are of the same.
+        # Only the tasks of the score at that step, so that score and hours are of the same tasks.
         there = averaged.loc[row.agent][row.step].dropna().index
         of_tasks = of_agent[of_agent.index.isin(members[row.group]) & of_agent.index.isin(there)]
         hours.append(of_tasks.groupby(level=0).mean().mean())

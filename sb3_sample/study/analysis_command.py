@@ -41,14 +41,14 @@ def steps_of(text: str) -> int:
     """
     :param text: a number of steps, as 100000, 100_000, 100k, 1.5M
     :return: the number
-    :raises ArgumentTypeError: it is none
+    :raises ArgumentTypeError: it is not a number of steps
     """
     digits = text.replace("_", "")
     factor = {"k": 1_000, "M": 1_000_000}.get(digits[-1:], 1)
     try:
-        # As it is written: the float 4.1 times a million is no whole number.
+        # A decimal, since the float 4.1 times a million is not a whole number.
         number = Decimal(digits if factor == 1 else digits[:-1]) * factor
-    except ArithmeticError:  # no number, or one beyond all of them
+    except ArithmeticError:  # not a number, or too large for Decimal
         number = Decimal(-1)
     if not (number.is_finite() and 0 <= number <= 2**53) or number != int(number):
         raise argparse.ArgumentTypeError(f"{text!r} is no number of steps, as 100000, 100k or 1M")
@@ -80,7 +80,7 @@ def _factor(text: str) -> tuple[str, list[str]]:
 
 def add_runs(parser: argparse.ArgumentParser) -> None:
     """
-    :param parser: gets the runs that a command reads
+    :param parser: parser to which the option for a command's runs is added
     """
     parser.add_argument(
         "sources",
@@ -93,9 +93,9 @@ def add_runs(parser: argparse.ArgumentParser) -> None:
 
 def add_sources(parser: argparse.ArgumentParser, pictures: bool = False, output: str = "") -> None:
     """
-    :param parser: gets the runs that a command reads, and its output
+    :param parser: parser to which the options for a command's runs and output are added
     :param pictures: whether the command draws
-    :param output: help of the output, where it is not a table or a picture
+    :param output: help of the output, if it is not a table or a picture
     """
     add_runs(parser)
     parser.add_argument(
@@ -113,9 +113,9 @@ def add_sources(parser: argparse.ArgumentParser, pictures: bool = False, output:
 
 def add_scores(parser: argparse.ArgumentParser, groups: bool = True, planned: bool = True) -> None:
     """
-    :param parser: of a command that makes scores
-    :param groups: whether it takes groups of tasks
-    :param planned: whether these can be those of a study's plan
+    :param parser: parser of a command that computes scores
+    :param groups: whether the command takes groups of tasks
+    :param planned: whether the groups can be those of a study's plan
     """
     parser.add_argument(
         "--score",
@@ -137,7 +137,7 @@ def add_scores(parser: argparse.ArgumentParser, groups: bool = True, planned: bo
 
 def add_intervals(parser: argparse.ArgumentParser, reps: int = REPS) -> None:
     """
-    :param parser: of a command that makes intervals
+    :param parser: parser of a command that computes intervals
     :param reps: bootstrap samples by default
     """
     parser.add_argument("--reps", type=int, default=reps, help=f"bootstrap samples (default: {reps:,})")
@@ -177,7 +177,7 @@ def _read(options: argparse.Namespace, *more: str) -> pd.DataFrame:
         parts.append(tables.read(options.sources, (*tables.METRICS, *more)))
     if options.published:
         theirs = tables.published_runs(options.published)
-        if parts:  # of which some may have the same names
+        if parts:  # tables may have the same names
             theirs = theirs.assign(agent=tables.marked_published(theirs["agent"]))
         parts.append(theirs)
     if curves:
@@ -202,7 +202,7 @@ _INTERVALS = ("reps", "confidence", "seed")
 @contextlib.contextmanager
 def refusing(command: str) -> Iterator[None]:
     """
-    Errors of arguments, files and missing extras end the command with one line; warnings are a line each.
+    End the command with one line on errors of arguments, files and missing extras; show each warning as one line.
 
     :param command: its name, after ``sb3-sample``
     """
@@ -221,8 +221,8 @@ def refusing(command: str) -> Iterator[None]:
 
 def markdown(table: pd.DataFrame) -> str:
     """
-    :param table: any
-    :return: the same as Markdown, numbers to three digits after the point, steps with separators, gaps as "-"
+    :param table: any table
+    :return: the table as Markdown, numbers with three decimals, steps with separators, gaps as "-"
     """
     rows = [[_cell(name, value) for name, value in row.items()] for row in table.to_dict("records")]
     numeric = [pd.api.types.is_numeric_dtype(table[name]) for name in table]
@@ -464,7 +464,7 @@ def _draw_grid(axes: Any, values: pd.DataFrame, **kwargs: Any) -> Any:
 
 
 def _readable_on(color: Sequence[float]) -> str:
-    """The one of black and white that has more contrast with a colour, as WCAG 2 has it."""
+    """Black or white, whichever has more contrast with a colour (WCAG 2)."""
     linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in color[:3]]
     luminance = sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
     return "black" if (luminance + 0.05) ** 2 > 0.05 * 1.05 else "white"
@@ -518,7 +518,7 @@ def _draw_cost(found: pd.DataFrame) -> "Figure":
     return figure
 
 
-#: The commands by name: help, what adds the arguments, and what runs it.
+#: Commands by name: help, function that adds the arguments, and function that runs it.
 COMMANDS: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace], None]]] = {
     "table": ("read runs into one table", _add_table, _run_table),
     "aggregate": ("scores over tasks and seeds, with intervals", _add_aggregate, _run_aggregate),

@@ -1,7 +1,7 @@
 """
-Runs of a study as tasks of a Ray cluster: a run is a task with its cores or its share of a GPU, in a process of its
-own, on whichever machine has room. Its folder, which all machines see, is its checkpoint, and its lock is held by the
-process that makes it, as without Ray.
+Runs of a study as tasks of a Ray cluster: a run is a task with its cores or its share of a GPU, in a separate process,
+on any machine that has room. Its folder, which all machines see, is its checkpoint, and the process that makes it holds
+its lock, as without Ray.
 """
 
 import contextlib
@@ -26,11 +26,11 @@ from sb3_sample.study.plan import Run
 from sb3_sample.study.runs import LIST, Outcome, StudyError, StudyFolder
 from sb3_sample.study.worker import TAKEN, TERMINATED, attempt_all
 
-#: Seconds between two looks at how many machines there are.
+#: Seconds between two checks of the number of machines.
 LOOK_EVERY = 2.0
-#: Bytes of a local cluster's object store: tasks pass a few kilobytes.
+#: Bytes of a local cluster's object store; tasks pass only a few kilobytes.
 OBJECT_STORE = 100_000_000
-#: Values of ``ray=`` beside an address.
+#: Values of ``ray=`` besides an address.
 LOCAL, AUTO = "local", "auto"
 #: GPUs of a run.
 GPUS = number("be above 0, and whole above 1", lambda share: 0 < share <= 1 or (share > 1 and share == int(share)))
@@ -38,7 +38,7 @@ GPUS = number("be above 0, and whole above 1", lambda share: 0 < share <= 1 or (
 
 def check(address: str, gpus: float | None) -> None:
     """
-    :param address: of a cluster, as :class:`Cluster` takes it
+    :param address: of a cluster, see :class:`Cluster`
     :param gpus: of a run
     :raises ValueError: an argument is out of range
     :raises ImportError: Ray is not installed
@@ -52,12 +52,12 @@ def check(address: str, gpus: float | None) -> None:
 
 class Cluster:
     """
-    A Ray cluster for the runs of a study. One that was started or connected to here is left at the end of the ``with``.
+    Ray cluster for the runs of a study. If it was started or connected to here, it is left at the end of the ``with``.
 
-    :param address: ``"local"`` for one on this machine; ``"auto"`` for the one that this machine is in; else the
-        address of one, as ``ray.init`` takes it
-    :param folder: the study's, which all machines of the cluster have under the same path
-    :param workers: runs at once; as many as the machines of the cluster have room for at the moment, if None
+    :param address: ``"local"`` for a cluster on this machine; ``"auto"`` for the cluster of this machine; else an
+        address, as for ``ray.init``
+    :param folder: the study's folder, which all machines of the cluster have under the same path
+    :param workers: runs at once; if None, as many as the machines of the cluster have room for at the moment
     :param threads: cores of a run
     :param gpus: GPUs of a run, or its share of one; None for none
     """
@@ -85,7 +85,7 @@ class Cluster:
         self._task = ray.remote(
             num_cpus=self._threads,
             num_gpus=self._gpus or 0,
-            # A process for each run, with its own imports and threads; what to do when it dies is the scheduler's.
+            # A process for each run, with its own imports and threads; the scheduler handles its death.
             max_calls=1,
             max_retries=0,
             runtime_env={"env_vars": threads_of_libraries(self._threads)},
@@ -134,7 +134,7 @@ class Cluster:
 
     def hire(self, events: "queue.Queue[tuple[Any, Any]]") -> "Slot":
         """
-        :param events: gets the answers
+        :param events: queue for the answers
         :return: a place for one run at a time
         """
         return Slot(self._task, str(self._folder), events)
@@ -142,11 +142,11 @@ class Cluster:
 
 class Slot:
     """
-    A place for one run at a time in a cluster, or for several together, as a worker is one on this machine.
+    Place for one run at a time in a cluster, or for several together, the counterpart of a worker on this machine.
 
-    :param task: makes runs, as Ray's remote function
+    :param task: Ray's remote function that makes runs
     :param folder: the study's
-    :param events: gets the answers, and None when a process has ended without one, each with the slot
+    :param events: queue for the answers, or None if a process has ended without one, each with the slot
     """
 
     def __init__(self, task: Any, folder: str, events: "queue.Queue[tuple[Any, Any]]"):
@@ -159,7 +159,7 @@ class Slot:
 
     def give(self, runs: tuple[Run, ...], options: list[str], threads: int) -> None:
         """
-        :param runs: what is to be made
+        :param runs: runs to make
         :param options: options of ``sb3-sample train``
         :param threads: of the task
         """
@@ -178,17 +178,17 @@ class Slot:
         try:
             answer = ray.get(order)
         except ray.exceptions.NodeDiedError:
-            answer = [TAKEN] * n  # the runs are none the worse: they go on elsewhere, when their locks are free
+            answer = [TAKEN] * n  # not the runs' fault: they resume elsewhere when their locks are free
         except Exception as error:
             self._why = f"the process that made the run has ended: {error}"
         self._events.put((self, answer))
 
     def leave(self) -> None:
-        """Have a run under way end: a training is saved first."""
+        """End the current run after saving its training."""
         self._cancel(force=False)
 
     def kill(self) -> None:
-        """Have a run under way end at once."""
+        """End the current run at once."""
         self._cancel(force=True)
 
     def _cancel(self, force: bool) -> None:
@@ -198,27 +198,27 @@ class Slot:
             ray.cancel(self._order, force=force)
 
     def wait(self) -> None:
-        """Wait until the run under way has ended, if there is one."""
+        """Wait until the current run has ended, if there is one."""
         if self._listener is not None:
             self._listener.join()
 
     def why_ended(self) -> str:
         """
-        :return: why there was no answer, in words
+        :return: the reason why there was no answer, in words
         """
         return self._why
 
 
 def make(folder: str, runs: list[dict[str, Any]], options: list[str], threads: int) -> list[dict[str, Any]]:
     """
-    Make a run, or several together, in a process of the cluster. After Ray's cancel and SIGTERM a training finishes its
-    turn and saves.
+    Make a run, or several together, in a process of the cluster. On Ray's cancel and SIGTERM a training finishes its
+    current iteration and saves.
 
     :param folder: the study's
     :param runs: the runs, as JSON
     :param options: options of ``sb3-sample train``
     :param threads: of the process
-    :return: what became of each, or that it is to be looked at again
+    :return: outcome of each run, or that it has to be looked at again
     :raises FileNotFoundError: this machine does not see the folder
     """
     if not (Path(folder) / LIST).is_file():
@@ -227,7 +227,7 @@ def make(folder: str, runs: list[dict[str, Any]], options: list[str], threads: i
             "cluster have under the same path"
         )
     outcomes: list[Outcome | None] = [None] * len(runs)
-    # In the place of Ray's, which an attempt would take for a failure of the run's.
+    # Replaces Ray's handler, whose exception an attempt would take for a failure of the run.
     signal.signal(signal.SIGTERM, _terminate)
     with contextlib.suppress(KeyboardInterrupt, SystemExit):
         outcomes = attempt_all(StudyFolder(folder), [Run.of_json(run) for run in runs], options, threads)
@@ -235,11 +235,11 @@ def make(folder: str, runs: list[dict[str, Any]], options: list[str], threads: i
 
 
 def _with_absolute_paths(run: Run) -> Run:
-    """A run whose data sets are named alike from any working directory, since a process of Ray's has another."""
+    """A run with absolute paths of its data sets, since a process of Ray has another working directory."""
 
     def absolute(value: Any) -> Any:
         is_path = isinstance(value, str) and (Path(value).suffix in HDF5 or Path(value).exists())
-        # A home is the machine's own; an id of Minari's is no path.
+        # Each machine has its own home; an id of Minari is not a path.
         return str(Path(value).absolute()) if is_path and not value.startswith("~") else value
 
     return dataclasses.replace(run, data={name: absolute(value) for name, value in run.data.items()})
@@ -262,7 +262,7 @@ def _words(CPU: float, GPU: float) -> str:
 
 @contextlib.contextmanager
 def _keeping_sigterm() -> Iterator[None]:
-    """Ray's import and its start set a handler of SIGTERM, in the place of the scheduler's."""
+    """Restore the scheduler's handler of SIGTERM, which Ray's import and start replace."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

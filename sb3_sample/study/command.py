@@ -1,4 +1,4 @@
-"""``sb3-sample study``: plans of many runs, made, looked at and estimated, and the tables made of them."""
+"""``sb3-sample study``: run plans of many runs, show their status and cost, and make tables of them."""
 
 import argparse
 import contextlib
@@ -20,12 +20,12 @@ from sb3_sample.study.runs import StudyError
 from sb3_sample.study.schedule import Stopped, run
 from sb3_sample.study.states import RUNNING, STATES, Status, status
 
-#: Seconds between two lines of counts where there is no terminal.
+#: Seconds between two lines of counts without a terminal.
 LINE_EVERY = 60.0
-#: Runs in progress that the live table names.
+#: Number of runs in progress that the live table names.
 SHOWN = 20
 
-#: A command: its help, what adds its arguments, and what runs it.
+#: A command: its help, the function that adds its arguments, and the function that runs it.
 Command = tuple[str, Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace], None]]
 
 
@@ -136,7 +136,7 @@ def _run(options: argparse.Namespace) -> None:
 
 @contextlib.contextmanager
 def _showing() -> Iterator[Callable[[Status], None]]:
-    """A live table in a terminal where rich is installed; lines anywhere else."""
+    """A live table in a terminal if rich is installed; lines otherwise."""
     try:
         from rich.console import Console
         from rich.live import Live
@@ -174,7 +174,7 @@ class _Lines:
 def ended(found: Status) -> list[str]:
     """
     :param found: a status
-    :return: a line for each run that has ended since the last one
+    :return: a line for each run that has ended since the last status
     """
     lines = []
     for each in found.ended:
@@ -186,7 +186,7 @@ def ended(found: Status) -> list[str]:
 def table(found: Status) -> Any:
     """
     :param found: a status
-    :return: the live table, as rich draws it
+    :return: the live table for rich
     """
     from rich.table import Table
 

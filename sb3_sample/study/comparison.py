@@ -1,4 +1,4 @@
-"""Groups of tasks and factors by which a study is compared, as its plan says, for the commands that analyse it."""
+"""Groups of tasks and factors for comparing a study's runs, from its plan, for the commands that analyse it."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -13,13 +13,13 @@ from sb3_sample.study.table import labelled
 
 def comparison(sources: str | Path | Iterable[str | Path]) -> Comparison:
     """
-    What the plans of studies say of how their runs are compared.
+    Read from the plans of studies how their runs are compared.
 
-    :param sources: folders of studies or of runs in them, as :func:`~sb3_sample.study.read` takes them; other sources
-        say nothing of it
+    :param sources: folders of studies or of runs in them, as for :func:`~sb3_sample.study.read`; other sources
+        contribute nothing
     :return: groups of tasks and factors by their names, as ``groups=`` and ``factors=`` of
         :func:`~sb3_sample.study.marginalize` take them
-    :raises ValueError: two plans have other tasks or arguments under the same name
+    :raises ValueError: two plans have different tasks or arguments under the same name
     """
     found = Comparison({}, {})
     for source in [sources] if isinstance(sources, (str, Path)) else sources:
@@ -43,10 +43,10 @@ def chosen_groups(
 ) -> dict[str, list[str]] | Sequence[str] | None:
     """
     :param planned: tasks of the plans' groups by their names
-    :param names: groups that are asked for; None for the plans', or the usual ones where there are none
+    :param names: requested groups; None for the plans' groups, or the default groups if there are none
     :param table: of the runs
-    :return: the groups, as :func:`~sb3_sample.study.aggregate` takes them; those of the plans have only tasks of the
-        table, and are left out if they have none
+    :return: the groups, as for :func:`~sb3_sample.study.aggregate`; the plans' groups have only tasks of the table, and
+        are left out if they have none
     :raises ValueError: there is no such group
     """
     if not planned:

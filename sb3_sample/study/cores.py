@@ -21,15 +21,15 @@ def threads_of_libraries(threads: int) -> dict[str, str]:
 
 def free_cores() -> int:
     """
-    :return: cores that this process may use and that nobody uses at present, at least 1
+    :return: number of cores that this process may use and that are idle, at least 1
     """
     return max(round(idle_cores()), 1)
 
 
 def idle_cores() -> float:
     """
-    :return: cores that this process may use and that nobody uses at present, with their parts; all that it may use
-        where the system does not tell
+    :return: number of cores that this process may use and that are idle, including fractions; all that it may use if
+        the system does not tell
     """
     usable = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
     free = float(len(usable))
@@ -40,12 +40,12 @@ def idle_cores() -> float:
         free = sum((after[core][0] - before[core][0]) / max(after[core][1] - before[core][1], 1) for core in after)
     with contextlib.suppress(OSError, ValueError):
         quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
-        free = min(free, int(quota) / int(period))  # "max": a ValueError
+        free = min(free, int(quota) / int(period))  # "max" raises a ValueError
     return free
 
 
 def _idle(usable: set[int]) -> dict[int, tuple[int, int]]:
-    """By core, the ticks that it was idle and all of them (Linux)."""
+    """Idle ticks and all ticks by core (Linux)."""
     found = {}
     for line in Path("/proc/stat").read_text().splitlines():
         name, *ticks = line.split()

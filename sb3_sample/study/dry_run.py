@@ -1,4 +1,4 @@
-"""Costs of a plan before it is run: hours, by the step time of this machine, and bytes."""
+"""Costs of a plan before it is run: hours, from the step time of this machine, and bytes."""
 
 import dataclasses
 import json
@@ -24,25 +24,25 @@ from sb3_sample.study.worker import train
 
 #: Seconds for which the step time of an agent on a task is measured.
 SECONDS = 3.0
-#: Steps of random actions before that.
+#: Steps of random actions before the measurement.
 WARM_UP = 500
-#: Algorithms whose step times may be known, and arguments that change neither these nor how steps are run.
+#: Algorithms whose step times may be known, and arguments that change neither these times nor how steps are run.
 _TIMED = {"bro": BRO, "bro_fast": BROFast}
 _UNTIMED = {
     "replay_ratio", "model_size", "resets", "reset_gradient_steps", "resets_to", "learning_starts", "buffer_size",
     "learning_rate", "gamma", "tau",
 }  # fmt: skip
-#: Gradient steps an environment step of a probe whose step time is known: too few to count.
+#: Gradient steps per environment step of a probe whose gradient-step time is known: too few to matter.
 _HARDLY_ANY = 1e-3
 _PROBE = (sys.executable, "-c", "from sb3_sample.study.dry_run import probe; probe()")
 
 
 class MeasurementFailed(RuntimeError):
     """
-    A training that was to be measured has failed.
+    A training to be measured has failed.
 
     :param title: the run in words
-    :param output: end of what it has printed, which ``output`` keeps; the message has its last line
+    :param output: end of its printed output, which ``output`` keeps; the message has its last line
     """
 
     def __init__(self, title: str, output: str):
@@ -52,8 +52,8 @@ class MeasurementFailed(RuntimeError):
 
 class Cost(NamedTuple):
     """
-    :param seconds: of an environment step, with what is learned from it
-    :param bytes_of_run: what the run's folder holds besides the replay buffer
+    :param seconds: of an environment step, including its gradient steps
+    :param bytes_of_run: size of the run's folder without the replay buffer
     :param bytes_of_step: of a transition
     """
 
@@ -65,11 +65,11 @@ class Cost(NamedTuple):
 class Estimate(NamedTuple):
     """
     :param n_runs: runs of the plan
-    :param n_done: those of them that are done
-    :param hours: of one core for each of the run's threads, for what those that are not done have left
+    :param n_done: number of these that are done
+    :param hours: remaining hours of the runs that are not done, with one core per thread of a run
     :param workers: runs at once
-    :param n_bytes: what their folders will hold
-    :param n_episodes: of their evaluations, which the hours do not count
+    :param n_bytes: size of their folders in the end
+    :param n_episodes: episodes of their evaluations, which the hours do not include
     """
 
     n_runs: int
@@ -105,20 +105,20 @@ def estimate(
     say: Callable[[str], None] = lambda _: None,
 ) -> Estimate:
     """
-    Estimate what a plan costs. The step time is measured on this machine, by the first seconds of a training of each
-    agent on the first task and of the first agent on each task; that of another pair is the product of the two ratios.
-    Where ``sb3-sample advise`` has kept the times of BRO's gradient steps, these are taken and not measured again.
+    Estimate the cost of a plan. The step time is measured on this machine, in the first seconds of a training of each
+    agent on the first task and of the first agent on each task; for other pairs it is the product of the two ratios. If
+    ``sb3-sample advise`` has stored the times of BRO's gradient steps, these are used and not measured again.
 
     :param plan: a plan or its file
-    :param folder: the study's, of which what is done is not counted, nor are the steps that runs under way have made;
+    :param folder: the study's folder, whose finished runs and already made steps are not counted;
         ``runs/<name of the plan>`` if None
-    :param workers: runs at once; as many as there are free cores for, if None
+    :param workers: runs at once; if None, as many as there are free cores for
     :param threads: of each run
     :param device: of each run
-    :param say: gets what is being measured
+    :param say: called with a message on each measurement
     :return: the estimate
     :raises PlanError: the plan cannot be run as it stands
-    :raises MeasurementFailed: a training that was to be measured has failed
+    :raises MeasurementFailed: a training to be measured has failed
     """
     plan = plan if isinstance(plan, Plan) else read_plan(plan)
     place = StudyFolder(Path("runs") / plan.name if folder is None else folder)
@@ -133,7 +133,7 @@ def estimate(
         base = left[0]
         pairs = [(base.variant, base.task), (run.variant, base.task), (base.variant, run.task)]
         if not all(pair in of_plan for pair in pairs):
-            # Agents that have data of some tasks only.
+            # Agents may have data of only some tasks.
             pairs = [(run.variant, run.task)] * 3
         for pair in pairs:
             if pair not in costs:
@@ -149,11 +149,11 @@ def estimate(
                     cost = cost._replace(seconds=cost.seconds + learning)
                 costs[pair] = cost
         first, agent, task = (costs[pair] for pair in pairs)
-        # Of a run that was begun, what is left of it.
+        # Only the rest of a run that was begun.
         made = min(place.progress(run).steps, run.steps)
         seconds += (run.steps - made) * agent.seconds * task.seconds / first.seconds
         n_episodes += (run.steps // run.eval_freq - made // run.eval_freq) * run.eval_episodes
-        # Networks are the agent's, observations the task's.
+        # Networks depend on the agent, observations on the task.
         n_bytes += agent.bytes_of_run * task.bytes_of_run / first.bytes_of_run
         n_bytes += min(run.steps, _buffer_size(run)) * (task.bytes_of_step if agent.bytes_of_step else 0.0)
     n_done, at_once = len(plan.runs) - len(left), min(at_once, max(len(left), 1))
@@ -164,11 +164,11 @@ def seconds_of_learning(run: Run, times: StepTimes) -> float | None:
     """
     :param run: the run
     :param times: of the machine
-    :return: seconds of the gradient steps of an environment step; None where the times are not those of such a run
+    :return: seconds of the gradient steps per environment step; None if the times do not apply to such a run
     """
     if run.algo not in _TIMED or not set(run.arguments) <= _UNTIMED or run.data:
         return None
-    if run.task.partition("/")[0] not in SUITES:  # which alone have no settings of their own
+    if run.task.partition("/")[0] not in SUITES:  # only these suites have no settings of their own
         return None
     defaults = _TIMED[run.algo].constructor_arguments
     size, ratio, warm_up = (
@@ -187,12 +187,12 @@ def _buffer_size(run: Run) -> float:
 
 def measure(run: Run, threads: int, device: str) -> Cost:
     """
-    Measure a run by its first seconds, in a process and a folder of its own.
+    Measure a run by its first seconds, in a separate process and folder.
 
     :param run: the run
     :param threads: its threads
     :param device: its device
-    :return: what it costs
+    :return: its cost
     :raises MeasurementFailed: it has failed, or ended before anything was learned
     """
     with tempfile.TemporaryDirectory() as folder:
@@ -201,7 +201,7 @@ def measure(run: Run, threads: int, device: str) -> Cost:
         arguments = {**run.arguments, "callback": stopwatch}
         if "learning_starts" in constructor_arguments(run.algo):
             arguments["learning_starts"] = WARM_UP
-        # As many steps as the run has, since what is compiled depends on them.
+        # As many steps as the run has, since the choice to compile depends on them.
         order = {
             "run": dataclasses.replace(
                 run, arguments=arguments, eval_freq=run.steps, measure=0, diagnostics=0
@@ -220,19 +220,19 @@ def measure(run: Run, threads: int, device: str) -> Cost:
 
 
 def probe() -> None:
-    """Make the run that the standard input gives as JSON in the folder that the command line names."""
+    """Make the run that the standard input gives as JSON, in the folder that the command line names."""
     order = json.loads(sys.stdin.read())
     train(Run.of_json(order["run"]), Path(sys.argv[1]), order["options"])
 
 
 def _bytes(folder: Path) -> float:
-    """Bytes of everything but rows of replay buffers, when the run has ended."""
+    """Bytes of everything except rows of replay buffers when the run has ended."""
     n_checkpoints = max(len(list(folder.glob("**/checkpoint-*"))), 1)
     found = 0.0
     for path in folder.rglob("*"):
         if path.is_file() and path.parent.name != SEGMENTS:
             size = path.stat().st_size
-            # Two checkpoints are kept, and the best model besides the last.
+            # Two checkpoints are kept, and both the best and the last model.
             if path.parent.name.startswith("checkpoint-"):
                 found += size * 2 / n_checkpoints
             else:

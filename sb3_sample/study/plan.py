@@ -1,4 +1,4 @@
-"""Runs of a study, and its plan: which of them to make."""
+"""Runs of a study, and its plan: the runs to make."""
 
 import dataclasses
 import functools
@@ -8,20 +8,20 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-#: Data that an agent learns from besides the environment, and the steps that it takes on them.
+#: Data that an agent learns from besides the environment, and the number of steps on them.
 DATA = ("dataset", "offline_steps", "prior_data")
-#: The published curves' evaluation.
+#: Evaluation interval and episodes of the published curves.
 EVERY, EPISODES = 25_000, 5
-#: Environment steps between two checkpoints, as of ``sb3-sample train``.
+#: Environment steps between two checkpoints, as in ``sb3-sample train``.
 CHECKPOINT_FREQ = 10_000
-#: Characters of one part of a folder's name.
+#: Most characters in one part of a folder's name.
 MAX_NAME = 120
-#: Names of agents.
+#: Allowed names of agents.
 AGENT_NAME = re.compile(r"\w[\w .+()-]*")
 
 
 class PlanError(ValueError):
-    """A plan that cannot be run as it stands."""
+    """A plan that cannot be run as it is written."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,9 +30,10 @@ class Run:
     One training.
 
     :param agent: the agent's name in the plan
-    :param algo: its algorithm, as ``sb3-sample train --algo`` has it
-    :param arguments: its arguments that differ from the settings of ``hyperparams/<algo>.yml``, those of the grid too
-    :param grid: the arguments of them that are the grid's
+    :param algo: its algorithm, as in ``sb3-sample train --algo``
+    :param arguments: its arguments that differ from the settings of ``hyperparams/<algo>.yml``, including those of the
+        grid
+    :param grid: those of the arguments that belong to the grid
     :param task: id of the environment
     :param seed: the seed
     :param steps: environment steps
@@ -42,8 +43,8 @@ class Run:
     :param env_kwargs: arguments of the environment
     :param gym_packages: modules that register environments
     :param measure: environment steps between two measurements of the noise scale and of overfitting, none if 0
-    :param data: data sets that it learns from, ``dataset`` and ``prior_data`` as ``train`` has them, and the
-        ``offline_steps``; those that there are
+    :param data: data sets that it learns from, ``dataset`` and ``prior_data`` as in ``train``, and the
+        ``offline_steps``; only those given
     :param diagnostics: environment steps between two measurements of ``DiagnosticsCallback``, none if 0
     """
 
@@ -65,7 +66,7 @@ class Run:
 
     @functools.cached_property
     def name(self) -> str:
-        """Name among the runs of a study and of its folder there: ``<agent>/<task>/<seed>``."""
+        """Name of the run and of its folder in the study: ``<agent>/<task>/<seed>``."""
         return f"{self.variant}/{part_of_path(self.task)}/{self.seed}"
 
     @property
@@ -75,7 +76,7 @@ class Run:
 
     @property
     def label(self) -> str:
-        """The agent's name in the plan with its place in the grid, as tables of results have it."""
+        """The agent's name in the plan with its place in the grid, as in tables of results."""
         grid = [f"{n}={_short(v)}" for n, v in sorted(self.grid.items())]
         return f"{self.agent} ({', '.join(grid)})" if grid else self.agent
 
@@ -87,13 +88,13 @@ class Run:
 
     @functools.cached_property
     def kind(self) -> str:
-        """Equal for runs that differ in their seed alone."""
+        """Equal for runs that differ only in their seed."""
         what = [self.algo, self.arguments, self.task, self.env_kwargs, self.data, self.steps]
         return json.dumps(what, sort_keys=True, default=str)
 
     def command(self, folder: Path) -> list[str]:
         """
-        :param folder: the run's
+        :param folder: the run's folder
         :return: the arguments of ``sb3-sample train`` that make the run
         """
         command = [
@@ -122,10 +123,10 @@ class Run:
 
     def as_json(self) -> dict[str, Any]:
         """
-        :return: the run as JSON has it
+        :return: the run as JSON
         """
         found = {**dataclasses.asdict(self), "gym_packages": list(self.gym_packages)}
-        # As runs were written before there were these.
+        # As in files from before these fields existed.
         for name in ("measure", "data", "diagnostics"):
             if not found[name]:
                 del found[name]
@@ -134,9 +135,9 @@ class Run:
     @classmethod
     def of_json(cls, found: Any) -> "Run":
         """
-        :param found: from ``as_json``, through a file that anybody may have written
+        :param found: from ``as_json``, through an untrusted file
         :return: the run
-        :raises ValueError: it is no such thing
+        :raises ValueError: it is not a run
         """
         kinds = {"arguments": dict, "grid": dict, "env_kwargs": dict, "gym_packages": list, "data": dict}
         kinds |= dict.fromkeys(("agent", "algo", "task"), str)
@@ -160,10 +161,10 @@ def _has_default(field: dataclasses.Field[Any]) -> bool:
 
 class Comparison(NamedTuple):
     """
-    How the runs of a study are compared, as its plan says.
+    Comparison of a study's runs, as given by its plan.
 
     :param groups: tasks by the name of their group; empty if the plan has none
-    :param factors: arguments that are one choice together, by the choice's name; empty if the plan has none
+    :param factors: arguments that together make one choice, by the choice's name; empty if the plan has none
     """
 
     groups: dict[str, list[str]]
@@ -172,11 +173,11 @@ class Comparison(NamedTuple):
 
 class Plan(NamedTuple):
     """
-    A study that is to be made.
+    A study to be made.
 
     :param name: its name
     :param runs: its runs, in their order: the first seed of everything first
-    :param text: the file, as it was read; empty for a plan that was made otherwise
+    :param text: the file as read; empty for a plan that is not from a file
     :param comparison: how its runs are compared
     """
 
@@ -187,7 +188,7 @@ class Plan(NamedTuple):
 
 
 def part_of_path(name: str) -> str:
-    """A name as a part of a path; a long one ends in a number that stands for the rest."""
+    """A name as a part of a path; a long one ends in a hash instead of the rest."""
     plain = re.sub(r"[^\w.,=+()-]+", "-", name)
     if len(plain) <= MAX_NAME:
         return plain

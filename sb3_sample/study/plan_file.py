@@ -1,8 +1,8 @@
 """
 Plans of studies as YAML files.
 
-A plan has agents (an algorithm and arguments), tasks, seeds, steps, an evaluation and a grid of arguments. All of it
-is checked before anything runs, and an error names file, line and what is allowed.
+A plan has agents (an algorithm and arguments), tasks, seeds, steps, an evaluation and a grid of arguments. All of it is
+checked before anything runs, and an error names file, line and allowed values.
 """
 
 import difflib
@@ -55,13 +55,13 @@ ENTRIES = (
 REQUIRED = ENTRIES[:4]
 #: Entries of an agent besides its arguments.
 OF_RUN = ("algo", "steps", *DATA)
-#: Stands in a data set's name for the task, as a part of a path.
+#: Placeholder in a data set's name for the task, as a part of a path.
 TASK = "{task}"
-#: Characters of a plan.
+#: Most characters of a plan.
 MAX_PLAN = 2**20
-#: Values in one entry, where an alias counts as what it stands for.
+#: Most values in one entry, where an alias counts as its content.
 MAX_VALUES = 10_000
-#: Arguments of every environment, which ``gymnasium.make`` takes itself.
+#: Arguments of ``gymnasium.make`` itself, for every environment.
 _OF_MAKE = ("max_episode_steps", "disable_env_checker")
 _EXPONENT = re.compile(r"[-+]?(\d[\d_]*)(\.\d*)?[eE][-+]?\d+$")
 
@@ -71,16 +71,16 @@ def read_plan(path: str | Path) -> Plan:
     Read and check a plan.
 
     :param path: of the YAML file
-    :return: the plan, named as the file
-    :raises PlanError: (a ``ValueError``) it cannot be read, or it says what cannot be run; the message names file, line
-        and what is allowed
+    :return: the plan, named after the file
+    :raises PlanError: (a ``ValueError``) it cannot be read or cannot be run; the message names file, line and allowed
+        values
     :raises ImportError: the zoo's commands are not installed
     """
     return _Reader(Path(path)).read()
 
 
 class _Loader(ShallowLoader):
-    """Plain values; ``1e6`` is a number, as everywhere but in YAML 1.1."""
+    """Loader of plain values; ``1e6`` is a number, as everywhere except in YAML 1.1."""
 
     def construct_yaml_float(self, node: yaml.ScalarNode) -> float:
         if _EXPONENT.match(node.value):
@@ -112,7 +112,7 @@ class _Agent(NamedTuple):
 class _Reader:
     def __init__(self, path: Path):
         self._path = path
-        #: Mappings that have been looked at: reading them puts what they merge among their own.
+        #: Mappings already checked for equal keys, before reading adds the keys that they merge.
         self._checked: set[int] = set()
 
     def _fail(self, node: yaml.Node, message: str) -> PlanError:
@@ -201,7 +201,7 @@ class _Reader:
         return found
 
     def _check_twice(self, node: yaml.MappingNode) -> None:
-        """YAML's reader lets the last of several equal keys win."""
+        """Reject equal keys, of which YAML's reader would silently keep the last."""
         if id(node) in self._checked:
             return
         self._checked.add(id(node))
@@ -285,7 +285,7 @@ class _Reader:
         return found
 
     def _source(self, node: yaml.Node, name: str) -> Any:
-        """Data set of all tasks, by ``{task}`` in its name, or of each; or gradient steps on it."""
+        """Data set for all tasks, with ``{task}`` in its name, or for each task; or number of gradient steps on it."""
         if name == "offline_steps":
             return self._count(node, name)
         value = self._plain(node)
@@ -295,7 +295,7 @@ class _Reader:
         return value
 
     def _check_data(self, agent: _Agent, steps: int, tasks: list[str]) -> None:
-        """Check that an agent can learn from its data so."""
+        """Check that an agent can learn from its data in this way."""
         data, entries = agent.data, agent.entries
         for name in ("dataset", "prior_data"):
             for task in data[name] if isinstance(data.get(name), dict) else ():
@@ -356,8 +356,8 @@ class _Reader:
         self, agents: list[_Agent], grid: dict[str, list[Any]]
     ) -> Iterator[tuple[_Agent, dict[str, Any], dict[str, Any], "spaces.Space[Any]"]]:
         """
-        Agents with each point of the grid, each of which can be made, and is there once; and the action space on which
-        it was made.
+        Agents with each point of the grid, checked to be possible and without repeats; and the action space with which
+        each was made.
         """
         seen: dict[str, _Agent] = {}
         for agent in agents:
@@ -388,7 +388,7 @@ class _Reader:
         tasks: list[str],
         env_kwargs: dict[str, Any],
     ) -> None:
-        """Check that each agent takes the actions of its tasks."""
+        """Check that each agent supports the action spaces of its tasks."""
         of_tasks = {task: action_space(task, env_kwargs) for task in tasks}
         for agent, arguments, _, made_on in variants:
             tried = set()
@@ -400,7 +400,7 @@ class _Reader:
                     raise self._fail(agent.node, f"agent {agent.name!r} cannot act in task {task!r}: {why}")
 
     def _check_measured(self, name: str, node: yaml.Node, agents: list[_Agent]) -> None:
-        """Check that all agents are of the off-policy family, of whose networks the measurements are."""
+        """Check that all agents are of the off-policy family, whose networks the measurements need."""
         from sb3_sample.sac import SAC
 
         for agent in agents:
@@ -526,12 +526,12 @@ class _Reader:
 
 
 def _without_data(agent: _Agent, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Arguments less the share of prior data, which are read when a run begins: without them it means nothing."""
+    """Arguments without the share of prior data, which needs the data, and these are read only when a run begins."""
     return {name: value for name, value in arguments.items() if name != "prior_share" or "prior_data" not in agent.data}
 
 
 def _has_data_on(data: Mapping[str, Any], task: str) -> bool:
-    """Check whether there is a data set for a task wherever they are named by task."""
+    """Check whether a task has a data set in each entry that names them by task."""
     return all(task in value for value in data.values() if isinstance(value, dict))
 
 
@@ -545,7 +545,7 @@ def _data_on(data: Mapping[str, Any], task: str) -> dict[str, Any]:
 
 
 def _nodes(node: yaml.Node) -> Iterator[yaml.Node]:
-    """A node and all below it. Without an end where one holds itself."""
+    """A node and all nodes below it; endless if a node contains itself."""
     waiting = deque([node])
     while waiting:
         yield (each := waiting.popleft())
@@ -555,7 +555,7 @@ def _nodes(node: yaml.Node) -> Iterator[yaml.Node]:
 
 
 def _key(value: Any) -> str:
-    """Equal for equal values: 1 is 1.0, and True is not 1."""
+    """Key that is equal for equal values: 1 equals 1.0, and True does not equal 1."""
     return json.dumps(_with_floats(value), sort_keys=True)
 
 
@@ -568,7 +568,7 @@ def _with_floats(value: Any) -> Any:
 
 
 def _without_defaults(algo: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments less those that are there anyway, since the settings of no task name them."""
+    """Arguments without those at their defaults, unless the settings of a task name them."""
     known, settings = constructor_arguments(algo), settings_of(algo).values()
     named = {name for entry in settings for name in entry or ()}
     return {
@@ -581,7 +581,7 @@ def _without_defaults(algo: str, arguments: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _env_arguments(suite: str, task: str) -> list[str] | None:
-    """Arguments of a task of this package's; None of another, which is not known before it is made."""
+    """Arguments of a task of this package; None for other tasks, whose arguments are unknown before they are made."""
     made = {"dmc": "DMCEnv", "metaworld": "MetaWorldEnv", "myosuite": "MyoSuiteEnv"}.get(suite)
     if made is None:
         return None

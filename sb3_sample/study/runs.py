@@ -1,9 +1,9 @@
 """
-The folder of a study: a folder a run, as ``sb3-sample train --run-dir`` makes it, and beside these what a study says of
-its runs.
+Folder of a study: one folder per run, as ``sb3-sample train --run-dir`` makes it, and beside them the study's records
+of its runs.
 
-A run is claimed by the lock of a file, which the process holds that makes the run. So no two processes have the same
-run, on one machine or on several that share the folder, and one that is dead has none.
+A run is claimed by a file lock that the process making the run holds. So no two processes make the same run, on one
+machine or on several that share the folder, and a dead process holds no run.
 """
 
 import json
@@ -22,19 +22,19 @@ from sb3_sample.saving.locks import Lock, is_taken, take
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.study.plan import Comparison, Plan, Run
 
-#: Content of a study's folder: its runs, the outcome of each, the list of them and the plan as it was read.
+#: Content of a study's folder: its runs, their outcomes, the list of runs and the plan as read.
 RUNS, STATE, LIST, PLAN = STUDY_RUNS, "state", STUDY_LIST, "plan.yml"
-#: In the list: runs that were in it and are not in the plan any more, by their names.
+#: Entry of the list with runs that are no longer in the plan, by name.
 FORMER = "former"
 _LOG = "progress.jsonl"
-#: Bytes of the list, of what is said of one run, and of the end of a log that is looked at.
+#: Most bytes of the list, of the outcome of one run, and of the end of a log that is read.
 MAX_LIST, MAX_OUTCOME, TAIL = 2**28, 2**20, 2**14
-#: Characters of a traceback that are kept.
+#: Most characters of a traceback that are kept.
 MAX_TRACEBACK = 20_000
 
 
 class StudyError(ValueError):
-    """A study that cannot be made or read as asked."""
+    """A study that cannot be made or read as requested."""
 
 
 def this_process() -> str:
@@ -46,17 +46,17 @@ def this_process() -> str:
 
 class Outcome(NamedTuple):
     """
-    What became of a run.
+    Outcome of a run.
 
-    :param done: whether it was made to its end
-    :param attempts: attempts that failed
-    :param traceback: of the last that failed
-    :param steps: environment steps that it has
+    :param done: whether it is complete
+    :param attempts: failed attempts
+    :param traceback: of the last failed attempt
+    :param steps: its environment steps so far
     :param seconds: of the last attempt
-    :param steps_made: environment steps of the last attempt, which goes on from a checkpoint
+    :param steps_made: environment steps of the last attempt, which may have resumed from a checkpoint
     :param last_return: mean return of the last evaluation, if there was one
     :param host: machine of the last attempt
-    :param threads: its threads
+    :param threads: threads of the last attempt
     :param finished: when it ended, in seconds since 1970
     """
 
@@ -74,12 +74,12 @@ class Outcome(NamedTuple):
 
 class Progress(NamedTuple):
     """
-    How far a run is, by its own files.
+    Progress of a run, from its own files.
 
     :param steps: environment steps
     :param last_return: mean return of the last evaluation; None before the first
-    :param timed_steps: those of the steps whose time its log has told, of all attempts; 0 before the first line
-    :param seconds: that time
+    :param timed_steps: steps whose time its log gives, over all attempts; 0 before the first line
+    :param seconds: time of these steps
     """
 
     steps: int
@@ -100,16 +100,16 @@ class StudyFolder:
 
     def enter(self, plan: Plan, keep: bool = False) -> None:
         """
-        Make the folder that of a plan. A plan that has been run there may have got more runs and more steps since.
+        Set up the folder for a plan. A plan that was run there before may have more runs and more steps now.
 
         :param plan: the plan
-        :param keep: whether runs stay in the list that are there and not in the plan
-        :raises StudyError: a run of its is there with other settings
-        :raises OSError: the folder cannot be made or written to, or has no locks
+        :param keep: whether runs that are in the list but not in the plan stay in the list
+        :raises StudyError: one of its runs exists with other settings
+        :raises OSError: the folder cannot be made or written to, or does not support locks
         """
         for name in (RUNS, STATE):
             (self.path / name).mkdir(parents=True, exist_ok=True)
-        # Two machines that begin at the same time.
+        # Two machines may begin at the same time.
         while (lock := take(self.path / STATE / ".lock")) is None:
             time.sleep(0.01)
         with lock:
@@ -123,7 +123,7 @@ class StudyFolder:
                     runs = {run.name: run for run in known} | runs
                     comparison = comparison if any(comparison) else self.comparison()
             listed = [run.as_json() for run in runs.values()]
-            # Runs that were taken out of the plan: their folders are there, and they may be put back.
+            # Runs that were removed from the plan: their folders still exist, and they may be put back.
             left = {run.name: run.as_json() for run in (*former, *known) if run.name not in runs}
             content = {"name": plan.name, **comparison._asdict(), "runs": listed, FORMER: left}
             _write(self.path / LIST, json.dumps(content, indent=1))
@@ -142,7 +142,7 @@ class StudyFolder:
     def runs(self) -> list[Run]:
         """
         :return: the runs of the plan that was last run there
-        :raises StudyError: there is none, or its list is not what was written
+        :raises StudyError: there is no list of runs, or it is damaged
         """
         content = self._list()
         try:
@@ -151,7 +151,7 @@ class StudyFolder:
             raise StudyError(f"{self.path / LIST} is not what sb3-sample study run has written: {error}") from error
 
     def _former(self) -> list[Run]:
-        """Runs of earlier plans that are not in the last one and whose folders are there still."""
+        """Runs of earlier plans that are not in the last one and whose folders still exist."""
         content = self._list()
         try:
             found = [Run.of_json(run) for run in content.get(FORMER, {}).values()]
@@ -161,8 +161,8 @@ class StudyFolder:
 
     def comparison(self) -> Comparison:
         """
-        :return: how the runs are compared, as the plan says that was last run there
-        :raises StudyError: there is none, or its list is not what was written
+        :return: how the runs are compared, from the plan that was last run there
+        :raises StudyError: there is no list of runs, or it is damaged
         """
         content = self._list()
         found: list[Any] = [content.get(n, {}) if isinstance(content, dict) else None for n in Comparison._fields]
@@ -175,7 +175,7 @@ class StudyFolder:
     def place(self, run: Run) -> Path:
         """
         :param run: a run
-        :return: its folder, as ``sb3-sample train --run-dir`` has it
+        :return: its folder, as for ``sb3-sample train --run-dir``
         """
         return self.path / RUNS / run.name
 
@@ -185,14 +185,14 @@ class StudyFolder:
     def output(self, run: Run) -> Path:
         """
         :param run: a run
-        :return: the file of what its process prints
+        :return: the file of its process's output
         """
         return self._beside(run, ".txt")
 
     def claim(self, run: Run) -> Lock | None:
         """
         :param run: a run
-        :return: its lock; None while another process has it
+        :return: its lock; None while another process holds it
         :raises OSError: the folder has no locks
         """
         path = self._beside(run, ".lock")
@@ -202,7 +202,7 @@ class StudyFolder:
     def holder(self, run: Run) -> str:
         """
         :param run: a run that a process has claimed
-        :return: the process, as it has said
+        :return: the process, as recorded in the lock
         """
         try:
             found = read_regular(self._beside(run, ".lock"), 1000).decode(errors="replace")
@@ -213,17 +213,17 @@ class StudyFolder:
     def is_claimed(self, run: Run) -> bool:
         """
         :param run: a run
-        :return: whether a process has it at present
-        :raises OSError: its lock cannot be read, or the folder has no locks
+        :return: whether a process holds it now
+        :raises OSError: its lock cannot be read, or the folder does not support locks
         """
         return is_taken(self._beside(run, ".lock"))
 
     def outcome(self, run: Run) -> Outcome:
         """
         :param run: a run
-        :return: what became of it so far. A run whose folder was removed is as one that was never made, and so is one
-            that shall have more steps
-        :raises StudyError: the file is not what was written
+        :return: its outcome so far. A run whose folder was removed counts as never made, and so does one that is to
+            have more steps
+        :raises StudyError: its file is damaged
         """
         path = self._beside(run, ".json")
         try:
@@ -242,8 +242,8 @@ class StudyFolder:
     def write_outcome(self, run: Run, outcome: Outcome) -> Outcome:
         """
         :param run: a run that this process has claimed
-        :param outcome: what became of it
-        :return: the same, with machine and time
+        :param outcome: its outcome
+        :return: the outcome with machine and time
         """
         whole = outcome._replace(
             traceback=outcome.traceback[-MAX_TRACEBACK:], host=socket.gethostname(), finished=time.time()
@@ -254,14 +254,14 @@ class StudyFolder:
     def progress(self, run: Run) -> Progress:
         """
         :param run: a run
-        :return: how far it is, by its checkpoints, its log and its evaluations, of which the last counts
+        :return: its progress, from whichever of its checkpoints, log and evaluations is farthest
         """
         folder = self.place(run)
         logged, timed_steps, seconds = _logged(folder / _LOG)
         steps = max(checkpointed(folder), logged)
         try:
             found = read_evaluations(folder / EVALUATIONS)
-        except (OSError, BadFile):  # none so far, or one is being written
+        except (OSError, BadFile):  # no evaluations yet, or a file that is being written
             return Progress(steps, None, timed_steps, seconds)
         steps = max(steps, int(found["timesteps"][-1]))
         return Progress(steps, float(found["results"][-1].mean()), timed_steps, seconds)
@@ -273,8 +273,8 @@ def _are_texts(value: Any) -> bool:
 
 def checkpointed(folder: Path) -> int:
     """
-    :param folder: a run's
-    :return: steps of its newest checkpoint, those on a data set included; 0 without one
+    :param folder: folder of a run
+    :return: steps of its newest checkpoint, including those on a data set; 0 without one
     """
     try:
         names = os.listdir(folder)
@@ -286,7 +286,7 @@ def checkpointed(folder: Path) -> int:
 
 
 def _logged(path: Path) -> tuple[int, int, float]:
-    """Environment steps by the last whole line of a run's log, and steps and seconds by the last that has a time."""
+    """Environment steps in a run's last whole log line, and steps and seconds in the last one with a time."""
     try:
         with path.open("rb") as file:
             file.seek(max(file.seek(0, os.SEEK_END) - TAIL, 0))
@@ -302,7 +302,7 @@ def _logged(path: Path) -> tuple[int, int, float]:
             continue
         if type(steps) is int:
             last = last or steps
-            if type(seconds) in (int, float):  # an evaluation's line has none
+            if type(seconds) in (int, float):  # an evaluation's line has no time
                 return last, steps, seconds
     return last, 0, 0.0
 

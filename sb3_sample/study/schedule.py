@@ -1,10 +1,10 @@
 """
-Running a study: which run is made next, by which process, and what becomes of it.
+Scheduling of a study: the choice of the next run, the process that makes it, and its outcome.
 
-Processes of this machine that make runs (:mod:`sb3_sample.study.worker`) stay for runs that differ in their seed alone,
-so that imports are paid for once; in a Ray cluster (:mod:`sb3_sample.study.cluster`) each run has its own. The
-scheduler holds no locks while they work and reads nothing of theirs but their answers: what is done, failed and claimed
-stands in the folder, so that it may be killed at any moment, and others may work beside it.
+Worker processes of this machine (:mod:`sb3_sample.study.worker`) are reused for runs that differ only in their seed, so
+that imports are paid for once; in a Ray cluster (:mod:`sb3_sample.study.cluster`) each run has its own process. The
+scheduler holds no locks while they work and reads nothing from them except their answers: the folder records which runs
+are done, failed and claimed, so that the scheduler may be killed at any moment, and others may work beside it.
 """
 
 import contextlib
@@ -31,13 +31,13 @@ from sb3_sample.study.states import DONE, FAILED, RUNNING, WAITING, RunStatus, S
 
 #: Command of a process that makes runs, before the study's folder.
 WORKER = (sys.executable, "-c", "from sb3_sample.study.worker import serve; serve()")
-#: Seconds between two looks at what is going on, and at runs that other machines have.
+#: Seconds between two status updates, and between two checks of runs that other machines have.
 REFRESH, ELSEWHERE = 2.0, 5.0
 
 
 class Stopped(Exception):
     """
-    SIGTERM or SIGHUP, raised in the midst of the scheduler's waiting.
+    SIGTERM or SIGHUP, raised while the scheduler waits.
 
     :param number: the signal
     """
@@ -62,32 +62,32 @@ def run(
     worker: Sequence[str] = WORKER,
 ) -> Status:
     """
-    Make all runs of a plan, or go on with them. Finished ones are not made again, interrupted ones go on from
-    their last checkpoint, and failed ones are tried again. Runs that other processes make in the folder are waited for.
+    Make or resume all runs of a plan. Finished runs are not made again, interrupted ones resume from their last
+    checkpoint, and failed ones are tried again. Runs that other processes make in the folder are waited for.
 
     :param plan: a plan or its file
-    :param folder: the study's; ``runs/<name of the plan>`` if None
-    :param workers: processes, each with one run at a time; as many as there are free cores for, if None; in a cluster,
+    :param folder: the study's folder; ``runs/<name of the plan>`` if None
+    :param workers: processes, each with one run at a time; if None, as many as there are free cores for; in a cluster,
         as many as its machines have room for
-    :param retries: how often a run is tried again that fails
+    :param retries: how often a failed run is tried again
     :param threads: of each process
-    :param device: of each run, as ``sb3-sample train --device`` takes it
-    :param ray: a Ray cluster makes the runs: ``"local"`` for one on this machine, ``"auto"`` for the one that this
-        machine is in, else its address; None for processes of this machine without Ray. The folder must be one that all
-        its machines see
-    :param gpus: GPUs of each run, or its share of one, with ``ray`` only
-    :param batch_seeds: whether runs that differ in their seed alone are made together, by one process, where their
-        algorithm can be (docs/many_learners.md); one that has failed is tried again by itself
-    :param show: gets the status, at the beginning, every two seconds and at the end
+    :param device: of each run, as for ``sb3-sample train --device``
+    :param ray: Ray cluster that makes the runs: ``"local"`` for one on this machine, ``"auto"`` for the one of this
+        machine, else its address; None for processes of this machine without Ray. All machines of the cluster must see
+        the folder
+    :param gpus: GPUs of each run, or its share of one; only with ``ray``
+    :param batch_seeds: whether runs that differ only in their seed are made together, by one process, if their
+        algorithm supports it (docs/many_learners.md); a failed run is tried again separately
+    :param show: called with the status, at the beginning, every two seconds and at the end
     :param worker: command of a process that makes runs without Ray, before the study's folder
-    :return: what became of the runs
-    :raises PlanError: the plan cannot be run as it stands; nothing was run
-    :raises StudyError: the folder has runs of other settings, and nothing was changed; or there is no such cluster, or
-        it has no room for a run
-    :raises ImportError: with ``ray``, that is not installed
-    :raises KeyboardInterrupt: after Ctrl-C, when the runs under way have written their checkpoints; a ``Stopped`` after
-        SIGTERM and SIGHUP. A second one leaves at once
-    :raises OSError: the folder cannot be written to, or has no locks
+    :return: final status of the runs
+    :raises PlanError: the plan cannot be run as it is written; nothing was run
+    :raises StudyError: the folder has runs with other settings, and nothing was changed; or there is no such cluster,
+        or it has no room for a run
+    :raises ImportError: ``ray`` is given, and Ray is not installed
+    :raises KeyboardInterrupt: after Ctrl-C, when the current runs have written their checkpoints; a ``Stopped`` after
+        SIGTERM and SIGHUP. A second one exits at once
+    :raises OSError: the folder cannot be written to, or does not support locks
     """
     check_value("retries", retries, integer(0))
     check_value("threads", threads, integer(1))
@@ -112,7 +112,7 @@ def run(
 
 @contextlib.contextmanager
 def _signals() -> Iterator[None]:
-    """Have SIGTERM and SIGHUP raise, as SIGINT does."""
+    """Make SIGTERM and SIGHUP raise, like SIGINT."""
 
     def stop(number: int, frame: Any) -> None:
         raise Stopped(number)
@@ -132,14 +132,14 @@ def _signals() -> Iterator[None]:
 class Worker(Protocol):
     """Maker of one run at a time, or of several together: a process of this machine, or a place in a cluster."""
 
-    #: The runs that it makes at present; none while it is idle.
+    #: The runs that it is making; none while it is idle.
     runs: tuple[Run, ...]
-    #: Of those runs, or of the last ones.
+    #: Kind of these runs, or of the last ones.
     kind: str
 
     def give(self, runs: tuple[Run, ...], options: list[str], threads: int) -> None:
         """
-        :param runs: what it is to make
+        :param runs: runs to make
         :param options: options of ``sb3-sample train``
         :param threads: its threads
         """
@@ -159,13 +159,13 @@ class Worker(Protocol):
         """
 
 
-#: Answers of workers: a list of what became of each run, or that it is to be looked at again; None when the worker has
-#: ended.
+#: Answers of workers: a list with the outcome of each run, or that it has to be looked at again; None when the worker
+#: has ended.
 Events = queue.Queue[tuple[Worker, Any]]
 
 
 class Crew(Protocol):
-    """Where workers come from, for as long as its ``with`` lasts."""
+    """Source of workers, for the duration of its ``with``."""
 
     def __enter__(self) -> Any: ...
 
@@ -178,17 +178,17 @@ class Crew(Protocol):
 
     def hire(self, events: Events) -> Worker:
         """
-        :param events: gets the worker's answers
+        :param events: queue for the worker's answers
         :return: a new one
         """
 
 
 class Processes(contextlib.nullcontext[None]):
     """
-    Workers that are processes of this machine.
+    Crew of workers that are processes of this machine.
 
     :param command: of each
-    :param slots: how many at once
+    :param slots: number at once
     :param threads: of each
     """
 
@@ -204,7 +204,7 @@ class Processes(contextlib.nullcontext[None]):
 
     def hire(self, events: Events) -> "Process":
         """
-        :param events: gets the worker's answers
+        :param events: queue for the worker's answers
         :return: a new one
         """
         return Process(self._command, self._threads, events)
@@ -216,11 +216,11 @@ class Process:
 
     :param command: of the process
     :param threads: its threads
-    :param events: gets its answers, and None when it has ended, each with the worker
+    :param events: queue for its answers, and for None when it has ended, each with the worker
     """
 
     def __init__(self, command: Sequence[str], threads: int, events: Events):
-        # A session of its own: the terminal's Ctrl-C is the scheduler's, which tells its workers.
+        # A separate session: only the scheduler gets the terminal's Ctrl-C, and it tells its workers.
         self.process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
@@ -237,7 +237,7 @@ class Process:
         try:
             with answers:
                 for line in answers:
-                    # A worker that is killed while it answers leaves a last line that is not whole.
+                    # A worker that is killed while it answers leaves an incomplete last line.
                     if line.endswith("\n"):
                         events.put((self, json.loads(line)))
         finally:
@@ -245,13 +245,13 @@ class Process:
 
     def give(self, runs: tuple[Run, ...], options: list[str], threads: int) -> None:
         """
-        :param runs: what it is to make
+        :param runs: runs to make
         :param options: options of ``sb3-sample train``
         :param threads: its threads
         """
         self.runs, self.kind = runs, runs[0].kind
         assert self.process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # it has died: its end is on the way
+        with contextlib.suppress(BrokenPipeError):  # it has died, and the event of its end follows
             print(
                 json.dumps({"runs": [run.as_json() for run in runs], "options": options, "threads": threads}),
                 file=self.process.stdin,
@@ -283,7 +283,7 @@ class Process:
 
 
 def _batches(runs: Sequence[Run]) -> list[tuple[Run, ...]]:
-    """Runs that differ in their seed alone, together where that can be; in the order of the first of each."""
+    """Group runs that differ only in their seed, if they can be made together; in the order of the first of each."""
     from sb3_sample.zoo.runs import can_train_together
 
     found: dict[str, list[Run]] = {}
@@ -296,14 +296,14 @@ def _batches(runs: Sequence[Run]) -> list[tuple[Run, ...]]:
 
 class Scheduler:
     """
-    :param runs: in their order
+    :param runs: runs in their order
     :param folder: the study's
-    :param crew: where workers come from
-    :param retries: how often a run is tried again that fails
+    :param crew: source of workers
+    :param retries: how often a failed run is tried again
     :param threads: of each run
     :param device: of each run
-    :param show: gets the status
-    :param batch_seeds: whether runs that differ in their seed alone are made together
+    :param show: called with the status
+    :param batch_seeds: whether runs that differ only in their seed are made together
     """
 
     def __init__(
@@ -323,9 +323,9 @@ class Scheduler:
         self._events: Events = queue.Queue()
         self._workers: list[Worker] = []
         self._pending: deque[tuple[Run, ...]] = deque()
-        #: By run, when it is looked at again that another process has.
+        #: Runs that other processes have, and when to look at them again, by name.
         self._elsewhere: dict[str, tuple[Run, float]] = {}
-        #: Failed attempts that do not count, since they were made before.
+        #: Failed attempts from before, which do not count.
         self._before: dict[str, int] = {}
         self._states: dict[str, RunStatus] = {}
         self._ended: list[RunStatus] = []
@@ -333,7 +333,7 @@ class Scheduler:
 
     def run(self) -> Status:
         """
-        :return: what became of the runs
+        :return: final status of the runs
         """
         left = []
         for run in self._runs:
@@ -387,7 +387,7 @@ class Scheduler:
             if self._folder.is_claimed(run):
                 self._elsewhere[name] = (run, now + ELSEWHERE)
                 continue
-            # It is done or has failed there, or that process has died.
+            # It is done or has failed there, or the other process has died.
             del self._elsewhere[name]
             self._judge(run, self._folder.outcome(run))
 
@@ -457,7 +457,7 @@ class Scheduler:
     # ------------------------------------------------ the end
 
     def _end(self) -> None:
-        """Have the workers end, after their checkpoints; a second Ctrl-C ends them at once."""
+        """End the workers after their checkpoints; a second Ctrl-C ends them at once."""
         for worker in self._workers:
             worker.leave()
         try:

@@ -1,4 +1,4 @@
-"""States of a study's runs (done, running, failed, waiting), and the time that the rest takes."""
+"""States of a study's runs (done, running, failed, waiting), and the remaining time."""
 
 import datetime
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ class RunStatus(NamedTuple):
     """
     :param run: a run
     :param state: ``"done"``, ``"running"``, ``"failed"`` or ``"waiting"``
-    :param outcome: what became of it so far
+    :param outcome: its outcome so far
     """
 
     run: Run
@@ -26,11 +26,11 @@ class RunStatus(NamedTuple):
 
 class Status:
     """
-    State of a study at one moment.
+    State of a study at a moment.
 
     :param folder: the study's
     :param runs: its runs, in their order
-    :param ended: those of them that have ended since the last time that a scheduler has told of them
+    :param ended: those that have ended since the scheduler's last status
     """
 
     def __init__(self, folder: StudyFolder, runs: list[RunStatus], ended: Sequence[RunStatus] = ()):
@@ -39,7 +39,7 @@ class Status:
     def of(self, state: str) -> list[RunStatus]:
         """
         :param state: one of the four
-        :return: the runs that are in it
+        :return: the runs in this state
         """
         return [each for each in self.runs if each.state == state]
 
@@ -50,12 +50,12 @@ class Status:
 
     @property
     def failures(self) -> dict[str, str]:
-        """By the title of each run that has failed, its traceback."""
+        """Tracebacks of failed runs by their titles."""
         return {each.run.title: each.outcome.traceback for each in self.of(FAILED)}
 
     @property
     def last_return(self) -> tuple[Run, float] | None:
-        """The run that has ended last, and the mean return of its last evaluation; None before the first."""
+        """The run that was completed last, and the mean return of its last evaluation; None before the first."""
         ended = [each for each in self.of(DONE) if each.outcome.last_return is not None]
         if not ended:
             return None
@@ -65,18 +65,17 @@ class Status:
 
     def progress(self) -> list[tuple[Run, Progress]]:
         """
-        :return: how far each run is that is running, by its own files, which are read now
+        :return: progress of each running run, read now from its own files
         """
         return [(each.run, self.folder.progress(each.run)) for each in self.of(RUNNING)]
 
     def seconds_left(self, progress: list[tuple[Run, Progress]]) -> float | None:
         """
-        Estimate how long the rest takes, by the seconds that an environment step took in the runs that are done and,
-        by their logs, in those that are running, of the same agent and task where there are some, and by how many runs
-        go on at once.
+        Estimate the remaining time from the seconds per environment step in finished runs and in the logs of running
+        ones, of the same agent and task if there are any, and from the number of runs at once.
 
         :param progress: of the runs that are running
-        :return: seconds; None while none of them has logged a time and none is done
+        :return: seconds; None while no run is running, or none has logged a time and none is done
         """
         steps, seconds = {"": 0}, {"": 0.0}
         made = [(each.run, each.outcome.steps_made, each.outcome.seconds) for each in self.of(DONE)]
@@ -128,19 +127,19 @@ def _times(number: int) -> str:
 def duration(seconds: float) -> str:
     """
     :param seconds: a time
-    :return: the same as hours, minutes and seconds
+    :return: the time as hours, minutes and seconds
     """
     return str(datetime.timedelta(seconds=round(seconds)))
 
 
 def status(folder: str | Path) -> Status:
     """
-    State of a study, whoever runs it, on whichever machine.
+    Read the state of a study, whichever process or machine runs it.
 
     :param folder: the study's
-    :return: its state. A run is running while a process has claimed it, and has failed if its last attempt did and
-        nobody has it at present
-    :raises StudyError: it is no such folder
+    :return: its state. A run is running while a process has claimed it, and has failed if its last attempt failed and
+        no process has claimed it
+    :raises StudyError: it is not a study's folder
     """
     place = StudyFolder(folder)
     found = []

@@ -1,4 +1,4 @@
-"""Times of BRO's gradient steps on this machine by size of the critics, measured once and kept in the user's cache."""
+"""Times of BRO's gradient steps on this machine by critic size, measured once and stored in the user's cache."""
 
 import dataclasses
 import functools
@@ -25,11 +25,11 @@ from sb3_sample.sac.bro import BRO, MODEL_SIZES
 from sb3_sample.saving.temporary import becoming
 from sb3_sample.saving.training_state import processor
 
-#: Features of an observation and of an action: cheetah-run's.
+#: Dimensions of an observation and of an action, as in cheetah-run.
 OBSERVATION, ACTION = 17, 6
-#: Seconds for which each thing is measured, and those after which a quick measurement ends.
+#: Seconds of each measurement, and of each quick measurement.
 SECONDS, QUICK_SECONDS = 3.0, 1.0
-#: Shapes of the matrix product whose rate a quick measurement takes: critics, rows, features.
+#: Shape of the matrix product that a quick measurement times: critics, rows, features.
 _PRODUCT = (2, 128, 512)
 
 
@@ -42,9 +42,9 @@ class StepTimes:
     :param torch: version
     :param threads: of torch
     :param how: execution of the gradient steps: "compiled", "captured", "eager", or "quick" for an estimate
-    :param gradient_step: by size of the model, drawing of the batch included
-    :param preparation: before the first gradient step, by size of the model: compiling
-    :param acting: of an environment step apart from the environment and from gradient steps
+    :param gradient_step: by size of the model, including the drawing of the batch
+    :param preparation: compile time before the first gradient step, by size of the model
+    :param acting: of an environment step, without the environment itself and gradient steps
     """
 
     processor: str
@@ -57,7 +57,7 @@ class StepTimes:
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """Processor, torch and threads, by which times are kept."""
+        """Processor, torch and threads: the key under which times are stored."""
         return self.processor, self.torch, self.threads
 
     def __str__(self) -> str:
@@ -77,7 +77,7 @@ def _key(threads: int, device: torch.device) -> tuple[str, str, int]:
 
 def cache_file() -> Path:
     """
-    :return: where step times are kept, in ``$XDG_CACHE_HOME`` or ``~/.cache``
+    :return: file of the step times, in ``$XDG_CACHE_HOME`` or ``~/.cache``
     """
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "sb3_sample" / "step_times.json"
 
@@ -102,15 +102,15 @@ def stored(threads: int, device: torch.device | str = "auto") -> StepTimes | Non
     """
     :param threads: of torch
     :param device: a device
-    :return: the times that were kept for this processor, torch and number of threads; None if there are none
-    :raises ValueError: the file that they are kept in is none
+    :return: the times stored for this processor, torch and number of threads; None if there are none
+    :raises ValueError: their file does not hold step times
     """
     return next((each for each in _read() if each.key == _key(threads, get_device(device))), None)
 
 
 def keep(times: StepTimes) -> Path:
     """
-    Keep step times in the place of those of the same processor, torch and number of threads.
+    Store step times, in place of those of the same processor, torch and number of threads.
 
     :param times: of this machine
     :return: the file
@@ -127,7 +127,7 @@ def keep(times: StepTimes) -> Path:
 
 
 class _Shapes(gym.Env):
-    """Environment that has only shapes and takes no time."""
+    """Environment with only shapes, whose steps take no time."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION,), np.float32)
     action_space = spaces.Box(-1, 1, (ACTION,), np.float32)
@@ -147,19 +147,18 @@ def measure(
     say: Callable[[str], None] = lambda _: None,
 ) -> StepTimes:
     """
-    Measure the times of BRO's steps, as long runs take them: compiled where that is possible, some minutes for all
-    sizes.
+    Measure the times of BRO's steps as in long runs: compiled if possible, which takes some minutes for all sizes.
 
-    With ``quick`` nothing is compiled. A compiled step lies between its matrix multiplications, at the rate at which
-    the processor multiplies, and the eager step; their geometric mean stands for it. On the machine of
-    ``docs/performance.md`` that is 4% to 14% below what the compiled steps take.
+    With ``quick`` nothing is compiled. The time of a compiled step lies between that of its matrix multiplications, at
+    the processor's rate of multiplication, and that of the eager step; their geometric mean is the estimate. On the
+    machine of ``docs/performance.md`` it is 4% to 14% below the time of compiled steps.
 
     :param threads: of torch
     :param device: a device
-    :param quick: estimate the compiled steps
-    :param say: gets what is being measured
+    :param quick: whether to estimate the compiled steps
+    :param say: called with a message on each measurement
     :return: the times
-    :raises ValueError: ``quick`` on a GPU, where eager steps say little of captured ones
+    :raises ValueError: ``quick`` on a GPU, where eager steps say little about captured ones
     """
     place = get_device(device)
     if quick and place.type != "cpu":
@@ -179,7 +178,7 @@ def measure(
             if not quick:
                 reason = why_not_compiled(model.learner)
                 how = "compiled" if reason is None else "captured" if place.type == "cuda" else "eager"
-                # Not False, which on a GPU would keep it from being captured.
+                # Not False, which would prevent the capture on a GPU.
                 model = _model(size, place, compile="auto" if reason else True)
             start = time.perf_counter()
             _train(model)
@@ -189,7 +188,7 @@ def measure(
             if quick:
                 with FlopCounterMode(display=False) as counter:
                     _train(model)
-                # Of the time of the multiplications and of the eager step.
+                # Geometric mean of the time of the multiplications and of the eager step.
                 steps[size] = float(np.sqrt(steps[size] * min(counter.get_total_flops() / rate, steps[size])))
         acting = _acting(place, seconds)
     return StepTimes(*_key(threads, place), how, steps, preparation, acting)
@@ -225,7 +224,7 @@ def _train(model: Any) -> None:
 
 
 def _median(call: Callable[[], Any], seconds: float) -> float:
-    """Median time of a call, of at least three."""
+    """Median time of a call, over at least three calls."""
     times: list[float] = []
     until = time.perf_counter() + seconds
     while len(times) < 3 or time.perf_counter() < until:
@@ -236,14 +235,14 @@ def _median(call: Callable[[], Any], seconds: float) -> float:
 
 
 def _rate(seconds: float) -> float:
-    """Floating-point operations a second of a batched matrix product as wide as the critics'."""
+    """Floating-point operations per second of a batched matrix product as wide as the critics'."""
     copies, rows, width = _PRODUCT
     x, w = torch.randn(copies, rows, width), torch.randn(copies, width, width)
     return 2 * copies * rows * width**2 / _median(lambda: torch.bmm(x, w), seconds)
 
 
 def _acting(device: torch.device, seconds: float) -> float:
-    """Time of an environment step of ``learn`` in an environment that takes none, without gradient steps."""
+    """Time of an environment step of ``learn`` in an environment that takes no time, without gradient steps."""
     model = BRO("MlpPolicy", _Shapes(), model_size=next(iter(MODEL_SIZES)), replay_ratio=0, device=device, seed=0,
                 learning_starts=0, buffer_size=20_000)  # fmt: skip
     model.set_logger(Logger(None, []))
@@ -255,7 +254,7 @@ def environment_seconds(env: gym.Env, seconds: float = SECONDS) -> float:
     """
     :param env: an environment
     :param seconds: how long to measure
-    :return: seconds of one of its steps, by random actions, resets included
+    :return: seconds per step with random actions, including resets
     """
     env.action_space.seed(0)
     env.reset(seed=0)

@@ -1,4 +1,4 @@
-"""Callback that measures what an environment step takes, and ends the training when that is known."""
+"""Callback that measures the time of an environment step and then ends the training."""
 
 import json
 import time
@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sample.saving.rings import Ring
 
-#: Turns after the first gradient steps that are not counted: what is compiled or allocated once falls into them.
+#: Turns after the first gradient steps that are not counted, since one-time compiling and allocation falls into them.
 SKIPPED = 5
 #: Rows of the replay buffer whose bytes are counted.
 _ROWS = 100
@@ -17,10 +17,10 @@ _ROWS = 100
 
 class Stopwatch(BaseCallback):
     """
-    Measure the time between the beginnings of turns (collect, then learn), from some turns after the first gradient
-    steps on.
+    Measure the time between the starts of turns (collect, then learn), beginning some turns after the first gradient
+    steps.
 
-    :param path: gets what was measured, as JSON: "steps", their "seconds", and "bytes_of_step", of the replay buffer in
+    :param path: JSON file for the results: "steps", their "seconds", and "bytes_of_step", of the replay buffer in
         checkpoints
     :param seconds: how long to measure; at least one turn, and at most the run
     """
@@ -42,7 +42,7 @@ class Stopwatch(BaseCallback):
         if self._first is None:
             if self.model._n_updates == 0:
                 return
-            # A turn of PPO is as long as hundreds of SAC's.
+            # A turn of PPO takes as long as hundreds of SAC's.
             if self._turns == (0 if hasattr(self.model, "rollout_buffer") else SKIPPED):
                 self._first = (self.num_timesteps, now)
             self._turns += 1
@@ -56,13 +56,13 @@ class Stopwatch(BaseCallback):
             return
         steps, seconds = self._last[0] - self._first[0], self._last[1] - self._first[1]
         if steps:
-            # A data set is not the run's to save.
+            # A data set is not saved with the run.
             buffer = getattr(self.model, "replay_buffer", None) if self._collects else None
             found = {"steps": steps, "seconds": seconds, "bytes_of_step": 0.0 if buffer is None else _bytes(buffer)}
             Path(self.path).write_text(json.dumps(found))
 
     def _on_training_end(self) -> None:
-        if not Path(self.path).exists():  # a run that is shorter
+        if not Path(self.path).exists():  # the run was shorter than the measurement
             self._write()
 
     def _on_step(self) -> bool:

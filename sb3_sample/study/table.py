@@ -1,8 +1,8 @@
 """
-One table of many runs: one row a run, step and metric.
+One table of many runs, with one row per run, step and metric.
 
 Columns (:data:`COLUMNS`): ``agent``; ``arguments``, its hyperparameters as JSON with sorted names; ``task``, an
-environment's id; ``seed``; ``step``, in steps of the simulator whatever the action repeat; ``metric``; ``value``.
+environment's id; ``seed``; ``step``, in simulator steps regardless of the action repeat; ``metric``; ``value``.
 """
 
 import fnmatch
@@ -26,29 +26,29 @@ from sb3_sample.study.runs import FORMER, LIST, MAX_LIST
 from sb3_sample.warn import warn
 
 COLUMNS = ["agent", "arguments", "task", "seed", "step", "metric", "value"]
-#: Columns that make a run.
+#: Columns that identify a run.
 RUN = ["agent", "arguments", "task", "seed"]
-#: The metrics that are read unless others are asked for. Patterns as of file names.
+#: Metrics read by default, as patterns like those of file names.
 METRICS = ("return", "success_rate", "hours", "diagnostics/*")
-#: Every seed of the authors' runs of BRO and BRO Fast on their 40 tasks.
+#: All seeds of the authors' runs of BRO and BRO Fast on their 40 tasks.
 SEEDS = DATA.parent / "published_seeds.npz"
-#: Statistics of a published curve, as the metrics ``return/mean``, ... of the table.
+#: Statistics of a published curve, as metrics ``return/mean``, ... in the table.
 STATISTICS = ("mean", "std", "min", "max", "iqm", "n_seeds")
 
 _EVALUATED = {"return": "results", "success_rate": "successes", "episode_length": "ep_lengths"}
 _MONITORED = {"return": "r", "success_rate": "is_success", "episode_length": "l"}
-#: Those of the training episodes, beside evaluations.
+#: Metrics of the training episodes, besides evaluations.
 ONLINE = {f"online_{metric}": _MONITORED[metric] for metric in ("return", "success_rate")}
 _LOG = "progress.jsonl"
 _SECONDS = "time/time_elapsed"
-#: A line of the log, as far as the time.
+#: A line of the log, up to the time.
 _TIMED = re.compile(rb'\{"step": (\d{1,15}), [^\n]*?"time/time_elapsed": (\d{1,15}(?:\.\d+)?)[,}]')
-#: Bytes of a run's log.
+#: Most bytes of a run's log.
 _MAX_LOG = 256 * 2**20
 
 
 class _Rows:
-    """A table in the making: a block of rows for each metric of each run."""
+    """Builder of a table: a block of rows for each metric of each run."""
 
     def __init__(self) -> None:
         self._heads: list[tuple[Any, ...]] = []
@@ -80,7 +80,7 @@ class _Rows:
 def to_json(arguments: Mapping[str, Any]) -> str:
     """
     :param arguments: plain values by name
-    :return: the text of them in the table
+    :return: their text in the table
     """
     return json.dumps(arguments, sort_keys=True)
 
@@ -90,25 +90,25 @@ def to_json(arguments: Mapping[str, Any]) -> str:
 
 def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = METRICS) -> pd.DataFrame:
     """
-    The table of runs: of this package (``--run-dir``), of the zoo, and of folders with Monitor files only.
+    Read the table of runs: of this package (``--run-dir``), of the zoo, and of folders with only Monitor files.
 
-    A run's values are those of its evaluations, the mean over the episodes of each. A run without evaluations has its
-    training episodes instead, a row an episode, at the step at which it ended; a warning says so. One of a study whose
-    other runs have evaluations is before its first, and has none of these values. One under way whose evaluations are
-    truncated, since it is just writing them, is left out with a warning. ``hours`` is the time that the run had taken,
-    and ``diagnostics/...`` what it has logged of itself.
+    A run's values are from its evaluations, each averaged over its episodes. A run without evaluations has its training
+    episodes instead, one row per episode, at the step at which it ended; a warning says so. If other runs of its study
+    have evaluations, it has not reached its first one, and has none of these values. A run in progress whose
+    evaluations are truncated, since they are just being written, is left out with a warning. ``hours`` is the time that
+    the run had taken, and ``diagnostics/...`` are its logged diagnostics.
 
     :param sources: folders of runs, or folders with runs at any depth, or tables as :func:`write` writes them.
-        ``"LABEL=FOLDER"`` names the agent; else it has the name of the study's plan or, outside of a study, of its
-        algorithm or, where no file says that, of the folder above the run's
+        ``"LABEL=FOLDER"`` names the agent; else its name is that in the study's plan or, outside a study, that of its
+        algorithm or, if no file gives it, that of the folder above the run's
     :param metrics: patterns of the metrics to keep: "return", "success_rate", "episode_length", "hours",
-        "online_return" and "online_success_rate" (the training episodes, which explore, also of runs with evaluations)
-        and whatever ``progress.jsonl`` has, e.g. "train/*"
-    :return: columns :data:`COLUMNS`, in the order of the sources. Runs that were taken out of their study's plan are
-        left out, with a warning. Where a run's files do not say its seed, it is its
-        number among the runs of that agent and task, from 0 on
-    :raises ValueError: there is no run in a source, a file is damaged, a run does not say its task, or two runs have
-        the same agent, arguments, task and seed
+        "online_return" and "online_success_rate" (of the training episodes, which explore, even for runs with
+        evaluations) and all entries of ``progress.jsonl``, e.g. "train/*"
+    :return: columns :data:`COLUMNS`, in the order of the sources. Runs that were removed from their study's plan are
+        left out, with a warning. If a run's files do not give its seed, its number among the runs of that agent and
+        task is used, from 0 on
+    :raises ValueError: there is no run in a source, a file is damaged, a run's task is unknown, or two runs have the
+        same agent, arguments, task and seed
     :raises OSError: if a file cannot be read
     """
     given = [sources] if isinstance(sources, (str, Path)) else list(sources)
@@ -193,10 +193,10 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
 
 class _List(NamedTuple):
     """
-    What is read of a study's list of runs.
+    The needed part of a study's list of runs.
 
     :param agents: agents by the beginning of their folders' names
-    :param former: names of runs that were taken out of the plan: they may have been made with other settings
+    :param former: names of runs that were removed from the plan; they may have been made with other settings
     """
 
     agents: dict[str, str]
@@ -206,7 +206,7 @@ class _List(NamedTuple):
 def _agent_of_study(folder: Path, study: Path | None, listed: Callable[[Path], _List]) -> str | None:
     """
     :param folder: of a run
-    :param study: that it is in, if it is in one
+    :param study: folder of its study, if it is in one
     :param listed: reads the list of a study
     :return: the agent's name in the plan; None outside of a study
     """
@@ -241,7 +241,7 @@ def labelled(source: str | Path) -> tuple[str | None, Path]:
 
 
 def _measured(folder: Path, run: RunSettings, metrics: Sequence[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Simulator steps and values of a run by metric. Each of its files is read once, and only if it is needed."""
+    """Simulator steps and values of a run by metric. Each of its files is read at most once, and only if needed."""
     found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     monitored: pd.DataFrame | None = None
     if (folder / EVALUATIONS).exists():
@@ -264,7 +264,7 @@ def _measured(folder: Path, run: RunSettings, metrics: Sequence[str]) -> dict[st
                 found[metric] = ended, monitored[column].to_numpy(float)
     if "episode_length" in found:
         found["episode_length"] = (steps, found["episode_length"][1] * run.repeat)
-    # A run that learned from data first has their log apart, and a clock that began anew afterwards.
+    # A run that learned from data first has a separate log of that phase, and a clock that restarted afterwards.
     before = folder / OFFLINE / _LOG
     logged = _logged(before, run.repeat * run.skip, metrics) if before.exists() else {}
     online = _logged(folder / _LOG, run.repeat * run.skip, metrics)
@@ -290,8 +290,8 @@ def _matches(metric: str, patterns: Sequence[str]) -> bool:
 
 def _hours(logged: np.ndarray, seconds: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Hours at the steps of the evaluations. Those after the last time that was logged, one log's interval at most, are
-    reached at the run's mean speed.
+    Hours at the steps of the evaluations. After the last logged time, at most one log interval, the run's mean speed is
+    assumed.
     """
     logged, seconds = np.append(0, logged), np.append(0.0, seconds)
     hours = np.interp(steps, logged, seconds)
@@ -302,14 +302,14 @@ def _hours(logged: np.ndarray, seconds: np.ndarray, steps: np.ndarray) -> tuple[
 
 
 def _logged(path: Path, repeat: int, metrics: Sequence[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Values of the lines of a log, by name, and ``_SECONDS``. A last line that is not whole is left out."""
+    """Values of the lines of a log, by name, and ``_SECONDS``. An incomplete last line is left out."""
     values: dict[str, dict[int, float]] = {}
     try:
         data = read_regular(path, _MAX_LOG)
     except FileNotFoundError:
         return {}
     kept = functools.cache(lambda name: name == _SECONDS or _matches(name, metrics))
-    # Most lines have nothing of what is asked for but the time, and parsing takes most of the reading.
+    # Most lines have none of the requested metrics except the time, and parsing takes most of the reading time.
     beginnings = {b'"' + re.split(r"[*?[]", pattern)[0].encode() for pattern in metrics}
     beginnings = {beginning for beginning in beginnings if beginning in data}
     for number, text in enumerate(data.splitlines(keepends=True), 1):
@@ -337,13 +337,12 @@ def _logged(path: Path, repeat: int, metrics: Sequence[str]) -> dict[str, tuple[
 
 def published_runs(agents: Sequence[str] | None = None, tasks: Sequence[str] | None = None) -> pd.DataFrame:
     """
-    Every seed of published runs: BRO and BRO Fast on BRO's 40 tasks, ten seeds, 40 evaluations to a million steps
+    Read all seeds of published runs: BRO and BRO Fast on BRO's 40 tasks, ten seeds, 40 evaluations to a million steps
     (naumix/BiggerRegularizedOptimistic, MIT; ``data/README.md``).
 
-    Meta-World's are of the v2 tasks, under the ids of v3.
+    Meta-World's runs are of the v2 tasks, under the ids of v3.
 
-    :param agents: names, as "BRO" or "BRO (RR=10)"; all if None. The table has them as they were asked for, without
-        brackets
+    :param agents: names, as "BRO" or "BRO (RR=10)"; all if None. The table has them as given, without brackets
     :param tasks: ids of environments; all if None
     :return: columns :data:`COLUMNS`
     :raises ValueError: there are no runs of that name or task
@@ -370,20 +369,20 @@ def published_runs(agents: Sequence[str] | None = None, tasks: Sequence[str] | N
 
 def marked_published(agents: Iterable[str]) -> list[str]:
     """
-    :param agents: names of agents that others have measured, which may be those of one's own
-    :return: names that say so
+    :param agents: names of agents that others have measured, which may equal names of the user's agents
+    :return: names marked as published
     """
     return [name if "published" in name.lower() else f"{name}, published" for name in agents]
 
 
 def published_curves(agents: Sequence[str] | None = None, tasks: Sequence[str] | None = None) -> pd.DataFrame:
     """
-    The published curves, of which only statistics over the seeds are there: metrics ``return/mean``, ``return/iqm``,
-    ... or ``success_rate/mean``, ..., so that none is taken for a run (:data:`STATISTICS`), and no seed.
+    Read the published curves, available only as statistics over the seeds: metrics ``return/mean``, ``return/iqm``, ...
+    or ``success_rate/mean``, ... (:data:`STATISTICS`) and no seed, so that none is taken for a run.
 
-    :param agents: names, as of ``sb3-sample plot --published``; all if None. The table has a name as it was asked for,
-        without brackets, where it is one algorithm's, and the whole names where it is those of several
-    :param tasks: ids of environments, which the table has as they are asked for; all if None
+    :param agents: names, as for ``sb3-sample plot --published``; all if None. The table has a name as given, without
+        brackets, if it is that of one algorithm, and the full names if it is that of several
+    :param tasks: ids of environments, which the table has as given; all if None
     :return: columns :data:`COLUMNS`
     :raises ValueError: there are no curves of that name or task
     """
@@ -410,7 +409,7 @@ def _bare(name: str) -> str:
 
 
 def _chosen_tasks(tasks: Sequence[str] | None, available: set[tuple[str, str]]) -> dict[tuple[str, str], list[str]]:
-    """The ids of the table by suite and task of what is published."""
+    """Ids for the table by published suite and task."""
     if tasks is None:
         return {key: [published_id(*key)] for key in available}
     chosen: dict[tuple[str, str], list[str]] = {}
@@ -427,9 +426,9 @@ def _chosen_tasks(tasks: Sequence[str] | None, available: set[tuple[str, str]]) 
 
 def write(table: pd.DataFrame, path: str | Path) -> None:
     """
-    :param table: any
+    :param table: any table
     :param path: .csv, which keeps every digit, or .parquet
-    :raises ValueError: it has another ending
+    :raises ValueError: the path has another ending
     :raises ImportError: .parquet without pyarrow
     """
     path = Path(path)
@@ -446,8 +445,8 @@ def write(table: pd.DataFrame, path: str | Path) -> None:
 def load(path: str | Path) -> pd.DataFrame:
     """
     :param path: of a table of runs, as :func:`write` writes it
-    :return: the table, of columns :data:`COLUMNS`
-    :raises ValueError: it is none
+    :return: the table, with columns :data:`COLUMNS`
+    :raises ValueError: it is not a table of runs
     :raises ImportError: .parquet without pyarrow
     """
     path = Path(path)

@@ -1,4 +1,4 @@
-"""Agents of a plan made on trial: their arguments, whether these go together, and whether they can act in a task."""
+"""Trial construction of a plan's agents: checks their arguments together, and whether they can act in a task."""
 
 import contextlib
 import functools
@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_sample.warn import warn
 
-#: Arguments of the constructors that are the run's, not the agent's; ``frame_stack`` is the zoo's VecFrameStack.
+#: Arguments of the constructors that belong to the run, not the agent; ``frame_stack`` is the zoo's VecFrameStack.
 NOT_OF_AGENTS = {
     "_init_setup_model", "action_space", "device", "env", "frame_stack", "observation_space", "prior_data", "seed",
     "tensorboard_log", "verbose",
@@ -20,7 +20,7 @@ NOT_OF_AGENTS = {
 
 
 def algorithms() -> dict[str, Any]:
-    """The algorithms by their names. Imported here: a study that is only looked at needs no zoo."""
+    """Algorithms by name. Imported here, since reading a study does not need the zoo."""
     from sb3_sample.zoo import ALGORITHMS
 
     return ALGORITHMS
@@ -38,8 +38,8 @@ def constructor_arguments(algo: str) -> dict[str, Any]:
 def constructor_value(name: str, value: Any) -> Any:
     """
     :param name: of an argument
-    :param value: as a plan has it
-    :return: the value for the constructor: a replay buffer of this package by its name, all else as it is
+    :param value: its value in a plan
+    :return: the value for the constructor: the class for a name of this package's replay buffers, all else unchanged
     """
     from sb3_sample.zoo.algorithms import BUFFERS
 
@@ -48,14 +48,14 @@ def constructor_value(name: str, value: Any) -> Any:
 
 def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | None" = None) -> "spaces.Space[Any]":
     """
-    Make an agent, on a small task and with the settings of ``hyperparams/<algo>.yml``, to have its arguments checked
-    together.
+    Make an agent, on a small task and with the settings of ``hyperparams/<algo>.yml``, so that its arguments are
+    checked together.
 
     :param algo: its algorithm
-    :param arguments: its arguments; the observations of the task are those that ``policy`` is for
-    :param actions: action space of the task; None: one that the agent is for
+    :param arguments: its arguments; the observations of the task are chosen for ``policy``
+    :param actions: action space of the task; None: one that the agent supports
     :return: action space of the agent that was made
-    :raises ValueError: they do not go together, or one is out of range; a ``TypeError`` where they are of another kind
+    :raises ValueError: they contradict each other, or one is out of range; a ``TypeError`` if they are of another kind
     """
     from rl_zoo3.exp_manager import ExperimentManager
 
@@ -68,7 +68,7 @@ def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | Non
     algorithm: Any = algorithms()[algo].algorithm
     policy = settings.setdefault("policy", "MlpPolicy" if "MlpPolicy" in algorithm.policy_aliases else "CnnPolicy")
     if policy == "CnnPolicy" and "buffer_size" in known:
-        settings["buffer_size"] = 1_000  # pictures, of which hardly anything is stored here
+        settings["buffer_size"] = 1_000  # images, hardly any of which are stored here
     observations = _observations(algo, policy)
     errors: list[Exception] = []
     for space in _USUAL_ACTIONS if actions is None else [actions]:
@@ -78,14 +78,14 @@ def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | Non
             return space
         except (ValueError, TypeError, AssertionError) as error:
             errors.append(error)
-    # All actions of a discrete space, say, are only there where actions are discrete.
+    # For example, "all actions of a discrete space" exists only with discrete actions.
     raise errors[-1 if _is_for_games(algo) else 0]
 
 
 class _TrialEnv(gym.Env[Any, Any]):
     """
-    Environment of given spaces in which nothing happens. One that can be reset, copied and restored: ``RewoundPPO``
-    tries that when it is made.
+    Environment of given spaces in which nothing happens. It can be reset, copied and restored, which ``RewoundPPO``
+    checks at construction.
 
     :param observation_space: observation space
     :param action_space: action space
@@ -103,12 +103,12 @@ class _TrialEnv(gym.Env[Any, Any]):
         return self._observation, 0.0, False, False, {}
 
 
-#: Small action spaces, for one of which each algorithm is.
+#: Small action spaces, one of which each algorithm supports.
 _USUAL_ACTIONS: "list[spaces.Space[Any]]" = [spaces.Box(-1, 1, (1,), np.float32), spaces.Discrete(3)]
 
 
 def _is_for_games(algo: str) -> bool:
-    """Check whether an algorithm is for Atari's games alone."""
+    """Check whether an algorithm is only for Atari's games."""
     algorithm: Any = algorithms()[algo].algorithm
     return "MlpPolicy" not in algorithm.policy_aliases and not hasattr(algorithm, "learn_offline")
 
@@ -122,7 +122,8 @@ def _observations(algo: str, policy: str) -> "spaces.Space[Any]":
 
 def action_space(task: str, env_kwargs: dict[str, Any]) -> "spaces.Space[Any] | None":
     """
-    Look up the action space of a task, which is made for that, unless it is of this package: bounded numbers.
+    Look up the action space of a task. The task is made for this, unless it is of this package, where actions are
+    bounded numbers.
 
     :param task: id of the environment, which is registered
     :param env_kwargs: its arguments
@@ -132,7 +133,7 @@ def action_space(task: str, env_kwargs: dict[str, Any]) -> "spaces.Space[Any] | 
         return spaces.Box(-1, 1, (1,), np.float32)
     try:
         env = gym.make(task, **env_kwargs)
-    except Exception as error:  # its own code; the run that meets it again says so
+    except Exception as error:  # the task's code may raise anything; the run will report it
         warn(f"{task} cannot be made here, so that nothing is known of its actions before the runs: {error}")
         return None
     with contextlib.suppress(Exception):
@@ -144,13 +145,13 @@ def why_not_acting(
     algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any]", made_on: "spaces.Space[Any]"
 ) -> str | None:
     """
-    Find why an agent does not take an action space.
+    Find why an agent does not support an action space.
 
     :param algo: its algorithm
     :param arguments: its arguments
     :param actions: action space of the task
-    :param made_on: one on which it could be made
-    :return: the reason; None if it takes them
+    :param made_on: action space on which it could be made
+    :return: the reason; None if it supports them
     """
     if isinstance(actions, type(made_on)) and _is_plain(actions):
         return None

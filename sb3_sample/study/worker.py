@@ -1,10 +1,10 @@
 """
-The process that makes runs, started by the scheduler with the study's folder as its argument.
+Process that makes runs, started by the scheduler with the study's folder as its argument.
 
-It takes one order after the other, as lines of JSON on its standard input, and answers each with a line on its standard
-output. An order is of one run, or of several that are made together. The output of a run goes to a file of its own.
-When the input ends, because the scheduler has nothing more or is gone, it stops: a training under way finishes its turn
-and writes a checkpoint, as after SIGTERM.
+It takes one order after another, as lines of JSON on its standard input, and answers each with a line on its standard
+output. An order is for one run, or for several that are made together. The output of a run goes to a separate file.
+When the input ends, because the scheduler has no more runs or is gone, the process stops: a running training finishes
+its current iteration and writes a checkpoint, as after SIGTERM.
 """
 
 import contextlib
@@ -28,20 +28,20 @@ from sb3_sample.study.runs import Outcome, StudyFolder, checkpointed, this_proce
 
 #: Makes a run: the run, its folder, and options of ``sb3-sample train``.
 Train = Callable[[Run, Path, list[str]], None]
-#: Exit code of a process that SIGTERM has ended in an orderly way.
+#: Exit code of a process that ended in an orderly way after SIGTERM.
 TERMINATED = 128 + signal.SIGTERM
-#: Answer of a process that has not made a run to its end: it is to be looked at again.
+#: Answer of a process that has not completed a run, which has to be looked at again.
 TAKEN = {"taken": True}
 
 
 def train(run: Run, folder: Path, options: list[str]) -> None:
     """
-    Make a run as ``sb3-sample train`` does.
+    Make a run like ``sb3-sample train``.
 
     :param run: the run
     :param folder: its folder
     :param options: more options
-    :raises Exception: whatever keeps the run from being made
+    :raises Exception: any error that makes the run fail
     """
     with training() as make:
         make(run, folder, options)
@@ -50,7 +50,7 @@ def train(run: Run, folder: Path, options: list[str]) -> None:
 @contextlib.contextmanager
 def training() -> Iterator[Train]:
     """
-    :return: makes a run as ``sb3-sample train`` does. Trainings in lockstep call it at the same time
+    :return: function that makes a run like ``sb3-sample train``. Trainings in lockstep call it concurrently
     """
     from sb3_sample import zoo
     from sb3_sample.zoo import runs
@@ -72,23 +72,23 @@ def serve(make: Train = train) -> None:
     """
     Make runs until the standard input ends.
 
-    :param make: makes one
+    :param make: function that makes a run
     """
     folder = StudyFolder(sys.argv[1])
-    # The terminal's Ctrl-C is the scheduler's to answer.
+    # Only the scheduler handles the terminal's Ctrl-C.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with os.fdopen(os.dup(sys.stdout.fileno()), "w") as replies:
         nothing = os.open(os.devnull, os.O_RDWR)
         os.dup2(nothing, sys.stdout.fileno())
         os.close(nothing)
         orders: queue.Queue[dict[str, Any] | None] = queue.Queue()
-        # Not sys.stdin, which could not be closed while a thread reads it.
+        # Not sys.stdin, which cannot be closed while a thread reads it.
         orders_file = os.fdopen(os.dup(sys.stdin.fileno()), "rb")
         threading.Thread(target=_listen, args=(orders_file, orders), daemon=True).start()
         n_made = 0
         while (order := orders.get()) is not None:
             if n_made < 2:
-                # Imported modules stay, those of the zoo too, which the first run imports: looking through all of it
+                # Imported modules stay, including the zoo's, which the first run imports: collecting over all of them
                 # after each run would take a quarter of a second.
                 gc.collect()
                 gc.freeze()
@@ -98,14 +98,14 @@ def serve(make: Train = train) -> None:
             reply = [TAKEN if outcome is None else outcome._asdict() for outcome in outcomes]
             print(json.dumps(reply), file=replies, flush=True)
             if any(outcome is not None and outcome.traceback for outcome in outcomes):
-                return  # what a failed run leaves in the process is not known
+                return  # a failed run leaves the process in an unknown state
 
 
 def _listen(file: IO[bytes], orders: "queue.Queue[dict[str, Any] | None]") -> None:
     for line in file:
         orders.put(json.loads(line))
     orders.put(None)
-    # A training finishes its turn and saves; whatever else is under way ends here.
+    # A training finishes its current iteration and saves; anything else ends here.
     os.kill(os.getpid(), signal.SIGTERM)
 
 
@@ -119,8 +119,8 @@ def attempt_all(
     :param runs: some of its runs, which differ in their seeds
     :param options: options of ``sb3-sample train``
     :param threads: of this process, for the record
-    :param make: makes a run that is alone
-    :return: what became of each; None of those that another process has
+    :param make: function that makes a single run
+    :return: outcome of each; None for runs that another process has
     :raises SystemExit: after SIGTERM, when the runs have written their checkpoints; a ``KeyboardInterrupt`` after
         SIGINT
     :raises OSError: if the folder cannot be written to, or has no locks
@@ -131,7 +131,7 @@ def attempt_all(
     from sb3_sample.sac.many import train_together
 
     outcomes: dict[str, Outcome | None] = {}
-    # Taken once, since each training begins while another's streams are in force.
+    # Saved once, since each training begins while another's streams are in place.
     with training() as make, _streams_in_force() as before:
 
         def body(run: Run) -> None:
@@ -141,7 +141,7 @@ def attempt_all(
         try:
             train_together(seats, folder.path)
         except Exception:
-            # Reasons not to make them together are in the outcome of each.
+            # The outcome of each run has the reason why they were not made together.
             if outcomes.keys() != {run.name for run in runs}:
                 raise
     return [outcomes[run.name] for run in runs]
@@ -156,15 +156,15 @@ def attempt(
     before: Sequence[int] | None = None,
 ) -> Outcome | None:
     """
-    Make a run in this process, or go on with it, and write down what became of it.
+    Make or resume a run in this process, and record its outcome.
 
     :param folder: the study's
     :param run: one of its runs
     :param options: options of ``sb3-sample train``
     :param threads: of this process, for the record
     :param make: makes a run
-    :param before: descriptors to which standard output and error go when it has ended; None: to where they go now
-    :return: what became of it; None if another process has it
+    :param before: descriptors to restore for standard output and error when it has ended; None: the current ones
+    :return: its outcome; None if another process has it
     :raises SystemExit: after SIGTERM, when the run has written its checkpoint; a ``KeyboardInterrupt`` after SIGINT
     :raises OSError: if the folder cannot be written to, or has no locks
     """
@@ -174,7 +174,7 @@ def attempt(
     with lock:
         lock.write(this_process())
         earlier = folder.outcome(run)
-        if earlier.done:  # by another process, since this one has looked
+        if earlier.done:  # by another process in the meantime
             return earlier
         place, start = folder.place(run), time.monotonic()
         first = checkpointed(place)
@@ -188,7 +188,7 @@ def attempt(
                 text = traceback.format_exc()
                 print(text, file=sys.stderr)
                 outcome = outcome._replace(attempts=earlier.attempts + 1, traceback=text)
-        gc.collect()  # networks and environments are in circles
+        gc.collect()  # networks and environments are in reference cycles
         progress = folder.progress(run)
         outcome = outcome._replace(
             done=not outcome.traceback,
@@ -202,7 +202,7 @@ def attempt(
 
 @contextlib.contextmanager
 def _streams_in_force() -> Iterator[list[int]]:
-    """Descriptors to which standard output and error go at present."""
+    """Copies of the current descriptors of standard output and error."""
     descriptors = [os.dup(stream.fileno()) for stream in (sys.stdout, sys.stderr)]
     try:
         yield descriptors
@@ -212,7 +212,7 @@ def _streams_in_force() -> Iterator[list[int]]:
 
 
 def _switch(descriptors: Sequence[int]) -> None:
-    """Have standard output and error go to descriptors."""
+    """Redirect standard output and error to descriptors."""
     for stream, descriptor in zip((sys.stdout, sys.stderr), descriptors, strict=True):
         stream.flush()
         os.dup2(descriptor, stream.fileno())
@@ -221,8 +221,8 @@ def _switch(descriptors: Sequence[int]) -> None:
 @contextlib.contextmanager
 def _printing_to(path: Path, before: Sequence[int] | None = None) -> Iterator[None]:
     """
-    Have a file take what this process and those that it starts print, after what it has. Of trainings in lockstep each
-    has its own, whenever it is its turn; ``before`` is then what was in force when none of them had begun.
+    Append the output of this process and of those that it starts to a file. Each of several trainings in lockstep has
+    its own file during its turns; ``before`` are then the descriptors from before any of them began.
     """
     with contextlib.ExitStack() as stack:
         before = stack.enter_context(_streams_in_force()) if before is None else before

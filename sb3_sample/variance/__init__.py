@@ -1,6 +1,6 @@
 """
-The variance of policy gradients, as the MBMA paper (Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011) takes it
-apart: whether more actions at each state or a longer trajectory lower it more, and what simulated samples cost in bias.
+Variance of policy gradients, decomposed as in the MBMA paper (Nauman and Cygan 2023, https://arxiv.org/abs/2210.13011):
+whether more actions at each state or a longer trajectory lower it more, and how much bias simulated samples cause.
 """
 
 from sb3_sample.envs.states import EnvState, check_restorable, restore_state, save_state

@@ -1,6 +1,6 @@
 """
-Bias and variance of policy gradients that see simulated samples, relative to the gradient's size (MBMA, appendix B
-and table 3). M estimates of each method, P parameters of the policy that its actions depend on.
+Bias and variance of policy gradients from simulated samples, relative to the gradient's size (MBMA, appendix B and
+table 3). M estimates of each method, P policy parameters that the actions depend on.
 """
 
 import copy
@@ -21,7 +21,7 @@ from sb3_sample.variance.estimate import Interval, check_counts, jackknife, seed
 from sb3_sample.variance.returns import Agent
 
 R = TypeVar("R")
-#: Given a rollout, an estimate of the gradient, (P,).
+#: Estimates the gradient, (P,), from a rollout.
 Estimator = Callable[[R], np.ndarray]
 #: The method without simulated samples, whose gradient has no bias: the actor-critic (AC) of the MBMA paper's tables.
 ORACLE = "PPO"
@@ -32,11 +32,11 @@ class GradientSamples:
     """
     Estimates of one policy's gradient by several methods, each from the same M rollouts.
 
-    ``relative_bias`` and ``relative_variance`` are those of MBMA, appendix B, "Table 3": means over the parameters of
-    ratios to the method's own mean gradient, parameter by parameter. Where the mean of a parameter's gradient is close
-    to 0 its ratio is huge, and the noise of the means counts as bias: a method without bias has a ``relative_bias``
-    that only vanishes as M grows (``noise_floor`` says how large). ``bias`` and ``variance`` are of the gradient as a
-    whole, with that noise taken off, so that they do not depend on M.
+    ``relative_bias`` and ``relative_variance`` are as in MBMA, appendix B, "Table 3": means over the parameters of each
+    parameter's ratio to the method's own mean gradient. If the mean of a parameter's gradient is close to 0, its ratio
+    is huge, and the noise of the means counts as bias: the ``relative_bias`` of an unbiased method vanishes only as M
+    grows (``noise_floor`` gives its size). ``bias`` and ``variance`` are of the gradient as a whole, with that noise
+    subtracted, so that they do not depend on M.
 
     :param gradients: by method, (M, P) each
     :param oracle: the method that is taken to be without bias
@@ -75,8 +75,8 @@ class GradientSamples:
 
     def noise_floor(self) -> float:
         """
-        :return: ``relative_bias`` of a half of the oracle's estimates against the other half: what a method without
-            bias would get, whose estimates were independent and half as many
+        :return: ``relative_bias`` of one half of the oracle's estimates against the other half: the value of an
+            unbiased method with independent and half as many estimates
         """
         half = self.n_estimates // 2
         gradients = self.gradients[self.oracle]
@@ -114,7 +114,7 @@ class GradientSamples:
         :param second: another
         :param confidence: of the interval
         :return: the first one's minus the second one's, by the jackknife
-        :raises ValueError: ``quantity`` is none of them, or M is below 5, so that too few are left without one
+        :raises ValueError: ``quantity`` is none of these, or M is below 5, too few for leaving one out
         """
         if quantity not in ("bias", "variance", "relative_bias", "relative_variance"):
             raise ValueError(
@@ -145,7 +145,7 @@ def sample_gradients(
 ) -> GradientSamples:
     """
     :param rollouts: M independent rollouts of one policy
-    :param estimators: by the names of the methods, each called with every rollout
+    :param estimators: estimators by name of the method, each called with every rollout
     :param oracle: the method that is taken to be without bias
     :return: their gradients
     """
@@ -158,12 +158,12 @@ def sample_gradients(
 
 def policy_gradient(model: SimulatedPPO, rollout: Rollout, samples: SimulatedSamples | None = None) -> np.ndarray:
     """
-    The gradient of PPO's policy objective at the policy that has collected the rollout, where all probability ratios
-    are 1 and nothing is clipped: the mean of advantage times score, over real and simulated samples.
+    Gradient of PPO's policy objective at the policy that collected the rollout, where all probability ratios are 1 and
+    nothing is clipped: the mean of advantage times score over real and simulated samples.
 
-    :param model: its policy
+    :param model: model whose policy is differentiated
     :param rollout: real samples
-    :param samples: simulated ones; None for PPO's gradient
+    :param samples: simulated samples; None for PPO's gradient
     :return: gradient with respect to the parameters that the actions depend on, in the policy's order, (P,)
     """
     distribution = model.distribution_at(rollout.observations)
@@ -197,12 +197,12 @@ def compare_gradients(
     on_estimate: Callable[[int], None] | None = None,
 ) -> GradientSamples:
     """
-    Gradients of one policy by PPO, MBMA, QMA and MBPO, as in MBMA, table 3: all from the same rollouts of that
-    policy, none ever applied.
+    Compute gradients of one policy by PPO, MBMA, QMA and MBPO, as in MBMA, table 3: all from the same rollouts of that
+    policy, and none is applied.
 
     First the learned models, the dynamics (one for MBMA and MBPO) and the Q-networks, are trained on ``n_fits``
-    rollouts of the policy as their algorithms do; then they stay as they are, so that the estimates are independent,
-    given the models, and their bias is that of these models.
+    rollouts of the policy as in their algorithms; then they are frozen, so that the estimates are independent, given
+    the models, and their bias comes from these models.
 
     :param model: a ``PPO`` or ``A2C``, or a subclass; nothing in it changes
     :param make_env: makes the environment
@@ -213,11 +213,11 @@ def compare_gradients(
     :param simulation_horizon: steps of the model, at least 2
     :param dynamics_kwargs: of :class:`~sb3_sample.ppo.MBMAPPO`
     :param q_kwargs: of :class:`~sb3_sample.ppo.QMAPPO`
-    :param seed: of everything that is random; the global generators are left as they are
-    :param on_estimate: called after each estimate, with the number of them so far
+    :param seed: of everything random; the global generators are left unchanged
+    :param on_estimate: called after each estimate, with the number of estimates so far
     :return: the gradients by method: "PPO", the oracle, "MBMA", "QMA", "MBPO"
     :raises TypeError: ``model`` is of another family
-    :raises ValueError: an argument is out of range, or the model is of a kind that :class:`Agent` refuses
+    :raises ValueError: an argument is out of range, or the model is of a kind that :class:`Agent` rejects
     """
     Agent(model)
     check_counts({"n_estimates": (n_estimates, 4), "n_steps": (n_steps, 2), "n_fits": (n_fits, 1), "seed": (seed, 0)})
@@ -234,7 +234,7 @@ def compare_gradients(
                 "gae_lambda": model.gae_lambda,
                 "device": model.device,
                 "n_simulated": n_simulated,
-                # Small networks: the policy is the model's, and takes the place of what is built here.
+                # Small networks, since the model's policy replaces the one built here.
                 "policy_kwargs": {"net_arch": [1]},
             }
             dynamics: dict[str, Any] = {"simulation_horizon": simulation_horizon, "dynamics_kwargs": dynamics_kwargs}
@@ -282,7 +282,7 @@ def compare_gradients(
 
 def jackknife_squares(samples: np.ndarray) -> tuple[float, np.ndarray]:
     """
-    The squared length of an expectation, from pairs of different samples, so that their noise adds nothing to it.
+    Squared length of an expectation, from pairs of different samples, so that their noise adds no bias.
 
     :param samples: (M, P)
     :return: estimate, and the estimates without each sample, (M,)
@@ -295,11 +295,11 @@ def jackknife_squares(samples: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _environment(model: OnPolicyAlgorithm, make_env: Callable[[], gym.Env]) -> VecEnv:
-    """A single environment, normalised by the model's statistics, which stay as they are."""
+    """A single environment, normalised by the model's statistics, which are frozen."""
     env: VecEnv = DummyVecEnv([make_env])
     normalize = model.get_vec_normalize_env()
     if normalize is not None:
-        # As VecNormalize's own file would have it: without its environment.
+        # A copy as from VecNormalize's own file, without its environment.
         own = copy.deepcopy(normalize)
         own.set_venv(env)
         own.training = False
@@ -312,6 +312,6 @@ def _difference_and_size(mine: np.ndarray, oracle: np.ndarray) -> tuple[np.ndarr
 
 
 def _mean_ratio(numerator: np.ndarray, denominator: np.ndarray) -> float:
-    """Mean over the parameters, without those whose gradient is exactly 0, of neurons that no state activates."""
+    """Mean over the parameters except those with a gradient of exactly 0, from neurons that no state activates."""
     used = denominator > 0
     return float((numerator[used] / denominator[used]).mean()) if used.any() else float("nan")

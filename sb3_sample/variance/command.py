@@ -1,4 +1,4 @@
-"""``sb3-sample variance``: the variance of a policy's gradient, what would lower it, as tables and a picture."""
+"""``sb3-sample variance``: the variance of a policy's gradient and ways to lower it, as tables and a picture."""
 
 import argparse
 import ast
@@ -39,7 +39,7 @@ ALGORITHMS: dict[str, type[OnPolicyAlgorithm]] = {
     "qma_ppo": QMAPPO,
     "mbpo_ppo": MBPOPPO,
 }
-#: Steps that a model is trained which is not given.
+#: Training steps of a model if none is given.
 TRAIN_STEPS = 10_240
 #: States of each gradient whose bias is measured.
 BIAS_STEPS = 2_048
@@ -50,11 +50,11 @@ MAX_ACTIONS = 16
 @dataclasses.dataclass(frozen=True)
 class Question:
     """
-    What the variance is to be known for.
+    Trajectory and costs for which the variance is evaluated.
 
     :param n_steps: T, states of the trajectory
     :param n_actions: N, actions at each of them
-    :param action_cost: cost of an additional action at a state, in units of that of a state with one action
+    :param action_cost: cost of an additional action at a state, in units of the cost of a state with one action
     """
 
     n_steps: int
@@ -75,7 +75,7 @@ class Question:
         return c.gain_of_steps(self.n_steps, self.delta, self.n_actions)
 
     def margin(self, c: Components) -> np.ndarray:
-        """How much further an action lowers the variance than a longer trajectory of the same cost."""
+        """How much more an additional action lowers the variance than a longer trajectory of the same cost."""
         return self.gain_of_steps(c) - self.gain_of_action(c)
 
 
@@ -84,7 +84,7 @@ def verdict(estimate: Estimate, question: Question, confidence: float = 0.95) ->
     :param estimate: estimated components
     :param question: for which T, N and cost
     :param confidence: of the interval that has to lie on one side of 0
-    :return: "actions" (one more lowers the variance further), "steps" (a longer trajectory does) or "undecided"
+    :return: "actions" (one more lowers the variance more), "steps" (a longer trajectory does) or "undecided"
     """
     margin = estimate.interval(question.margin, confidence)
     return "actions" if margin.low > 0 else "steps" if margin.high < 0 else "undecided"
@@ -166,7 +166,7 @@ def format_gradients(samples: GradientSamples, confidence: float = 0.95) -> str:
     """
     :param samples: gradients of several methods
     :param confidence: of the intervals
-    :return: Markdown table of bias and variance, by MBMA's definitions (appendix B) and by those of the whole gradient
+    :return: Markdown table of bias and variance, by MBMA's definitions (appendix B) and by those for the whole gradient
     """
     lines = [
         "| method | relative bias (MBMA, B) | relative variance (MBMA, B) | squared bias | variance |",
@@ -311,7 +311,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         _run(args)
     except (ValueError, TypeError, ImportError, OSError, NotImplementedError, gym.error.Error) as error:
-        # NotImplementedError is what Stable-Baselines3 raises for spaces that it has no policy for.
+        # Stable-Baselines3 raises NotImplementedError for spaces that it has no policy for.
         refuse("variance", error)
 
 
@@ -320,7 +320,7 @@ def _run(args: argparse.Namespace) -> None:
         name: getattr(args, name)
         for name in ("n_steps", "n_rollouts", "n_actions", "n_returns", "horizon", "max_lag", "burn_in")
     }
-    # Before the minutes that training and rollouts take.
+    # Checked before training and rollouts, which take minutes.
     check_arguments(**settings, n_envs=1)
     trajectory = args.n_steps if args.trajectory is None else args.trajectory
     train_steps = TRAIN_STEPS if args.train_steps is None else args.train_steps
@@ -394,7 +394,7 @@ def _run(args: argparse.Namespace) -> None:
 
 def _check_picture(output: Path) -> None:
     """
-    :raises ValueError: it is no picture that can be written
+    :raises ValueError: it is not a picture format that can be written
     :raises ImportError: matplotlib is not installed
     """
     with needing_matplotlib():
@@ -434,7 +434,7 @@ def _model(args: argparse.Namespace, make: Callable[[], gym.Env], train_steps: i
     if args.vecnormalize is not None:
         venv = load_vec_normalize(args.vecnormalize, DummyVecEnv([make]), allow_pickle=args.allow_pickle)
         venv.training = False
-    # The model may have learned in another number of environments, which set_env would refuse.
+    # The model may have learned in another number of environments, which set_env would reject.
     return cls.load(args.model, env=venv, device="cpu", **({"allow_pickle": args.allow_pickle} if is_safe else {}))
 
 

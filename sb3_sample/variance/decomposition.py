@@ -1,11 +1,11 @@
 """
-Variance of a policy gradient (MBMA, lemma 3.1), and what one more action or a longer trajectory would take off it
-(lemma 3.2, theorem 3.3 and corollary 3.4). Numbers in, numbers out: nothing here samples anything.
+Variance of a policy gradient (MBMA, lemma 3.1), and its reduction by one more action or a longer trajectory (lemma 3.2,
+theorem 3.3 and corollary 3.4). Numbers in, numbers out: nothing here samples anything.
 
 The gradient is the mean over T states of a trajectory of the mean over N actions of Y(s, a) = Q(s, a) grad log pi(a|s)
 (MBMA, equation 3, without its factor gamma^t, as in appendix A: with it equation 4 does not hold); only the first of
-the N actions is carried out. Variances and covariances are traces, sums over the policy's parameters of what the paper
-writes of each of them. Y_t is Y at the state t steps later.
+the N actions is carried out. Variances and covariances are traces: sums over the policy's parameters of the quantities
+that the paper writes for each. Y_t is Y at the state t steps later.
 """
 
 from dataclasses import dataclass
@@ -17,16 +17,16 @@ import numpy as np
 @dataclass(frozen=True)
 class Components:
     """
-    The components of the variance, which depend neither on N nor on T.
+    Components of the variance, which depend neither on N nor on T.
 
-    All may have further axes in front (...), for replicates; operations work on the last one.
+    All may have leading axes (...), for replicates; operations work on the last axis.
 
     :param marginal_variance: variance over states of Y's mean over actions, lemma 3.1's ``Var_s[mean Y]``, (...)
     :param marginal_covariance: covariances of Y's means over actions at two states t = 1, ..., L steps apart,
         ``Cov[mean Y, mean Y_t]``, (..., L)
     :param policy_variance: mean over states of the variance over actions, ``E_s Var_a[Y]``, (...)
-    :param policy_covariance: mean over states s of the covariance, given s, of Y(s, a) and of Y t = 1, ..., L steps
-        after a was taken there, ``E_s Cov[Y, Y_t | s]``, (..., L)
+    :param policy_covariance: mean over states s of the covariance, given s, between Y(s, a) and Y t = 1, ..., L steps
+        after taking a there, ``E_s Cov[Y, Y_t | s]``, (..., L)
     """
 
     marginal_variance: np.ndarray
@@ -36,7 +36,7 @@ class Components:
 
     @property
     def max_lag(self) -> int:
-        """L. Covariances at a larger distance are taken to be 0."""
+        """L. Covariances at larger distances are taken to be 0."""
         return self.marginal_covariance.shape[-1]
 
     def marginal_covariance_sum(self, n_steps: int) -> np.ndarray:
@@ -56,7 +56,7 @@ class Components:
     def marginalized_policy_variance(self, n_steps: int) -> np.ndarray:
         """
         :param n_steps: T
-        :return: equation 6's first part: T times the variance that remains however many actions are sampled, (...)
+        :return: equation 6's first part: T times the variance that remains with any number of actions, (...)
         """
         return self.marginal_variance + self.marginal_covariance_sum(n_steps)
 
@@ -71,7 +71,7 @@ class Components:
         """
         Equation 6: the variance of the gradient.
 
-        :param n_steps: T; with a fraction, which a comparison at equal costs gives, the sums go on linearly
+        :param n_steps: T; for fractions, as in a comparison at equal cost, the sums are interpolated linearly
         :param n_actions: N
         :return: variance, (...)
         :raises ValueError: an argument is out of range
@@ -88,8 +88,7 @@ class Components:
 
         :param n_steps: T
         :param n_actions: N
-        :return: change of the variance by an action more at each state, from N to N + 1: a number below 0 is a
-            reduction, (...)
+        :return: change of the variance by one more action at each state, from N to N + 1; below 0 is a reduction, (...)
         :raises ValueError: an argument is out of range
         """
         _check_counts(n_steps, n_actions)
@@ -97,11 +96,11 @@ class Components:
 
     def gain_of_steps(self, n_steps: int, delta: float, n_actions: int = 1, tail: bool = True) -> np.ndarray:
         """
-        Delta_T: change of the variance by going on for ``delta * T`` more steps: below 0 is a reduction.
+        Delta_T: change of the variance by ``delta * T`` more steps; below 0 is a reduction.
 
-        Lemma 3.2 leaves out the covariances at a distance of T steps and more, saying that a trajectory of length T
-        reaches a regenerative state. With ``tail`` they are counted as far as they are known, and Delta_T is
-        V(T + delta T) - V(T) without that assumption; where all of them are 0 the two are the same.
+        Lemma 3.2 leaves out the covariances at distances of T steps and more, assuming that a trajectory of length T
+        reaches a regenerative state. With ``tail`` these covariances are included as far as they are known, and Delta_T
+        is V(T + delta T) - V(T) without that assumption; if all of them are 0, the two are equal.
 
         :param n_steps: T
         :param delta: share of T by which the trajectory gets longer, above 0
@@ -124,11 +123,11 @@ class Components:
     def theorem_3_3(self, n_steps: int, delta: float = 1.0, n_actions: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """
         The two sides of equation 14, of which theorem 3.3 is the case N = 1, delta = 1 (with equal terms moved between
-        the sides) and corollary 3.4 that of no covariances. One more action lowers the variance at least as much as
-        ``delta * T`` more steps where the left side is at least the right one.
+        the sides) and corollary 3.4 the case without covariances. One more action lowers the variance at least as much
+        as ``delta * T`` more steps if the left side is at least the right side.
 
         :param n_steps: T
-        :param delta: cost of an action more at all T states, in units of the cost of those T states
+        :param delta: cost of one more action at all T states, in units of the cost of those T states
         :param n_actions: N
         :return: left and right side, (...) each
         :raises ValueError: an argument is out of range
@@ -158,10 +157,10 @@ class Components:
 
 class Choice(NamedTuple):
     """
-    A number of actions and the variance that it gives at the same cost as T states with a single action.
+    A number of actions, and its variance at the same cost as T states with a single action.
 
     :param n_actions: N
-    :param n_steps: states for that cost, as a fraction
+    :param n_steps: number of states for that cost, possibly fractional
     :param variance: of the gradient
     """
 
@@ -172,11 +171,11 @@ class Choice(NamedTuple):
 
 def at_equal_cost(components: Components, n_steps: int, action_cost: float, max_actions: int = 16) -> list[Choice]:
     """
-    The variance of 1, 2, ... actions when each shortens the trajectory by what it costs.
+    Variance with 1, 2, ... actions when each shortens the trajectory by its cost.
 
     :param components: components of the variance
     :param n_steps: T, states of the trajectory with a single action
-    :param action_cost: cost of an additional action at one state, in units of that of a state with a single action
+    :param action_cost: cost of an additional action at one state, in units of the cost of a state with a single action
         (0 if it costs nothing): with N actions there are ``T / (1 + action_cost (N - 1))`` states
     :param max_actions: largest number of actions
     :return: one choice for each number of actions
@@ -189,9 +188,9 @@ def at_equal_cost(components: Components, n_steps: int, action_cost: float, max_
 
 def relative_cost(action_cost: float, n_actions: int = 1) -> float:
     """
-    Lemma 3.2's delta: one action more at all T states for the price of ``delta * T`` states, each of N actions.
+    Lemma 3.2's delta: one more action at all T states costs as much as ``delta * T`` states with N actions each.
 
-    :param action_cost: cost of an additional action at one state, in units of that of a state with a single action
+    :param action_cost: cost of an additional action at one state, in units of the cost of a state with a single action
     :param n_actions: N, actions at each state so far
     :return: delta
     :raises ValueError: an argument is out of range
@@ -202,7 +201,7 @@ def relative_cost(action_cost: float, n_actions: int = 1) -> float:
 
 
 def _check_counts(n_steps: float, n_actions: float) -> None:
-    if not n_steps > 0:  # a comparison at equal costs may come to less than one
+    if not n_steps > 0:  # below 1 is possible in a comparison at equal cost
         raise ValueError(f"n_steps must be above 0, not {n_steps!r}")
     if not n_actions >= 1:
         raise ValueError(f"n_actions must be at least 1, not {n_actions!r}")

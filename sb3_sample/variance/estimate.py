@@ -1,5 +1,5 @@
 """
-Estimates the components of a policy gradient's variance from rollouts with further actions tried at every state.
+Estimate the components of a policy gradient's variance from rollouts with further actions tried at every state.
 
 Shapes: M rollouts, T states of each, K actions at each state (the first is carried out), R returns of each action,
 L lags, P parameters.
@@ -27,8 +27,8 @@ from sb3_sample.variance.scores import Scores
 class Interval(NamedTuple):
     """
     :param value: estimate
-    :param low: lower end of its confidence interval
-    :param high: upper end
+    :param low: lower bound of its confidence interval
+    :param high: upper bound
     """
 
     value: float
@@ -42,7 +42,7 @@ class RolloutSamples(NamedTuple):
 
     :param observations: as the policy gets them, (T, ...)
     :param actions: as the policy sampled them, (T, K, ...)
-    :param returns: samples of their Q-values, less the baseline, (T, K, R)
+    :param returns: samples of their Q-values, minus the baseline, (T, K, R)
     """
 
     observations: np.ndarray
@@ -52,13 +52,14 @@ class RolloutSamples(NamedTuple):
 
 class Moments(NamedTuple):
     """
-    What a rollout says, each entry without bias, of the products whose means make up the components. Y is as in
+    A rollout's unbiased estimates of the products whose means make up the components. Y is as in
     :mod:`~sb3_sample.variance.decomposition`, <x, y> an inner product.
 
     :param squared: <Y, Y> of one action
     :param crossed: <Y, Y'> of two actions at the same state
-    :param marginal_lagged: <Y', Y_t>, Y' of an action that is not carried out, Y_t at the state t steps later, (L,)
-    :param policy_lagged: <Y - Y', Y_t>, Y of the action that is carried out, (L,)
+    :param marginal_lagged: <Y', Y_t>, with Y' of an action that is not carried out and Y_t at the state t steps later,
+        (L,)
+    :param policy_lagged: <Y - Y', Y_t>, with Y of the action that is carried out, (L,)
     :param gradient: the mean of Y, (P,)
     """
 
@@ -76,7 +77,7 @@ class Estimate:
 
     :param components: the estimate
     :param replicates: the estimate without each of the M rollouts, for the jackknife; entries (M,) and (M, L)
-    :param squared_gradient: squared length of the gradient, without the bias that noise gives it
+    :param squared_gradient: squared length of the gradient, without the bias from noise
     :param n_parameters: P
     """
 
@@ -94,8 +95,8 @@ class Estimate:
         """
         Confidence interval of a quantity by the jackknife over the rollouts, which are independent, with Student's t.
 
-        :param quantity: takes components, with any axes in front, and gives one number for each
-        :param confidence: probability with which the interval is to cover the quantity
+        :param quantity: function of components, with any leading axes, that returns one number for each
+        :param confidence: nominal coverage probability of the interval
         :return: estimate and interval
         """
         left_out = np.asarray(quantity(self.replicates), dtype=float)
@@ -106,7 +107,7 @@ def jackknife(value: float, left_out: np.ndarray, confidence: float = 0.95) -> I
     """
     :param value: estimate from all M samples
     :param left_out: estimates without each of them, (M,)
-    :param confidence: probability with which the interval is to cover what is estimated
+    :param confidence: nominal coverage probability of the interval
     :return: estimate, and its interval by the jackknife with Student's t
     :raises ValueError: ``confidence`` is out of range
     """
@@ -137,32 +138,31 @@ def estimate_components(
     Estimate the components of lemma 3.1 for a policy in an environment.
 
     Each of ``n_rollouts`` independent rollouts starts after a random number of steps from a reset, so that its states
-    are those of a long run, and goes on over the ends of episodes as PPO's do. At each state ``n_actions`` actions are
-    sampled; of each of them ``n_returns`` returns, from the state restored, are samples of its Q-value, independent of
-    what the rollout does next. No product that is averaged has the same noise in both factors, but for the square of
-    Q, which has the variance of its noise taken off; so the noise of Q, which lemma 3.1 does not know (the paper
-    averages it away with 100 returns of each action), adds to the intervals, but not to the components.
+    are those of a long run, and continues across the ends of episodes like PPO's. At each state ``n_actions`` actions
+    are sampled; ``n_returns`` returns of each, from the restored state, are samples of its Q-value, independent of the
+    rest of the rollout. No averaged product has the same noise in both factors, except for the square of Q, from which
+    the variance of its noise is subtracted. So the noise of Q, which lemma 3.1 does not include (the paper averages it
+    away with 100 returns of each action), widens the intervals, but does not bias the components.
 
-    Environment steps, of which there are about ``n_rollouts * n_steps * n_actions * n_returns * horizon``, take most of
-    the time.
+    Most of the time goes into environment steps, about ``n_rollouts * n_steps * n_actions * n_returns * horizon``.
 
-    :param model: a ``PPO`` or ``A2C``, or a subclass; nothing in it changes. The critic ends the returns and is the
+    :param model: a ``PPO`` or ``A2C``, or a subclass, which is not changed. Its critic ends the returns and is the
         baseline
-    :param make_env: makes the environment; called ``n_envs + 1`` times, each time for a new one, equal to the others
+    :param make_env: makes the environment; called ``n_envs + 1`` times, and has to make a new, equal one each time
     :param n_steps: T, steps of a rollout
-    :param n_rollouts: M, at least 3. The intervals are of these independent rollouts, so that more of them narrow
-        these intervals as longer ones would not do
+    :param n_rollouts: M, at least 3. The intervals are taken over these independent rollouts, so that more rollouts
+        narrow them in a way that longer rollouts would not
     :param n_actions: K, at least 2
-    :param n_returns: R. 1 only where Q-values have no noise: deterministic environments with ``horizon=1``
+    :param n_returns: R. 1 only if Q-values have no noise: deterministic environments with ``horizon=1``
     :param horizon: steps after which the critic's value ends a return
-    :param max_lag: L, largest distance of two states whose covariance is measured, below ``n_steps``; beyond it
-        covariances are taken to be 0. ``n_steps - 1`` if None
-    :param burn_in: each rollout starts after ``burn_in`` to ``2 * burn_in - 1`` steps, every number equally often;
-        ``gym``'s ``max_episode_steps`` if None, or else 1,000. If all episodes have that length, any step of an
-        episode is as likely as any other to be the first one of a rollout
+    :param max_lag: L, largest distance between two states whose covariance is measured, below ``n_steps``; covariances
+        beyond it are taken to be 0. ``n_steps - 1`` if None
+    :param burn_in: each rollout starts after ``burn_in`` to ``2 * burn_in - 1`` steps, all equally likely. None: the
+        environment's time limit in steps, 1,000 if it has none. If all episodes have that length, every step of an episode is
+        equally likely to be the first of a rollout
     :param baseline: whether the critic's value is subtracted from the returns. It changes the variance, not the
-        gradient; MBMA, table 1, is without it
-    :param seed: of everything that is random; the global generators are left as they are
+        gradient; MBMA, table 1, does without it
+    :param seed: of everything random; the global generators are left unchanged
     :param n_envs: environments in which returns are sampled side by side
     :param on_rollout: called after each rollout, with the number of rollouts so far
     :return: estimate
@@ -259,14 +259,14 @@ class _RolloutSampler:
         return RolloutSamples(agent.normalize_observations(observations), np.stack(all_actions), returns)
 
     def _step(self, action: np.ndarray) -> np.ndarray:
-        """One step, into the next episode if this one ends; ``action`` is (1, ...)."""
+        """Take one step, into the next episode if this one ends; ``action`` is (1, ...)."""
         observation, _, terminated, truncated, _ = self.env.step(self.agent.to_env(action)[0])
         return self.env.reset()[0] if terminated or truncated else observation
 
 
 def rollout_moments(model: OnPolicyAlgorithm, rollout: RolloutSamples, max_lag: int) -> Moments:
     """
-    :param model: the model whose policy the rollout is of
+    :param model: the model whose policy made the rollout
     :param rollout: rollout
     :param max_lag: L
     :return: its moments
@@ -277,7 +277,7 @@ def rollout_moments(model: OnPolicyAlgorithm, rollout: RolloutSamples, max_lag: 
     scores = Scores(model.policy, rollout.observations, rollout.actions)  # type: ignore[arg-type]
     norms = scores.squared_norms()
     total = scores.weighted(weights)
-    # All pairs of actions at a state, less those of an action and itself.
+    # All pairs of actions at a state, minus those of an action with itself.
     crossed = (total.squared_norms() - (weights**2 * norms).sum(axis=1)) / (n_actions * (n_actions - 1))
     others = weights / (n_actions - 1)
     others[:, 0] = 0
@@ -303,7 +303,7 @@ def combine(moments: Sequence[Moments]) -> Estimate:
     squared, crossed, marginal, policy = (
         np.stack([np.asarray(entry[i]) for entry in moments]) for i in range(len(Moments._fields) - 1)
     )
-    # The squared length of the expected gradient, from pairs of different rollouts: of all, and without each of them.
+    # Squared length of the expected gradient, from pairs of different rollouts: of all, and without each of them.
     m, between = len(moments), products - np.diag(np.diag(products))
     square = between.sum() / (m * (m - 1))
     squares = (between.sum() - 2 * between.sum(axis=1)) / ((m - 1) * (m - 2))
@@ -335,7 +335,7 @@ def check_arguments(
     n_envs: int,
 ) -> None:
     """
-    Arguments of :func:`estimate_components`.
+    Check the arguments of :func:`estimate_components`.
 
     :raises ValueError: one of them is out of range
     """
@@ -357,8 +357,8 @@ def check_arguments(
 
 def check_counts(counts: dict[str, tuple[int, int]]) -> None:
     """
-    :param counts: by name, an argument and the least that it may be
-    :raises ValueError: one of them is no whole number, or below that
+    :param counts: by name, an argument and its minimum
+    :raises ValueError: one of them is not a whole number, or is below its minimum
     """
     for name, (value, low) in counts.items():
         if not is_integer(value) or value < low:
@@ -368,9 +368,9 @@ def check_counts(counts: dict[str, tuple[int, int]]) -> None:
 @contextlib.contextmanager
 def seeded(model: OnPolicyAlgorithm, seed: int) -> Iterator[None]:
     """
-    The policy in evaluation mode, the global generators of torch and NumPy seeded; all is put back at the end.
+    Put the policy into evaluation mode and seed the global generators of torch and NumPy; all are restored at the end.
 
-    :param model: its policy, and the device whose generators are meant
+    :param model: model of the policy, and of the device whose generators are seeded
     :param seed: below 2**32
     """
     training, numpy_state = model.policy.training, np.random.get_state()  # noqa: NPY002
@@ -387,7 +387,7 @@ def seeded(model: OnPolicyAlgorithm, seed: int) -> Iterator[None]:
 
 
 def _episode_steps(env: gym.Env) -> int:
-    """Steps of an episode that nothing but its time limit ends, 1,000 if there is no limit."""
+    """Steps of an episode that only its time limit ends; 1,000 if there is no limit."""
     dm_env = getattr(env.unwrapped, "dm_env", None)
     if dm_env is not None:
         from sb3_sample.envs.dmc import EPISODE_STEPS

@@ -1,4 +1,4 @@
-"""Q-values of actions at visited states: the environment goes back to the state and the policy goes on from there."""
+"""Q-values of actions at visited states: the environment is rewound to the state and the policy continues there."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,13 +18,13 @@ from sb3_sample.warn import warn
 
 class Agent:
     """
-    What is needed of a model: samples of its policy, its critic, and the units in which it learns.
+    Interface to a model: samples of its policy, its critic, and the units in which it learns.
 
     :param model: a ``PPO`` or ``A2C``, or a subclass. The statistics of a ``VecNormalize`` around its environment are
-        used as they are
+        used unchanged
     :raises TypeError: ``model`` is of another family
-    :raises ValueError: its policy is of a kind that :func:`~sb3_sample.variance.scores.check_policy` refuses, or it has
-        learned in a ``VecNormalize`` and is now without an environment
+    :raises ValueError: its policy is of a kind that :func:`~sb3_sample.variance.scores.check_policy` rejects, or it has
+        learned in a ``VecNormalize`` and now has no environment
     """
 
     def __init__(self, model: OnPolicyAlgorithm):
@@ -42,7 +42,7 @@ class Agent:
             )
             if model.env is None:
                 raise ValueError(message)
-            # It may have been trained on in an environment without one.
+            # Its training may have continued in an environment without one.
             warn(message)
 
     def normalize_observations(self, observations: np.ndarray) -> np.ndarray:
@@ -62,7 +62,7 @@ class Agent:
     def sample(self, observations: np.ndarray) -> np.ndarray:
         """
         :param observations: the environment's, (B, ...)
-        :return: actions as the policy samples them, by torch's global generator, (B, ...)
+        :return: actions as the policy samples them, with torch's global generator, (B, ...)
         """
         with torch.no_grad():
             return self.policy.get_distribution(self._tensor(observations)).sample().cpu().numpy()
@@ -78,7 +78,7 @@ class Agent:
     def to_env(self, actions: np.ndarray) -> np.ndarray:
         """
         :param actions: from :meth:`sample`, (B, ...)
-        :return: what the environment gets, as in ``OnPolicyAlgorithm.collect_rollouts``: clipped to the space
+        :return: actions for the environment, as in ``OnPolicyAlgorithm.collect_rollouts``: clipped to the space
         """
         space = self.model.action_space
         return np.clip(actions, space.low, space.high) if isinstance(space, spaces.Box) else actions
@@ -96,15 +96,15 @@ def sample_returns(
     rng: np.random.Generator,
 ) -> np.ndarray:
     """
-    One sample of Q(s, a) for each state and action: the discounted rewards of the action and of the policy after it,
-    and after ``horizon`` steps, or at a time limit, the critic's value.
+    Draw one sample of Q(s, a) for each state and action: the discounted rewards of the action and of the policy after
+    it, bootstrapped with the critic's value after ``horizon`` steps or at a time limit.
 
     :param agent: policy and critic
     :param envs: environments to restore the states in, as many as are to be stepped side by side
     :param states: B states
     :param actions: as the policy samples them, (B, ...)
     :param horizon: steps, at least 1
-    :param rng: generator for what is random in the environments after the states
+    :param rng: generator for the randomness in the environments after the states
     :return: (B,)
     """
     return rewound_returns(agent, envs, states, actions, [horizon] * len(states), rng)[0]

@@ -1,9 +1,9 @@
 """
-Gradients of log-probabilities, one of every state and action, without ever writing them out.
+Gradients of log-probabilities, one for every state and action, never stored explicitly.
 
-The gradient of a linear layer's weight is the outer product of its input and of the gradient of its output. Both inner
-products and sums of such gradients follow from the two factors, so that T states of a policy with P parameters take
-memory of T times the width of its layers (and T times T for all inner products), not T times P.
+The gradient of a linear layer's weight is the outer product of its input and of the gradient of its output. Inner
+products and sums of such gradients follow from the two factors, so that the memory for T states of a policy with P
+parameters is T times the width of its layers (and T times T for all inner products), not T times P.
 
 Shapes: T states, K actions of each, O observation, A action, P parameters of the policy that its actions depend on.
 """
@@ -22,10 +22,10 @@ class Factor(NamedTuple):
     Gradients with respect to the parameters of one layer.
 
     :param inputs: input of the layer at each state, (T, in), which is the same for all actions; None for parameters
-        that are no layer's
+        that belong to no layer
     :param has_bias: whether the layer has a bias
     :param outputs: gradients with respect to the layer's output (to the parameters themselves if there is no input),
-        (T, K, out) or, of weighted sums over the actions, (T, out)
+        (T, K, out) or, for weighted sums over the actions, (T, out)
     """
 
     inputs: torch.Tensor | None
@@ -33,7 +33,7 @@ class Factor(NamedTuple):
     outputs: torch.Tensor
 
     def input_products(self) -> torch.Tensor:
-        """Inner products of the inputs, the bias's being 1: (T, T)."""
+        """Inner products of the inputs, where the bias's input is 1: (T, T)."""
         assert self.inputs is not None
         return self.inputs @ self.inputs.T + float(self.has_bias)
 
@@ -42,7 +42,7 @@ class StateGradients:
     """
     One gradient for every state.
 
-    :param factors: of all layers, outputs (T, out)
+    :param factors: factors of all layers, with outputs (T, out)
     """
 
     def __init__(self, factors: list[Factor]):
@@ -63,9 +63,9 @@ class StateGradients:
     def lagged_products(self, other: "StateGradients", max_lag: int) -> np.ndarray:
         """
         :param other: gradients at the same states, (T, P) as well
-        :param max_lag: largest distance of two states, below T
-        :return: means over i of the inner products of this gradient at state i and the other at state i + t, for
-            t = 1, ..., ``max_lag``, (max_lag,)
+        :param max_lag: largest distance between two states, below T
+        :return: means over i of the inner products of this gradient at state i with the other at state i + t, for t =
+            1, ..., ``max_lag``, (max_lag,)
         """
         n_states = len(self.factors[0].outputs)
         products = torch.zeros(n_states, n_states, dtype=torch.float64)
@@ -84,7 +84,7 @@ class StateGradients:
 
 class Scores:
     """
-    The scores, gradients of log pi(a | s), of K actions at each of T states.
+    Scores, the gradients of log pi(a | s), of K actions at each of T states.
 
     :param policy: policy of a ``PPO`` or ``A2C``; see :func:`check_policy`
     :param observations: as the policy gets them, (T, ...)
@@ -106,7 +106,7 @@ class Scores:
     def weighted(self, weights: np.ndarray) -> StateGradients:
         """
         :param weights: one for every score, (T, K)
-        :return: at each state the sum over its actions of weight times score
+        :return: the sum of weight times score over the actions of each state
         """
         w = torch.as_tensor(weights, dtype=torch.float64)
         return StateGradients(
@@ -123,7 +123,7 @@ class Scores:
 def check_policy(policy: Any) -> None:
     """
     :param policy: anything
-    :raises TypeError: it is no policy of ``PPO`` or ``A2C``
+    :raises TypeError: it is not a policy of ``PPO`` or ``A2C``
     :raises ValueError: actions depend on something other than linear layers, each used once, and a Gaussian's
         ``log_std``; or the policy uses generalised state-dependent exploration
     """
@@ -159,7 +159,7 @@ def check_policy(policy: Any) -> None:
 def _factors(
     policy: ActorCriticPolicy, observations: torch.Tensor, actions: torch.Tensor
 ) -> list[tuple[torch.Tensor | None, bool, torch.Tensor]]:
-    """Input, whether there is a bias, and gradient of the output, of every layer that the actions depend on."""
+    """Input, whether there is a bias, and gradient of the output for every layer that the actions depend on."""
     seen: list[tuple[nn.Linear, torch.Tensor, torch.Tensor]] = []
 
     def remember(module: nn.Module, inputs: tuple[torch.Tensor, ...], output: torch.Tensor) -> None:
@@ -179,7 +179,7 @@ def _factors(
     if gaussian:
         leaves.append(distribution.distribution.scale)
     gradients = torch.autograd.grad(log_prob.sum(), leaves)
-    # Sums of many terms that cancel each other: float64 from here on, on the CPU since not every device has it.
+    # Sums of many terms that cancel each other need float64, on the CPU since not every device has it.
     factors: list[tuple[torch.Tensor | None, bool, torch.Tensor]] = [
         (_double(inputs), layer.bias is not None, _double(gradient))
         for (layer, inputs, _), gradient in zip(seen, gradients, strict=False)

@@ -1,11 +1,11 @@
 """
-Makes the data sets of offline.yml with this package's own agents: the replay of the first half of a training, and
+Make the data sets of offline.yml with this package's own agents: the replay of the first half of a training, and
 episodes of the trained agent.
 
     python studies/evidence/offline.py [--folder DIR]
 
-About half an hour on one core. Interrupted trainings go on; data sets that are there are left. ``make evidence`` calls
-it before the plan's first run. ``datasets.json`` says of what agents the data are, by seeds and returns.
+It takes about half an hour on one core. Interrupted trainings resume; existing data sets are kept. ``make evidence``
+calls it before the plan's first run. ``datasets.json`` describes the agents that made the data, by seeds and returns.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from stable_baselines3 import HerReplayBuffer
 from sb3_sample import SAC, BROFast, Dataset, record
 from sb3_sample.dataset_command import facts_of
 
-#: Folder of the data sets, as the plan has it.
+#: Folder of the data sets, the same as in the plan.
 FOLDER = Path("~/.cache/sb3_sample/datasets/offline")
 #: Kinds of data.
 REPLAY, EXPERT = "medium-replay", "expert"
@@ -33,7 +33,7 @@ SEED = 0
 
 class Recipe(NamedTuple):
     """
-    How the data of a task are made.
+    Recipe for the data of a task.
 
     :param algorithm: class of the agent
     :param arguments: its arguments
@@ -49,7 +49,7 @@ class Recipe(NamedTuple):
     packages: tuple[str, ...] = ()
 
 
-#: By task, ids as in the plan.
+#: Recipes by task, with the ids of the plan.
 RECIPES = {
     "dmc/cartpole-swingup-v0": Recipe(BROFast, {"policy": "MlpPolicy", "model_size": "0.55M"}, 60_000, 25),
     "FetchReach-v4": Recipe(
@@ -72,9 +72,9 @@ def make(task: str, recipe: Recipe, folder: Path) -> dict[str, Any]:
     Train an agent and write its data sets.
 
     :param task: id of the environment
-    :param recipe: how
+    :param recipe: how they are made
     :param folder: of the task's data sets
-    :return: what there is to say of them
+    :return: facts about them
     """
     for package in recipe.packages:
         gym.register_envs(importlib.import_module(package))
@@ -97,7 +97,7 @@ def make(task: str, recipe: Recipe, folder: Path) -> dict[str, Any]:
 
 def main(argv: Sequence[str] | None = None, recipes: dict[str, Recipe] = RECIPES) -> None:
     """
-    Make the data sets that are not there.
+    Make the data sets that are missing.
 
     :param argv: arguments; None for this process's
     :param recipes: by task, how they are made
@@ -107,14 +107,14 @@ def main(argv: Sequence[str] | None = None, recipes: dict[str, Recipe] = RECIPES
     root = parser.parse_args(argv).folder.expanduser()
     root.mkdir(parents=True, exist_ok=True)
     with (root / ".lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # of two runs that begin at the same time
+        fcntl.flock(file, fcntl.LOCK_EX)  # two runs may begin at the same time
         for task, recipe in recipes.items():
             folder = root / task.replace("/", "-")
             done = folder / "datasets.json"
             if done.exists():
                 continue
             with warnings.catch_warnings():
-                # Of a training that was interrupted between its halves, and of steps that a replay cuts off.
+                # Warnings about a training interrupted between its halves, and about steps that a replay cuts off.
                 warnings.filterwarnings("ignore", "Nothing is left to train|[0-9]+ of [0-9]+ steps left out")
                 facts = make(task, recipe, folder)
             done.write_text(json.dumps(facts, indent=1) + "\n")

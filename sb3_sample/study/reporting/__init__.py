@@ -1,6 +1,6 @@
 """
-The report of a study, as one HTML page or as Markdown with pictures.
+Report of a study, as one HTML page or as Markdown with pictures.
 
-``reading`` gathers runs and states, ``facts`` computes what is said of them, ``content`` says it, as data; ``figures``,
-``html`` and ``markdown`` put that into files.
+``reading`` gathers runs and states, ``facts`` computes their numbers, ``content`` makes the report as data;
+``figures``, ``html`` and ``markdown`` write it to files.
 """

@@ -1,4 +1,4 @@
-"""``sb3-sample study report``, and the same as a function."""
+"""``sb3-sample study report``, also as a function."""
 
 import argparse
 from collections.abc import Iterable, Sequence
@@ -38,27 +38,28 @@ def report(
     seed: int = 0,
 ) -> Report:
     """
-    Write what runs have come to as one HTML page, as Markdown with pictures, or both.
+    Write the results of runs as one HTML page, as Markdown with pictures, or both.
 
     The same runs give the same files, byte by byte.
 
-    :param folders: folders of studies and of runs, tables and files of them, as of :func:`~sb3_sample.study.read`
+    :param folders: folders of studies and of runs, tables and files of tables, as for :func:`~sb3_sample.study.read`
     :param path: of the page, ``.html``; None for none
-    :param markdown: of a page of Markdown, ``.md``; one that is there must have the lines around an earlier report
-        of this title, and only what is between them is replaced. None for none
+    :param markdown: of a Markdown page, ``.md``; an existing page must have the marker lines of an earlier report with
+        this title, and only the text between them is replaced. None for none
     :param pictures: folder of its pictures; ``<page>_files`` beside it if None
     :param title: of the report; the sources' names if None
-    :param plan: file of a plan, to say which of its runs are missing; the folder of a study has its own
-    :param published: runs of others besides, each a name as of :func:`~sb3_sample.study.published_runs` or a file of a
-        table. They have intervals; without ``folders`` they are the runs that are compared
-    :param curves: published algorithms whose curves, of which there are statistics over seeds only, are drawn beside
-        the runs, named as in ``sb3-sample plot``; none if empty; None for BRO, BRO Fast and SAC where there are some
-    :param steps: simulator steps at which averages are told; None for the last that half of each agent's runs have
-        reached
+    :param plan: file of a plan, to list its missing runs; the folder of a study has its own plan
+    :param published: additional runs of others, each a name as for :func:`~sb3_sample.study.published_runs` or a file
+        of a table. They have intervals; without ``folders`` they are the runs compared
+    :param curves: published algorithms whose curves, available only as statistics over seeds, are drawn beside the
+        runs, named as in ``sb3-sample plot``; none if empty; None for BRO, BRO Fast and SAC where available
+    :param steps: simulator steps at which averages are reported; None for the last step that half of each agent's runs
+        have reached
     :param groups: of tasks, see :func:`~sb3_sample.study.aggregate`
-    :param scores: of tasks without a common one, likewise
-    :param all_tasks: average each agent over all its tasks, not over those that every agent has reached the step on
-    :param laws: scaling laws that the report has too, of :func:`~sb3_sample.study.scaling.fit` or a file of them
+    :param scores: of tasks without a common score, likewise
+    :param all_tasks: whether to average each agent over all its tasks, not only over those on which every agent has
+        reached the step
+    :param laws: scaling laws to include, from :func:`~sb3_sample.study.scaling.fit` or a file of them
     :param reps: bootstrap samples
     :param confidence: of the intervals
     :param seed: of the bootstrap
@@ -102,7 +103,7 @@ def report(
 
 
 def _default_path(sources: Sequence[str]) -> Path:
-    """``report.html`` in the folder that the command is given, if it is one, else in the present one."""
+    """``report.html`` in the source if it is the only one and a folder, else in the working directory."""
     if len(sources) == 1:
         _, path = tables.labelled(sources[0])
         if path.is_dir():
@@ -193,5 +194,5 @@ def _run(options: argparse.Namespace) -> None:
                 print(f"Saved to {path}")
 
 
-#: The command: its help, what adds its arguments, and what runs it.
+#: The command: its help, the function that adds its arguments, and the function that runs it.
 COMMAND = ("write what the runs have come to as one page, HTML or Markdown", _add, _run)

@@ -1,4 +1,4 @@
-"""Content of a report: what was run, who is better and how sure that is, what it cost, and how it was made."""
+"""Content of a report: the runs, which agent is better and how certainly, their costs, and their settings."""
 
 import json
 from collections import Counter
@@ -39,11 +39,11 @@ from sb3_sample.study.states import FAILED, STATES, Status
 from sb3_sample.study.table import RUN
 from sb3_sample.version import __version__
 
-#: Rows of a table of runs that is not folded.
+#: Most rows of a table of runs that is not folded.
 UNFOLDED = 12
-#: Letters of an agent's name in a pair.
+#: Most letters of an agent's name in a pair.
 PAIR = 12
-#: Circumstances of checkpoints and of records beside tables, in the order of the table.
+#: Circumstances in checkpoints and in records beside tables, in the order of the report's table.
 _MADE_WITH = (
     "sb3_sample", "commit", "torch", "stable_baselines3", "gymnasium", "mujoco", "numpy", "python", "processor",
     "device", "threads", "torch threads", "made_by",
@@ -69,14 +69,14 @@ def build(
     :param gathered: runs
     :param title: of the report
     :param curves: published algorithms beside the runs
-    :param steps: see :func:`~sb3_sample.study.reporting.facts.compute`, as what follows
+    :param steps: see :func:`~sb3_sample.study.reporting.facts.compute`
     :param groups: likewise
     :param scores: likewise
     :param all_tasks: likewise
     :param reps: likewise
     :param confidence: likewise
     :param seed: likewise
-    :param laws: scaling laws that the report has too
+    :param laws: scaling laws to include
     :return: the report
     :raises ValueError: an argument is out of range
     """
@@ -247,7 +247,7 @@ def _training(facts: Facts, drawn: Sequence[Curves], looks: Looks, scores: Score
 def _mean_panels(
     facts: Facts, drawn: Sequence[Curves], looks: Looks, scores: Scores | None
 ) -> tuple[list[Lines], list[Agent]]:
-    """Means over tasks of our agents and of published curves; and the published agents that have one."""
+    """Means over tasks of our agents and of published curves, and the published agents that have such a mean."""
     assert facts.curves is not None
     by_label: dict[str, dict[str, Curve]] = {}
     for each in drawn:

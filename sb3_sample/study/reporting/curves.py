@@ -1,4 +1,4 @@
-"""Curves of single tasks, those of others beside them, and the look of each agent."""
+"""Curves of single tasks, published curves beside them, and the look of each agent."""
 
 import itertools
 import json
@@ -23,8 +23,8 @@ class Curves(NamedTuple):
     Curves of one task.
 
     :param task: id of the environment
-    :param metric: that is drawn
-    :param own: curves of the table's agents, mean and range over the runs that get farthest, by agent
+    :param metric: the metric drawn
+    :param own: curves of the table's agents by agent: mean and range over the runs that get farthest
     :param under_way: the other runs, by agent
     :param others: published curves
     """
@@ -64,7 +64,7 @@ def task_curves(gathered: Gathered, task: str, scores: Scores | None, names: Seq
         there = [run.steps[-1] + spacing(run.steps) > last or run.steps[-1] == last for run in runs]
         if max(run.steps[0] for run in itertools.compress(runs, there)) > min(
             run.steps[-1] for run in itertools.compress(runs, there)
-        ):  # Soon after the start the first episode of one may end after the last of another.
+        ):  # Early in training, the first episode of one run may end after the last of another.
             farthest = next(i for i, run in enumerate(runs) if run.steps[-1] == last)
             there = [i == farthest for i in range(len(runs))]
         own[agent] = Curve(agent, summarize(list(itertools.compress(runs, there))))
@@ -75,11 +75,11 @@ def task_curves(gathered: Gathered, task: str, scores: Scores | None, names: Seq
 
 class Looks(NamedTuple):
     """
-    The look that agents have in all figures. A published one has the colour of ours of the same name, else one of its
-    own.
+    Looks of agents, the same in all figures. A published agent has the colour of our agent of the same name, else its
+    own colour.
 
-    :param runs: of the table's agents, by name
-    :param curves: of published curves, by algorithm, which may be called as an agent is
+    :param runs: looks of the table's agents, by name
+    :param curves: looks of published curves, by algorithm, which may have the same name as an agent
     """
 
     runs: dict[str, Agent]
@@ -89,7 +89,7 @@ class Looks(NamedTuple):
 def dressed(gathered: Gathered, curves: Sequence[Curves]) -> Looks:
     """
     :param gathered: runs
-    :param curves: of all tasks
+    :param curves: curves of all tasks
     :return: looks
     """
     own = gathered.table[~gathered.table["agent"].isin(gathered.published)]
@@ -127,7 +127,7 @@ def _seeds_words(found: Sequence[tuple[Curves, Curve]]) -> str:
 
 
 def _difference_words(found: Sequence[tuple[Curves, Curve]], repeats: Mapping[str, set[int]]) -> str:
-    """Seeds of a published curve on all its tasks, and what of its measurement was otherwise."""
+    """Seeds of a published curve over all its tasks, and differences in its measurement."""
     words = [_seeds_words(found)]
     notes = Counter(
         note
@@ -142,7 +142,7 @@ def _difference_words(found: Sequence[tuple[Curves, Curve]], repeats: Mapping[st
 
 
 def _repeats(table: pd.DataFrame) -> dict[str, set[int]]:
-    """Action repeats of the runs of each task, with the frames that wrappers skip."""
+    """Action repeats of the runs of each task, including frames skipped by wrappers."""
     found: dict[str, set[int]] = {}
     for task, rows in table.groupby("task", sort=False):
         for text in rows["arguments"].unique():

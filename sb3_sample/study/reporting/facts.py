@@ -1,4 +1,4 @@
-"""The numbers of a report: averages, profiles and improvement of its runs, each computed once, by ``aggregate.py``."""
+"""Numbers of a report: averages, profiles and improvement of its runs, each computed once by ``aggregate.py``."""
 
 import dataclasses
 import itertools
@@ -24,9 +24,9 @@ from sb3_sample.study.reporting.pieces import counted
 from sb3_sample.study.reporting.reading import Gathered
 from sb3_sample.study.table import RUN
 
-#: Points of a curve, at most.
+#: Most points of a curve.
 POINTS = 40
-#: Agents of which all pairs are compared; of more, the best with each other one.
+#: Most agents for comparing all pairs; with more agents, the best is compared with each other one.
 ALL_PAIRS = 6
 _MEASURED = ("return", "success_rate", "episode_length")
 
@@ -36,15 +36,15 @@ class Facts:
     """
     :param lacking: tasks without a score, with the reason
     :param reason: why there are no averages; empty if there are
-    :param tasks: those that are averaged over
-    :param n_scored: how many have a score
-    :param steps: at which the averages are told
-    :param groups: of tasks, by name; the first is the one of profiles and improvement
-    :param averages: of :func:`~sb3_sample.study.aggregate`, at ``steps``
+    :param tasks: the tasks averaged over
+    :param n_scored: number of tasks with a score
+    :param steps: steps at which averages are reported
+    :param groups: of tasks, by name; profiles and improvement are of the first
+    :param averages: result of :func:`~sb3_sample.study.aggregate` at ``steps``
     :param curves: the same along the training
     :param profiles: at the last step, of the first group; None without averages
-    :param improvement: likewise, of pairs, the one with the better average first; None with one agent
-    :param all_pairs: whether all pairs are compared, not only those with the best
+    :param improvement: likewise, of pairs, the agent with the better average first; None with one agent
+    :param all_pairs: whether all pairs are compared, not only those with the best agent
     :param left_out: agents without averages, with the reason
     :param notes: warnings
     :param confidence: of the intervals
@@ -77,8 +77,8 @@ class Facts:
 
     def at(self, step: int, group: str | None = None) -> pd.DataFrame:
         """
-        :param step: of ``steps``
-        :param group: of ``groups``; the first if None
+        :param step: one of ``steps``
+        :param group: one of ``groups``; the first if None
         :return: the averages there, the highest first
         """
         assert self.averages is not None
@@ -99,10 +99,11 @@ def compute(
 ) -> Facts:
     """
     :param gathered: runs
-    :param steps: at which the averages are told; None for the last that half of each agent's runs have reached
+    :param steps: steps at which averages are reported; None for the last step that half of each agent's runs have
+        reached
     :param groups: see :func:`~sb3_sample.study.aggregate`, as ``scores``, ``reps``, ``confidence`` and ``seed``
     :param scores: likewise
-    :param all_tasks: average each agent over all its tasks, not over those that all agents have
+    :param all_tasks: whether to average each agent over all its tasks, not only over those that all agents have
     :param reps: bootstrap samples
     :param confidence: of the intervals
     :param seed: of the bootstrap
@@ -133,7 +134,7 @@ def compute(
     shared: dict[str, Any] = {"scores": scores, "reps": reps, "confidence": confidence, "seed": seed}
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", UserWarning)
-        # Apart, so that the numbers are those of "study aggregate": samples depend on how many steps there are.
+        # Separate, so that the numbers equal those of "study aggregate": samples depend on the number of steps.
         facts.averages = aggregate(rows, facts.steps, facts.groups, **shared)
         facts.curves = aggregate(rows, grid, facts.groups, **shared)
         first = {facts.group: facts.groups[facts.group]}
@@ -153,14 +154,14 @@ def compute(
 def spacing(steps: Any) -> int:
     """
     :param steps: of a run's evaluations, increasing
-    :return: steps between its last two; 0 if there is one
+    :return: steps between its last two evaluations; 0 if there is only one
     """
     last = np.asarray(steps)[-2:]
     return int(last[-1] - last[0])
 
 
 def _reached(ends: pd.DataFrame) -> int:
-    """The last step that half of the runs of each agent have reached, or will by their next evaluation."""
+    """Last step that half of the runs of each agent have reached, or will reach by their next evaluation."""
     halves = ends.groupby("agent")["max"].apply(lambda last: sorted(last)[len(last) // 2])
     step = int(halves.min())
     # Episodes of a training do not all end at the same step.
@@ -171,7 +172,7 @@ def _reached(ends: pd.DataFrame) -> int:
 def _comparable(
     reaching: pd.DataFrame, own: pd.DataFrame, gathered: Gathered, facts: Facts, all_tasks: bool
 ) -> pd.DataFrame:
-    """The runs of the tasks that all agents have, and of others' agents those that have them all, too."""
+    """Runs on the tasks that all our agents have; agents of others are included if they have all these tasks."""
     tasks = {agent: set(found) for agent, found in reaching.groupby("agent")["task"]}
     ours = [agent for agent in gathered.agents if agent in tasks and agent not in gathered.published]
     for agent in own["agent"].unique():
@@ -190,7 +191,7 @@ def _comparable(
 
 
 def _groups(groups: Groups | None, tasks: list[str]) -> dict[str, list[str]]:
-    """The groups, of those that were not asked for only the ones that are not all tasks."""
+    """The groups; of the default groups, those that contain all tasks are left out, except the first."""
     found = group_tasks(groups, tasks)
     if groups is None:
         all_of_them = found[DEFAULT_GROUPS[0]]
@@ -199,7 +200,7 @@ def _groups(groups: Groups | None, tasks: list[str]) -> dict[str, list[str]]:
 
 
 def _grid(rows: pd.DataFrame, first: int, last: int) -> list[int]:
-    """Steps of a curve, of the evaluations of all runs."""
+    """Steps of a curve, chosen from the evaluations of all runs."""
     steps = np.unique(rows["step"])
     steps = steps[(first <= steps) & (steps <= last)]
     if len(steps) > POINTS:

@@ -1,4 +1,4 @@
-"""Figures of a report by matplotlib: panels as SVG, whose colours the page chooses, or a figure as PNG."""
+"""Figures of a report with matplotlib: panels as SVG, whose colours the page chooses, or a figure as PNG."""
 
 import contextlib
 import io
@@ -17,26 +17,26 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Drawing
 
-#: Colours that those with defects of colour vision can tell apart (Okabe and Ito 2008 without yellow and black; violet
-#: and olive besides), and the same for a dark ground.
+#: Colours that people with colour vision deficiency can tell apart (Okabe and Ito 2008 without yellow and black, with
+#: violet and olive added), and their counterparts for a dark background.
 LIGHT = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6f3fa0", "#7a7a1f")
 DARK = ("#4aa8e8", "#ff8552", "#2fcf9f", "#f0a6cf", "#ffc64d", "#a5dcff", "#b58ae6", "#c9c95a")
-#: Text and axes, lines of the grid and the bands of others in a figure that is a file of its own.
+#: Colours of text and axes, grid lines, and the bands of published agents in a figure that is a separate file.
 INK, GRID, BAND = "#222427", "#d9dce1", "#9aa0a8"
-#: The same in an SVG, where the page's colours take their place.
+#: The same in an SVG, as placeholders for the page's colours.
 _INK, _GRID, _BAND = "#010203", "#030201", "#020301"
-#: Styles of lines of agents that share a colour, by how often all colours were taken before; those of others.
+#: Line styles of agents that share a colour, by how often all colours were taken before; style of published agents.
 _STYLES, _DASHED = ("-", "-.", ":"), (0, (4, 2))
 _MARKERS = ("o", "s", "D")
-#: Inches of a panel of lines, of one of dots, and panels side by side in a file.
+#: Width and height of a panel of lines and width of a panel of dots in inches, and panels side by side in a file.
 WIDTH, HEIGHT, DOTS_WIDTH, COLUMNS = 4.4, 3.1, 5.4, 3
-#: Letters of a name beside dots, of a legend in an inch, and dots of a file in an inch.
+#: Letters of a name beside dots, letters of a legend per inch, and dots of a file per inch.
 BESIDE, _LETTERS, _DPI = 26, 13, 100
 
 
 @contextlib.contextmanager
 def _style(ink: str, grid: str) -> Iterator[None]:
-    """Settings of matplotlib that a figure depends on, whatever the user's are. Two drawings are equal to the byte."""
+    """Fix all matplotlib settings that a figure depends on, so that two drawings are equal to the byte."""
     with needing_matplotlib():
         from matplotlib import style
     settings = {
@@ -54,8 +54,8 @@ def shortened(name: str, letters: int = LETTERS) -> str:
     """
     :param name: of an agent or task, from a file
     :param letters: that are kept
-    :return: the same for a figure: in one line, not too long. A space that does not break keeps a leading underscore,
-        which matplotlib takes for "not in the legend"
+    :return: the name for a figure: in one line, not too long. A non-breaking space protects a leading underscore, which
+        matplotlib takes for "not in the legend"
     """
     text = cut(name, letters)
     return f"\u00a0{text}" if text.startswith("_") else text
@@ -64,7 +64,7 @@ def shortened(name: str, letters: int = LETTERS) -> str:
 def svg(panel: Lines | Dots, prefix: str) -> str:
     """
     :param panel: of a figure
-    :param prefix: of the ids in it, which are unique in a page
+    :param prefix: of the ids in it, which makes them unique in a page
     :return: an SVG element whose colours are variables of the page: ``--ink``, ``--grid``, ``--band``, ``--c0``, ...
     :raises ImportError: matplotlib is not installed
     """
@@ -87,7 +87,7 @@ def svg(panel: Lines | Dots, prefix: str) -> str:
         inside = re.sub(r'(\bid="|\bhref="#|url\(#)', rf"\g<1>{prefix}-", inside)
         return colors.sub(lambda color: names[color[0]], inside)
 
-    # In tags only: what is between them are names from files.
+    # Only inside tags: the text between them contains names from files.
     text = re.sub(r"<[^>]*>", tag, text)
     head, end, rest = text.partition(">")
     # The page sets the size; the view box keeps the proportions.
@@ -98,7 +98,7 @@ def svg(panel: Lines | Dots, prefix: str) -> str:
 def png(figure: Figure) -> bytes:
     """
     :param figure: of a report
-    :return: all its panels, with a legend, as a PNG file
+    :return: a PNG file of all its panels, with a legend
     :raises ImportError: matplotlib is not installed
     """
     n = len(figure.panels)
@@ -127,7 +127,7 @@ def png(figure: Figure) -> bytes:
 def dash(agent: Agent) -> str:
     """
     :param agent: an agent
-    :return: the dashes of its lines, as SVG has them; empty for none
+    :return: the dashes of its lines for SVG; empty for none
     """
     return "6 3" if agent.published else ("", "7 2 2 2", "2 2")[min(agent.turn, 2)]
 
@@ -179,7 +179,7 @@ def _draw_lines(axes: "Axes", panel: Lines, band: str) -> None:
 
 
 def _until(line: Line, end: float) -> Line:
-    """A line up to an x, so that what is not shown has no part in the choice of the axes."""
+    """A line up to an x, so that the hidden rest does not affect the axes."""
     x = np.asarray(line.x, float)
     shown = x <= end
     if shown.all():

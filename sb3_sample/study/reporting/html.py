@@ -28,8 +28,8 @@ TEMPLATE, SCRIPT = "page.html", "page.js"
 def page(report: Report) -> str:
     """
     :param report: content
-    :return: the page; the same for the same content. Everything that comes from files is escaped, and the page allows
-        its browser no request and no script but its own
+    :return: the page; equal for equal content. All text from files is escaped, and the page allows the browser no
+        requests and only its own script
     :raises ImportError: Jinja or matplotlib is not installed
     """
     try:
@@ -94,7 +94,7 @@ def shown(cell: Cell) -> str:
 def order(cell: Cell) -> str:
     """
     :param cell: of a table
-    :return: what it is sorted by, as JavaScript reads a number; empty for none, and for words
+    :return: its sort key, as a number for JavaScript; empty for none, and for words
     """
     value = cell.value if isinstance(cell, Interval) else cell.number if isinstance(cell, Count) else cell
     return "" if value is None or isinstance(value, str) or value != value else repr(value)

@@ -15,7 +15,7 @@ _POINTS = 60
 def scaling(laws: Laws) -> Section:
     """
     :param laws: of ``sb3-sample scaling fit``
-    :return: what they say, with their limits
+    :return: a section on the laws, with their limits
     """
     head = f"Laws of {', '.join(laws.tasks)}, {laws.seeds} seeds at least; sigma is the replay ratio. {beginning(laws)}"
     section = Section("scaling", "Scaling laws", [head, _figure(laws)])

@@ -1,4 +1,4 @@
-"""A report as Markdown with pictures beside it, or as a part of a page that says more."""
+"""A report as Markdown with pictures beside it, or as a part of a larger page."""
 
 import os
 import re
@@ -9,19 +9,19 @@ from sb3_sample.study.reporting import figures
 from sb3_sample.study.reporting.html import shown
 from sb3_sample.study.reporting.pieces import Figure, Report, Section, Table, Text
 
-#: Lines around what is written, by which it is found again.
+#: Marker lines around the report, by which it is found again.
 BEGIN, END = "<!-- begin: sb3-sample study report: {} -->", "<!-- end: sb3-sample study report: {} -->"
 _SPECIAL = re.compile(r"([\\`*\[\]|~$#!]|(?<!\w)_|_(?!\w))")
 
 
 def write(report: Report, path: Path, pictures: Path | None = None) -> None:
     """
-    Write a report, or, into a page that has the lines of an earlier one with this title, what is between them.
+    Write a report; in a page with the marker lines of an earlier report with this title, replace the text between them.
 
     :param report: content
     :param path: of the page
     :param pictures: folder of the pictures; ``<page>_files`` beside the page if None
-    :raises ValueError: the page is there without these lines
+    :raises ValueError: the page exists without these lines
     :raises ImportError: matplotlib is not installed
     :raises OSError: a file cannot be written
     """
@@ -53,7 +53,7 @@ def around(page: str, begin: str, end: str) -> tuple[str, str] | None:
     :param page: a text
     :param begin: a line of it
     :param end: another one
-    :return: the text up to the first line and from the second one on, both with it; None if it does not have each of
+    :return: the text up to and including the first line, and from the second line on; None if it does not have each of
         them once, in this order
     """
     if page.count(begin) != 1 or page.count(end) != 1 or page.index(begin) > page.index(end):
@@ -65,7 +65,7 @@ def markdown(report: Report, pictures: str) -> str:
     """
     :param report: content
     :param pictures: folder of the pictures, as the page names it
-    :return: the text; the same for the same content
+    :return: the text; equal for equal content
     """
     lines = [f"## {escaped(report.title)}", ""]
     lines += [f"- **{heading}.** {escaped(' '.join(words))}" for heading, words in report.summary]
@@ -76,8 +76,8 @@ def markdown(report: Report, pictures: str) -> str:
 
 def escaped(text: str) -> str:
     """
-    :param text: any, from a file
-    :return: the same in one line, of which Markdown and HTML take nothing for their own
+    :param text: any text, from a file
+    :return: the text in one line, with the characters special to Markdown and HTML escaped
     """
     text = " ".join(text.split())
     text = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
@@ -110,7 +110,7 @@ def _html(text: str) -> str:
 
 
 def _lines(text: str) -> list[str]:
-    # An empty line ends a block of HTML in Markdown, and what follows would be Markdown again.
+    # An empty line ends a block of HTML in Markdown, and the rest would be Markdown again.
     text = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     return [line if line.strip() else "&nbsp;" for line in text.splitlines()]
 

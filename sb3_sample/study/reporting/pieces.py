@@ -1,8 +1,8 @@
 """
-A report as data that know nothing of HTML and Markdown: sections of paragraphs, tables, figures and texts.
+A report as data, independent of HTML and Markdown: sections of paragraphs, tables, figures and texts.
 
-Names of agents and tasks, tracebacks and settings come from files that anybody may have written: they stand here as
-they are, and whoever writes them into a file escapes them.
+Names of agents and tasks, tracebacks and settings come from untrusted files: they are unescaped here, and escaped by
+the code that writes them into a file.
 """
 
 import dataclasses
@@ -10,13 +10,13 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-#: Between two ends, and where there is nothing.
+#: Stands between the two ends of a range, and for missing values.
 DASH = "\N{EN DASH}"
-#: The unit of all steps.
+#: Unit of all steps.
 STEPS = "simulator steps"
-#: Colours that figures have.
+#: Number of colours in figures.
 N_COLORS = 8
-#: Letters of a name in a sentence or a figure.
+#: Most letters of a name in a sentence or a figure.
 LETTERS = 36
 
 
@@ -34,10 +34,10 @@ class Interval(NamedTuple):
 
 class Count(NamedTuple):
     """
-    A number of runs that is shown as a badge.
+    A number of runs, shown as a badge.
 
     :param number: how many
-    :param state: of the states of a study
+    :param state: one of the states of a study
     """
 
     number: int
@@ -63,8 +63,8 @@ class Table(NamedTuple):
 
 class Text(NamedTuple):
     """
-    :param title: what it is
-    :param text: lines, shown as they are, on demand
+    :param title: title of the text
+    :param text: lines, shown unchanged, on demand
     """
 
     title: str
@@ -79,8 +79,8 @@ class Agent:
     :param name: its name
     :param color: number of its colour
     :param turn: how often all colours were taken before
-    :param published: whether others have measured it, which is dashed
-    :param label: name with what there is to say of it in a legend
+    :param published: whether others have measured it; its lines are then dashed
+    :param label: its name with additional words for a legend
     """
 
     name: str
@@ -92,13 +92,13 @@ class Agent:
 
 class Line(NamedTuple):
     """
-    :param agent: whose it is
+    :param agent: agent of the line
     :param x: numbers
     :param y: numbers
-    :param low: lower end of the band, if there is one
+    :param low: lower bounds of the band, if there is one
     :param high: upper end
-    :param thin: whether it is a run by itself
-    :param bound: whether it is a point that is a lower bound, which is a hollow triangle
+    :param thin: whether it is a single run
+    :param bound: whether it is a point that is a lower bound, drawn as a hollow triangle
     """
 
     agent: Agent
@@ -115,9 +115,9 @@ class Lines(NamedTuple):
     :param title: of the panel
     :param x_label: of the axis
     :param y_label: likewise
-    :param lines: what is drawn
-    :param x_end: last x that is shown
-    :param y_range: lowest and highest y, where these are fixed
+    :param lines: the lines drawn
+    :param x_end: last x shown
+    :param y_range: lowest and highest y, if fixed
     """
 
     title: str
@@ -145,7 +145,7 @@ class Figure(NamedTuple):
     :param name: of its file
     :param caption: what it shows
     :param panels: its parts
-    :param agents: those in its legend; none if the panels name them
+    :param agents: agents in its legend; none if the panels name them
     """
 
     name: str
@@ -171,7 +171,7 @@ class Section:
 class Report:
     """
     :param title: of the page
-    :param summary: heading and sentences of what a reader should know first
+    :param summary: headings and sentences on the most important results
     :param sections: the rest
     :param version: of the package
     """
@@ -185,8 +185,8 @@ class Report:
 def number(value: float, digits: int = 3) -> str:
     """
     :param value: any number
-    :param digits: after the point, for those of the order of 1
-    :return: the same for people; a dash for NaN
+    :param digits: digits after the point for numbers of the order of 1
+    :return: the number as text for readers; a dash for NaN
     """
     if math.isnan(value):
         return DASH
@@ -198,7 +198,7 @@ def number(value: float, digits: int = 3) -> str:
 def interval_text(found: Interval) -> str:
     """
     :param found: an estimate
-    :return: it with its interval
+    :return: the estimate with its interval, as text
     """
     if math.isnan(found.low):
         return number(found.value)
@@ -208,7 +208,7 @@ def interval_text(found: Interval) -> str:
 def p_text(p: float) -> str:
     """
     :param p: of a test
-    :return: the same for people, to two digits
+    :return: p as text for readers, to two digits
     """
     return f"{p:.2g}" if p >= 1e-3 else "below 0.001"
 
@@ -236,7 +236,7 @@ def cut(name: str, letters: int = LETTERS) -> str:
     """
     :param name: from a file
     :param letters: that are kept
-    :return: the same in one line, cut where it is longer than a sentence can bear
+    :return: the name in one line, cut if it is too long for a sentence
     """
     text = " ".join("".join(letter if letter.isprintable() else " " for letter in name).split())
     return text if len(text) <= letters else f"{text[: letters - 1]}…"

@@ -1,4 +1,4 @@
-"""How published curves were measured, as ``data/README.md`` has it, and what of it differs from runs of one's own."""
+"""Measurement of published curves, as in ``data/README.md``, and its differences from the user's own runs."""
 
 from collections.abc import Iterable, Sequence
 
@@ -12,10 +12,10 @@ from sb3_sample.plots import (
     published_curves,
 )
 
-#: Seeds below which a legend says that there are few.
+#: Number of seeds below which a legend says that there are few.
 FEW = 5
-#: Action repeat by algorithm: of one suite, of one task of it by the beginning of its name, or of all ("").
-#: Not stated where nothing fits. BRO's: see :func:`action_repeat`.
+#: Action repeat by algorithm and beginning of ``suite/task``; "" stands for all. Without a match it is not stated. For
+#: BRO see :func:`action_repeat`.
 _REPEATS: dict[str, dict[str, int]] = {
     "BRC (single task)": {"": 1},
     "BRC (multi-task)": {"": 1},
@@ -36,24 +36,25 @@ _REPEATS: dict[str, dict[str, int]] = {
     "FlashSAC": {"": 1},
     "DR.Q": {"gymnasium": 1, "": 2},
 }
-#: How success is counted where not at any step of the episode.
+#: How success is counted, unless at any step of the episode.
 _SUCCESS = {
     "TD-MPC2": "success at the last step",
     "SAC (TD-MPC2 authors)": "success at the last step",
     "DreamerV3 (TD-MPC2 authors)": "success at the last step",
     "FlashSAC": "success at any or the last step: not stated",
 }
-#: Of the tasks that were published.
+#: Versions of the published tasks.
 _VERSIONS = {"metaworld": "v2", "gymnasium": "v4"}
 
 
 def action_repeat(algorithm: str, suite: str, task: str, n_seeds: int) -> int:
     """
-    :param algorithm: as the published curves have it
+    :param algorithm: as in the published curves
     :param suite: likewise
     :param task: likewise
-    :param n_seeds: of the curve. BRO's authors have ten; reruns by others, whose repeat is not stated, five
-    :return: simulator steps of a decision; 0 if that is not stated
+    :param n_seeds: number of seeds of the curve. BRO's authors have ten; reruns by others, whose action repeat is not
+        stated, five
+    :return: simulator steps per decision; 0 if not stated
     """
     if algorithm in ("BRO (RR=10)", "BRO Fast (RR=2)"):
         return 1 if n_seeds >= 10 else 0
@@ -63,18 +64,18 @@ def action_repeat(algorithm: str, suite: str, task: str, n_seeds: int) -> int:
 
 def differences(curve: Curve, task: str, metric: str, own_repeats: Iterable[int]) -> list[str]:
     """
-    :param curve: of others, on a task
+    :param curve: a published curve on a task
     :param task: id of the environment
     :param metric: "return" or "success_rate"
-    :param own_repeats: action repeats of the runs beside it
-    :return: what keeps it from being compared without care, in words
+    :param own_repeats: action repeats of the runs shown beside it
+    :return: differences that limit the comparison, in words
     """
     n_seeds = int(curve.data["n_seeds"].min())
     found = [f"{n_seeds} seeds only"] if n_seeds < FEW else []
     names = named_algorithms(curve.label, list(all_published_curves()["algorithm"].unique()))
     try:
         suite, name = published_key(task)
-    except ValueError:  # of a suite that is not in the package
+    except ValueError:  # the suite is not in the package
         names = []
     if len(names) != 1:
         return [*found, "how it was measured is not known"]
@@ -97,12 +98,12 @@ def differences(curve: Curve, task: str, metric: str, own_repeats: Iterable[int]
 
 def chosen_curves(names: Sequence[str] | None, covered: Sequence[str], task: str, metric: str) -> list[Curve]:
     """
-    :param names: of published algorithms, as of ``sb3-sample plot --published``; None for its default
-    :param covered: names without brackets that are not drawn by default, since every seed of them is there
+    :param names: of published algorithms, as for ``sb3-sample plot --published``; None for its default
+    :param covered: names without brackets that are not drawn by default, since all their seeds are shown as runs
     :param task: id of an environment
     :param metric: "return" or "success_rate"
-    :return: their curves of that task, as far as there are some
-    :raises ValueError: there are no curves of that name of any task
+    :return: their curves of that task, as far as they exist
+    :raises ValueError: a name has no curves on any task
     """
     known = list(all_published_curves()["algorithm"].unique())
     for name in names or ():

@@ -1,4 +1,4 @@
-"""Runs for a report: one table of them, those of others, the states of studies, and what the runs were made with."""
+"""Runs for a report: one table of all runs, including others', the states of studies, and how the runs were made."""
 
 import dataclasses
 import warnings
@@ -20,9 +20,9 @@ from sb3_sample.study.reporting.pieces import counted
 from sb3_sample.study.runs import LIST, PLAN, checkpointed
 from sb3_sample.study.states import Status, status
 
-#: Where runs are, or a table of them.
+#: Path of runs, or a table of them.
 Source: TypeAlias = str | Path | pd.DataFrame
-#: Bytes of a plan, of a checkpoint's manifest, and of the records beside a table.
+#: Most bytes of a plan, of a checkpoint's manifest, and of the records beside a table.
 _MAX_PLAN, _MAX_MANIFEST, _MAX_RECORDS = 2**20, 8 * 2**20, 64 * 2**20
 _MEASURED = ("return", "success_rate")
 
@@ -30,21 +30,21 @@ _MEASURED = ("return", "success_rate")
 @dataclasses.dataclass
 class Gathered:
     """
-    Everything that a report is made of.
+    All data behind a report.
 
-    :param names: of the sources, as they were given
-    :param titles: the same without their folders, or their labels
+    :param names: names of the sources, as given
+    :param titles: the names without folders, or their labels
     :param table: runs, agents with different arguments named apart
     :param runs: agent (as its source names it), arguments, task and seed of the sources' runs that have a seed
-    :param published: the agents of it that others have measured
-    :param asked: names by which every seed of a published agent was asked for
-    :param curves: of others, of which there are statistics over seeds only, by task and metric
-    :param states: of the studies among the sources
+    :param published: agents in the table that others have measured
+    :param asked: names of published agents requested with all their seeds
+    :param curves: curves of others, available only as statistics over seeds, by task and metric
+    :param states: states of the studies among the sources
     :param plans: plans' texts, by folder or file
-    :param planned: runs of the plan that was given
-    :param made_with: of each run that says so, by what it was made: versions, device, processor, commit
-    :param notes: what was left out, and why
-    :param labels: names that the agents of each of ``states`` were given, None for those of the plan
+    :param planned: runs of the given plan
+    :param made_with: for each run that records them: versions, device, processor, commit
+    :param notes: what was left out, with the reason
+    :param labels: name given to the agents of each of ``states``, None for the names of the plan
     """
 
     names: list[str]
@@ -63,13 +63,13 @@ class Gathered:
 
     @property
     def agents(self) -> list[str]:
-        """Agents, those of others last."""
+        """Agents, with others' agents last."""
         found = list(self.table["agent"].unique())
         return sorted(found, key=lambda agent: agent in self.published)
 
     @property
     def evaluated(self) -> pd.DataFrame:
-        """The rows that scores are of; what a run logs of itself may go on after its last evaluation."""
+        """Rows that scores are made from; a run's other logs may continue after its last evaluation."""
         return self.table[self.table["metric"].isin([*_MEASURED, "episode_length"])]
 
     @property
@@ -84,12 +84,12 @@ def gather(
     """
     Read all that a report needs, each file once.
 
-    :param sources: as of :func:`~sb3_sample.study.read`, or tables
-    :param published: runs that others have made: names as of :func:`~sb3_sample.study.published_runs`, or files of
-        tables. Their tasks are those of the sources; without sources they are the runs that are compared
-    :param plan: file of a plan whose runs are to be found among them
+    :param sources: as for :func:`~sb3_sample.study.read`, or tables
+    :param published: runs of others: names as for :func:`~sb3_sample.study.published_runs`, or files of tables. Only
+        the sources' tasks are kept; without sources, these runs are the ones compared
+    :param plan: file of a plan whose runs are looked for among the sources
     :return: runs and states
-    :raises ValueError: there are neither, a file is damaged, or a name is unknown
+    :raises ValueError: there are neither sources nor published runs, a file is damaged, or a name is unknown
     :raises OSError: a file cannot be read
     """
     given: list[Source] = [sources] if isinstance(sources, (str, Path, pd.DataFrame)) else list(sources)
@@ -133,7 +133,7 @@ def gather(
 
 
 def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
-    """The runs of a source, those of a study that have been evaluated; its state and what its runs were made with."""
+    """Runs of a source (of a study only evaluated ones); adds its state and how its runs were made to ``found``."""
     label, path = tables.labelled(source)
     found.titles.append(label or (path.stem if path.is_file() else path.resolve().name))
     if path.is_file():
@@ -145,7 +145,7 @@ def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
         folders = find_runs(path)
     except BadFile:
         raise
-    except ValueError:  # there is none
+    except ValueError:  # there is no run
         if not is_study:
             raise
     if is_study:
@@ -165,25 +165,25 @@ def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
 
 def made_with(folder: Path) -> dict[str, str]:
     """
-    :param folder: a run's
-    :return: what its last checkpoint was made with, by name; empty if there is none that says so
+    :param folder: folder of a run
+    :return: circumstances of its last checkpoint, by name; empty if none are recorded
     """
     path = folder / f"checkpoint-{checkpointed(folder):012d}" / "manifest.json"
     try:
         manifest = parse_json(read_regular(path, _MAX_MANIFEST), str(path))
-    except (OSError, BadFile):  # none, or one that is being replaced
+    except (OSError, BadFile):  # no checkpoint, or one that is being replaced
         return {}
     found = manifest.get("circumstances") if isinstance(manifest, dict) else None
     return {str(name): str(value) for name, value in found.items()} if isinstance(found, dict) else {}
 
 
 def _recorded(path: Path) -> list[dict[str, str]]:
-    """Versions and machines of a table's runs, by the file beside it that ``studies/evidence.py`` writes."""
+    """Versions and machines of a table's runs, from the file beside it that ``studies/evidence.py`` writes."""
     if not path.is_file():
         return []
     try:
         records = parse_json(read_regular(path, _MAX_RECORDS), str(path))
-    except BadFile:  # of something else
+    except BadFile:  # a file of another kind
         return []
     kept = [record for record in records if isinstance(record, dict)] if isinstance(records, list) else []
     return [
@@ -202,7 +202,7 @@ def _published(name: str | Path, found: Gathered) -> pd.DataFrame:
 
 
 def _measured(parts: list[pd.DataFrame], found: Gathered) -> pd.DataFrame:
-    """The runs of tables, named apart; their rows of statistics over seeds become curves."""
+    """Runs of tables, named apart; rows of statistics over seeds become curves."""
     parts = [part for part in parts if len(part)]
     if not parts:
         return found.table

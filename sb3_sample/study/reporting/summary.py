@@ -1,4 +1,4 @@
-"""The beginning of a report: what was compared, who is better and how sure that is, and what is missing."""
+"""Beginning of a report: what was compared, which agent is better and how certainly, and what is missing."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from sb3_sample.study.reporting.reading import Gathered
 from sb3_sample.study.states import DONE, FAILED
 from sb3_sample.study.table import RUN
 
-#: Agents that are named.
+#: Most agents that are named.
 NAMED = 3
 
 
@@ -21,7 +21,7 @@ def summary(gathered: Gathered, facts: Facts) -> list[tuple[str, list[str]]]:
     """
     :param gathered: runs
     :param facts: their numbers
-    :return: headings with sentences: what was compared, with which result, and what is missing
+    :return: headings with sentences on the comparison, its result, and what is missing
     """
     return [
         ("Compared", _compared(gathered)),
@@ -87,7 +87,7 @@ def _result(gathered: Gathered, facts: Facts) -> list[str]:
 
 def _lost(gathered: Gathered, facts: Facts) -> dict[str, Counter[str]]:
     """
-    Numbers by agent of its runs that have failed, or may have (planned, but not here), and are in no average: without
+    Count by agent the runs that have failed, or may have failed (planned, but not here), and are in no average: without
     its worst runs an agent looks better than it is.
     """
     ends = gathered.evaluated.groupby(["agent", "task", "seed"])["step"].max()
@@ -103,7 +103,7 @@ def _lost(gathered: Gathered, facts: Facts) -> dict[str, Counter[str]]:
             for agent in {
                 agent
                 for agent, given in heads
-                # With its arguments where these tell agents of one name apart.
+                # With its arguments if these distinguish agents of one name.
                 if (agent == name or agent.startswith(f"{name} (")) and _is_of_grid(run, given)
             }:
                 found[agent] += ends.get((agent, run.task, run.seed), -1) < facts.step
@@ -118,7 +118,7 @@ def _lost(gathered: Gathered, facts: Facts) -> dict[str, Counter[str]]:
 
 
 def _lost_text(lost: Mapping[str, Counter[str]], agents: Sequence[str]) -> list[str]:
-    """Sentences on runs that are in no average, one for all agents that lack equally many."""
+    """Sentences on runs that are in no average, one for all agents that lack the same number."""
     found = []
     for kind, counts in lost.items():
         together: dict[int, list[str]] = {}
@@ -140,8 +140,8 @@ def _lost_text(lost: Mapping[str, Counter[str]], agents: Sequence[str]) -> list[
 
 def _verdict(x: str, y: str, chance: Interval, p: float, level: float, is_whole: bool) -> list[str]:
     """
-    Probability of improvement, in words, of the two agents with the highest averages. A verdict needs the permutation
-    test beside the interval, which is too narrow where there are few runs, and all runs of the agent that it favours.
+    Probability of improvement, in words, of the two agents with the highest averages. A verdict needs the interval,
+    which is too narrow with few runs, the permutation test, and all runs of the favoured agent.
     """
     why = f"A run of {x} beats one of {y} on the same task with probability {interval_text(chance)}, p = {p_text(p)}."
     if chance.low <= 0.5 <= chance.high:
@@ -197,7 +197,7 @@ def holes(gathered: Gathered) -> list[tuple[str, str]]:
 def missing(gathered: Gathered) -> dict[tuple[str, str], list[int]]:
     """
     :param gathered: runs
-    :return: seeds of the given plan's runs that are not among them, by agent (with the grid's arguments) and task
+    :return: seeds of the given plan's runs that are missing, by agent (with the grid's arguments) and task
     """
     found: dict[tuple[str, str], list[int]] = {}
     for run in missing_runs(gathered):
@@ -213,7 +213,7 @@ def _is_of_grid(run: Run, given: Mapping[str, Any]) -> bool:
 def missing_runs(gathered: Gathered) -> list[Run]:
     """
     :param gathered: runs
-    :return: those of the given plan that are not among them
+    :return: the given plan's runs that are missing
     """
     runs = gathered.runs
     arguments = [json.loads(text) for text in runs["arguments"]]

@@ -1,5 +1,5 @@
 """
-Scaling laws of value-based reinforcement learning: which batch size, learning rate and replay ratio for which budget
+Scaling laws of value-based reinforcement learning: the best batch size, learning rate and replay ratio for a budget
 ("Value-Based Deep RL Scales Predictably", Rybkin et al. 2025). Pure functions of the table of
 :func:`sb3_sample.study.read`; the command is ``sb3-sample scaling``.
 """

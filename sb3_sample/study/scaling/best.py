@@ -1,4 +1,4 @@
-"""Best batch size and learning rate by task and replay ratio (paper, D.1 and D.4)."""
+"""Best batch size and learning rate for each task and replay ratio (paper, D.1 and D.4)."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,9 +10,9 @@ from sb3_sample.study.aggregate import Scores
 from sb3_sample.study.scaling.crossings import Configuration, check_levels, configurations, number
 from sb3_sample.warn import warn
 
-#: Bootstrap draws of the choice (K).
+#: Bootstrap draws for each choice (K).
 DRAWS = 100
-#: Values of one array at once.
+#: Most values of one array at a time.
 _CHUNK = 2**23
 NAMES = ("batch_size", "learning_rate")
 
@@ -22,9 +22,9 @@ class Cell(NamedTuple):
     All configurations of one task and replay ratio.
 
     :param task: id of the environment
-    :param replay_ratio: gradient steps an environment step
-    :param batch_sizes: one a configuration, NaN where the runs were not given it
-    :param learning_rates: one a configuration, NaN where the runs were not given it
+    :param replay_ratio: gradient steps per environment step
+    :param batch_sizes: one per configuration, NaN if its runs were not given one
+    :param learning_rates: one per configuration, NaN if its runs were not given one
     :param members: the configurations
     """
 
@@ -37,7 +37,8 @@ class Cell(NamedTuple):
     def lines(self, name: str) -> list[np.ndarray]:
         """
         :param name: "batch_size" or "learning_rate"
-        :return: numbers of the configurations that differ in it alone, at least two, by value of the other
+        :return: for each value of the other hyperparameter, the numbers of the configurations that differ only in this
+            one, at least two
         """
         own, other = self.batch_sizes, self.learning_rates
         if name == "learning_rate":
@@ -50,8 +51,8 @@ class Cell(NamedTuple):
 def cells(found: Sequence[Configuration]) -> list[Cell]:
     """
     :param found: configurations of one agent and size
-    :return: the same by task and replay ratio, sorted by these within the order of the tasks
-    :raises ValueError: one was not given its replay ratio, or two differ in something else
+    :return: the configurations by task and replay ratio, in the order of the tasks and sorted by replay ratio
+    :raises ValueError: one has no replay ratio, or two differ in another argument
     """
     tasks = list(dict.fromkeys(each.task for each in found))
     by: dict[tuple[int, float], list[Configuration]] = {}
@@ -84,15 +85,15 @@ def choose(
     cell: Cell, level: float, samples: dict[int, np.ndarray], draws: int, rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
     """
-    The choices of a cell for resampled seeds.
+    Choose the hyperparameters of a cell for resampled seeds.
 
     :param cell: the cell
     :param level: of the return
     :param samples: numbers of the seeds of each sample, (R, m), by number of seeds
-    :param draws: K, of each sample
+    :param draws: K, draws from each sample
     :param rng: of the draws
-    :return: by name of the hyperparameter, (R, K, lines) values, NaN where no value reaches the level; only those of
-        which the cell has several values. A tie between values is their mean
+    :return: chosen values by hyperparameter, (R, K, lines), NaN where no value reaches the level; only hyperparameters
+        of which the cell has several values. Ties give the mean of the tied values
     """
     lines = {name: cell.lines(name) for name in NAMES}
     used = sorted({int(i) for found in lines.values() for line in found for i in line})
@@ -141,24 +142,24 @@ def best_hyperparameters(
     resets: int | Sequence[int] | None = None,
 ) -> pd.DataFrame:
     """
-    Best batch size and learning rate by task and replay ratio: in each of K bootstrap draws of the seeds, the batch
-    size with the earliest crossing of a level at each learning rate, and the learning rate at each batch size; the mean
-    over draws and over the values of the other.
+    Find the best batch size and learning rate for each task and replay ratio: in each of K bootstrap draws of the
+    seeds, the batch size that reaches a level first at each learning rate, and the learning rate that does at each
+    batch size; then the mean over draws and over the values of the other hyperparameter.
 
-    A value that does not reach the level is later than all that do. Where none does there is no choice, and the draw is
-    left out of the mean; the authors' code takes the smallest value there. Values that are reached at the same
+    A value that does not reach the level ranks after all values that do. If none does, there is no choice, and the draw
+    is left out of the mean; the authors' code takes the smallest value there. Values that reach the level at the same
     evaluation are averaged.
 
     :param table: of :func:`~sb3_sample.study.read`, runs of one agent and size
-    :param level: of the return, of 0 to 1000; the authors' is the largest that they fit, 800
+    :param level: of the return, from 0 to 1000; the authors use the largest that they fit, 800
     :param draws: K
     :param seed: of the draws
     :param scores: as for :func:`crossings`
     :param keep_after_reset: as for :func:`crossings`
     :param resets: as for :func:`crossings`
-    :return: columns ``task``, ``replay_ratio``, ``name``, ``value`` (NaN where fewer than half of the draws have a
+    :return: columns ``task``, ``replay_ratio``, ``name``, ``value`` (NaN if fewer than half of the draws have a
         choice), ``std`` over the draws, ``decided`` (share of the draws with a choice) and ``edge`` (share of these
-        whose choice is the smallest or largest value that was tried)
+        whose choice is the smallest or largest value tried)
     :raises ValueError: no task and replay ratio has two batch sizes or learning rates, or no draw reaches the level
     """
     check_levels([level])

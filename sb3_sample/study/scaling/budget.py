@@ -1,9 +1,9 @@
 """
-Compute by replay ratio, its frontier with the environment steps, and the paper's three questions ("Value-Based Deep RL
-Scales Predictably", Rybkin et al. 2025, problems 3.1 and 3.2, equations 4.2, 4.5, A.4 and A.7).
+Compute as a function of the replay ratio, its frontier with the environment steps, and the paper's three questions
+("Value-Based Deep RL Scales Predictably", Rybkin et al. 2025, problems 3.1 and 3.2, equations 4.2, 4.5, A.4 and A.7).
 
-All laws may hold arrays (R,) in the place of numbers, of R bootstrap samples; answers are then (R,), NaN where there is
-none.
+All laws may hold arrays (R,) of R bootstrap samples instead of numbers; answers are then (R,), NaN where no answer
+exists.
 """
 
 from collections.abc import Sequence
@@ -13,19 +13,19 @@ import numpy as np
 
 from sb3_sample.study.scaling.laws import DataLaw, HyperparameterLaw
 
-#: FLOPs of a gradient step by parameter of the critics and row of the batch.
+#: FLOPs of a gradient step per parameter of the critics and row of the batch.
 FLOPS = 10.0
-#: FLOPs that an environment step is worth (appendix B, DeepMind Control).
+#: Cost of an environment step in FLOPs (appendix B, DeepMind Control).
 DELTA = 1e10
-#: Replay ratios that are searched, as logarithms.
+#: Range of the searched replay ratios, as logarithms.
 _ENDS = (-25.0, 25.0)
 
 
 class Point(NamedTuple):
     """
-    A place on the frontier of a level.
+    A point on the frontier of a level.
 
-    :param replay_ratio: gradient steps an environment step
+    :param replay_ratio: gradient steps per environment step
     :param steps: environment steps
     :param compute: FLOPs
     """
@@ -39,9 +39,9 @@ class ComputeLaw(NamedTuple):
     """
     FLOPs by replay ratio sigma: ``10 N B(sigma) sigma D(sigma)`` with ``B(sigma) = batch_size * sigma ** slope`` (4.2).
 
-    :param data: environment steps
+    :param data: law of the environment steps
     :param batch_size: at replay ratio 1, the mean over the tasks
-    :param slope: of the batch size; 0 for one batch size at all replay ratios
+    :param slope: of the batch size; 0 for the same batch size at all replay ratios
     :param critic_params: parameters N of the critics
     """
 
@@ -53,8 +53,8 @@ class ComputeLaw(NamedTuple):
     @classmethod
     def of(cls, data: DataLaw, batch_size: HyperparameterLaw | float, critic_params: float) -> "ComputeLaw":
         """
-        :param data: environment steps
-        :param batch_size: its law, or one for all replay ratios
+        :param data: law of the environment steps
+        :param batch_size: its law, or one value for all replay ratios
         :param critic_params: parameters of the critics
         :return: the law
         :raises ValueError: a number is not positive
@@ -85,9 +85,9 @@ class ComputeLaw(NamedTuple):
 
     def least(self) -> Any:
         """
-        :return: replay ratio of the least compute, 0 where compute grows from the smallest replay ratio on. Below it
-            both compute and steps fall with the replay ratio, so that nothing there is on the frontier; inf where they
-            do so everywhere
+        :return: replay ratio of the least compute; 0 if compute grows from the smallest replay ratio on. Below it both
+            compute and steps fall with the replay ratio, so that nothing there is on the frontier; inf if they do so
+            everywhere
         """
         grows, falls = 1 + self.slope, self.data.alpha - (1 + self.slope)
         with np.errstate(all="ignore"):
@@ -97,13 +97,12 @@ class ComputeLaw(NamedTuple):
 
     def most_data_efficient(self, compute: float) -> Point:
         """
-        The fewest environment steps under a limit of compute: the largest replay ratio whose compute is within it
-        (problem 3.1).
+        Find the fewest environment steps under a limit of compute: the largest replay ratio whose compute is within the
+        limit (problem 3.1).
 
         :param compute: FLOPs
         :return: the point
-        :raises ValueError: the limit is below the least compute with which the level is reached, or is no positive
-            number
+        :raises ValueError: the limit is below the least compute that reaches the level, or is not a positive number
         """
         _check("compute", compute)
         floor = np.log(np.maximum(self.least(), np.exp(_ENDS[0])))
@@ -131,11 +130,12 @@ class ComputeLaw(NamedTuple):
 
     def cheapest(self, steps: float) -> Point:
         """
-        The least compute under a limit of environment steps (problem 3.2; A.7, whose sign is printed the other way).
+        Find the least compute under a limit of environment steps (problem 3.2; A.7, which is printed with the opposite
+        sign).
 
         :param steps: environment steps
         :return: the point
-        :raises ValueError: the limit is not above ``d_min``, or is no positive number
+        :raises ValueError: the limit is not above ``d_min``, or is not a positive number
         """
         _check("steps", steps)
         d_min, beta, alpha = self.data
@@ -152,12 +152,12 @@ class ComputeLaw(NamedTuple):
 
     def best(self, delta: float = DELTA, ends: Sequence[float] | None = None) -> Point:
         """
-        The least total C + δ D with which the level is reached.
+        Find the least total C + δ D that reaches the level.
 
-        :param delta: FLOPs that an environment step is worth
+        :param delta: cost of an environment step in FLOPs
         :param ends: smallest and largest replay ratio; any if None
         :return: the point
-        :raises ValueError: delta is no positive number
+        :raises ValueError: delta is not a positive number
         """
         _check("delta", delta)
         shape = np.broadcast(self.data.d_min, self.batch_size).shape
@@ -167,21 +167,21 @@ class ComputeLaw(NamedTuple):
             point = self.at(np.exp(log_ratio))
             return point.compute + delta * point.steps
 
-        # A sum of exponentials of log sigma: convex.
+        # A sum of exponentials of log sigma, hence convex.
         for _ in range(120):
             left, right = low + (high - low) / 3, high - (high - low) / 3
             less = total(left) < total(right)
             low, high = np.where(less, low, left), np.where(less, right, high)
         middle = (low + high) / 2
-        # A search by comparisons ends somewhere even where there is no law.
+        # The search ends somewhere even where there is no law.
         return self.at(np.exp(np.where(np.isfinite(total(middle)), middle, np.nan))[()])
 
     def frontier(self, low: float, high: float, n: int = 100) -> Point:
         """
         :param low: smallest replay ratio
-        :param high: largest
-        :param n: how many
-        :return: the points from the least compute on, at logarithmically spaced replay ratios; arrays (m,)
+        :param high: largest replay ratio
+        :param n: number of points
+        :return: the points from the least compute upwards, at logarithmically spaced replay ratios; arrays (m,)
         """
         if not 0 < low < high:
             raise ValueError(f"replay ratios must ascend from above 0, not {low}, {high}")
@@ -215,11 +215,11 @@ class BudgetLaw(NamedTuple):
 
 def fit_budget(budget: Sequence[float] | np.ndarray, replay_ratio: Sequence[float] | np.ndarray) -> BudgetLaw:
     """
-    Fit the best replay ratios of several levels by their budgets: least squares of logarithms.
+    Fit the best replay ratios of several levels against their budgets, by least squares of logarithms.
 
     :param budget: (..., L) FLOPs
     :param replay_ratio: (..., L)
-    :return: the law, of shape (...); NaN of samples with a level without a law, or whose budgets are all the same
+    :return: the law, of shape (...); NaN for samples with a level without a law, or with all budgets equal
     :raises ValueError: no sample has two different budgets, or a number is not positive
     """
     budgets, ratios = np.asarray(budget, float), np.asarray(replay_ratio, float)

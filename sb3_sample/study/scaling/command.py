@@ -18,7 +18,7 @@ from sb3_sample.study.scaling.fitting import REPS, fit
 from sb3_sample.study.scaling.page import page
 from sb3_sample.study.scaling.result import Estimate, Laws
 
-#: A command: its help, what adds its arguments, and what runs it.
+#: A command: its help, the function that adds its arguments, and the function that runs it.
 Command = tuple[str, Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace], None]]
 
 
@@ -78,7 +78,7 @@ def pairs(batch_sizes: Sequence[int], learning_rates: Sequence[float], full: boo
     """
     :param batch_sizes: of the sweep
     :param learning_rates: of the sweep
-    :param full: whether every one at every other; each at the middle one of the other if not
+    :param full: whether to take all pairs; if not, each value only with the middle value of the other
     :return: batch sizes and learning rates of the runs
     """
     if full:
@@ -88,7 +88,7 @@ def pairs(batch_sizes: Sequence[int], learning_rates: Sequence[float], full: boo
 
 
 def _written(value: float) -> str:
-    """A number with all its digits, short where it has few."""
+    """A number with all its digits, short if it has few."""
     short = f"{value:g}"
     return short if float(short) == value else repr(value)
 
@@ -221,7 +221,7 @@ def _table(options: argparse.Namespace) -> pd.DataFrame:
 def online(table: pd.DataFrame) -> pd.DataFrame:
     """
     :param table: of :func:`~sb3_sample.study.read`, with ``online_return`` or ``online_success_rate``
-    :return: the same with these in the place of ``return`` and ``success_rate``
+    :return: the table with these in place of ``return`` and ``success_rate``
     :raises ValueError: a run does not have them
     """
     prefix = "online_"

@@ -1,6 +1,6 @@
 """
-Steps at which runs reach a level: returns averaged over the seeds, made non-decreasing, and their first evaluation that
-is at least the level ("Value-Based Deep RL Scales Predictably", Rybkin et al. 2025, appendix D).
+Steps at which runs reach a level: the first evaluation at which the return, averaged over the seeds and made
+non-decreasing, is at least the level ("Value-Based Deep RL Scales Predictably", Rybkin et al. 2025, appendix D).
 """
 
 import json
@@ -17,17 +17,17 @@ from sb3_sample.run_settings import simulator_steps
 from sb3_sample.study.aggregate import Scores, scored
 from sb3_sample.warn import warn
 
-#: Levels and returns are on a scale of 0 to this.
+#: Levels and returns are on a scale from 0 to this value.
 SCALE = 1_000.0
-#: Arguments of runs that the laws are over.
+#: Arguments of runs that enter the laws.
 ARGUMENTS = ("replay_ratio", "batch_size", "learning_rate", "model_size")
-#: A mean return this close to a level has reached it: sums of floats are not exact.
+#: A mean return this close to a level counts as reaching it, since sums of floats are not exact.
 _CLOSE = 1e-9
 
 
 def default_levels(low: float = 200.0, high: float = 800.0, n: int = 10) -> list[float]:
     """
-    The authors' levels, closer together towards the highest: 1000 minus logarithmically spaced distances.
+    The authors' levels, which are closer together towards the highest: 1000 minus logarithmically spaced distances.
 
     :param low: lowest level
     :param high: highest, below 1000
@@ -41,7 +41,7 @@ def default_levels(low: float = 200.0, high: float = 800.0, n: int = 10) -> list
 
 def isotonic(values: Sequence[float] | np.ndarray) -> np.ndarray:
     """
-    Non-decreasing least squares, equal weights, by pooling adjacent violators.
+    Isotonic regression with equal weights, by pooling adjacent violators.
 
     :param values: (T,)
     :return: (T,)
@@ -63,8 +63,8 @@ def first_crossing(curves: np.ndarray, levels: np.ndarray, kept: np.ndarray | No
     """
     Number of the first evaluation at which the isotonic regression of a curve is at least a level.
 
-    The points at which the regression is below a level are the shortest prefix whose sum of (value - level) is least,
-    so that one cumulated sum takes the place of the regression.
+    The points at which the regression is below a level are the shortest prefix with the least sum of (value - level),
+    so that a cumulative sum replaces the regression.
 
     :param curves: (..., T) mean returns
     :param levels: (L,)
@@ -83,7 +83,7 @@ def first_crossing(curves: np.ndarray, levels: np.ndarray, kept: np.ndarray | No
         excess = sums - level * counts
         least = np.minimum(excess.min(axis=-1), 0.0)
         close = excess <= (least + _CLOSE * max(abs(level), 1.0))[..., None]
-        # The prefix without any point has the sum zero.
+        # The empty prefix has the sum zero.
         found[..., i] = np.where(least >= -_CLOSE * max(abs(level), 1.0), 0, close.argmax(axis=-1) + 1)
     if kept is not None:
         number = np.where(kept, np.arange(n), n)
@@ -95,7 +95,8 @@ def first_crossing(curves: np.ndarray, levels: np.ndarray, kept: np.ndarray | No
 
 def kept_evaluations(steps: np.ndarray, curves: np.ndarray, resets: Sequence[float]) -> np.ndarray:
     """
-    Evaluations without those after a reset at which the mean return is not yet back at its value before it.
+    Select evaluations, without those after a reset at which the mean return has not yet recovered its value before the
+    reset.
 
     :param steps: (T,) of the evaluations
     :param curves: (..., T) mean returns
@@ -108,7 +109,7 @@ def kept_evaluations(steps: np.ndarray, curves: np.ndarray, resets: Sequence[flo
         if first == 0:
             continue
         end = len(steps) if i + 1 == len(resets) else int(np.searchsorted(steps, resets[i + 1], side="right"))
-        # The curve before this reset may itself be on the way back from the one before.
+        # Before this reset, the curve may itself still be recovering from the previous one.
         before = np.where(kept[..., :first], np.arange(first), -1).max(axis=-1)
         value = np.take_along_axis(curves, np.maximum(before, 0)[..., None], axis=-1)
         back = np.maximum.accumulate(curves[..., first:end] >= value, axis=-1)
@@ -124,9 +125,9 @@ class Configuration(NamedTuple):
     :param arguments: JSON
     :param task: id of the environment
     :param steps: (T,) simulator steps of the evaluations that all seeds have
-    :param curves: (n, T) returns of the seeds, of 0 to 1000
+    :param curves: (n, T) returns of the seeds, from 0 to 1000
     :param resets: simulator steps at which the agent was reset, as far as the runs reach
-    :param repeat: simulator steps of a step of the agent
+    :param repeat: simulator steps per step of the agent
     """
 
     agent: str
@@ -149,7 +150,7 @@ class Configuration(NamedTuple):
         Steps at which the mean over the seeds reaches levels.
 
         :param levels: (L,)
-        :param samples: (..., m) numbers of the seeds that are averaged; all of them once if None
+        :param samples: (..., m) numbers of the seeds to average; all of them once if None
         :return: (..., L), inf for never
         """
         if samples is None:
@@ -180,10 +181,10 @@ def configurations(
     resets: int | Sequence[int] | None = None,
 ) -> list[Configuration]:
     """
-    The runs of a table by agent, arguments and task.
+    Group the runs of a table by agent, arguments and task.
 
     :param table: see :func:`crossings`, also for the other arguments
-    :return: in the order of the table
+    :return: the configurations in the order of the table
     """
     found = []
     rows = scored(table, scores)
@@ -251,8 +252,8 @@ def _resets(
 
 def _warm_up(agent: str, arguments: dict[str, Any]) -> float:
     """
-    Transitions before the first gradient step: what a run was given, else the default of the class that is called as
-    the agent is, else none.
+    Transitions before the first gradient step: the run's argument, else the default of the class with the agent's name,
+    else 0.
     """
     given = number(arguments.get("learning_starts"))
     if given is not None:
@@ -267,7 +268,7 @@ def _warm_up(agent: str, arguments: dict[str, Any]) -> float:
 def number(value: Any) -> float | None:
     """
     :param value: an argument of a run: a number, or a model size as "0.55M"
-    :return: it as a number; None where it is none
+    :return: the value as a number; None if it is not a number
     """
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return float(value)
@@ -289,25 +290,25 @@ def crossings(
     resets: int | Sequence[int] | None = None,
 ) -> pd.DataFrame:
     """
-    Environment steps at which runs reach levels of the return.
+    Find the environment steps at which runs reach levels of the return.
 
     Returns of the seeds are averaged first, evaluation by evaluation; isotonic regression over the evaluations then
-    makes the mean non-decreasing; a level is reached at the first evaluation at which that is at least the level.
+    makes the mean non-decreasing; a level is reached at the first evaluation at which this mean is at least the level.
     Nothing is interpolated.
 
     :param table: of :func:`~sb3_sample.study.read`
-    :param levels: on the scale of 0 to 1000, on which 1000 is a score of 1 (:mod:`sb3_sample.envs.scores`)
+    :param levels: on the scale from 0 to 1000, where 1000 is a score of 1 (:mod:`sb3_sample.envs.scores`)
     :param scores: of tasks without a common scale, as for :func:`~sb3_sample.study.aggregate`
-    :param keep_after_reset: whether the evaluations after a reset at which the mean return is not yet back at its value
-        before it count too. They do in the authors' crossings; by default they do not here
-    :param resets: environment steps of the resets, or the steps between two; None for what the arguments of the runs
-        say (``resets``, ``reset_gradient_steps``), and none where they say nothing: an agent's default (BRO's) is not
-        among the arguments of its runs. ``reset_gradient_steps`` are counted from ``learning_starts`` on: the run's,
-        else the default of the class that is called as the agent is ("bro_fast", "BRO Fast"), else 0
-    :return: a row a configuration (agent, arguments, task) and level: ``agent``, ``arguments``, ``task``,
+    :param keep_after_reset: whether evaluations after a reset count even if the mean return has not yet recovered its
+        value before the reset. They count in the authors' crossings, but not here by default
+    :param resets: environment steps of the resets, or the steps between two; None to take them from the arguments of
+        the runs (``resets``, ``reset_gradient_steps``), without resets if these are not given: an agent's default
+        (BRO's) is not among the arguments of its runs. ``reset_gradient_steps`` are counted from ``learning_starts``
+        on: the run's, else the default of the class with the agent's name ("bro_fast", "BRO Fast"), else 0
+    :return: one row per configuration (agent, arguments, task) and level: ``agent``, ``arguments``, ``task``,
         ``replay_ratio``, ``batch_size``, ``learning_rate``, ``model_size`` as far as a run was given them, ``level``,
-        ``step`` (simulator steps, NaN where the level is never reached), ``last_step`` (of the evaluations: a level
-        that is never reached takes more), ``runs``
+        ``step`` (simulator steps, NaN if the level is never reached), ``last_step`` (of the evaluations: a lower bound
+        for a level that is never reached), ``runs``
     :raises ValueError: a level is out of range, or seeds have no evaluations in common
     """
     wanted = check_levels(levels)
@@ -334,7 +335,7 @@ def check_levels(levels: Sequence[float]) -> np.ndarray:
     """
     :param levels: of the return
     :return: (L,)
-    :raises ValueError: there are none, or one is no positive number
+    :raises ValueError: there are none, or one is not a positive number
     """
     found = np.asarray(levels, float).reshape(-1)
     if not len(found) or not np.isfinite(found).all() or (found <= 0).any():
@@ -345,6 +346,6 @@ def check_levels(levels: Sequence[float]) -> np.ndarray:
 def sorted_levels(levels: Sequence[float]) -> Iterator[float]:
     """
     :param levels: of the return
-    :return: the same, ascending, each once
+    :return: the levels, ascending and without repeats
     """
     yield from sorted(set(map(float, levels)))

@@ -1,4 +1,4 @@
-"""The paper's figures 1 to 7 and 9 to 11, of runs of one's own."""
+"""The paper's figures 1 to 7 and 9 to 11, for the user's own runs."""
 
 import argparse
 import json
@@ -22,14 +22,14 @@ from sb3_sample.study.scaling.result import Laws
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Data of figure 4: values by replay ratio, one line for each value of an argument; the first that was recorded.
+#: Data of figure 4: values by replay ratio, one line for each value of an argument; the first recorded metric is used.
 _LOGGED = {
     "batch_size": ("diagnostics/overfitting_newest", "diagnostics/overfitting"),
     "learning_rate": ("diagnostics/parameter_norm_critic",),
 }
-#: Data of figures 10 and 11: squared norms of the critics' gradients of two batch sizes.
+#: Data of figures 10 and 11: squared norms of the critics' gradients at two batch sizes.
 _SQUARES = {size: f"diagnostics/gradient_square_{size}" for size in (SMALL, LARGE)}
-#: Measurements that are averaged in figure 10.
+#: Number of measurements averaged in figure 10.
 _WINDOW = 10
 
 
@@ -40,7 +40,7 @@ def draw_all(
     :param laws: of the runs
     :param table: the runs
     :param options: of ``sb3-sample scaling plot``
-    :return: figures by name, and why one of them cannot be drawn by name
+    :return: figures by name, and for figures that cannot be drawn the reasons by name
     :raises ImportError: matplotlib is not installed
     """
     of_one = table
@@ -92,7 +92,7 @@ def _points(
     label: str = "runs",
     bound: str = "a lower bound",
 ) -> None:
-    """Steps of runs: dots; hollow triangles for lower bounds, of a level that not every task reaches."""
+    """Steps of runs as dots; lower bounds, for levels that not every task reaches, as hollow triangles."""
     x = np.asarray(x, float)
     if not censored.all():
         axes.plot(x[~censored], y[~censored], "o", color=color, label=label)
@@ -162,7 +162,7 @@ def steps_and_compute(laws: Laws) -> "Figure":
 def budgets(laws: Laws) -> "Figure":
     """
     :param laws: of runs
-    :return: figure 3: frontiers, lines of one budget, and the optima, compute and steps on linear axes
+    :return: figure 3: frontiers, lines of equal budget, and the optima; compute and steps on linear axes
     :raises ValueError: the laws have no compute
     """
     figure, (axes,) = _axes(1, 6)
@@ -186,8 +186,8 @@ def logged(table: pd.DataFrame) -> "Figure":
     """
     :param table: of runs that have recorded diagnostics
     :return: figure 4: overfitting by replay ratio for each batch size, norm of the critics' parameters for each
-        learning rate; lines by least squares
-    :raises ValueError: the runs have recorded neither, or differ in no such argument
+        learning rate; lines from least squares
+    :raises ValueError: the runs have recorded neither, or no run was given such an argument
     """
     recorded = set(table["metric"])
     there = {name: [metric for metric in metrics if metric in recorded] for name, metrics in _LOGGED.items()}
@@ -217,7 +217,7 @@ def logged(table: pd.DataFrame) -> "Figure":
 def hyperparameters(laws: Laws) -> "Figure":
     """
     :param laws: of runs
-    :return: figure 5: best values by replay ratio over those at replay ratio 1, and against each other
+    :return: figure 5: best values by replay ratio relative to those at replay ratio 1, and against each other
     :raises ValueError: nothing was swept
     """
     if not laws.hyperparameters:
@@ -268,8 +268,8 @@ def extrapolation(laws: Laws, table: pd.DataFrame, options: argparse.Namespace) 
     :param laws: of all runs
     :param table: the runs
     :param options: of the fit
-    :return: figure 6: steps at the smallest and at the largest replay ratio, as fitted without it; no error where they
-        are a lower bound that the law is above
+    :return: figure 6: steps at the smallest and at the largest replay ratio, each predicted by a fit without it; no
+        error if they are a lower bound that the law exceeds
     :raises ValueError: there are fewer than four replay ratios
     """
     if len(laws.replay_ratios) < 4:
@@ -279,11 +279,11 @@ def extrapolation(laws: Laws, table: pd.DataFrame, options: argparse.Namespace) 
     numbers = pd.to_numeric(pd.Series(argument(table, "replay_ratio"), index=table.index))
     for each, held in zip(axes, (laws.replay_ratios[0], laws.replay_ratios[-1]), strict=True):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # said once, of all runs
+            warnings.simplefilter("ignore", UserWarning)  # already shown once, for all runs
             rest = fit(table[numbers != held], **_again(options, level.level))
         law, fine = rest.levels[-1].law(), _fine(laws)
         at = laws.replay_ratios.index(held)
-        # The mean over the tasks is by their medians, which are others without one replay ratio.
+        # The mean over the tasks uses their medians, which differ without one replay ratio.
         kept = np.array([ratio != held for ratio in laws.replay_ratios])
         factor = float(np.exp(np.mean(np.log(level.points[kept] / rest.levels[-1].points))))
         _points(each, np.array(laws.replay_ratios)[kept], level.points[kept], level.censored[kept])
@@ -304,7 +304,7 @@ def choice(laws: Laws, table: pd.DataFrame, options: argparse.Namespace) -> "Fig
     :param laws: of the runs
     :param table: the runs
     :param options: of the fit
-    :return: figure 7: mean return and its isotonic regression of one configuration, and what the draws have chosen
+    :return: figure 7: mean return and its isotonic regression for one configuration, and the choices of the draws
     :raises ValueError: nothing was swept
     """
     again = _again(options, laws.choice_level)
@@ -359,9 +359,9 @@ def levels(laws: Laws) -> "Figure":
 def squares(table: pd.DataFrame) -> dict[tuple[str, float], pd.DataFrame]:
     """
     :param table: of runs that have recorded the norms of their gradients (NoiseScaleCallback)
-    :return: by task and replay ratio the squared norms by environment step (rows) and batch size (columns 64 and
-        1,024), the mean over the seeds and over whatever else the runs differ in
-    :raises ValueError: the runs have recorded none, or do not say their replay ratio
+    :return: by task and replay ratio, the squared norms by environment step (rows) and batch size (columns 64 and
+        1,024), averaged over the seeds and all other differences between runs
+    :raises ValueError: the runs have recorded none, or have no replay ratio
     """
     rows = table[table["metric"].isin(list(_SQUARES.values()))].dropna(subset=["value"])
     if not len(rows):
@@ -369,7 +369,7 @@ def squares(table: pd.DataFrame) -> dict[tuple[str, float], pd.DataFrame]:
     repeats = {text: simulator_steps(json.loads(text)) for text in rows["arguments"].unique()}
     rows = rows.assign(
         ratio=pd.to_numeric(pd.Series(argument(rows, "replay_ratio"), index=rows.index), "coerce"),
-        # A table has steps of the simulator.
+        # The table has simulator steps.
         step=rows["step"] / rows["arguments"].map(repeats),
     )
     if rows["ratio"].isna().any():
@@ -384,8 +384,8 @@ def squares(table: pd.DataFrame) -> dict[tuple[str, float], pd.DataFrame]:
 def critical(table: pd.DataFrame) -> "Figure":
     """
     :param table: as for :func:`squares`
-    :return: figure 10: critical batch size over the training, by rolling means of the squared norms; gaps where these
-        leave no gradient beside the noise
+    :return: figure 10: critical batch size over the training, from rolling means of the squared norms; gaps where these
+        show only noise and no gradient
     """
     found = squares(table)
     tasks = list(dict.fromkeys(task for task, _ in found))
@@ -408,9 +408,9 @@ def critical_and_best(laws: Laws, table: pd.DataFrame) -> "Figure":
     """
     :param laws: of the runs
     :param table: as for :func:`squares`
-    :return: figure 11: the best batch size against the critical one, that of the mean squared norms over the second
-        half of the training, a point a task and replay ratio
-    :raises ValueError: there is no best batch size, or no critical one beside it
+    :return: figure 11: the best batch size against the critical one, which is from the mean squared norms over the
+        second half of the training, one point per task and replay ratio
+    :raises ValueError: there is no best batch size, or no critical batch size beside it
     """
     if "batch_size" not in laws.hyperparameters:
         raise ValueError("batch size has no law")

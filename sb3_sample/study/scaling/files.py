@@ -1,4 +1,4 @@
-"""The file of laws: JSON, with the bootstrap samples that intervals of predictions are made of."""
+"""File of laws: JSON, with the bootstrap samples for intervals of predictions."""
 
 import dataclasses
 import json
@@ -31,7 +31,7 @@ def write_laws(laws: Laws, path: str | Path) -> None:
 def summary(laws: Laws) -> dict[str, Any]:
     """
     :param laws: of :func:`fit`
-    :return: every number of them with its interval, as JSON has it; None for what is not determined
+    :return: all their numbers with intervals, as JSON; None for numbers that are not determined
     """
     found: dict[str, Any] = {"hyperparameters": {}, "data": []}
     for name, law in laws.hyperparameters.items():
@@ -59,7 +59,7 @@ def summary(laws: Laws) -> dict[str, Any]:
             try:
                 of = laws.budget_laws()
             except ValueError as error:
-                # Of levels that are reached at the same evaluations; the other laws stand.
+                # Happens if levels are reached at the same evaluations; the other laws remain valid.
                 notes.append(f"there is no law of the budget: {error}")
             else:
                 found["budget"] = {
@@ -75,7 +75,7 @@ def _json(found: Estimate) -> dict[str, float | None]:
 
 
 def _clean(value: Any) -> Any:
-    """The same with None for what JSON has no number for."""
+    """A value with None in place of numbers that JSON cannot represent."""
     if isinstance(value, dict):
         return {name: _clean(each) for name, each in value.items()}
     if isinstance(value, (list, tuple)):
@@ -101,9 +101,9 @@ def _plain(value: Any) -> Any:
 
 def read_laws(path: str | Path) -> Laws:
     """
-    :param path: of a file of :meth:`Laws.write`
+    :param path: file written by :func:`write_laws`
     :return: the laws
-    :raises ValueError: it is none
+    :raises ValueError: it is not a file of laws
     """
     found = parse_json(read_regular(Path(path), _MAX_FILE), str(path))
     if not isinstance(found, dict) or found.get("format") != _FORMAT:
@@ -129,7 +129,7 @@ def read_laws(path: str | Path) -> Laws:
         rest = {
             field.name: found[field.name]
             for field in dataclasses.fields(Laws)
-            # Older files do not have the last two.
+            # Older files lack "others" and "without_law".
             if field.name not in ("hyperparameters", "levels")
             and (field.name in found or field.name not in ("others", "without_law"))
         }

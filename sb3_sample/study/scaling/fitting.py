@@ -33,16 +33,17 @@ def normalize(
     steps: np.ndarray, last: np.ndarray, *, across_levels: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    Average environment steps over tasks that take differently many: those of each task over its median over the replay
-    ratios, times the median of these medians.
+    Average environment steps over tasks that need different numbers of steps: each task's steps are divided by their
+    median over the replay ratios, and multiplied by the median of these medians.
 
     :param steps: (..., tasks, S, L), inf where a level is not reached
-    :param last: (tasks, S) steps of the last evaluation, in the place of what is not reached in the means: a lower
-        bound. In the medians it is later than all that is reached, however early its runs ended
-    :param across_levels: whether the median is over replay ratios and levels together, as in the authors' code; of the
-        replay ratios at each level, as in the paper, otherwise
-    :return: means (..., S, L), where one of a task is not reached (..., S, L), and the factors by which the means are
-        those of a task (..., tasks, L). NaN where half or more of a task is not reached, which leaves no median
+    :param last: (tasks, S) steps of the last evaluation, which replace unreached levels in the means, as a lower bound.
+        In the medians an unreached level ranks after all reached ones, however early its runs ended
+    :param across_levels: whether the median is over replay ratios and levels together, as in the authors' code;
+        otherwise it is over the replay ratios at each level, as in the paper
+    :return: means (..., S, L), whether any task does not reach the level (..., S, L), and the factors from the means to
+        the steps of each task (..., tasks, L). NaN if half or more of a task's values are not reached, so that it has
+        no median
     """
     bounded = ~np.isfinite(steps)
     filled = np.where(bounded, last[..., None], steps)
@@ -55,7 +56,7 @@ def normalize(
     return scaled.mean(axis=-3), bounded.any(axis=-3), factors
 
 
-#: Numbers of the seeds of each sample, (R, m), by number of seeds of a configuration.
+#: Seeds drawn in each sample, as indices (R, m), by number of seeds of a configuration.
 _Samples = dict[int, np.ndarray]
 
 
@@ -81,36 +82,36 @@ def fit(
     """
     Fit all laws that a table of runs allows.
 
-    Batch size and learning rate: where runs of a task and replay ratio differ in them, the best by
-    :func:`best_hyperparameters`, then :func:`fit_hyperparameter`. Data: of each task and replay ratio the only
+    Batch size and learning rate: if runs of a task and replay ratio differ in them, the best by
+    :func:`best_hyperparameters`, then :func:`fit_hyperparameter`. Data: for each task and replay ratio, the only
     configuration, or the one nearest to these laws (not the one that happened to be first, whose steps would be too
-    few). Of those that differ in one without a law it is that with a value that all replay ratios have, so that the
-    data law mixes none, else that nearest to the best one there. Tasks are averaged by :func:`normalize`, then
-    :func:`fit_data`. A level that a run does not reach enters as a lower bound; a task that reaches it at half of
-    the replay ratios or fewer has no median and is left out, by name.
-    Compute and budget follow from these.
+    few). Among configurations that differ in a hyperparameter without a law, it is the one with a value that all replay
+    ratios share, so that the data law does not mix values, else the one nearest to the best value there. Tasks are
+    averaged by :func:`normalize`, then :func:`fit_data`. A level that a run does not reach enters as a lower bound; a
+    task that reaches it at half of the replay ratios or fewer has no median and is left out and named. Compute and
+    budget follow from these laws.
 
-    Intervals are of the bootstrap over seeds (:mod:`sb3_sample.study.scaling.intervals`): everything from the choice of
-    hyperparameters on is done again for each sample, with the configurations of the data law kept.
+    Intervals are from the bootstrap over seeds (:mod:`sb3_sample.study.scaling.intervals`): everything from the choice
+    of hyperparameters on is repeated for each sample, but with the same configurations of the data law.
 
     :param table: of :func:`~sb3_sample.study.read`
-    :param levels: of the return, of 0 to 1000; the authors' ten if None
-    :param choice_level: of the choice of batch size and learning rate; the largest of ``levels`` if None
-    :param critic_params: parameters of the critics, for compute; those that ``model_size`` says if None
-    :param delta: FLOPs that an environment step is worth
-    :param agent: whose runs; needed where the table has several
-    :param model_size: of the runs; needed where the table has several
-    :param loss: as of :func:`fit_data`; with "squared" tasks with a level that is not reached are left out there
-    :param across_levels: as of :func:`normalize`
-    :param draws: as of :func:`best_hyperparameters`
+    :param levels: of the return, from 0 to 1000; the authors' ten if None
+    :param choice_level: level at which batch size and learning rate are chosen; the largest of ``levels`` if None
+    :param critic_params: parameters of the critics, for compute; from ``model_size`` if None
+    :param delta: cost of an environment step in FLOPs
+    :param agent: agent of the runs; needed if the table has several
+    :param model_size: of the runs; needed if the table has several
+    :param loss: as for :func:`fit_data`; with "squared", tasks that do not reach a level are left out at that level
+    :param across_levels: as for :func:`normalize`
+    :param draws: as for :func:`best_hyperparameters`
     :param reps: bootstrap samples of the intervals
     :param seed: of all draws
-    :param batch_size: of all runs, for compute, where their arguments do not say it
+    :param batch_size: of all runs, for compute, if their arguments do not give it
     :param scores: as for :func:`crossings`
     :param keep_after_reset: as for :func:`crossings`
     :param resets: as for :func:`crossings`
     :return: the laws
-    :raises ValueError: there is one replay ratio only, no level is reached at three of them, or an argument is out of
+    :raises ValueError: there is only one replay ratio, no level is reached at three of them, or an argument is out of
         range
     """
     wanted = check_levels(list(sorted_levels(default_levels() if levels is None else levels)))
@@ -198,7 +199,7 @@ def fit(
 
 
 def _others(found: list[Configuration]) -> dict[str, Any]:
-    """The arguments that all runs have, without those that the laws are of, and the policy that is every agent's."""
+    """Arguments that all runs share, without those of the laws and without the default policy."""
     first, *rest = (json.loads(each.arguments) for each in found)
     own = {"replay_ratio", *NAMES} | ({"policy"} if first.get("policy") == "MlpPolicy" else set())
     return {
@@ -209,7 +210,7 @@ def _others(found: list[Configuration]) -> dict[str, Any]:
 
 
 def _only(values: Iterable[float]) -> float | None:
-    """The one value that all have; None if they differ or one is not known."""
+    """The value that all share; None if they differ or one is not known."""
     found = set(values)
     value = found.pop()
     return None if found or math.isnan(value) else float(value)
@@ -236,7 +237,7 @@ def _of_one(found: list[Configuration], agent: str | None, model_size: Any) -> l
 def _hyperparameters(
     grid: list[Cell], level: float, stages: list[_Samples], draws: int, rng: np.random.Generator, notes: list[str]
 ) -> tuple[dict[str, Hyperparameter], dict[str, pd.DataFrame]]:
-    """The laws, and what was chosen of all that was swept: some of it may have no law."""
+    """The laws, and the choices of all swept hyperparameters, some of which may have no law."""
     rows: dict[str, list[dict[str, object]]] = {}
     values: dict[str, list[list[np.ndarray]]] = {}
     for cell in grid:
@@ -246,7 +247,7 @@ def _hyperparameters(
                     rows.setdefault(name, []).append(summarize(cell, name, chosen[0]))
                     values.setdefault(name, []).append([])
                 with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", RuntimeWarning)  # samples without any choice
+                    warnings.simplefilter("ignore", RuntimeWarning)  # from samples without any choice
                     values[name][-1].append(np.nanmean(chosen, axis=(1, 2)))
     found = {}
     tables = {name: pd.DataFrame(rows[name]) for name in NAMES if name in rows}
@@ -266,7 +267,7 @@ def _hyperparameters(
         slopes, intercepts = [], []
         for stage in range(len(stages)):
             y = np.stack([each[stage] for each, there in zip(values[name], known, strict=True) if there], axis=1)
-            # A sample that does not reach the level anywhere says nothing: the other samples' mean.
+            # A sample that does not reach the level anywhere gets the mean of the other samples.
             y = np.where(np.isfinite(y), y, np.nanmean(y, axis=0))
             slope, intercept = shared_slope(x, groups, np.log(y))
             slopes.append(slope)
@@ -278,8 +279,8 @@ def _hyperparameters(
 def _pick(
     grid: list[Cell], hyperparameters: dict[str, Hyperparameter], chosen: dict[str, pd.DataFrame]
 ) -> dict[tuple[str, float], Cell]:
-    """Of each cell the configuration nearest to the laws, a cell of one."""
-    # A hyperparameter without a law, swept at one replay ratio only, say, has no part in the distance.
+    """For each cell, a cell of only the configuration nearest to the laws."""
+    # A hyperparameter without a law, for example swept at only one replay ratio, does not enter the distance.
     values = {name: [_values(cell, name) for cell in grid] for name in NAMES if name not in hyperparameters}
     common = {name: functools.reduce(np.intersect1d, of_cells) for name, of_cells in values.items()}
     picked = {}
@@ -305,14 +306,14 @@ def _pick(
 
 
 def _values(cell: Cell, name: str) -> np.ndarray:
-    """One a configuration; -1 where the runs were not given it, which is a value too, the default."""
+    """One value per configuration; -1 if its runs were not given one, which stands for the default."""
     return np.nan_to_num(cell.batch_sizes if name == "batch_size" else cell.learning_rates, nan=-1.0)
 
 
 def _one_value(
     cell: Cell, name: str, members: np.ndarray, common: np.ndarray, chosen: pd.DataFrame | None
 ) -> np.ndarray:
-    """Those of the configurations that have one value of a hyperparameter without a law: all cells', else the best."""
+    """Configurations with one value of a hyperparameter without a law: one that all cells have, else the best."""
     own = _values(cell, name)
     if np.isin(own[members], common).any():
         members = members[np.isin(own[members], common)]
@@ -363,7 +364,7 @@ def _data(
     x = np.array(ratios)
     found = []
     there = np.isfinite(steps[0][0])  # (tasks, S, L)
-    # A median of the replay ratios is there if more than half reach the level.
+    # The median over the replay ratios exists if more than half reach the level.
     known = there.all(axis=1) if loss == "squared" else 2 * there.sum(axis=1) > len(ratios)  # (tasks, L)
     for i, level in enumerate(levels):
         reached, kept = there[:, :, i], known[:, i]
@@ -374,7 +375,7 @@ def _data(
                 "a data law needs three, and there is none"
             )
             continue
-        # Levels without a median would leave none across levels.
+        # Across levels, a level without a median would leave none.
         used = np.flatnonzero(known[kept].all(axis=0)) if across_levels else np.array([i])
         fits, means = [], []
         for each in steps:
@@ -403,7 +404,7 @@ def _data(
 
 
 def _fits(ratios: np.ndarray, steps: np.ndarray, censored: np.ndarray, loss: str) -> DataLaw:
-    """Laws (R,) of samples; NaN of those without a median, or with bounds alone."""
+    """Laws (R,) of samples; NaN for samples without a median, or with only bounds."""
     law = DataLaw(*np.full((3, len(steps)), np.nan))
     known = np.isfinite(steps).all(axis=1) & ~censored.all(axis=1)
     if known.any():

@@ -5,7 +5,7 @@ from scipy.stats import norm, t
 
 from sb3_sample.study.aggregate import check_samples
 
-#: Seeds below which the percentiles' distances are multiplied.
+#: Number of seeds below which the percentiles' distances are multiplied.
 FEW = 5
 
 
@@ -23,20 +23,20 @@ def interval(
     point: np.ndarray | float, reps: np.ndarray, n: int | None, confidence: float = 0.95
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Percentiles of bootstrap samples, widened for few seeds: a bootstrap sample of n seeds has a variance that is too
-    small by (n - 1) / n, and n seeds know their own no better than Student's t says (the expanded percentile interval
-    of Hesterberg 2015, "What teachers should know about the bootstrap", section 5.3).
+    Percentiles of bootstrap samples, widened for few seeds: the variance of a bootstrap sample of n seeds is too small
+    by the factor (n - 1) / n, and n seeds estimate their variance only as well as Student's t allows for (the expanded
+    percentile interval of Hesterberg 2015, "What teachers should know about the bootstrap", section 5.3).
 
-    Samples of three or four seeds do not reach as far out as that: there the distances of the plain percentiles from
-    the number are multiplied, by logarithms where all are positive.
+    Samples of three or four seeds do not reach that far out: there the distances of the plain percentiles from the
+    point estimate are multiplied, in logarithms if all are positive.
 
-    BCa and studentised intervals cover less here (``benchmarks/scaling_coverage.py``).
+    BCa and studentised intervals have lower coverage here (``benchmarks/scaling_coverage.py``).
 
-    :param point: (...) of all seeds
-    :param reps: (R, ...)
+    :param point: (...) estimates from all seeds
+    :param reps: (R, ...) estimates from the bootstrap samples
     :param n: seeds of a configuration, at least 2; None for plain percentiles
     :param confidence: of the interval
-    :return: lower and upper ends, (...); NaN where fewer than half of the samples have a value
+    :return: lower and upper bounds, (...); NaN where fewer than half of the samples have a value
     """
     check_samples(len(reps), confidence)
     level = (1 - confidence) / 2
@@ -49,7 +49,7 @@ def interval(
             level = float(norm.cdf(wide))
     there = np.isfinite(reps)
     enough = (2 * there.sum(axis=0) >= len(reps)) & np.isfinite(point)
-    # Where there are not enough, zeros in their place: no warnings of what is not shown.
+    # Zeros where there are not enough, to avoid warnings about values that are not used.
     center, known = np.where(enough, point, 0.0), np.where(enough, np.where(there, reps, np.nan), 0.0)
     ends = np.nanquantile(known, [level, 1 - level], axis=0)
     if factor != 1:

@@ -1,7 +1,7 @@
 """
-The laws: batch size and learning rate by replay ratio, environment steps by replay ratio and model size ("Value-Based
-Deep RL Scales Predictably", Rybkin et al. 2025, "paper" below; "Compute-Optimal Scaling for Value-Based Deep RL", Fu et
-al. 2025, "follow-up").
+Scaling laws: batch size and learning rate by replay ratio, environment steps by replay ratio and model size
+("Value-Based Deep RL Scales Predictably", Rybkin et al. 2025, "paper" below; "Compute-Optimal Scaling for Value-Based
+Deep RL", Fu et al. 2025, "follow-up").
 """
 
 import math
@@ -12,9 +12,9 @@ import numpy as np
 import pandas as pd
 from scipy.optimize import least_squares
 
-#: Exponents that are searched.
+#: Range of searched exponents.
 ALPHA = (0.02, 20.0)
-#: How far the smaller of the two terms of the data law may fall below the steps, as a logarithm; nothing can be seen of
+#: How far the smaller of the two terms of the data law may fall below the steps, as a logarithm; the data do not show
 #: it then.
 _FAR = 12.0
 _GRID_ALPHA, _GRID_BETA = 40, 60
@@ -37,7 +37,7 @@ class HyperparameterLaw(NamedTuple):
 
     def value(self, task: str, replay_ratio: float | np.ndarray) -> Any:
         """
-        :param task: one of the fit
+        :param task: a task of the fit
         :param replay_ratio: any shape
         :return: the value, same shape
         """
@@ -55,8 +55,8 @@ class HyperparameterLaw(NamedTuple):
 
 def fit_hyperparameter(values: pd.DataFrame) -> HyperparameterLaw:
     """
-    Fit a power law with one slope for all tasks and an intercept for each: least squares of logarithms (paper, C.1 and
-    C.2; the multiplicative form of its tables).
+    Fit a power law with one slope for all tasks and an intercept for each, by least squares of logarithms (paper, C.1
+    and C.2; the multiplicative form of its tables).
 
     :param values: columns ``task``, ``replay_ratio``, ``value``; rows without a value are left out
     :return: the law. With one task nothing is shared
@@ -78,7 +78,7 @@ def fit_hyperparameter(values: pd.DataFrame) -> HyperparameterLaw:
 
 def shared_slope(x: np.ndarray, groups: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Least squares with one slope and an intercept a group.
+    Least squares with one slope and an intercept per group.
 
     :param x: (m,)
     :param groups: (m,) integers from 0 on
@@ -104,12 +104,11 @@ class DataLaw(NamedTuple):
     """
     Environment steps by replay ratio sigma: ``d_min * (1 + (beta / sigma) ** alpha)`` (paper, D.5).
 
-    The authors' code fits ``c + (sigma / b) ** -a`` and prints it as ``c * (1 + (sigma / b) ** -a)``; the two are
-    equal with
-    ``beta = b * c ** (-1 / a)`` in the place of ``b``, which is what stands here.
+    The authors' code fits ``c + (sigma / b) ** -a`` and prints it as ``c * (1 + (sigma / b) ** -a)``; the two are equal
+    with ``beta = b * c ** (-1 / a)`` in place of ``b``, which is the form used here.
 
     :param d_min: steps at infinite replay ratio; a number, or (R,) of R laws
-    :param beta: replay ratio at which twice as many are needed
+    :param beta: replay ratio at which twice as many steps are needed
     :param alpha: exponent
     """
 
@@ -126,14 +125,14 @@ class DataLaw(NamedTuple):
 
     def doubts(self, replay_ratio: Sequence[float] | np.ndarray) -> list[str]:
         """
-        :param replay_ratio: those of the fit
-        :return: what they did not determine
+        :param replay_ratio: replay ratios of the fit
+        :return: doubts about parameters that they did not determine, in words
         """
         return [words for words, _ in self._doubts(replay_ratio)]
 
     def undetermined(self, replay_ratio: Sequence[float] | np.ndarray) -> set[str]:
         """
-        :param replay_ratio: those of the fit
+        :param replay_ratio: replay ratios of the fit
         :return: names of the parameters that they did not determine
         """
         return {name for _, names in self._doubts(replay_ratio) for name in names}
@@ -146,7 +145,7 @@ class DataLaw(NamedTuple):
             found.append((f"alpha is at the end of what is searched, {ALPHA[0]} to {ALPHA[1]}", ("alpha",)))
         falling = (self.beta / ratios) ** self.alpha
         if falling.min() > 20:
-            # Of a power only the product d_min * beta ** alpha is known.
+            # For a pure power law only the product d_min * beta ** alpha is known.
             words = "d_min and beta are not determined: at the largest replay ratio steps still fall as a power of it"
             found.append((words, ("d_min", "beta")))
         if falling.max() < 0.02:
@@ -164,22 +163,22 @@ def fit_data(
     censored: Sequence[bool] | np.ndarray | None = None,
 ) -> DataLaw:
     """
-    Fit the environment steps that a level takes, by replay ratio.
+    Fit the environment steps needed for a level, by replay ratio.
 
     The least squares of logarithms are found on a grid of ``alpha`` and ``beta``, then by damped Gauss-Newton steps
-    (the paper has L-BFGS; it is the same minimum). With "squared" the law is linear in the other two parameters for
-    each ``alpha``, which is searched on a grid and then refined, so that the minimum is the global one.
+    (the paper uses L-BFGS; the minimum is the same). With "squared" the law is linear in the other two parameters for
+    each ``alpha``, which is searched on a grid and then refined, so that the minimum is global.
 
     :param replay_ratio: (S,)
     :param steps: (S,) environment steps, or any multiple of them
-    :param loss: "log", squared differences of logarithms, as the paper says, or "squared", of the steps themselves, as
-        the authors' code has it
+    :param loss: "log" for squared differences of logarithms, as in the paper, or "squared" for those of the steps
+        themselves, as in the authors' code
     :param alpha: exponent, if it is known
-    :param censored: (S,) where the level was not reached, and ``steps`` has those after which that was given up: a law
-        above them is not in error there. Of "log" only
-    :return: the law; :meth:`DataLaw.doubts` says what is not determined
-    :raises ValueError: fewer different replay ratios than parameters with a level that was reached, or numbers that
-        are not positive and finite
+    :param censored: (S,) where the level was not reached and ``steps`` has the last step tried: a law above it has no
+        error there. Only with "log"
+    :return: the law; :meth:`DataLaw.doubts` lists what is not determined
+    :raises ValueError: fewer different replay ratios that reach the level than parameters, or numbers that are not
+        positive and finite
     """
     ratios = _positive(replay_ratio, "replay_ratio").reshape(-1)
     values = np.asarray(steps, float).reshape(-1)
@@ -218,7 +217,7 @@ def fit_logs(
     ratios: np.ndarray, steps: np.ndarray, censored: np.ndarray | None = None, alpha: float | None = None
 ) -> DataLaw:
     """
-    Many fits of :func:`fit_data` at once, with loss "log".
+    Do many fits of :func:`fit_data` at once, with loss "log".
 
     :param ratios: (S,)
     :param steps: (R, S)
@@ -279,7 +278,7 @@ def fit_logs(
 
 
 def _start(x: np.ndarray, logs: np.ndarray, bound: np.ndarray, alpha: float | None) -> np.ndarray:
-    """Best points of a grid, (R, 3): logarithms of the two terms at sigma = 1 and of the exponent."""
+    """Best grid points, (R, 3): logarithms of the two terms at sigma = 1 and of the exponent."""
     rates = np.geomspace(0.1, 6, _GRID_ALPHA) if alpha is None else np.array([alpha])
     scales = np.linspace(x.min() - 4, x.max() + 6, _GRID_BETA)
     rate, scale = (each.reshape(-1) for each in np.meshgrid(rates, scales, indexing="ij"))
@@ -295,7 +294,7 @@ def _start(x: np.ndarray, logs: np.ndarray, bound: np.ndarray, alpha: float | No
 
 def fit_squared(ratios: np.ndarray, steps: np.ndarray, alpha: float | None = None) -> DataLaw:
     """
-    Many fits of :func:`fit_data` at once, with loss "squared".
+    Do many fits of :func:`fit_data` at once, with loss "squared".
 
     :param ratios: (S,)
     :param steps: (R, S)
@@ -306,7 +305,7 @@ def fit_squared(ratios: np.ndarray, steps: np.ndarray, alpha: float | None = Non
     y = steps / scale
 
     def profile(rates: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The other two, not negative, for exponents (R, A), and the error."""
+        """The other two parameters, non-negative, for exponents (R, A), and the error."""
         # Normalised to 1 at the smallest ratio, so that no power overflows.
         x = np.exp(-rates[..., None] * np.log(ratios / ratios.min()))
         centred, target = x - x.mean(axis=-1, keepdims=True), y[:, None] - y[:, None].mean(axis=-1, keepdims=True)
@@ -341,12 +340,13 @@ def shared_alpha(
     replay_ratio: Sequence[float] | np.ndarray, steps: np.ndarray, censored: np.ndarray | None = None
 ) -> float:
     """
-    The exponent with which the laws of several levels together fit best, each with a ``d_min`` and ``beta`` of its own;
-    squared differences of logarithms. For few replay ratios, of which three leave nothing over for one level alone.
+    Find the exponent with which the laws of several levels fit best together, each with its own ``d_min`` and ``beta``,
+    by squared differences of logarithms. For few replay ratios: three of them leave no degree of freedom for a single
+    level.
 
     :param replay_ratio: (S,)
     :param steps: (levels, S)
-    :param censored: (levels, S), as of :func:`fit_data`
+    :param censored: (levels, S), as for :func:`fit_data`
     :return: the exponent
     """
     ratios = _positive(replay_ratio, "replay_ratio").reshape(-1)
@@ -388,7 +388,7 @@ class SizeLaw(NamedTuple):
     :param c: steps at infinite replay ratio and size
     :param a: replay ratio at which its term is 1
     :param alpha: exponent of the replay ratio
-    :param b: parameters at which their term is 1
+    :param b: number of parameters at which its term is 1
     :param beta: exponent of the parameters
     """
 
@@ -414,7 +414,7 @@ def fit_model_size(
     steps: Sequence[float] | np.ndarray,
 ) -> SizeLaw:
     """
-    Fit the environment steps that a level takes, by replay ratio and size: least squares of logarithms, from several
+    Fit the environment steps needed for a level, by replay ratio and size: least squares of logarithms, from several
     starts.
 
     :param replay_ratio: (m,)
@@ -433,7 +433,7 @@ def fit_model_size(
             f"{len(values)}, of {len(np.unique(ratios))} and {len(np.unique(sizes))}"
         )
     x, z, y = np.log(ratios), np.log(sizes), np.log(values)
-    # Terms are then of the sizes of the steps, which bound them.
+    # The terms are then of the order of the steps, which bound them.
     middle_x, middle = x.mean(), z.mean()
     x, z = x - middle_x, z - middle
 

@@ -1,4 +1,4 @@
-"""Laws in words and tables, for the page of ``sb3-sample scaling fit`` and for a study's report."""
+"""Laws as words and tables, for the page of ``sb3-sample scaling fit`` and for a study's report."""
 
 import math
 from typing import Any, NamedTuple
@@ -27,7 +27,7 @@ class Part(NamedTuple):
 def beginning(laws: Laws) -> str:
     """
     :param laws: of :func:`~sb3_sample.study.scaling.fit`
-    :return: of which runs they are
+    :return: a description of their runs
     """
     ratios = ", ".join(f"{ratio:g}" for ratio in laws.replay_ratios)
     return f"Replay ratios {ratios}. In brackets 95% intervals over seeds."
@@ -73,7 +73,7 @@ def parts(laws: Laws) -> list[Part]:
 
 
 def _worst(row: dict[str, Any]) -> float:
-    """Largest relative error of a fit; a law above a lower bound is in none."""
+    """Largest relative error of a fit; a law above a lower bound has no error."""
     errors = [fitted / steps - 1 for fitted, steps in zip(row["fitted"], row["steps"], strict=True)]
     return max(max(-error, 0.0) if hit else abs(error) for error, hit in zip(errors, row["censored"], strict=True))
 
@@ -97,7 +97,7 @@ def _budget(laws: Laws, found: dict[str, Any]) -> str:
 def limits(laws: Laws) -> list[str]:
     """
     :param laws: of :func:`~sb3_sample.study.scaling.fit`
-    :return: what they do not say, a sentence each
+    :return: their limits, one sentence each
     """
     numbers = summary(laws)
     found = list(numbers["notes"])

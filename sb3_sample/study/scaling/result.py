@@ -1,4 +1,4 @@
-"""Laws of a table of runs: their numbers with intervals, and what they predict."""
+"""Laws of a table of runs: their numbers with intervals, and their predictions."""
 
 import dataclasses
 import math
@@ -13,11 +13,11 @@ from sb3_sample.study.scaling.budget import FLOPS, BudgetLaw, ComputeLaw, fit_bu
 from sb3_sample.study.scaling.intervals import interval
 from sb3_sample.study.scaling.laws import DataLaw, HyperparameterLaw
 
-#: Largest budgets that are held out of the budget's law (appendix D).
+#: Number of largest budgets held out of the budget's law (appendix D).
 HELD_OUT = 2
-#: How far beyond the replay ratios of the runs a prediction may go; the paper's own checks go four times as far.
+#: Factor by which a prediction may go beyond the runs' replay ratios; the paper's own checks go to a factor of 4.
 BEYOND = 4.0
-#: Batch sizes are multiples of this, at least this.
+#: Batch sizes are positive multiples of this.
 MULTIPLE = 16
 
 
@@ -25,9 +25,9 @@ class Estimate(NamedTuple):
     """
     A number with its interval.
 
-    :param value: of all seeds
-    :param low: lower end; NaN where there is none
-    :param high: upper end
+    :param value: estimate from all seeds
+    :param low: lower bound; NaN if there is none
+    :param high: upper bound
     """
 
     value: float
@@ -40,19 +40,19 @@ class Estimate(NamedTuple):
         return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]"
 
 
-#: Numbers of all seeds (1,), and of the bootstrap samples (R,).
+#: Numbers from all seeds (1,), and from the bootstrap samples (R,).
 Stages = Sequence[np.ndarray]
 
 
 @dataclasses.dataclass
 class Hyperparameter:
     """
-    The law of batch size or learning rate.
+    Law of batch size or learning rate.
 
-    :param values: what was chosen: task, replay_ratio, name, value, std, decided, edge
+    :param values: the choices: task, replay_ratio, name, value, std, decided, edge
     :param tasks: of the law
     :param slopes: (1,), (R,)
-    :param intercepts: the same with an axis of tasks
+    :param intercepts: likewise, with an axis of tasks
     """
 
     values: pd.DataFrame
@@ -62,15 +62,15 @@ class Hyperparameter:
 
     def law(self) -> HyperparameterLaw:
         """
-        :return: the law of all seeds
+        :return: the law from all seeds
         """
         intercepts = map(float, self.intercepts[0][0])
         return HyperparameterLaw(float(self.slopes[0][0]), dict(zip(self.tasks, intercepts, strict=True)))
 
     def at(self, replay_ratio: Any, task: str | None = None) -> list[np.ndarray]:
         """
-        :param replay_ratio: a number, or one a sample for each stage
-        :param task: whose; the mean over all if None
+        :param replay_ratio: a number, or one per sample for each stage
+        :param task: task of the values; the mean over all if None
         :return: values
         """
         ratios = replay_ratio if isinstance(replay_ratio, list) else [replay_ratio] * len(self.slopes)
@@ -84,15 +84,15 @@ class Hyperparameter:
 @dataclasses.dataclass
 class Level:
     """
-    The data law of a level.
+    Data law of a level.
 
-    :param level: of the return, of 0 to 1000
-    :param tasks: that it is over
+    :param level: of the return, from 0 to 1000
+    :param tasks: tasks of the law
     :param left_out: tasks that reach the level at too few replay ratios
     :param points: (S,) mean environment steps by replay ratio
     :param censored: (S,) where a task does not reach the level, so that its mean is a lower bound
-    :param factors: by which the mean is the steps of a task, (tasks,)
-    :param laws: of (1,), (R,)
+    :param factors: factors from the mean to the steps of each task, (tasks,)
+    :param laws: with parameters (1,), (R,)
     """
 
     level: float
@@ -105,22 +105,22 @@ class Level:
 
     def law(self) -> DataLaw:
         """
-        :return: the law of all seeds
+        :return: the law from all seeds
         """
         return DataLaw(*(float(each[0]) for each in self.laws[0]))
 
 
 class Prediction(NamedTuple):
     """
-    Settings, and what they take.
+    Settings, with their steps and compute.
 
-    :param replay_ratio: gradient steps an environment step
-    :param batch_size: rows, a multiple of 16; None where it has no law and differs
-    :param learning_rate: to three digits; None where it has no law and differs
-    :param steps: environment steps to the level, as the mean over the tasks or of one
+    :param replay_ratio: gradient steps per environment step
+    :param batch_size: rows, a multiple of 16; None if it has no law and differs
+    :param learning_rate: to three digits; None if it has no law and differs
+    :param steps: environment steps to the level, as the mean over the tasks or for one task
     :param compute: FLOPs; None without the size of the critics
     :param level: of the return; None for a budget between levels
-    :param limits: what the prediction rests on, and what not
+    :param limits: assumptions and limits of the prediction
     :param others: further arguments that all runs of the laws have
     """
 
@@ -146,14 +146,14 @@ class Prediction(NamedTuple):
 
 
 def _quoted(text: str) -> str:
-    """A word of a shell."""
+    """A text as one word for a shell."""
     plain = shlex.quote(text)
     return f'"{text}"' if plain != text and not set(text) & set('"$`\\!') else plain
 
 
 def rounded_batch_size(value: float) -> int:
     """
-    :param value: of a law
+    :param value: batch size from a law
     :return: the nearest multiple of 16, at least 16, as in the paper's tables 6 and 8
     """
     return max(MULTIPLE, MULTIPLE * round(value / MULTIPLE))
@@ -166,18 +166,18 @@ class Laws:
 
     :param tasks: of the runs
     :param replay_ratios: of the runs, ascending
-    :param seeds: fewest of a configuration
+    :param seeds: fewest seeds of a configuration
     :param hyperparameters: laws by name, "batch_size" and "learning_rate" as far as they were swept
     :param levels: data laws, ascending
     :param critic_params: parameters of the critics; None if they are not known
-    :param delta: FLOPs that an environment step is worth
-    :param batch_size: where all runs of the data laws have one
-    :param learning_rate: where all runs of the data laws have one
+    :param delta: cost of an environment step in FLOPs
+    :param batch_size: of the runs of the data laws, if all share it
+    :param learning_rate: of the runs of the data laws, if all share it
     :param loss: of the data laws
-    :param choice_level: at which batch sizes and learning rates were chosen
-    :param notes: limits of all this, in words
+    :param choice_level: level at which batch sizes and learning rates were chosen
+    :param notes: limits of the laws, in words
     :param others: further arguments that all runs have
-    :param without_law: batch size or learning rate, where it was swept at too few replay ratios for a law
+    :param without_law: "batch_size" or "learning_rate", if swept at too few replay ratios for a law
     """
 
     tasks: list[str]
@@ -199,7 +199,7 @@ class Laws:
 
     @property
     def has_compute(self) -> bool:
-        """Whether size and batch size are known."""
+        """Whether the critics' size and the batch size are known."""
         return self.critic_params is not None and ("batch_size" in self.hyperparameters or self.batch_size is not None)
 
     def interval(self, stages: Stages) -> Estimate:
@@ -231,7 +231,7 @@ class Laws:
         """
         :param level: of the fit; the largest if None
         :param task: one of the level's; the mean over the tasks if None
-        :return: laws of (1,), (R,)
+        :return: laws with parameters (1,), (R,)
         """
         if not self.has_compute:
             raise ValueError("compute needs the size of the critics and the batch size, which these laws do not have")
@@ -260,7 +260,7 @@ class Laws:
 
     def budgets(self) -> pd.DataFrame:
         """
-        :return: of each level the replay ratio of the least C + δ D and this budget, each with its interval, and
+        :return: for each level, the replay ratio of the least C + δ D and this budget, each with its interval, and
             whether the replay ratio is within those of the runs
         """
         rows = []
@@ -280,7 +280,7 @@ class Laws:
 
     def budget_laws(self) -> list[BudgetLaw]:
         """
-        :return: laws of all but the two largest budgets, of (1,), (R,)
+        :return: laws of all but the two largest budgets, with parameters (1,), (R,)
         :raises ValueError: there are fewer than four levels, or no compute
         """
         if len(self.levels) < HELD_OUT + 2:
@@ -309,17 +309,18 @@ class Laws:
         task: str | None = None,
     ) -> Prediction:
         """
-        Settings for a replay ratio, for the fewest steps under a limit of compute, for the least compute under a limit
-        of steps, or for a budget C + δ D.
+        Predict settings for a replay ratio, for the fewest steps under a limit of compute, for the least compute under
+        a limit of steps, or for a budget C + δ D.
 
-        :param replay_ratio: gradient steps an environment step
+        :param replay_ratio: gradient steps per environment step
         :param compute: FLOPs
         :param data: environment steps
-        :param budget: FLOPs and, by δ, steps
-        :param level: of the return, one of the fit; the largest if None. Not of a budget, which says how far one gets
-        :param task: whose; the mean over the tasks if None
+        :param budget: FLOPs, including steps at a cost of δ each
+        :param level: of the return, a level of the fit; the largest if None. Not with a budget, which determines the
+            level
+        :param task: task of the prediction; the mean over the tasks if None
         :return: the settings
-        :raises ValueError: not exactly one is given, there is no answer, or it lies more than four times beyond the
+        :raises ValueError: not exactly one is given, there is no answer, or it is more than four times beyond the
             replay ratios of the runs
         """
         given = {"replay_ratio": replay_ratio, "compute": compute, "data": data, "budget": budget}
@@ -341,7 +342,7 @@ class Laws:
         answer: Callable[[ComputeLaw], Any] = (
             (lambda law: law.most_data_efficient(value)) if name == "compute" else (lambda law: law.cheapest(value))
         )
-        answer(_first(laws[0]))  # raises where there is none
+        answer(_first(laws[0]))  # raises if there is no answer
         ratios = [np.atleast_1d(answer(law).replay_ratio) for law in laws]
         self._check_reach(float(ratios[0][0]))
         return self._at(ratios, of, task)
@@ -377,7 +378,7 @@ class Laws:
             )
         reached = float(table.loc[table["budget"] <= budget, "level"].max()) if inside else None
         sizes = self._values("batch_size", ratios, task)
-        assert self.critic_params is not None and sizes is not None  # else there are no laws of budgets
+        assert self.critic_params is not None and sizes is not None  # otherwise there are no laws of budgets
         steps = [
             budget / (FLOPS * self.critic_params * size * each + self.delta)
             for size, each in zip(sizes, ratios, strict=True)
@@ -414,7 +415,7 @@ class Laws:
         return Estimate(float(values[0][0]))
 
     def _values(self, name: str, ratios: list[np.ndarray], task: str | None) -> list[np.ndarray] | None:
-        """Batch sizes or learning rates at replay ratios; None where they are not known."""
+        """Batch sizes or learning rates at replay ratios; None if not known."""
         if name in self.hyperparameters:
             law = self.hyperparameters[name]
             return law.at(ratios, task if task in law.tasks else None)
