@@ -158,8 +158,8 @@ def estimate_components(
     :param max_lag: L, largest distance between two states whose covariance is measured, below ``n_steps``; covariances
         beyond it are taken to be 0. ``n_steps - 1`` if None
     :param burn_in: each rollout starts after ``burn_in`` to ``2 * burn_in - 1`` steps, all equally likely. None: the
-        environment's time limit in steps, 1,000 if it has none. If all episodes have that length, every step of an episode is
-        equally likely to be the first of a rollout
+        environment's time limit in steps, 1,000 if it has none. If all episodes have that length, every step of an
+        episode is equally likely to be the first of a rollout
     :param baseline: whether the critic's value is subtracted from the returns. It changes the variance, not the
         gradient; MBMA, table 1, does without it
     :param seed: of everything random; the global generators are left unchanged
