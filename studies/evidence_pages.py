@@ -56,23 +56,29 @@ def figure1(ours: pd.DataFrame, others: pd.DataFrame | None) -> str:
     return runpy.run_path(str(CHECKOUT / "benchmarks" / "rewound_actions.py"))["figure"](ours)
 
 
-def by_task(ours: pd.DataFrame, others: pd.DataFrame | None) -> str:
+def evaluations(ours: pd.DataFrame, others: pd.DataFrame | None, index: str) -> str:
     """
-    :param ours: runs of one agent on Meta-World
+    :param ours: runs of one agent on several tasks, or of several agents on one
     :param others: None
-    :return: return and success of each task at each evaluation, means over the seeds, in Markdown
+    :param index: "task" or "agent"
+    :return: return, and success where it is recorded, by task or agent at each evaluation, means over the seeds; for
+        tasks with their mean; in Markdown
     """
-    means = ours.pivot_table(index="task", columns=["metric", "step"], values="value")
-    means.loc["mean"] = means.mean()
-    columns = [(metric, step) for metric in ("return", "success_rate") for step in means["return"].columns]
+    means = ours.pivot_table(index=index, columns=["metric", "step"], values="value")
+    if index == "task":
+        means.loc["mean"] = means.mean()
+    columns = [column for metric in ("return", "success_rate") for column in means.columns if column[0] == metric]
     lines = [
-        "| task | " + " | ".join(f"{metric.removesuffix('_rate')}, {step:,}" for metric, step in columns) + " |",
+        f"| {index} | " + " | ".join(f"{metric.removesuffix('_rate')}, {step:,}" for metric, step in columns) + " |",
         "| --- |" + " ---: |" * len(columns),
     ]
-    for task, values in means.iterrows():
+    for name, values in means.iterrows():
         cells = [f"{values[column]:,.{2 if column[0] == 'success_rate' else 0}f}" for column in columns]
-        lines.append(f"| {task} | " + " | ".join(cells) + " |")
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+by_task, by_agent = (functools.partial(evaluations, index=index) for index in ("task", "agent"))
 
 
 class Page(NamedTuple):
@@ -119,7 +125,7 @@ PAGES = {
     "flash_sac": Page("after_bro.md", "FlashSAC", ("--groups", "all", "--curves", "FlashSAC")),
     "best_agent": Page("best_agent.md", "Screening"),
     "best_agent_final": Page("best_agent.md", "Final"),
-    "drq": Page("drq.md", "DrQ at 64 by 64", ("--groups", "all", "--curves", "none")),
+    "drq": Page("drq.md", "DrQ at 64 by 64", ("--groups", "all", "--curves", "none"), table=by_agent),
     "drqv2": Page("drq.md", "DrQ-v2", ("--groups", "all", "--curves", "none")),
     "srspr": Page("srspr.md", "SR-SPR on Breakout", ("--groups", "all", "--curves", "none")),
     "offline": Page("offline_study.md", "Figure 11 on data of our own"),

@@ -25,7 +25,7 @@ from sb3_sample.warn import warn
 #: With ``compile="auto"``, gradient steps in one ``learn`` from which compiling pays: compiling takes the time of some
 #: thousand steps (docs/performance.md). A fixed number, not a measurement, so that a seed determines the whole run.
 PAYS_FROM = 20_000
-#: The same of gradient steps on images on a CPU, each of which takes as long as a hundred others.
+#: The same of gradient steps on images on a CPU, each of which takes tens of times as long.
 PAYS_FROM_IMAGES = 2_000
 #: The oldest torch with which a gradient step is compiled.
 COMPILES_FROM = (2, 11)

@@ -42,7 +42,7 @@ class Projected(Network):
         self.projection = nn.Sequential(linear(n_features, width, None, gain=gain), nn.LayerNorm(width), nn.Tanh())
         self.network = network(in_features - n_features + width, n_copies=n_copies, **network_kwargs)
         self.out_features = self.network.out_features
-        # What the network requires of its owner.
+        # Requirements of the network to its owner.
         self.trains_in_target = self.network.trains_in_target
         self.stacks_rows, self.stacks_actor_rows = self.network.stacks_rows, self.network.stacks_actor_rows
         self.statistics_every_step = self.network.statistics_every_step

@@ -173,7 +173,7 @@ class SAC(  # type: ignore[misc]  # actor
         # Whether the ``learn`` under way acts in a separate thread, and at how many steps a second; and that thread.
         self._acts_at: tuple[bool, float | None] = (False, None)
         self._apart: Apart | None = None
-        # What a file records of the prior data.
+        # Record of the prior data for the model's file.
         self._prior_of: dict[str, Any] | None = None
         #: Gradient steps planned, for ``learning_rate_schedule``; None until known.
         self.planned_updates: int | None = self.schedule_steps

@@ -109,6 +109,15 @@ class _Agent(NamedTuple):
     node: yaml.Node
 
 
+class _Variant(NamedTuple):
+    """An agent at a point of the grid, and the action space with which it was made on trial."""
+
+    agent: _Agent
+    arguments: dict[str, Any]
+    point: dict[str, Any]
+    made_on: "spaces.Space[Any]"
+
+
 class _Reader:
     def __init__(self, path: Path):
         self._path = path
@@ -352,9 +361,7 @@ class _Reader:
             grid[name] = values
         return grid
 
-    def _variants(
-        self, agents: list[_Agent], grid: dict[str, list[Any]]
-    ) -> Iterator[tuple[_Agent, dict[str, Any], dict[str, Any], "spaces.Space[Any]"]]:
+    def _variants(self, agents: list[_Agent], grid: dict[str, list[Any]]) -> Iterator[_Variant]:
         """
         Agents with each point of the grid, checked to be possible and without repeats; and the action space with which
         each was made.
@@ -373,7 +380,7 @@ class _Reader:
                         f"agent {agent.name!r} is agent {first.name!r} of line {line} once more: an agent can be there "
                         "once",
                     )
-                yield agent, arguments, point, self._made_on(agent, arguments, point)
+                yield _Variant(agent, arguments, point, self._made_on(agent, arguments, point))
 
     def _made_on(self, agent: _Agent, arguments: dict[str, Any], point: dict[str, Any]) -> "spaces.Space[Any]":
         try:
@@ -384,7 +391,7 @@ class _Reader:
 
     def _check_actions(
         self,
-        variants: list[tuple[_Agent, dict[str, Any], dict[str, Any], "spaces.Space[Any]"]],
+        variants: list[_Variant],
         tasks: list[str],
         env_kwargs: dict[str, Any],
     ) -> None:

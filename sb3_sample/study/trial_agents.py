@@ -71,7 +71,8 @@ def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | Non
         settings["buffer_size"] = 1_000  # images, hardly any of which are stored here
     observations = _observations(algo, policy)
     errors: list[Exception] = []
-    for space in _USUAL_ACTIONS if actions is None else [actions]:
+    usual = _USUAL_ACTIONS[::-1] if _is_for_games(algo) else _USUAL_ACTIONS
+    for space in usual if actions is None else [actions]:
         env = DummyVecEnv([functools.partial(_TrialEnv, observations, space)])
         try:
             algorithm(**{"device": "cpu", **settings, "env": env})
@@ -79,7 +80,7 @@ def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | Non
         except (ValueError, TypeError, AssertionError) as error:
             errors.append(error)
     # For example, "all actions of a discrete space" exists only with discrete actions.
-    raise errors[-1 if _is_for_games(algo) else 0]
+    raise errors[0]
 
 
 class _TrialEnv(gym.Env[Any, Any]):

@@ -311,7 +311,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         _run(args)
     except (ValueError, TypeError, ImportError, OSError, NotImplementedError, gym.error.Error) as error:
-        # Stable-Baselines3 raises NotImplementedError for spaces that it has no policy for.
+        # Spaces without a policy in Stable-Baselines3 are among these errors.
         refuse("variance", error)
 
 
