@@ -1,7 +1,7 @@
 """Rank tests of two sets of runs, against numbers worked by hand."""
 
 import runpy
-from math import log
+from math import comb, log
 from pathlib import Path
 
 import pandas as pd
@@ -38,6 +38,17 @@ def test_p_values_by_hand() -> None:
         assert found.loc["all", name] == pytest.approx(p**2 * (1 - log(p**2)))
     assert found.loc["dmc/b-v0", ["n", "mean", "low", "high"]].tolist() == [3, 20, 10, 30]
     assert found.loc["dmc/b-v0", ["n_others", "mean_others", "low_others", "high_others"]].tolist() == [3, 50, 40, 60]
+
+
+def test_ten_runs_against_ten_are_exact_unless_returns_are_equal() -> None:
+    """One of the 184,756 ways to place ten of twenty ranks has all lower; SciPy's approximation is 17 times that."""
+    rank_tests = runpy.run_path(SCRIPT)["rank_tests"]
+    ours = table("ours", {"dmc/a-v0": list(range(10)), "dmc/b-v0": list(range(10))})
+    others = table("others", {"dmc/a-v0": list(range(10, 20)), "dmc/b-v0": [9, *range(11, 20)]})
+    found = rank_tests(ours, others, 50_000).set_index("task")
+    assert found.loc["dmc/a-v0", "p_lower"] == pytest.approx(1 / comb(20, 10))
+    assert found.loc["dmc/a-v0", "p"] == pytest.approx(2 / comb(20, 10))
+    assert found.loc["dmc/b-v0", "p_lower"] == pytest.approx(1e-4, rel=0.2)
 
 
 def test_tables_without_a_comparison_are_refused() -> None:
