@@ -445,10 +445,11 @@ class Learner(Executable):
         # One step ahead, at the start and after every delay, if the first of the steps is the actors'.
         ahead = self.policy_delay - 1 if self.actor_at_once else 0
         of_actors = schedule.rate((before + ahead) // self.policy_delay, self.planned_updates)
+        every_step = {id(each) for each in (self.critic.optimizer, *self.objective.optimizers().values())}
         for optimizer in self.optimizers().values():
             for group in optimizer.param_groups:
                 if group.get("scheduled", True):
-                    group["lr"] = of_critics if optimizer is self.critic.optimizer else of_actors
+                    group["lr"] = of_critics if id(optimizer) in every_step else of_actors
             if isinstance(optimizer, AdamW):
                 optimizer.prepare_rates()
 

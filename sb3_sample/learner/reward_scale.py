@@ -244,7 +244,7 @@ class TaskScale(RewardScale):
         self._has_looked = False
 
     def on_observations(self, learner: Learning, observations: Any) -> None:
-        told = observations.get("task") if isinstance(observations, dict) else None
+        told = observations.get("task") if isinstance(observations, dict) and len(self.largest) > 1 else None
         self._tasks = [] if told is None else torch.as_tensor(told).reshape(-1).tolist()
 
     def on_step(self, learner: Learning, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
@@ -253,7 +253,9 @@ class TaskScale(RewardScale):
         for i, (episode, reward, done, info) in enumerate(zip(self._episodes, rewards, dones, infos, strict=True)):
             episode.append(float(reward))
             if done:
-                task = self._tasks[i] if self._tasks else int(info.get("task", 0))
+                task = 0
+                if len(self.largest) > 1:  # with one task, "task" is anything of the environment's own
+                    task = self._tasks[i] if self._tasks else int(info.get("task", 0))
                 self._take(episode, bool(info.get("TimeLimit.truncated", False)), task, learner.gamma)
                 episode.clear()
 
@@ -292,7 +294,7 @@ class TaskScale(RewardScale):
         self.divisors.copy_(((size - entropy) / self.max_return).clamp(min=1e-8))
 
     def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
-        return self.divisors[0] if task is None else self.divisors[task]
+        return self.divisors[0] if task is None or len(self.divisors) == 1 else self.divisors[task]
 
     def get_extra_state(self) -> dict[str, Any]:
         return {"episodes": [list(episode) for episode in self._episodes]}

@@ -1,5 +1,6 @@
 """A mixture of sources: batches with a fixed share of each."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -20,7 +21,8 @@ class Mixture:
     Batches of several sources, such as a data set and a replay buffer, the rows of the first source first.
 
     :param sources: each with ``sample(batch_size)``
-    :param shares: share of each source in a batch; they add up to 1. The last source gets the remainder of rounding
+    :param shares: share of each source in a batch; they add up to 1. Batches have as many rows of the first sources
+        together as their shares together make, rounded
     :raises ValueError: if there are not as many shares as sources, one is negative, or they do not add up to 1
     """
 
@@ -39,8 +41,9 @@ class Mixture:
         """
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1, not {batch_size}")
-        sizes = [round(share * batch_size) for share in self.shares[:-1]]
-        sizes.append(batch_size - sum(sizes))
+        # Rounding sums instead of shares never makes more rows, or fewer, than batch_size.
+        ends = [round(total * batch_size) for total in itertools.accumulate(self.shares[:-1])]
+        sizes = [end - begin for begin, end in itertools.pairwise((0, *ends, batch_size))]
         return mixed([source.sample(n) for source, n in zip(self.sources, sizes, strict=True) if n > 0])
 
 

@@ -180,8 +180,11 @@ def _tensors(learner: Any) -> dict[str, torch.Tensor]:
     networks = learner.networks
     found = dict(networks.named_parameters("networks", remove_duplicate=False))
     found |= dict(networks.named_buffers("networks", remove_duplicate=False))
-    # Not the explorer's buffers, which may hold the progress of the acting explorer itself.
     found |= dict(learner.explorer.named_parameters("explorer"))
+    # Running statistics of the explorer's networks, but not its own buffers, which may hold the progress of the acting
+    # explorer itself.
+    for name, network in learner.explorer.named_children():
+        found |= dict(network.named_buffers(f"explorer.{name}"))
     return found | dict(learner.pessimism_rule.named_parameters("pessimism"))
 
 

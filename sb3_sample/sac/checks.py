@@ -456,7 +456,7 @@ def _check_buffer_class(agent: Any) -> None:
         raise ValueError(
             f"replay_buffer_class={cls.__name__} needs a Dict observation space, not {space}: leave it out"
         )
-    if is_dict and cls in (ReplayBuffer, NStepReplayBuffer):
+    if is_dict and (cls is ReplayBuffer or issubclass(cls, (DeviceReplayBuffer, NStepReplayBuffer))):
         raise ValueError(f"replay_buffer_class={cls.__name__} cannot hold the observations of {space}: leave it out")
     goals = {"observation", "achieved_goal", "desired_goal"}
     if issubclass(cls, HerReplayBuffer) and isinstance(space, spaces.Dict) and not goals <= space.spaces.keys():
@@ -537,7 +537,8 @@ def check_device_buffer(agent: Any, normalization: Any) -> None:
 
 def _check_n_steps(agent: Any) -> None:
     cls = agent.replay_buffer_class
-    if agent.n_steps > 1 and cls is not None and not issubclass(cls, (NStepReplayBuffer, WindowReplay)):
+    makes_returns = (NStepReplayBuffer, WindowReplay) if agent.draws_windows else NStepReplayBuffer
+    if agent.n_steps > 1 and cls is not None and not issubclass(cls, makes_returns):
         raise ValueError(
             f"n_steps={agent.n_steps} needs a buffer that makes n-step returns, NStepReplayBuffer, not "
             f"replay_buffer_class={cls.__name__}: leave replay_buffer_class out"

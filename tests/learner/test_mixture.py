@@ -30,6 +30,17 @@ def test_every_batch_has_the_shares(shares: tuple[float, float], batch_size: int
     assert torch.equal(batch.observations[:, :1], batch.rewards) and batch.discounts is None
 
 
+@pytest.mark.parametrize(
+    ("shares", "batch_size", "sizes"),
+    [((0.3, 0.3, 0.3, 0.1), 5, (2, 1, 1, 1)), ((0.3, 0.3, 0.3, 0.1), 2, (1, 0, 1, 0)), ((0.5, 0.5, 0.0), 3, (2, 1, 0)),
+     ((1 / 3, 1 / 3, 1 / 3, 0.0), 10, (3, 4, 3, 0))],
+)  # fmt: skip
+def test_rounding_keeps_the_batch_size(shares: tuple[float, ...], batch_size: int, sizes: tuple[int, ...]) -> None:
+    """Sums of shares times the batch size are rounded, half to even."""
+    batch = Mixture([data(float(i)) for i in range(len(shares))], shares).sample(batch_size)
+    assert batch.rewards.flatten().tolist() == [float(i) for i, n in enumerate(sizes) for _ in range(n)]
+
+
 def test_dicts_are_joined_by_key() -> None:
     batch = Mixture([data(1.0, as_dict=True), data(2.0, as_dict=True)], (0.5, 0.5)).sample(4)
     assert batch.observations["b"].flatten().tolist() == [1, 1, 2, 2] and batch.observations["a"].shape == (4, 3)

@@ -320,6 +320,19 @@ def test_tasks_told_by_tensors() -> None:
         assert scale.largest.tolist() == [-math.inf, 3.0]
 
 
+def test_one_task_is_not_looked_up() -> None:
+    """With one task, "task" is anything: a name in the infos, two numbers among the observations."""
+    of, o = learner(), torch.zeros(2, 1)
+    scale: Any = REWARD_SCALES["brc"](of)
+    scale.on_observations(of, {"observation": np.zeros((1, 3)), "task": np.array([[-0.3, 5.0]])})
+    scale.on_step(of, np.array([3.0]), np.array([True]), [{"task": "reach"}])
+    scale.before_updates(of)
+    assert scale.largest.tolist() == [3.0]
+    observations = {"observation": torch.zeros(2, 3), "task": torch.tensor([[-0.3, 5.0], [7.0, 1.0]])}
+    found = scale.transform(Batch(observations, o, observations, o, torch.full((2, 1), 4.0), 0.9), None).rewards
+    assert found.flatten().tolist() == pytest.approx([4 / ((3 + 5) / 10)] * 2, rel=1e-6)
+
+
 def test_spaces_that_are_not_normalised() -> None:
     from gymnasium import spaces
 

@@ -11,7 +11,7 @@ from stable_baselines3.common.utils import ConstantSchedule
 
 from sb3_sample.learner.schedules import LearningRateSchedule
 from sb3_sample.sac import SAC, XQC
-from tests.sac.common import COMPILES, bro, differing, random_batch, sac, state, vec
+from tests.sac.common import COMPILES, MAKERS, bro, differing, random_batch, sac, state, vec
 
 
 def test_a_learn_without_gradient_steps_plans_nothing() -> None:
@@ -51,6 +51,19 @@ def test_each_optimizer_goes_by_its_own_steps() -> None:
         for name in ("actor.optimizer", "temperature_optimizer", "explorer.actor_optimizer"):
             assert found[name] == pytest.approx(1e-3 * (1 - k // 2 / 10)), (name, k)
     assert found["explorer.scalar_optimizer"] == own
+
+
+def test_a_value_network_goes_by_the_critics_steps() -> None:
+    """That of IQL learns in every step, whatever the actor's delay."""
+    model = MAKERS["IQL"](
+        learning_rate=1e-3, learning_rate_schedule="linear", final_learning_rate=0.0, schedule_steps=10, policy_delay=2
+    )
+    batch = random_batch(model)
+    for k in range(6):
+        model._update(batch)
+        found = rates(model)
+        assert found["critic.optimizer"] == found["objective.optimizer"] == pytest.approx(1e-3 * (1 - k / 10))
+        assert found["actor.optimizer"] == pytest.approx(1e-3 * (1 - k // 2 / 10))
 
 
 def test_planned_are_the_first_learns(tmp_path: Path) -> None:

@@ -462,6 +462,19 @@ def test_a_shared_encoder_is_handed_over(maker: str, clock: Made) -> None:
     assert torch.equal(acting.features(observations), learning.features(observations))
 
 
+def test_running_statistics_of_an_explorer_are_handed_over(clock: Made) -> None:
+    """Batch moments of an optimistic actor: without them its copy acts by another policy."""
+    model = MAKERS["CrossQ"](env=vec(), exploration="optimistic_actor", policy_delay=1)
+    model.learn(60, asynchronous=True, control_frequency=20)
+    apart = Apart(model, None)
+    for value in model.explorer.actor.buffers():
+        value += 1
+    apart._hand_over()
+    theirs, ours = (dict(each.explorer.actor.named_buffers()) for each in (model.learner, apart._learner))
+    assert any("running_mean" in name for name in theirs)
+    assert ours.keys() == theirs.keys() and all(torch.equal(ours[name], theirs[name]) for name in theirs)
+
+
 class Embedding(BaseFeaturesExtractor):
     def __init__(self, observation_space: Any):
         super().__init__(observation_space, 4)

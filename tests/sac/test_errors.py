@@ -17,6 +17,7 @@ from stable_baselines3.her import HerReplayBuffer
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
+from sb3_sample import CompactNStepReplayBuffer, DeviceReplayBuffer, FadedReplayBuffer, WindowReplayBuffer
 from sb3_sample.sac import BRO, BROTD3, DAC, GPLSAC, OAC, SAC, TOPSAC, VPLSAC, RegularizedSAC
 from tests.sac.common import MAKERS, WRONG_ARGUMENTS, WRONG_ARGUMENTS_OF_LEARN, Toy, bro, sac, vec
 
@@ -572,6 +573,37 @@ def test_dac_starts_above_the_bound_also_when_loaded(tmp_path: Path) -> None:
     sac(cls=DAC).learn(30).save(tmp_path / "m")
     with pytest.raises(ValueError, match="initial_optimism must be above"):
         DAC.load(tmp_path / "m", initial_optimism=-5.0)
+
+
+def test_dac_starts_above_the_bound_of_every_arm() -> None:
+    """Whichever arm the bandit draws first."""
+    for seed in range(6):
+        with pytest.raises(ValueError, match=r"initial_optimism must be above minus the pessimism, 0.0, not -0.5"):
+            sac(cls=DAC, pessimism="top", initial_optimism=-0.5, seed=seed)
+        model = sac(cls=DAC, pessimism="top", pessimism_kwargs={"arms": (0.6, 1.0)}, initial_optimism=-0.5, seed=seed)
+        optimism = model.explorer.optimism_distance() - model.learner.pessimism_rule.beta()
+        assert float(optimism) == pytest.approx(-0.5, abs=1e-6)
+
+
+@pytest.mark.parametrize("cls", [DeviceReplayBuffer, CompactNStepReplayBuffer])
+def test_buffers_of_single_observations(cls: Any) -> None:
+    class Mine(cls):
+        pass
+
+    for each in (cls, Mine):
+        with pytest.raises(
+            ValueError, match=f"replay_buffer_class={each.__name__} cannot hold the observations of Dict"
+        ):
+            sac(vec(obs_space=OBS_DICT), policy="MultiInputPolicy", replay_buffer_class=each)
+
+
+@pytest.mark.parametrize("cls", [WindowReplayBuffer, FadedReplayBuffer])
+def test_returns_of_several_steps_need_a_buffer_that_makes_them(cls: Any) -> None:
+    """Only DebiasedRQ draws windows."""
+    with pytest.raises(
+        ValueError, match=f"n_steps=3 needs a buffer that makes .* not replay_buffer_class={cls.__name__}"
+    ):
+        sac(n_steps=3, replay_buffer_class=cls)
 
 
 def test_what_load_does_not_take(tmp_path: Path) -> None:
