@@ -119,12 +119,7 @@ class _RawPolicy(nn.Module):
         self.spaces = _inputs(policy.observation_space)
         self.is_dict = isinstance(policy.observation_space, spaces.Dict)
         policy.set_training_mode(False)
-        try:
-            self.acting = policy if policy.device.type == "cpu" else copy.deepcopy(policy).cpu()
-        except RuntimeError as error:
-            raise ValueError(
-                f"the policy cannot be copied from {policy.device} ({error}): load the model with device='cpu'"
-            ) from error
+        self.acting = policy if policy.device.type == "cpu" else self._copied(policy)
         self.action_space, self.squashed = policy.action_space, policy.squash_output
         if isinstance(self.action_space, spaces.Box):
             # Bounds of integers as floats, in the type of the actions that ``predict`` gives.
@@ -135,6 +130,20 @@ class _RawPolicy(nn.Module):
         self.normalized: list[str] = []
         if vec_normalize is not None and vec_normalize.norm_obs:
             self._take_statistics(vec_normalize)
+
+    def _copied(self, policy: BasePolicy) -> BasePolicy:
+        """Copy of a policy on the CPU."""
+        zeros = self.example(1)
+        here = {name: x.to(policy.device) for name, x in zeros.items()} if self.is_dict else zeros.to(policy.device)
+        with torch.no_grad():
+            # An actor-critic's distribution after a gradient step has tensors of its graph, which cannot be copied.
+            policy._predict(here, deterministic=True)
+        try:
+            return copy.deepcopy(policy).cpu()
+        except RuntimeError as error:
+            raise ValueError(
+                f"the policy cannot be copied from {policy.device} ({error}): load the model with device='cpu'"
+            ) from error
 
     def _take_statistics(self, vec_normalize: VecNormalize) -> None:
         statistics = vec_normalize.obs_rms

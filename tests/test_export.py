@@ -1,5 +1,6 @@
 """Exported policies give ``predict``'s actions without this package."""
 
+import copy
 import importlib.util
 import json
 import resource
@@ -17,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 
 from sb3_sample import MBMAPPO, SAC, TrainingDiverged, export
-from sb3_sample.export import OPSET
+from sb3_sample.export import OPSET, _RawPolicy
 from tests.agents import OFF_POLICY
 from tests.ppo.common import ALGORITHMS, tiny
 from tests.sac.common import Toy, bro, sac, vec
@@ -249,6 +250,18 @@ def test_no_state_is_touched(tmp_path: Path) -> None:
     assert all(torch.equal(before[name], value) for name, value in model.policy.state_dict().items())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["policy.onnx", "policy.pt"]
     model.learn(20)
+
+
+def test_a_copy_after_a_gradient_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A policy elsewhere than on the CPU is copied, also with a distribution of the last step's tensors."""
+    model = tiny(MBMAPPO, vec()).learn(64)
+    with pytest.raises(RuntimeError, match="deepcopy"):
+        copy.deepcopy(model.policy)
+    raw = _RawPolicy(model.policy, None)
+    moved = raw._copied(model.policy)
+    assert moved is not model.policy and moved.device.type == "cpu"
+    expected = model.policy._predict(raw.example(3), deterministic=True)
+    assert torch.equal(moved._predict(raw.example(3), deterministic=True), expected)
 
 
 @pytest.mark.slow

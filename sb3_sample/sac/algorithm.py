@@ -299,8 +299,8 @@ class SAC(  # type: ignore[misc]  # actor
 
     @classmethod
     def _made(cls, content: Any, attributes: dict[str, Any], kwargs: dict[str, Any], *args: Any) -> Any:
-        n_step_buffers = NStepReplayBuffer, CompactNStepReplayBuffer
-        if "n_steps" in kwargs and attributes.get("replay_buffer_class") in n_step_buffers:
+        chosen = NStepReplayBuffer, CompactNStepReplayBuffer, CompactReplayBuffer, CompactDictReplayBuffer
+        if "n_steps" in kwargs and attributes.get("replay_buffer_class") in chosen:
             # The class was chosen for the file's n_steps, which older files list among the buffer's arguments.
             attributes["replay_buffer_class"] = None
             of_buffer = attributes.get("replay_buffer_kwargs")

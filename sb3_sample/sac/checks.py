@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import ConstantSchedule
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_sample.arguments import NotAllowed, check_every, check_unused
+from sb3_sample.arguments import NotAllowed, check_every, check_unused, default_of
 from sb3_sample.kinds import (
     check_value,
     integer,
@@ -41,9 +41,8 @@ def check(agent: Any) -> None:
     n_critics = check_value("n_critics", agent._n_critics(), integer(1))
     check_target_entropy(agent)
     check_use_sde(agent.use_sde)
-    if n_critics == 1 and (isinstance(agent.pessimism, (str, type)) or agent.exploration == "oac"):
-        what = f"pessimism={agent.pessimism!r}" if isinstance(agent.pessimism, (str, type)) else "exploration='oac'"
-        raise ValueError(f"{what} weighs the critics' spread, which n_critics=1 has not")
+    if n_critics == 1:
+        _check_no_spread(agent)
     if agent.redo_period is None:
         check_unused(agent, ["redo_threshold"], "redo_period=None")
     if agent.reset_gradient_steps is not None and has_resets(agent.resets):
@@ -406,6 +405,19 @@ def _check_no_entropy(agent: Any, name: str) -> None:
         raise ValueError(
             f"{name}={getattr(agent, name)!r} asks for an entropy, which a deterministic actor (backbone='td3') has "
             f"not: leave {name} out"
+        )
+
+
+def _check_no_spread(agent: Any) -> None:
+    """Refuse arguments that weigh the spread of several critics; numbers only if they differ from the class's."""
+    weighs = [f"exploration={agent.exploration!r}"] if agent.exploration == "oac" else []
+    for name in "pessimism", "actor_pessimism":
+        value = getattr(agent, name)
+        if isinstance(value, (str, type)) or value not in (None, 0, default_of(type(agent), name)):
+            weighs.append(f"{name}={value!r}")
+    if weighs:
+        raise ValueError(
+            f"{weighs[-1]} weighs the critics' spread, which n_critics=1 has not: pass n_critics=2, or a pessimism of 0"
         )
 
 

@@ -250,9 +250,11 @@ class MultiTaskEvalCallback(EvalCallback):
     def _write(self, folder: Path) -> None:
         for number, task_id in enumerate(self.task_ids):
             own = folder / task_id.replace(":", "_")
-            if not (own / "run.json").exists():
-                own.mkdir(parents=True, exist_ok=True)
-                (own / "run.json").write_text(json.dumps(self._record(task_id), indent=1))
+            own.mkdir(parents=True, exist_ok=True)
+            # Anew for every training: an earlier one in the same folder may have had another seed.
+            record, path = json.dumps(self._record(task_id), indent=1), own / "run.json"
+            if not path.exists() or path.read_text() != record:
+                path.write_text(record)
             arrays: dict[str, Any] = {
                 "timesteps": self.evaluations_timesteps,
                 "results": [each[number] for each in self.evaluations_results],

@@ -564,6 +564,18 @@ def test_no_spread_of_one_critic(kwargs: dict[str, Any]) -> None:
         sac(policy_kwargs={"net_arch": [8], "n_critics": 1}, **kwargs)
 
 
+def test_pessimism_of_one_critic() -> None:
+    """A number that would have no effect is refused, the class's own and 0 are not."""
+    one: Any = {"net_arch": [8], "n_critics": 1}
+    for name in "pessimism", "actor_pessimism":
+        with pytest.raises(ValueError, match=f"{name}=0.5 weighs the critics' spread, which n_critics=1 has not"):
+            sac(policy_kwargs=one, **{name: 0.5})
+    sac(policy_kwargs=one, pessimism=0.0, actor_pessimism=0)
+    with pytest.raises(ValueError, match="pessimism=0.5 weighs"):
+        MAKERS["SimBa"](n_critics=1, pessimism=0.5)
+    MAKERS["SimBa"](n_critics=1)
+
+
 def test_no_spread_of_one_target() -> None:
     with pytest.raises(ValueError, match="target_subset=1 leaves none"):
         sac(pessimism="gpl", target_subset=1)
@@ -582,7 +594,7 @@ def test_dac_starts_above_the_bound_of_every_arm() -> None:
             sac(cls=DAC, pessimism="top", initial_optimism=-0.5, seed=seed)
         model = sac(cls=DAC, pessimism="top", pessimism_kwargs={"arms": (0.6, 1.0)}, initial_optimism=-0.5, seed=seed)
         optimism = model.explorer.optimism_distance() - model.learner.pessimism_rule.beta()
-        assert float(optimism) == pytest.approx(-0.5, abs=1e-6)
+        assert optimism.item() == pytest.approx(-0.5, abs=1e-6)
 
 
 @pytest.mark.parametrize("cls", [DeviceReplayBuffer, CompactNStepReplayBuffer])

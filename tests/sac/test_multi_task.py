@@ -439,6 +439,13 @@ def test_evaluation_by_task() -> None:
     assert found[PENDULUM].mean_return == pytest.approx(np.mean(returns), rel=1e-4)
 
 
+def test_a_later_training_in_the_same_folder_is_recorded_as_its_own(tmp_path: Path) -> None:
+    for seed in (4, 5):
+        callback = MultiTaskEvalCallback(tasks(seed=9), eval_freq=10, n_eval_episodes=1, log_path=tmp_path, verbose=0)
+        make("SAC", seed=seed).learn(24, callback=callback)
+    assert set(study.read(tmp_path)["seed"]) == {5}
+
+
 def test_callback_logs_and_writes_what_a_study_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     model = make("BRC", seed=4)
     model.set_logger(configure(str(tmp_path / "logger"), ["json"]))

@@ -180,6 +180,8 @@ def test_n_step_returns_are_those_of_the_arguments(tmp_path: Path) -> None:
                 assert type(buffer) is NStepReplayBuffer
                 assert {"n_steps": 5, "gamma": 0.9} | kwargs == {"n_steps": buffer.n_steps, "gamma": buffer.gamma}
             assert type(SAC.load(tmp_path / name, env=vec(), n_steps=1).replay_buffer) is CompactReplayBuffer
+        sac().save(tmp_path / "one")
+        assert SAC.load(tmp_path / "one", env=vec(), n_steps=3).replay_buffer.n_steps == 3  # type: ignore[union-attr]
 
 
 def test_bad_override_at_loading(tmp_path: Path) -> None:
