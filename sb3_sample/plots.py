@@ -24,6 +24,7 @@ from sb3_sample.exits import refuse
 from sb3_sample.extras import install
 from sb3_sample.run_logs import EVALUATIONS, is_truncated, monitor_files, read_evaluations, read_monitors
 from sb3_sample.run_settings import read_settings, run_env_id, study_of
+from sb3_sample.study_list import is_evaluated, read_list
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -36,6 +37,9 @@ COLUMNS = ["env_step", "n_seeds", "mean", "std", "min", "max", "iqm"]
 #: The zoo's names of our algorithms, where they differ from the published names.
 ZOO_NAMES = {"flashsac": "flash_sac", "sac": "sac_sample"}
 METRICS = {"return": "return", "success_rate": "success rate"}
+#: Line styles of curves that share a colour, by how often all colours were taken before: ours, and published ones.
+STYLES: tuple[Any, ...] = ("-", "-.", ":")
+DASHES: tuple[Any, ...] = ("--", (0, (8, 2)), (0, (2, 1)))
 #: Rows of the printed table per curve.
 MAX_TABLE_STEPS = 10
 
@@ -236,20 +240,30 @@ def _ends(folder: Path, episodes: pd.DataFrame) -> np.ndarray:
 def _with_episodes(labelled: Sequence[tuple[str, Path]]) -> list[tuple[str, Path]]:
     """
     :param labelled: labels and folders of runs
-    :return: those that have evaluations or a finished training episode; a line on stderr names each of the others,
-        which have just begun or are just writing their evaluations
+    :return: those that have evaluations or a finished training episode, which is not enough where other runs of their
+        study have evaluations; a line on stderr names each of the others, which have just begun or are just writing
+        their evaluations
     :raises ValueError: there are none
     """
     found = []
+    evaluated = functools.cache(is_evaluated)
     for label, folder in labelled:
+        study = study_of(folder)
         if is_truncated(folder):
             print(f"{folder / EVALUATIONS} is just being written, and the run is left out", file=sys.stderr)
-        elif (folder / EVALUATIONS).exists() or len(read_monitors(folder)):
+        elif (folder / EVALUATIONS).exists():
+            found.append((label, folder))
+        elif study is not None and evaluated(study):
+            print(f"{folder} is before its first evaluation, and is left out", file=sys.stderr)
+        elif len(read_monitors(folder)):
             found.append((label, folder))
         else:
             print(f"{folder} has no finished episode yet, and is left out", file=sys.stderr)
     if not found:
-        raise ValueError("runs must have at least one finished episode; none of them has")
+        raise ValueError(
+            "runs must have an evaluation or, if no run of their study has one, at least one finished episode; none "
+            "of them has"
+        )
     return found
 
 
@@ -315,7 +329,7 @@ def needing_matplotlib() -> Iterator[None]:
 def draw(env_id: str, curves: Sequence[Curve], metric: str, xlim: tuple[float, float] | None = None) -> "Figure":
     """
     :param env_id: id of the environment, the title
-    :param curves: what to draw; published ones are dashed
+    :param curves: what to draw; published ones are dashed. Beyond ten curves the styles of the lines differ too
     :param metric: "return" or "success_rate"
     :param xlim: first and last simulator step; if None from 0 to the end of the longest curve that is not published
     :return: the picture: lines are means, shaded areas the range over seeds
@@ -331,17 +345,18 @@ def draw(env_id: str, curves: Sequence[Curve], metric: str, xlim: tuple[float, f
         xlim = (0.0, float(max(curve.data["env_step"].iloc[-1] for curve in own)))
     figure = Figure(figsize=(7, 4.8), layout="constrained", dpi=150)
     axes = figure.add_subplot()
-    palette: Any = itertools.cycle(colormaps["tab10"].colors)  # type: ignore[attr-defined]
-    colors_of_ours: dict[str, Any] = {}
+    colors: Any = colormaps["tab10"].colors  # type: ignore[attr-defined]
+    looks = ((colors[i % len(colors)], min(i // len(colors), len(STYLES) - 1)) for i in itertools.count())
+    looks_of_ours: dict[str, tuple[Any, int]] = {}
     for curve in sorted(curves, key=lambda curve: curve.published):
         shown = curve.data[curve.data["env_step"].between(*xlim)]
         # A published curve has the colour of ours of the same algorithm ("bro_fast" is "BRO Fast (RR=2)").
         name = curve.label.partition(" (")[0].lower().replace(" ", "_")
-        if curve.published and ZOO_NAMES.get(name) in colors_of_ours:
+        if curve.published and ZOO_NAMES.get(name) in looks_of_ours:
             name = ZOO_NAMES[name]
-        color = colors_of_ours.pop(name) if curve.published and name in colors_of_ours else next(palette)
+        color, turn = looks_of_ours.pop(name) if curve.published and name in looks_of_ours else next(looks)
         if not curve.published:
-            colors_of_ours[name] = color
+            looks_of_ours[name] = color, turn
         axes.fill_between(
             shown["env_step"],
             shown["min"],
@@ -355,7 +370,7 @@ def draw(env_id: str, curves: Sequence[Curve], metric: str, xlim: tuple[float, f
             shown["env_step"],
             shown["mean"],
             color=color,
-            linestyle="--" if curve.published else "-",
+            linestyle=(DASHES if curve.published else STYLES)[turn],
             linewidth=1.5 if curve.published else 2.2,
             marker="o" if len(shown) == 1 else None,
             label=f"{curve.label}, {curve.seeds}",
@@ -514,6 +529,8 @@ def _labelled_folders(arguments: Sequence[str], env_id: str | None) -> tuple[str
     :return: the id, and the folders of its runs with their labels
     """
     labelled: list[tuple[str, Path, str | None]] = []
+    listed = functools.cache(read_list)
+    former: list[Path] = []
     for argument in arguments:
         label, equals, path = argument.partition("=")
         if not equals or Path(argument).exists():
@@ -527,7 +544,15 @@ def _labelled_folders(arguments: Sequence[str], env_id: str | None) -> tuple[str
                 continue
             if any(folder.samefile(other) for _, other, _ in labelled):
                 raise ValueError(f"runs must be named once; {folder} is there twice")
+            study = study_of(folder)
+            if study is not None and listed(study).is_former(folder):
+                former.append(folder)
+                continue
             labelled.append((label or _name_of(folder), folder, found))
+    for folder in former:
+        print(f"{folder} is not in its study's plan any more, and is left out", file=sys.stderr)
+    if former and not labelled:
+        raise ValueError("runs must be in their study's plan; none of them is any more")
     if not labelled:
         raise ValueError(f"env must be one that the runs are of, not {env_id!r}")
     if env_id is None:

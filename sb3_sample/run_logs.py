@@ -176,7 +176,8 @@ def read_monitors(folder: str | Path) -> pd.DataFrame:
 
     :param folder: the run's folder
     :return: columns "r", the return, "l", the length in steps, "t", seconds since the run began, by which the episodes
-        are sorted, and "is_success", if there is one
+        are sorted, and "is_success", if there is one. Where a Monitor of a later process has appended to a file and
+        counted the seconds anew, they go on from the last ones before
     :raises LoadMonitorResultsError: if there are no such files
     :raises BadFile: (a ``ValueError``) if one is no such file
     :raises OSError: if one cannot be read
@@ -212,6 +213,9 @@ def _read_monitor(path: Path) -> tuple[pd.DataFrame, float]:
     times, lengths = frame["t"].to_numpy(), frame["l"].to_numpy()
     if not ((lengths >= 1) & (lengths < 2**31)).all() or not (np.abs(times) < 2**53).all():
         raise BadFile(f"{path} is no file of Monitor's: an episode has no length or no time")
+    # A Monitor that appends to the file (override_existing=False) counts from 0 again, and writes no second head.
+    has_restarted = np.diff(times, prepend=-np.inf) < 0
+    frame["t"] = times + np.cumsum(np.where(has_restarted, np.roll(times, 1), 0.0))
     return frame, head["t_start"]
 
 

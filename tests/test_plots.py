@@ -229,13 +229,57 @@ def test_plot_takes_labels_and_infers_the_environment(tmp_path: Path, capsys: py
 
 
 def test_the_agents_of_a_study_are_curves_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "study.json").write_text("{}")
+    (tmp_path / "study.json").write_text('{"runs": []}')
     for agent, value in (("Good,gamma=0.9", 900), ("Bad", 100)):
         for seed in (0, 1):
             write_run(tmp_path / "runs" / agent / "dmc-cheetah-run-v0" / str(seed), [25_000], [value])
     plots.main([str(tmp_path), "--env", ENV, "-o", str(tmp_path / "x.png"), "-p", "none"])
     output = capsys.readouterr().out
     assert "| 25,000 | Good,gamma=0.9 | 2 | 900 |" in output and "| 25,000 | Bad | 2 | 100 |" in output
+
+
+def test_a_run_of_a_study_before_its_first_evaluation_is_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "study.json").write_text('{"runs": []}')
+    runs = [tmp_path / "runs" / "A" / "dmc-cheetah-run-v0" / str(seed) for seed in (0, 1)]
+    write_run(runs[0], [25_000, 50_000], [500, 600])
+    write_monitor(runs[1], [1_000] * 60, [5.0] * 60)  # its episodes reach further than the evaluations
+    plots.main([str(tmp_path), "-o", str(tmp_path / "x.png"), "-p", "none"])
+    output, errors = capsys.readouterr()
+    assert "| 25,000 | A | 1 | 500 |" in output and "| 50,000 | A | 1 | 600 |" in output
+    assert f"{runs[1]} is before its first evaluation, and is left out" in errors
+    with pytest.raises(SystemExit, match="if no run of their study has one"):
+        plots.main([str(runs[1]), "-o", str(tmp_path / "x.png"), "-p", "none"])
+
+
+def test_a_run_that_was_taken_out_of_the_plan_is_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    former = "A/dmc-cheetah-run-v0/2"
+    (tmp_path / "study.json").write_text(json.dumps({"runs": [{"agent": "A"}], "former": {former: {}}}))
+    for seed, value in enumerate((100, 100, 500)):
+        write_run(tmp_path / "runs" / "A" / "dmc-cheetah-run-v0" / str(seed), [25_000], [value])
+    plots.main([str(tmp_path), "-o", str(tmp_path / "x.png"), "-p", "none"])
+    output, errors = capsys.readouterr()
+    assert "| 25,000 | A | 2 | 100 |" in output
+    assert f"{tmp_path / 'runs' / former} is not in its study's plan any more, and is left out" in errors
+    with pytest.raises(SystemExit, match="runs must be in their study's plan; none of them is any more"):
+        plots.main([str(tmp_path / "runs" / former), "-o", str(tmp_path / "x.png"), "-p", "none"])
+
+
+def test_lines_that_share_a_colour_differ_in_style() -> None:
+    pytest.importorskip("matplotlib")
+    run = plots.Run("", Path("1"), np.array([25_000, 50_000]), np.array([1.0, 2.0]))
+    data = plots.summarize([run])
+    ours = [plots.Curve(f"c{i}", data) for i in range(12)]
+    # The last two have the colours of the algorithms' own runs, of which the second is the eleventh.
+    theirs = [plots.Curve(f"d{i}", data, published=True) for i in range(12)]
+    theirs += [plots.Curve(f"{name} (RR=2)", data, published=True) for name in ("c0", "c10")]
+    lines = plots.draw(ENV, [*ours, *theirs], "return").axes[0].get_lines()
+    looks = [(line.get_color(), line._dash_pattern) for line in lines]  # type: ignore[attr-defined]
+    assert len(looks) == len(set(map(str, looks))) == 26
+    assert {line.get_linestyle() for line in lines[:10]} == {"-"}
+    assert lines[0].get_color() == lines[10].get_color() == lines[-2].get_color() == lines[-1].get_color()
+    assert all(line.get_linestyle() == "--" for line in lines[12:])
 
 
 def test_picture_has_a_line_a_curve_and_the_colour_tells_the_algorithm() -> None:

@@ -64,6 +64,17 @@ def test_what_a_killed_run_has_left_of_a_line_is_left_out(tmp_path: Path) -> Non
         read_monitors(tmp_path)
 
 
+def test_a_file_that_a_later_monitor_appended_to_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Monitor writes it with override_existing=False: no second head, and seconds from 0 on."""
+    write_monitor(tmp_path / "0.monitor.csv", 10.0, "1,100,2.0\n2,100,4.0\n3,50,1.0\n4,50,3.0\n5,20,0.5\n6,20,0.5\n")
+    write_monitor(tmp_path / "1.monitor.csv", 11.0, "7,30,4.5\n")
+    for block in (2**20, 7):
+        monkeypatch.setattr(run_logs, "_BLOCK", block)
+        episodes = read_monitors(tmp_path)
+        assert list(episodes["r"]) == [1, 2, 3, 7, 4, 5, 6]
+        assert list(episodes["t"]) == [2, 4, 5, 5.5, 7, 7.5, 7.5]
+
+
 def test_runs_are_found_however_deep_they_lie_and_not_through_links(tmp_path: Path) -> None:
     folder = tmp_path
     for _ in range(400):  # more levels than Python calls can be nested, in the paths that systems take

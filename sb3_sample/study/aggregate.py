@@ -8,7 +8,7 @@ import contextlib
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,8 @@ GROUPS: dict[str, Callable[[str], bool]] = {
 DEFAULT_GROUPS = ("all", "dmc", "metaworld", "myosuite", "dog & humanoid")
 #: Bootstrap samples.
 REPS = 2_000
+#: Metrics of an evaluation, of which a task's score is one.
+_MEASURED = ("return", "success_rate", "episode_length")
 _STATISTICS = ("iqm", "mean", "median", "optimality_gap")
 
 
@@ -65,7 +67,8 @@ def scored(table: pd.DataFrame, scores: Scores | None = None) -> pd.DataFrame:
         raise ValueError("table must have returns or success rates of runs, and has none")
     columns = [*RUN, "step", "score"]
     found = pd.concat(parts)[columns].sort_index(kind="stable")
-    twice = found.duplicated([*RUN, "step"])
+    texts = {text: _plain_numbers(text) for text in found["arguments"].unique()}
+    twice = found.assign(arguments=found["arguments"].map(texts)).duplicated([*RUN, "step"])
     if twice.any():
         row = found[twice].iloc[0]
         raise ValueError(
@@ -79,6 +82,15 @@ def scored(table: pd.DataFrame, scores: Scores | None = None) -> pd.DataFrame:
             f"{row['step']:,}"
         )
     return found.reset_index(drop=True)
+
+
+def _plain_numbers(arguments: str) -> str:
+    """Arguments with 2.0 as 2: both are one agent, since equal arguments do not tell agents apart."""
+    return json.dumps(json.loads(arguments, parse_float=lambda number: _whole(float(number))), sort_keys=True)
+
+
+def _whole(number: float) -> float | int:
+    return int(number) if number.is_integer() else number
 
 
 def unscored(table: pd.DataFrame, scores: Scores | None = None) -> dict[str, str]:
@@ -104,10 +116,14 @@ def score_for(task: str, scores: Scores | None = None) -> Score | None:
 
 def _by_task(table: pd.DataFrame, scores: Scores | None) -> tuple[list[pd.DataFrame], dict[str, str]]:
     """Rows of each task with their scores, and the tasks without a score, with the reason."""
-    measured = table[~table["metric"].str.contains("/") & (table["metric"] != "hours")]
+    named = {score.metric for score in (scores or {}).values() if isinstance(score, Score)}
     parts, reasons = [], {}
-    for task, rows in measured.groupby("task", sort=False):
+    for task, rows in table[table["metric"].isin({*_MEASURED, *named})].groupby("task", sort=False):
         score = score_for(task, scores)
+        # A run that has recorded other metrics only, e.g. of training episodes, has not been evaluated yet.
+        rows = rows[rows["metric"].isin([*_MEASURED, *([] if score is None else [score.metric])])]
+        if not len(rows):
+            continue
         if score is None:
             reasons[task] = (
                 f"scores must say how {task} is scored: there is a common scale for {SCORED} only. Give the return "
@@ -172,15 +188,16 @@ def _word(value: Any) -> str:
     return value if isinstance(value, str) else "default" if value is None else json.dumps(value)
 
 
-def group_tasks(groups: Groups | None, tasks: Sequence[str]) -> dict[str, list[str]]:
+def group_tasks(groups: Groups | None, tasks: Sequence[str], in_table: Iterable[str] = ()) -> dict[str, list[str]]:
     """
     :param groups: names of :data:`GROUPS`, or tasks by name of the group; None for :data:`DEFAULT_GROUPS`
-    :param tasks: of a table
-    :return: the tasks of each group; groups without tasks are left out
+    :param tasks: to be grouped
+    :param in_table: all tasks of the table, if some of them are not to be grouped, e.g. before their first evaluation
+    :return: those of ``tasks`` in each group; groups without any are left out
     :raises ValueError: there is no such group, a task is not in the table, or no group has a task
     """
     if isinstance(groups, Mapping):
-        unknown = sorted(set(itertools.chain(*groups.values())) - set(tasks))
+        unknown = sorted(set(itertools.chain(*groups.values())) - {*tasks, *in_table})
         if unknown:
             raise ValueError(f"groups must be of tasks in the table, not {', '.join(unknown)}")
         found = {name: [task for task in tasks if task in members] for name, members in groups.items()}
@@ -267,7 +284,7 @@ def _common_tasks(scores: pd.DataFrame) -> pd.DataFrame:
 
 
 def compared(
-    scores: pd.DataFrame, steps: Sequence[int] | None, groups: Groups | None, common: bool
+    scores: pd.DataFrame, steps: Sequence[int] | None, groups: Groups | None, common: bool, tasks: Iterable[str]
 ) -> tuple[pd.DataFrame, list[int], dict[str, list[str]]]:
     """
     :param scores: of :func:`scored`, agents named apart
@@ -275,16 +292,17 @@ def compared(
     :param groups: see :func:`group_tasks`
     :param common: whether to compare at each step only the tasks that all agents that reach it have in common; a
         warning names what is left out
+    :param tasks: all tasks of the runs' table, with or without a score
     :return: the result of :func:`at_steps`, also NaN for tasks left out, and the tasks of each group
     :raises ValueError: there are no such steps, no run reaches one, or no task is left
     """
     # From all tasks, since a group may contain tasks that not all agents have.
-    members = group_tasks(groups, list(scores["task"].unique()))
+    members = group_tasks(groups, list(scores["task"].unique()), tasks)
     if common:
         scores = _common_tasks(scores)
         kept = set(scores["task"])
-        members = {name: [task for task in tasks if task in kept] for name, tasks in members.items()}
-        members = {name: tasks for name, tasks in members.items() if tasks}
+        members = {name: [task for task in of_group if task in kept] for name, of_group in members.items()}
+        members = {name: of_group for name, of_group in members.items() if of_group}
         if not members:
             raise ValueError("common: the groups have no task that all agents have")
     matrix, steps = at_steps(scores, steps)
@@ -470,7 +488,8 @@ def aggregate(
     :raises ImportError: rliable is not installed
     """
     check_samples(reps, confidence)
-    matrix, steps, members = compared(named_apart(scored(table, scores)), steps, groups, common)
+    tasks_of_table = table["task"].unique()
+    matrix, steps, members = compared(named_apart(scored(table, scores)), steps, groups, common, tasks_of_table)
     _warn_of_tasks(matrix, members)
     rows = []
     for agent, of_agent in matrix.groupby("agent", sort=False):
@@ -660,7 +679,8 @@ def _at_step(
 
     :param common: None if the tasks are compared pair by pair
     """
-    matrix, _, members = compared(named_apart(scored(table, scores)), [step], groups, bool(common))
+    tasks_of_table = table["task"].unique()
+    matrix, _, members = compared(named_apart(scored(table, scores)), [step], groups, bool(common), tasks_of_table)
     _warn_of_tasks(matrix, {} if common is None else members)
     matrix = matrix.dropna()
     for group, tasks in members.items():

@@ -190,7 +190,7 @@ def marginalize(
             else [", ".join(f"{n}={v}" for n, v in zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
         )
     rows: list[dict[str, Any]] = []
-    for group, tasks in group_tasks(groups, list(runs["task"].unique())).items():
+    for group, tasks in group_tasks(groups, list(runs["task"].unique()), table["task"].unique()).items():
         in_group = runs[runs["task"].isin(tasks)]
         for head, part in _parted(in_group, list(by)):
             _warn_of_missing(part, list(factors), group)
@@ -286,7 +286,7 @@ def correlate(
         runs[name] = argument(runs, name)
     rows: list[dict[str, Any]] = []
     variables = ["score", *metrics]
-    for group, tasks in group_tasks(groups, list(runs["task"].unique())).items():
+    for group, tasks in group_tasks(groups, list(runs["task"].unique()), table["task"].unique()).items():
         for head, part in _parted(runs[runs["task"].isin(tasks)], list(by)):
             for x, y in itertools.product(variables, repeat=2):
                 both = part[[x]].assign(other=part[y]).dropna()
@@ -323,8 +323,9 @@ def regress(
     :param last: values at the end of a run that are averaged
     :param scores: see :func:`~sb3_sample.study.aggregate.scored`
     :return: columns ``task``, ``metric``, ``log`` (whether the logarithm was taken), ``slope``, ``standard_error`` of
-        the slope, ``intercept``, ``r_squared``, ``p`` (of a slope of 0), ``spearman``, ``spearman_p``, ``runs``. NaN if
-        there are fewer than three runs, or all have the same value
+        the slope, ``intercept``, ``r_squared``, ``p`` (of a slope of 0), ``spearman``, ``spearman_p``, ``runs``. Runs
+        that lack the metric are left out, with a warning those for which it is infinite. NaN if there are fewer than
+        three runs, or all have the same value
     :raises ValueError: no run has recorded a metric, or an argument is out of range
     """
     from scipy.stats import linregress
@@ -334,6 +335,13 @@ def regress(
     for task, of_task in runs.groupby("task", sort=False):
         for metric in metrics:
             both = of_task[["score", metric]].dropna()
+            finite = both[np.isfinite(both).all(axis=1)]
+            if len(finite) < len(both):
+                warn(
+                    f"{len(both) - len(finite)} of {len(both)} runs on {task} have an infinite {metric} or score and "
+                    "are left out there"
+                )
+                both = finite
             is_log = not any(fnmatch.fnmatchcase(metric, pattern) for pattern in linear)
             x = symlog(both[metric]) if is_log else both[metric].to_numpy(float)
             row = {"task": task, "metric": metric, "log": is_log}
@@ -444,7 +452,7 @@ def cost(
     steps = list(dict.fromkeys(found["step"]))
     with warnings.catch_warnings():  # aggregate has already warned
         warnings.simplefilter("ignore", UserWarning)
-        averaged, _, members = compared(scored(table, scores), steps, groups, common)
+        averaged, _, members = compared(scored(table, scores), steps, groups, common, table["task"].unique())
     timed = table[table["metric"] == "hours"].rename(columns={"value": "score"})
     matrix, _ = at_steps(timed, steps)
     by_agent = dict(list(matrix.groupby("agent")))

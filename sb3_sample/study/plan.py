@@ -2,11 +2,12 @@
 
 import dataclasses
 import functools
-import hashlib
 import json
 import re
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from sb3_sample.study_list import part_of_path, short, variant_of
 
 #: Data that an agent learns from besides the environment, and the number of steps on them.
 DATA = ("dataset", "offline_steps", "prior_data")
@@ -14,8 +15,6 @@ DATA = ("dataset", "offline_steps", "prior_data")
 EVERY, EPISODES = 25_000, 5
 #: Environment steps between two checkpoints, as in ``sb3-sample train``.
 CHECKPOINT_FREQ = 10_000
-#: Most characters in one part of a folder's name.
-MAX_NAME = 120
 #: Allowed names of agents.
 AGENT_NAME = re.compile(r"\w[\w .+()-]*")
 
@@ -72,12 +71,12 @@ class Run:
     @property
     def variant(self) -> str:
         """Name of the agent with its place in the grid, as a part of a path."""
-        return part_of_path(",".join([self.agent, *(f"{name}={_short(value)}" for name, value in self.grid.items())]))
+        return variant_of(self.agent, self.grid)
 
     @property
     def label(self) -> str:
         """The agent's name in the plan with its place in the grid, as in tables of results."""
-        grid = [f"{n}={_short(v)}" for n, v in sorted(self.grid.items())]
+        grid = [f"{n}={short(v)}" for n, v in sorted(self.grid.items())]
         return f"{self.agent} ({', '.join(grid)})" if grid else self.agent
 
     @property
@@ -185,15 +184,3 @@ class Plan(NamedTuple):
     runs: tuple[Run, ...]
     text: str = ""
     comparison: Comparison = Comparison({}, {})
-
-
-def part_of_path(name: str) -> str:
-    """A name as a part of a path; a long one ends in a hash instead of the rest."""
-    plain = re.sub(r"[^\w.,=+()-]+", "-", name)
-    if len(plain) <= MAX_NAME:
-        return plain
-    return f"{plain[:MAX_NAME]}-{hashlib.sha256(name.encode()).hexdigest()[:12]}"
-
-
-def _short(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)

@@ -35,7 +35,6 @@ from sb3_sample.study.plan import (
     Plan,
     PlanError,
     Run,
-    part_of_path,
 )
 from sb3_sample.study.trial_agents import (
     action_space,
@@ -46,6 +45,7 @@ from sb3_sample.study.trial_agents import (
     settings_of,
     why_not_acting,
 )
+from sb3_sample.study_list import part_of_path
 
 #: Entries of a plan; those after the first four have defaults.
 ENTRIES = (

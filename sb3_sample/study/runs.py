@@ -21,14 +21,13 @@ from sb3_sample.saving import temporary
 from sb3_sample.saving.locks import Lock, is_taken, take
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.study.plan import Comparison, Plan, Run
+from sb3_sample.study_list import FORMER, MAX_LIST
 
 #: Content of a study's folder: its runs, their outcomes, the list of runs and the plan as read.
 RUNS, STATE, LIST, PLAN = STUDY_RUNS, "state", STUDY_LIST, "plan.yml"
-#: Entry of the list with runs that are no longer in the plan, by name.
-FORMER = "former"
 _LOG = "progress.jsonl"
-#: Most bytes of the list, of the outcome of one run, and of the end of a log that is read.
-MAX_LIST, MAX_OUTCOME, TAIL = 2**28, 2**20, 2**14
+#: Most bytes of the outcome of one run, and of the end of a log that is read.
+MAX_OUTCOME, TAIL = 2**20, 2**14
 #: Most characters of a traceback that are kept.
 MAX_TRACEBACK = 20_000
 

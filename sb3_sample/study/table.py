@@ -7,9 +7,10 @@ environment's id; ``seed``; ``step``, in simulator steps regardless of the actio
 
 import fnmatch
 import functools
+import itertools
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +23,7 @@ from sb3_sample.plots import DATA, all_published_curves, find_runs, named_algori
 from sb3_sample.run_logs import EVALUATIONS, OFFLINE, is_truncated, read_evaluations, read_monitors
 from sb3_sample.run_settings import RECORD, RunSettings, plain_id, read_settings, study_of
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
-from sb3_sample.study.runs import FORMER, LIST, MAX_LIST
+from sb3_sample.study_list import is_evaluated, read_list
 from sb3_sample.warn import warn
 
 COLUMNS = ["agent", "arguments", "task", "seed", "step", "metric", "value"]
@@ -88,15 +89,33 @@ def to_json(arguments: Mapping[str, Any]) -> str:
 # ---------------------------------------------------------------- runs
 
 
+class _Found(NamedTuple):
+    """
+    A run to be read.
+
+    :param folder: its folder
+    :param study: folder of its study, if it is in one
+    :param agent: name of its agent in the table
+    :param task: id of its environment
+    :param settings: from its files
+    """
+
+    folder: Path
+    study: Path | None
+    agent: str
+    task: str
+    settings: RunSettings
+
+
 def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = METRICS) -> pd.DataFrame:
     """
     Read the table of runs: of this package (``--run-dir``), of the zoo, and of folders with only Monitor files.
 
     A run's values are from its evaluations, each averaged over its episodes. A run without evaluations has its training
     episodes instead, one row per episode, at the step at which it ended; a warning says so. If other runs of its study
-    have evaluations, it has not reached its first one, and has none of these values. A run in progress whose
-    evaluations are truncated, since they are just being written, is left out with a warning. ``hours`` is the time that
-    the run had taken, and ``diagnostics/...`` are its logged diagnostics.
+    have evaluations, whether or not they are among the sources, it has not reached its first one, and has none of these
+    values. A run in progress whose evaluations are truncated, since they are just being written, is left out with a
+    warning. ``hours`` is the time that the run had taken, and ``diagnostics/...`` are its logged diagnostics.
 
     :param sources: folders of runs, or folders with runs at any depth, or tables as :func:`write` writes them.
         ``"LABEL=FOLDER"`` names the agent; else its name is that in the study's plan or, outside a study, that of its
@@ -105,37 +124,30 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
         "online_return" and "online_success_rate" (of the training episodes, which explore, even for runs with
         evaluations) and all entries of ``progress.jsonl``, e.g. "train/*"
     :return: columns :data:`COLUMNS`, in the order of the sources. Runs that were removed from their study's plan are
-        left out, with a warning. If a run's files do not give its seed, its number among the runs of that agent and
-        task is used, from 0 on
-    :raises ValueError: there is no run in a source, a file is damaged, a run's task is unknown, or two runs have the
-        same agent, arguments, task and seed
+        left out, with a warning. If a run's files do not give its seed, it has the first number from 0 on that no
+        other run of that agent and task has
+    :raises ValueError: there is no run in a source, a file is damaged, a run's task is unknown, two runs have the same
+        agent, arguments, task and seed, or a folder is there twice under the same agent
     :raises OSError: if a file cannot be read
     """
     given = [sources] if isinstance(sources, (str, Path)) else list(sources)
     if not given:
         raise ValueError("sources must be at least one folder or table, not none")
     tables, rows = [], _Rows()
-    seen: dict[tuple[Any, ...], Path] = {}
-    numbered: dict[tuple[str, str], int] = {}
-    training: list[Path] = []
-    listed = functools.cache(_list_of_study)
+    found: list[_Found] = []
+    listed = functools.cache(read_list)
+    evaluated = functools.cache(is_evaluated)
     left_out: list[Path] = []
-    early: list[Path] = []
-    writing: list[Path] = []
     for source in given:
         label, path = labelled(source)
         if path.suffix in (".csv", ".parquet") and path.is_file():
             table = load(path)
             tables.append(table if label is None else table.assign(agent=label))
             continue
-        folders = [(folder, study_of(folder), (folder / EVALUATIONS).exists()) for folder in find_runs(path)]
-        with_evaluations = {study for _, study, has_evaluations in folders if study is not None and has_evaluations}
-        for folder, study, has_evaluations in folders:
-            if study is not None and "/".join(folder.absolute().parts[-3:]) in listed(study).former:
+        for folder in find_runs(path):
+            study = study_of(folder)
+            if study is not None and listed(study).is_former(folder):
                 left_out.append(folder)
-                continue
-            if has_evaluations and is_truncated(folder):
-                writing.append(folder)
                 continue
             run = read_settings(folder)
             if run.task is None:
@@ -143,26 +155,39 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
                     f"{folder} does not say which task it is of: it has no {RECORD}, no args.yml of the zoo, and no "
                     "environment's id in its Monitor files"
                 )
-            agent = label or _agent_of_study(folder, study, listed) or run.agent or folder.resolve().parent.name
-            seed = run.seed
-            if seed is None:
-                seed = numbered.get((agent, run.task), 0)
-                numbered[agent, run.task] = seed + 1
-            arguments = to_json(run.arguments)
-            key = (agent, arguments, run.task, seed)
-            if key in seen:
-                raise ValueError(
-                    f"runs must differ in agent, arguments, task or seed, and {folder} has those of {seen[key]}: "
-                    f"{agent}, {run.task}, seed {seed}. LABEL=FOLDER names one otherwise"
-                )
-            seen[key] = folder
-            before_first = not has_evaluations and study in with_evaluations
-            if not has_evaluations:
-                (early if before_first else training).append(folder)
-            for metric, (steps, values) in _measured(folder, run, metrics).items():
-                if before_first and metric in _MONITORED:
-                    continue
-                rows.add(agent, arguments, run.task, seed, metric, steps, values)
+            of_study = None if study is None else listed(study).agent(folder)
+            agent = label or of_study or run.agent or folder.resolve().parent.name
+            found.append(_Found(folder, study, agent, run.task, run))
+    early: list[Path] = []
+    training: list[Path] = []
+    writing: list[Path] = []
+    folders: set[tuple[str, Path]] = set()
+    seen: dict[tuple[Any, ...], Path] = {}
+    for (folder, study, agent, task, run), seed in zip(found, _seeds(found), strict=True):
+        # Without a recorded seed, the same folder would be two runs with different numbers.
+        if (agent, folder.resolve()) in folders:
+            raise ValueError(f"runs must be named once, and {folder} is there twice. LABEL=FOLDER names one otherwise")
+        folders.add((agent, folder.resolve()))
+        arguments = to_json(run.arguments)
+        key = (agent, arguments, task, seed)
+        if key in seen:
+            raise ValueError(
+                f"runs must differ in agent, arguments, task or seed, and {folder} has those of {seen[key]}: "
+                f"{agent}, {task}, seed {seed}. LABEL=FOLDER names one otherwise"
+            )
+        seen[key] = folder
+        # Directly before its files are read: the run may be under way.
+        if is_truncated(folder):
+            writing.append(folder)
+            continue
+        has_evaluations = (folder / EVALUATIONS).exists()
+        before_first = not has_evaluations and study is not None and evaluated(study)
+        if not has_evaluations:
+            (early if before_first else training).append(folder)
+        for metric, (steps, values) in _measured(folder, run, metrics).items():
+            if before_first and metric in _MONITORED:
+                continue
+            rows.add(agent, arguments, task, seed, metric, steps, values)
     if left_out:
         warn(
             f"{len(left_out)} runs ({left_out[0]}, ...) are not in their study's plan any more and are left out; "
@@ -191,39 +216,24 @@ def read(sources: str | Path | Iterable[str | Path], metrics: Sequence[str] = ME
     return table.reset_index(drop=True)
 
 
-class _List(NamedTuple):
+def _seeds(runs: Iterable[_Found]) -> list[int]:
     """
-    The needed part of a study's list of runs.
-
-    :param agents: agents by the beginning of their folders' names
-    :param former: names of runs that were removed from the plan; they may have been made with other settings
+    Seeds of runs. A run whose files do not give its seed gets the first free number of its agent and task, after all
+    recorded seeds. Seeds of tables do not count: a table may be of the same runs, and is then to be refused.
     """
-
-    agents: dict[str, str]
-    former: set[str]
-
-
-def _agent_of_study(folder: Path, study: Path | None, listed: Callable[[Path], _List]) -> str | None:
-    """
-    :param folder: of a run
-    :param study: folder of its study, if it is in one
-    :param listed: reads the list of a study
-    :return: the agent's name in the plan; None outside of a study
-    """
-    return None if study is None else listed(study).agents.get(folder.absolute().parents[1].name.partition(",")[0])
-
-
-def _list_of_study(folder: Path) -> _List:
-    path = folder / LIST
-    found = parse_json(read_regular(path, MAX_LIST), str(path))
-    runs, former = (found.get("runs"), found.get(FORMER, {})) if isinstance(found, dict) else (None, None)
-    if (
-        not isinstance(runs, list)
-        or not all(isinstance(run, dict) and isinstance(run.get("agent"), str) for run in runs)
-        or not isinstance(former, dict)
-    ):
-        raise BadFile(f"{path} is no list of a study's runs")
-    return _List({re.sub(r"[^\w.,=+()-]+", "-", run["agent"]): run["agent"] for run in runs}, set(former))
+    runs = list(runs)
+    recorded: dict[tuple[str, str], set[int]] = {}
+    for run in runs:
+        if run.settings.seed is not None:
+            recorded.setdefault((run.agent, run.task), set()).add(run.settings.seed)
+    free: dict[tuple[str, str], Iterator[int]] = {}
+    seeds = []
+    for run in runs:
+        key = run.agent, run.task
+        taken = recorded.get(key, set())
+        numbers = free.setdefault(key, itertools.filterfalse(taken.__contains__, itertools.count()))
+        seeds.append(next(numbers) if run.settings.seed is None else run.settings.seed)
+    return seeds
 
 
 def labelled(source: str | Path) -> tuple[str | None, Path]:

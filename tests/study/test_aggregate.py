@@ -236,6 +236,30 @@ def test_returns_do_not_stand_for_success() -> None:
     assert as_return["mean"].iloc[0] == pytest.approx(0.475)
 
 
+def test_a_task_that_is_not_evaluated_yet_is_in_no_average() -> None:
+    """Its early runs have other metrics only: hours, and returns of the training episodes."""
+    early = [*runs_of("a", WALKER, [1, 2], metric="online_return"), *runs_of("a", WALKER, [3, 4], metric="hours")]
+    table = made_up([*runs_of("a", CHEETAH, [100, 300]), *early])
+    found = study.aggregate(table, [10], {"mine": [CHEETAH, WALKER]}, reps=5)
+    assert found[["group", "mean", "tasks", "runs"]].to_numpy().tolist() == [["mine", 0.2, 1, 2]]
+    # One of the task's runs is evaluated, the other has not reached its first evaluation.
+    some = pd.concat([table, made_up(runs_of("a", WALKER, [600]))])
+    found = study.aggregate(some, [10], {"mine": [CHEETAH, WALKER]}, reps=5)
+    assert found["mean"].tolist() == pytest.approx([0.4]) and found["runs"].tolist() == [3]
+    profiles = study.performance_profiles(table, 10, [0.15], groups={"mine": [CHEETAH, WALKER]}, reps=5)
+    assert profiles["share"].tolist() == [0.5]
+    with pytest.raises(ValueError, match="groups must be of tasks in the table, not metaworld/push-v3"):
+        study.aggregate(table, [10], {"mine": [CHEETAH, PUSH]}, reps=5)
+    with pytest.raises(ValueError, match="groups must have a task of the runs, and there is none in mine"):
+        study.aggregate(table, [10], {"mine": [WALKER]}, reps=5)
+
+
+def test_a_score_of_another_metric() -> None:
+    table = made_up([*runs_of("a", CHEETAH, [1, 3], metric="online_return"), *runs_of("a", WALKER, [400])])
+    found = study.aggregate(table, [10], ["dmc"], scores={CHEETAH: study.Score("online_return", 10)}, reps=5)
+    assert found["mean"].tolist() == pytest.approx([0.3]) and found["tasks"].tolist() == [2]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -254,6 +278,10 @@ def test_bad_arguments(arguments: dict, message: str) -> None:
 def test_bad_tables() -> None:
     with pytest.raises(ValueError, match="two of a, dmc/cheetah-run-v0, seed 0 at 10"):
         study.aggregate(made_up(runs_of("a", CHEETAH, [0]) * 2))
+    # Equal arguments are one agent, however they are written.
+    equal = [*runs_of("a", CHEETAH, [0], replay_ratio=2), *runs_of("a", CHEETAH, [1], replay_ratio=2.0)]
+    with pytest.raises(ValueError, match="two of a, dmc/cheetah-run-v0, seed 0 at 10"):
+        study.aggregate(made_up(equal))
     with pytest.raises(ValueError, match="table must have numbers"):
         study.aggregate(made_up(runs_of("a", CHEETAH, [float("nan")])))
     with pytest.raises(ValueError, match="table must have returns or success rates"):

@@ -219,6 +219,32 @@ def test_regressions_are_task_by_task() -> None:
     assert study.regress(few, ["diagnostics/over"])[["slope", "p"]].isna().all(axis=None)
 
 
+def test_regressions_leave_out_infinite_values_and_say_so() -> None:
+    rows = []
+    for seed, score in enumerate((0.0, 2_000.0, 2_000.0, 4_000.0)):
+        rows.append(("a", {}, CHEETAH, seed, 10, "return", score))
+        rows.append(("a", {}, CHEETAH, seed, 10, "diagnostics/norm", math.expm1(seed)))
+    rows += [("a", {}, CHEETAH, 4, 10, "return", 1.0), ("a", {}, CHEETAH, 4, 10, "diagnostics/norm", math.inf)]
+    with pytest.warns(UserWarning, match=f"1 of 5 runs on {CHEETAH} have an infinite diagnostics/norm or score"):
+        (row,) = study.regress(made_up(rows), ["diagnostics/norm"]).to_dict("records")
+    # As without the run, by hand above.
+    assert (row["slope"], row["intercept"], row["r_squared"]) == pytest.approx((1.2, 0.2, 0.9)) and row["runs"] == 4
+
+
+def test_groups_may_have_tasks_that_are_not_evaluated_yet() -> None:
+    early = correlated()[lambda table: table["metric"] != "return"].assign(task=WALKER)
+    table = pd.concat([correlated(), early])
+    groups = {"mine": [CHEETAH, WALKER]}
+    found = study.correlate(table, ["diagnostics/over"], groups=groups).set_index(["x", "y"])
+    assert found.loc["score", "diagnostics/over"]["spearman"] == pytest.approx(-0.9)
+    hours = made_up([("a", {}, WALKER, 0, 10, "hours", 1.0)])
+    found = study.marginalize(pd.concat([grid(tasks=(CHEETAH,)), hours]), groups=groups, reps=5)
+    assert set(found["group"]) == {"mine"} and set(found["tasks"]) == {1}
+    table = pd.concat([sized(), hours])
+    (first, second) = (study.cost(table, [100], each, reps=5) for each in (["dmc"], groups))
+    pd.testing.assert_frame_equal(first.drop(columns="group"), second.drop(columns="group"))
+
+
 # ---------------------------------------------------------------- two arguments, and costs
 
 

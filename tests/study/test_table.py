@@ -11,6 +11,7 @@ import pytest
 
 from sb3_sample import study
 from sb3_sample.study import table as tables
+from sb3_sample.study.runs import StudyFolder
 from tests.study.made_up import made_up, write_monitor, write_run, write_zoo_run
 
 
@@ -162,6 +163,25 @@ def test_seeds_that_no_file_says_are_numbers_of_the_runs(tmp_path: Path) -> None
     assert list(table["value"][::3]) == [1.0, 2.0, 10.0] and list(table["seed"][::3]) == [0, 1, 2]
 
 
+@pytest.mark.parametrize("again", ["x", "x/../x/run_1"])
+def test_a_folder_without_a_seed_that_is_named_twice_is_refused(tmp_path: Path, again: str) -> None:
+    for name in ("run_1", "run_2"):
+        write_monitor(tmp_path / "x" / name)
+    with pytest.raises(ValueError, match=r"runs must be named once, and \S*run_1 is there twice\. LABEL=FOLDER"):
+        study.read([tmp_path / "x" / "run_1", tmp_path / again])
+    with pytest.warns(UserWarning, match="no evaluations"):
+        table = study.read([f"other={tmp_path / 'x' / 'run_1'}", tmp_path / "x"], ["return"])
+    assert table[["agent", "seed"]].drop_duplicates().to_numpy().tolist() == [["other", 0], ["x", 0], ["x", 1]]
+
+
+def test_numbers_in_place_of_seeds_leave_out_the_recorded_ones(tmp_path: Path) -> None:
+    for name, seed in (("a", None), ("b", 0), ("c", None), ("d", 2)):
+        folder = write_run(tmp_path / name)
+        record = json.loads((folder / "run.json").read_text())
+        (folder / "run.json").write_text(json.dumps({**record, "seed": seed}))
+    assert list(only(study.read(tmp_path), "return")["seed"][::3]) == [1, 0, 3, 2]
+
+
 def test_a_run_of_a_study_before_its_first_evaluation_has_no_return(tmp_path: Path) -> None:
     first, second = (tmp_path / "study" / "runs" / "BRO" / "dmc-cheetah-run-v0" / seed for seed in "01")
     write_run(first)
@@ -179,16 +199,43 @@ def test_a_run_of_a_study_before_its_first_evaluation_has_no_return(tmp_path: Pa
     assert set(table["seed"]) == {0, 1}
 
 
+def test_a_run_before_its_first_evaluation_has_no_return_as_a_source_of_its_own(tmp_path: Path) -> None:
+    first, second = (tmp_path / "study" / "runs" / "BRO" / "dmc-cheetah-run-v0" / seed for seed in "01")
+    write_run(first)
+    write_run(second, seed=1)
+    (second / "evaluations.npz").unlink()
+    (tmp_path / "study" / "study.json").write_text(json.dumps({"name": "x", "runs": [{"agent": "BRO"}]}))
+    for sources in ([first, second], [second, first], [second]):
+        with pytest.warns(UserWarning, match="before their first evaluation"):
+            table = study.read(sources)
+        assert set(table.loc[table["seed"] == 1, "metric"]) == {"hours"}
+
+
 def test_agents_of_a_study_have_the_names_of_its_plan(tmp_path: Path) -> None:
     folder = tmp_path / "study" / "runs" / "BRO-Fast,replay_ratio=2" / "dmc-cheetah-run-v0"
     write_run(folder / "0", algo="bro_fast", seed=0)
     write_run(folder / "1", algo="bro_fast", seed=1)
-    (tmp_path / "study" / "study.json").write_text(json.dumps({"name": "x", "runs": [{"agent": "BRO Fast"}] * 2}))
+    runs = [{"agent": "BRO Fast", "grid": {"replay_ratio": 2}}] * 2
+    (tmp_path / "study" / "study.json").write_text(json.dumps({"name": "x", "runs": runs}))
     assert set(study.read(tmp_path / "study")["agent"]) == {"BRO Fast"}
     assert set(study.read(folder / "1")["agent"]) == {"BRO Fast"}
-    (tmp_path / "study" / "study.json").write_text('{"runs": [1]}')
-    with pytest.raises(ValueError, match="no list of a study's runs"):
-        study.read(tmp_path / "study")
+    for bad in ('{"runs": [1]}', '{"runs": [{"agent": "a", "grid": 1}]}', '{"runs": [], "former": []}', "[]"):
+        (tmp_path / "study" / "study.json").write_text(bad)
+        with pytest.raises(ValueError, match="no list of a study's runs"):
+            study.read(tmp_path / "study")
+
+
+@pytest.mark.parametrize("grid", [{}, {"tau": 0.01}])
+def test_agents_with_long_names_keep_them(tmp_path: Path, grid: dict[str, Any]) -> None:
+    """Their folders' names are cut at 120 characters, and end in a hash."""
+    names = ["x" * 125, "x" * 124 + "y", "z" * 120]
+    runs = [study.Run(name, "bro", grid, grid, "dmc/cheetah-run-v0", 0, 3_000) for name in names]
+    folder = StudyFolder(tmp_path / "study")
+    folder.enter(study.Plan("x", tuple(runs)))
+    for i, run in enumerate(runs):
+        write_run(folder.place(run), values=[float(i)] * 3, arguments=grid)
+    table = only(study.read(folder.path), "return")
+    assert dict(zip(table["agent"], table["value"], strict=True)) == dict(zip(names, (0.0, 1.0, 2.0), strict=True))
 
 
 def test_two_runs_that_cannot_be_told_apart_are_refused(tmp_path: Path) -> None:
