@@ -21,11 +21,11 @@ from sb3_sample.saving.training_state import commit, processor
 from sb3_sample.study.plan import Plan, Run
 from sb3_sample.study.reporting import facts as facts_module
 from sb3_sample.study.reporting import figures, pieces, published
+from sb3_sample.study.reporting.absent import missing
 from sb3_sample.study.reporting.content import build
 from sb3_sample.study.reporting.curves import _repeats as repeats_of
 from sb3_sample.study.reporting.curves import task_curves
 from sb3_sample.study.reporting.reading import gather
-from sb3_sample.study.reporting.summary import missing
 from sb3_sample.study.runs import Outcome, StudyFolder
 from tests.study.made_up import made_up, write_evaluations, write_monitor, write_run
 from tests.study.test_aggregate import TABLE_9
@@ -182,7 +182,7 @@ def test_one_agent_one_task_one_seed(tmp_path: Path) -> None:
     text = text_of(written(tmp_path / "r.html", made_up(runs("alone", CHEETAH, [500]))))
     assert "1 task, 1 seed each" in text and "There is one agent." in text
     assert "There are no intervals, since no task has a second run" in text and "alone 0.500." in text
-    assert "Left out: there is one agent to compare." in text
+    assert "Left out: there is one agent." in text
 
 
 def test_agents_that_cannot_be_told_apart(tmp_path: Path) -> None:
@@ -243,9 +243,11 @@ def test_runs_under_way_are_in_their_tasks_and_in_no_average(tmp_path: Path) -> 
     text = text_of(written(tmp_path / "r.html", table[~cut]))
     assert "at 200 steps over 1 task:" in text and "(of 2: those that every agent has reached 200 steps on)" in text
     text = text_of(written(tmp_path / "r.html", table[~cut], all_tasks=True))
-    assert "over 2 tasks" in text and "agents have not the same tasks" in text
+    assert f"at 200 steps, each over its own 1{pieces.DASH}2 tasks: good" in text
+    assert f"Averages are over 1{pieces.DASH}2 tasks (of 2, each agent over its own)." in text
+    assert "agents have not the same tasks" in text
     text = text_of(written(tmp_path / "r.html", table[(table["agent"] == "good") | (table["task"] == CHEETAH)]))
-    assert "1 pair of agent and task has no run." in text
+    assert "1 pair of agent and task has no evaluated run." in text
     # Agents whose evaluations do not overlap cannot be compared.
     late = made_up(runs("late", CHEETAH, [1, 2], LATER))
     text = text_of(written(tmp_path / "r.html", pd.concat([table, late])))
@@ -430,7 +432,7 @@ def test_an_empty_study_and_one_without_evaluations(tmp_path: Path) -> None:
     place = StudyFolder(tmp_path / "empty")
     place.enter(Plan("empty", (planned("A", 0), planned("B", 0))))
     page = written(tmp_path / "r.html", place.path)
-    assert "Nothing yet." in text_of(page) and "Planned: A, B." in text_of(page)
+    assert "Nothing yet." in text_of(page) and "Not evaluated: A, B." in text_of(page)
     assert "0 of 2 planned runs are done; 2 waiting." in text_of(page)
     assert "No averages. No run has been evaluated yet." in text_of(page) and "<figure" not in page
     write_run(place.place(place.runs()[0]))
