@@ -12,6 +12,7 @@ import pandas as pd
 from sb3_sample.plots import COLUMNS as CURVE_COLUMNS
 from sb3_sample.plots import Curve, find_runs
 from sb3_sample.run_logs import EVALUATIONS
+from sb3_sample.run_settings import study_of
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.study import table as tables
 from sb3_sample.study.aggregate import named_apart
@@ -19,7 +20,7 @@ from sb3_sample.study.plan import Run
 from sb3_sample.study.plan_file import read_plan
 from sb3_sample.study.reporting.pieces import counted
 from sb3_sample.study.reporting.planned import missing_runs
-from sb3_sample.study.runs import LIST, PLAN, checkpointed
+from sb3_sample.study.runs import LIST, PLAN, StudyFolder, checkpointed
 from sb3_sample.study.states import Status, status
 
 #: Path of runs, or a table of them.
@@ -165,19 +166,26 @@ def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
     except ValueError:  # there is no run
         if not is_study:
             raise
+    former = _former(folders)
     if is_study:
         found.states.append(status(path))
         found.labels.append(label)
         if (path / PLAN).is_file():
             found.plans[str(source)] = read_regular(path / PLAN, _MAX_PLAN).decode(errors="replace")
         evaluated = [folder for folder in folders if (folder / EVALUATIONS).exists()]
-        if len(evaluated) < len(folders):
-            found.notes.append(
-                f"{counted(len(folders) - len(evaluated), 'run')} of {source} without an evaluation yet: in no figure."
-            )
+        n = len({folder.absolute() for folder in folders} - {folder.absolute() for folder in evaluated} - former)
+        if n:
+            found.notes.append(f"{counted(n, 'run')} of {source} without an evaluation yet: in no figure.")
         folders = evaluated
-    found.made_with += [made for folder in folders if (made := made_with(folder))]
+    kept = [folder for folder in folders if folder.absolute() not in former]
+    found.made_with += [made for folder in kept if (made := made_with(folder))]
     return [folder if label is None else f"{label}={folder}" for folder in folders]
+
+
+def _former(folders: Iterable[Path]) -> set[Path]:
+    """Folders of runs that were removed from the plans of their studies; the table leaves them out."""
+    studies = [StudyFolder(study) for study in {study_of(folder) for folder in folders} if study is not None]
+    return {study.place(run) for study in studies for run in study.former()}
 
 
 def made_with(folder: Path) -> dict[str, str]:
