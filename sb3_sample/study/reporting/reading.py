@@ -97,7 +97,7 @@ def gather(
     :param sources: as for :func:`~sb3_sample.study.read`, or tables
     :param published: runs of others: names as for :func:`~sb3_sample.study.published_runs`, or files of tables. Only
         the sources' tasks are kept; without sources, these runs are the ones compared
-    :param plan: file of a plan whose runs are looked for among the sources
+    :param plan: file of a plan whose runs are looked for among the sources; a label must be one of its agents
     :return: runs and states
     :raises ValueError: there are neither sources nor published runs, a file is damaged, a name is unknown,
         or a source's label is no agent of the plan
