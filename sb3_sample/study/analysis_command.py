@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 #: Endings of the files that commands write.
 _TABLES, _PICTURES = (".csv", ".parquet", ".md"), (".png", ".svg")
+#: Line styles of agents whose colours were all taken before.
+_STYLES = ("-", "-.", ":")
 
 
 # ---------------------------------------------------------------- arguments
@@ -506,15 +508,20 @@ def _last_word(metric: str) -> str:
 def _draw_cost(found: pd.DataFrame) -> "Figure":
     groups = list(found["group"].unique())
     figure = new_figure(4.5 * len(groups), 4)
+    # An agent has one look in all groups, and not every agent has tasks of every group.
+    looks = {agent: (f"C{i % 10}", _STYLES[i // 10 % len(_STYLES)]) for i, agent in enumerate(found["agent"].unique())}
+    drawn: dict[str, Any] = {}
     for axes, group in zip(figure.subplots(1, len(groups), squeeze=False)[0], groups, strict=True):
         for agent, rows in found[found["group"] == group].dropna(subset="hours").groupby("agent", sort=False):
-            lines = axes.plot(rows["hours"], rows["iqm"], marker="o" if len(rows) < 3 else None, label=agent)
-            axes.fill_between(rows["hours"], rows["low"], rows["high"], alpha=0.2, color=lines[0].get_color())
+            color, style = looks[agent]
+            marker = "o" if len(rows) < 3 else None
+            (drawn[agent],) = axes.plot(rows["hours"], rows["iqm"], style, marker=marker, color=color)
+            axes.fill_between(rows["hours"], rows["low"], rows["high"], alpha=0.2, color=color)
         axes.set_title(group)
         axes.set_xlabel("hours")
         axes.set_ylabel("IQM of the scores")
         axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
+    figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=2 * len(groups), frameon=False)
     return figure
 
 

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from sb3_sample import study
-from sb3_sample.study.analysis_command import COMMANDS, _readable_on, markdown, steps_of
+from sb3_sample.study.analysis_command import COMMANDS, _draw_cost, _readable_on, markdown, steps_of
 from sb3_sample.study.plan import Comparison, Plan
 from sb3_sample.study.plan import Run as Run_
 from sb3_sample.study.runs import StudyFolder
@@ -159,6 +159,28 @@ def test_heatmaps_and_costs(run: Run) -> None:
     out = run("cost", "t.csv", "--steps", "200", "--groups", "all", "--reps", "3", "-o", "c.png")
     assert "| hours | steps_per_second |" in out and "a (model_size=4.92M, replay_ratio=10)" in out
     assert Path("c.png").exists()
+
+
+def test_a_picture_of_costs_names_each_agents_lines() -> None:
+    """A has tasks of the first group only: in each group B has the colour that the legend says."""
+    pytest.importorskip("matplotlib")
+    row = {"step": 100, "iqm": 0.5, "low": 0.4, "high": 0.6}
+    found = pd.DataFrame(
+        [
+            {"agent": agent, "group": group, "hours": hours, **row}
+            for agent, group in (("A", "dmc"), ("B", "dmc"), ("B", "metaworld"), ("C", "metaworld"))
+            for hours in (1.0, 2.0, 3.0)
+        ]
+    )
+    figure = _draw_cost(found)
+    (legend,) = figure.legends
+    colors = {
+        text.get_text(): line.get_color() for text, line in zip(legend.get_texts(), legend.get_lines(), strict=True)
+    }
+    assert list(colors) == ["A", "B", "C"] and len(set(colors.values())) == 3
+    drawn = [[line.get_color() for line in axes.get_lines()] for axes in figure.axes]
+    assert drawn == [[colors["A"], colors["B"]], [colors["B"], colors["C"]]]
+    assert all(axes.get_legend() is None for axes in figure.axes)
 
 
 @pytest.mark.parametrize("name", ["viridis", "RdBu_r"])

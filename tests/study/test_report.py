@@ -20,12 +20,13 @@ from sb3_sample.plots import Curve, all_published_curves, published_curves
 from sb3_sample.saving.training_state import commit, processor
 from sb3_sample.study.plan import Plan, Run
 from sb3_sample.study.reporting import facts as facts_module
-from sb3_sample.study.reporting import figures, pieces, published
+from sb3_sample.study.reporting import figures, pieces, published, reading
+from sb3_sample.study.reporting import planned as planned_runs
+from sb3_sample.study.reporting.absent import missing
 from sb3_sample.study.reporting.content import build
 from sb3_sample.study.reporting.curves import _repeats as repeats_of
 from sb3_sample.study.reporting.curves import task_curves
 from sb3_sample.study.reporting.reading import gather
-from sb3_sample.study.reporting.summary import missing
 from sb3_sample.study.runs import Outcome, StudyFolder
 from tests.study.made_up import made_up, write_evaluations, write_monitor, write_run
 from tests.study.test_aggregate import TABLE_9
@@ -182,7 +183,7 @@ def test_one_agent_one_task_one_seed(tmp_path: Path) -> None:
     text = text_of(written(tmp_path / "r.html", made_up(runs("alone", CHEETAH, [500]))))
     assert "1 task, 1 seed each" in text and "There is one agent." in text
     assert "There are no intervals, since no task has a second run" in text and "alone 0.500." in text
-    assert "Left out: there is one agent to compare." in text
+    assert "Left out: there is one agent." in text
 
 
 def test_agents_that_cannot_be_told_apart(tmp_path: Path) -> None:
@@ -243,13 +244,55 @@ def test_runs_under_way_are_in_their_tasks_and_in_no_average(tmp_path: Path) -> 
     text = text_of(written(tmp_path / "r.html", table[~cut]))
     assert "at 200 steps over 1 task:" in text and "(of 2: those that every agent has reached 200 steps on)" in text
     text = text_of(written(tmp_path / "r.html", table[~cut], all_tasks=True))
-    assert "over 2 tasks" in text and "agents have not the same tasks" in text
+    assert f"at 200 steps, each over its own 1{pieces.DASH}2 tasks: good" in text
+    assert f"Averages are over 1{pieces.DASH}2 tasks (of 2, each agent over its own)." in text
+    assert "agents have not the same tasks" in text
     text = text_of(written(tmp_path / "r.html", table[(table["agent"] == "good") | (table["task"] == CHEETAH)]))
-    assert "1 pair of agent and task has no run." in text
+    assert "1 pair of agent and task has no evaluated run." in text
     # Agents whose evaluations do not overlap cannot be compared.
     late = made_up(runs("late", CHEETAH, [1, 2], LATER))
     text = text_of(written(tmp_path / "r.html", pd.concat([table, late])))
     assert "late is in no average: no run of it was evaluated around 200 steps." in text
+
+
+def test_averages_say_whose_tasks_they_are_over(tmp_path: Path) -> None:
+    rows = runs("a", CHEETAH, [500, 510]) + runs("b", WALKER, [500, 510])
+    text = text_of(written(tmp_path / "r.html", made_up(rows)))
+    assert "No two agents have a task in common." in text and "has the highest average" not in text
+    assert "at 200 steps, each over its own 1 task: a 0.505 (" in text and "over 2 tasks" not in text
+    assert "Averages are over 1 task (of 2, each agent over its own)." in text
+    # Two tasks of one agent, one of them the other's.
+    rows += runs("a", WALKER, [400, 410])
+    text = text_of(written(tmp_path / "r.html", made_up(rows), all_tasks=True))
+    assert f"at 200 steps, each over its own 1{pieces.DASH}2 tasks: " in text
+    assert "at 200 steps over 1 task: " in text_of(written(tmp_path / "r.html", made_up(rows)))
+
+
+def test_an_agent_without_averages_is_one_all_the_same(tmp_path: Path) -> None:
+    rows = runs("a", CHEETAH, [500, 510])
+    late = rows + runs("late", CHEETAH, [1, 2], LATER)
+    page = text_of(written(tmp_path / "r.html", made_up(late)))
+    assert "Only a has averages." in page and "Left out: only a has averages." in page and "one agent" not in page
+    page = text_of(written(tmp_path / "r.html", made_up(rows + runs("own", OWN, [1, 2]))))
+    assert "Only a has averages." in page and "own is in no average: none of its tasks has a score." in page
+    page = text_of(written(tmp_path / "r.html", made_up(rows + runs("pusher", PUSH, [1, 1])), groups=["dmc"]))
+    assert "pusher is in no average: it has no task of the groups." in page and "Only a has averages" in page
+    started = [row for row in runs("b", CHEETAH, [1, 2]) if row[5] == "hours"]
+    page = text_of(written(tmp_path / "r.html", made_up(rows + started)))
+    assert "Not evaluated: b." in page and "b is in no average: no run of it has been evaluated." in page
+    page = text_of(written(tmp_path / "r.html", made_up(started)))
+    assert "Nothing yet." in page and "Not evaluated: b." in page and "2 runs have no evaluation yet." in page
+
+
+def test_runs_of_a_table_that_have_no_evaluation_yet(tmp_path: Path) -> None:
+    """The table of a running study has the hours of runs before their first evaluation."""
+    rows = runs("a", CHEETAH, [500, 510, 520]) + [row for row in runs("a", WALKER, [0, 0]) if row[5] == "hours"]
+    page = written(tmp_path / "r.html", made_up(rows))
+    assert "1 task, 3 seeds each, up to 200 simulator steps." in text_of(page)
+    assert "2 runs have no evaluation yet." in text_of(page) and "Nothing." not in text_of(page)
+    assert "1 pair of agent and task has no evaluated run." in text_of(page)
+    (rows_of_table,) = [rows for caption, rows in tables_of(page).items() if caption.startswith("Runs that were")]
+    assert [row[:3] for row in rows_of_table[1:]] == [["a", CHEETAH, "3"], ["a", WALKER, "0"]]
 
 
 def test_agents_that_share_a_task_of_the_second_group_only(tmp_path: Path) -> None:
@@ -278,6 +321,49 @@ def test_training_episodes_of_runs_that_do_not_overlap(tmp_path: Path) -> None:
     found = task_curves(gather([tmp_path / "mine"]), CHEETAH, None, [])
     assert list(found.own["mine"].data["env_step"]) == [2_100, 2_900]
     assert [list(run.steps) for run in found.under_way["mine"]] == [[1_000, 2_000]]
+
+
+def test_agents_of_a_grid_are_told_apart(tmp_path: Path) -> None:
+    rows = []
+    for i, (size, ratio) in enumerate((size, ratio) for size in ("0.26M", "0.55M") for ratio in (2, 4)):
+        rows += runs("bro", CHEETAH, [100 * i + 100, 100 * i + 101], model_size=size, replay_ratio=ratio)
+    found = study.report(made_up(rows), tmp_path / "r.html", markdown=tmp_path / "r.md", reps=5, curves=[])
+    result = dict(found.summary)["Result"]
+    assert result[0] == (
+        "bro (model_size=0.55M, replay_ratio=4) is ahead of bro (model_size=0.55M, replay_ratio=2), without certainty."
+    )
+    drawn = {part.name: part for section in found.sections for part in section.parts if isinstance(part, pieces.Figure)}
+    labels = {name: [label for label, _, _ in drawn[name].panels[0].rows] for name in ("averages", "improvement")}
+    assert labels["averages"] == ["bro (0.55M, 4)", "bro (0.55M, 2)", "bro (0.26M, 4)", "bro (0.26M, 2)"]
+    assert labels["improvement"][0] == "bro (0.55M, 4)\n> bro (0.55M, 2)" and len(set(labels["improvement"])) == 6
+    # Both names are in the picture, in lines of their own.
+    texts = re.findall(r"<text[^>]*>([^<]*)</text>", figures.svg(drawn["improvement"].panels[0], "p"))
+    assert "bro (0.55M, 4)" in texts and "&gt; bro (0.26M, 2)" in texts
+    # All names of a table are shown in full: no cell ends in an ellipsis.
+    assert "text-overflow" not in (tmp_path / "r.html").read_text()
+
+
+def test_names_are_shortened_together() -> None:
+    def short(*names: str, letters: int = 12) -> list[str]:
+        return list(pieces.distinct(names, letters).values())
+
+    assert short("SAC", "BRO") == ["SAC", "BRO"]
+    assert short("SAC (tau=0.5)", "SAC (tau=1)", letters=13) == ["SAC (tau=0.5)", "SAC (tau=1)"]
+    assert short("SAC (replay_ratio=0.5)", "SAC (replay_ratio=1)") == ["SAC (0.5)", "SAC (1)"]
+    # Arguments that are one name's only leave equal values.
+    assert short("SAC (replay_ratio=1)", "SAC (update_ratio=1)") == ["SAC (1) #1", "SAC (1) #2"]
+    assert short("a very long name", "another long one") == ["a very long…", "another lon…"]
+    assert short("a very long name 1", "a very long name 2") == ["a ver…name 1", "a ver…name 2"]
+    assert short("a very long 1 long name", "a very long 2 long name") == ["a very l… #1", "a very l… #2"]
+    assert short("a\nb", "a b") == ["a b #1", "a b #2"]
+    assert short() == []
+
+
+def test_tasks_of_one_beginning_have_titles_of_their_own(tmp_path: Path) -> None:
+    tasks = [f"My/AnAntThatWalksThroughAMazeOfTheSize{n}-v0" for n in (1, 2)]
+    page = written(tmp_path / "r.html", made_up([row for task in tasks for row in runs("a", task, [1, 2])]))
+    titles = re.findall(r"<svg>(.*?)</svg>", page)
+    assert titles == [f"My/AnAntThatWalks…AMazeOfTheSize{n}-v0" for n in (1, 2)]
 
 
 # ---------------------------------------------------------------- a study's folder
@@ -363,6 +449,73 @@ def test_an_agent_with_failed_runs_is_not_better(tmp_path: Path) -> None:
     assert "A is better than B." in text and "1 failed run of B is not counted" in text
 
 
+def study_of_agents(path: Path, agents: dict[str, dict[str, Any]], failed: dict[tuple[str, int], int]) -> StudyFolder:
+    """A study of three seeds whose other runs are done; of those that failed, how many evaluations they have."""
+    place = StudyFolder(path)
+    made = [
+        Run(agent, "bro", arguments, {}, CHEETAH, seed, 3_000, 1_000, 2)
+        for seed in range(3)
+        for agent, arguments in agents.items()
+    ]
+    place.enter(Plan("s", tuple(made)))
+    for run in made:
+        with place.claim(run):  # type: ignore[union-attr]
+            pass
+        n = failed.get((run.agent, run.seed), 3)
+        if n:
+            steps = (1_000, 2_000, 3_000)[:n]
+            write_run(place.place(run), seed=run.seed, steps=steps, values=(1.0,) * n, arguments=run.arguments)
+        place.write_outcome(run, Outcome((run.agent, run.seed) not in failed, steps=1_000 * n, attempts=2))
+    return place
+
+
+def test_a_failed_run_is_its_own_agents(tmp_path: Path) -> None:
+    agents = {"SAC": {"tau": 0.01}, "SAC (no clip)": {"tau": 0.02}}
+    place = study_of_agents(tmp_path / "s", agents, {("SAC", 2): 2})
+    text = text_of(written(tmp_path / "r.html", place.path))
+    assert "1 failed run of SAC is not counted: the comparison favours it." in text and "of each agent" not in text
+    # Under one label, agents are known by their arguments.
+    text = text_of(written(tmp_path / "r.html", f"X={place.path}"))
+    assert "1 failed run of X (tau=0.01) is not counted: the comparison favours it." in text
+
+
+def test_an_agent_whose_runs_have_all_failed_is_named(tmp_path: Path) -> None:
+    agents: dict[str, dict[str, Any]] = {"SAC": {}, "B": {"tau": 0.02}}
+    place = study_of_agents(tmp_path / "s", agents, {("B", seed): 0 for seed in range(3)})
+    text = text_of(written(tmp_path / "r.html", place.path))
+    assert "SAC. 1 task, 3 seeds each, up to 3,000 simulator steps. Not evaluated: B." in " ".join(text.split())
+    assert "Only SAC has averages." in text and "There is one agent" not in text
+    assert "B is in no average: all of its 3 runs failed." in text
+    # Of some runs nothing is known yet.
+    (place.path / "s.yml").write_text(
+        f"agents: {{SAC: {{algo: bro}}, B: {{algo: bro, gamma: 0.9}}, C: {{algo: bro, gamma: 0.8}}}}\n"
+        f"tasks: [{CHEETAH}]\nseeds: 2\nsteps: 3_000\nevaluation: {{every: 1_000}}\n"
+    )
+    study.write(study.read(place.path), tmp_path / "t.csv")
+    text = text_of(written(tmp_path / "r.html", tmp_path / "t.csv", plan=place.path / "s.yml"))
+    assert "Not evaluated: B, C." in text and "C is in no average: none of its 2 planned runs is here." in text
+    place.write_outcome(place.runs()[1], Outcome(False))
+    text = text_of(written(tmp_path / "r.html", place.path))
+    assert "B is in no average: none of its 3 runs has been evaluated (2 failed, 1 waiting)." in text
+
+
+def test_runs_that_were_removed_from_the_plan_are_in_no_count(tmp_path: Path) -> None:
+    place = study_of_agents(tmp_path / "s", {"SAC": {}, "B": {"tau": 0.02}}, {("B", 1): 0})
+    made = {"circumstances": {"torch": "9.9"}}
+    for run in place.runs():
+        checkpoint = place.place(run) / "checkpoint-000000003000"
+        checkpoint.mkdir(parents=True)
+        (checkpoint / "manifest.json").write_text(json.dumps(made))
+    write_monitor(place.place(place.runs()[3]), CHEETAH)
+    page = written(tmp_path / "r.html", place.path)
+    assert ["torch", "9.9", "5"] in tables_of(page)["Versions and machines of the runs that say so"]
+    assert "1 run of " in text_of(page)
+    place.enter(Plan("s", tuple(run for run in place.runs() if run.agent == "SAC")))
+    page = written(tmp_path / "r.html", place.path)
+    assert ["torch", "9.9", "3"] in tables_of(page)["Versions and machines of the runs that say so"]
+    assert "not in their study's plan any more" in text_of(page) and "without an evaluation yet" not in text_of(page)
+
+
 @pytest.mark.parametrize(
     ("n_of_c", "sentences"),
     [
@@ -430,7 +583,7 @@ def test_an_empty_study_and_one_without_evaluations(tmp_path: Path) -> None:
     place = StudyFolder(tmp_path / "empty")
     place.enter(Plan("empty", (planned("A", 0), planned("B", 0))))
     page = written(tmp_path / "r.html", place.path)
-    assert "Nothing yet." in text_of(page) and "Planned: A, B." in text_of(page)
+    assert "Nothing yet." in text_of(page) and "Not evaluated: A, B." in text_of(page)
     assert "0 of 2 planned runs are done; 2 waiting." in text_of(page)
     assert "No averages. No run has been evaluated yet." in text_of(page) and "<figure" not in page
     write_run(place.place(place.runs()[0]))
@@ -480,6 +633,52 @@ def test_planned_runs_are_known_by_the_plans_names(tmp_path: Path) -> None:
     # A table that does not say seeds says of no planned run that it is here.
     seedless = made_up(rows).assign(seed=pd.array([pd.NA] * len(rows), "Int64"))
     assert len(missing(gather([seedless], plan=plan))) == 2
+
+
+def test_a_plan_knows_its_agents_by_name_not_by_a_label(tmp_path: Path) -> None:
+    plan = tmp_path / "plan.yml"
+    plan.write_text(
+        "agents: {SAC: {algo: sac_sample}, B: {algo: sac_sample, gamma: 0.9}}\n"
+        "tasks: [Pendulum-v1]\nseeds: 2\nsteps: 200\nevaluation: {every: 100}\n"
+    )
+    study.write(made_up(runs("mine", "Pendulum-v1", [-900, -800])), tmp_path / "t.csv")
+    with pytest.raises(ValueError, match="plan has the agents SAC, B, and 'Mine', the label of a source, is none"):
+        gather(f"Mine={tmp_path / 't.csv'}", plan=plan)
+    assert missing(gather(f"SAC={tmp_path / 't.csv'}", plan=plan)) == {("B", "Pendulum-v1"): [0, 1]}
+
+
+def test_planned_runs_are_looked_up_and_not_compared_with_every_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Values of the grid are read once for each run that is there and each that is planned."""
+    calls: list[Any] = []
+    original = planned_runs._values
+    monkeypatch.setattr(planned_runs, "_values", lambda *args: calls.append(args) or original(*args))
+    made = [
+        Run("a", "bro", {}, {"x": x, "y": [x, 0.5]}, CHEETAH, seed, 1_000, 1_000)
+        for x in range(40)
+        for seed in range(5)
+    ]
+    # Numbers are equal as in Python, and lists as in JSON.
+    rows = [("a", {"y": [x, 0.5], "x": float(x), "z": 1}, CHEETAH, seed) for x in range(39) for seed in range(5)]
+    known = made_up([(*row, 1_000, "return", 1.0) for row in rows])
+    assert planned_runs.missing_runs(made, known) == made[-5:]
+    assert len(calls) == len(rows) + len(made)
+    shown = {("a", text): text for text in known["arguments"].unique()}
+    calls.clear()
+    agents_of = planned_runs.namer(shown)
+    assert [len(agents_of("a", run)) for run in made] == [1] * 195 + [0] * 5
+    assert len(calls) == len(shown) + len(made)
+
+
+def test_missing_runs_are_looked_for_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = tmp_path / "plan.yml"
+    plan.write_text(f"agents: {{a: {{algo: bro}}}}\ntasks: [{CHEETAH}]\nseeds: 3\nsteps: 25_000\n")
+    calls: list[Any] = []
+    original = planned_runs.missing_runs
+    monkeypatch.setattr(reading, "missing_runs", lambda *args: calls.append(args) or original(*args))
+    assert "2 of 3 planned runs are here." in text_of(
+        written(tmp_path / "r.html", made_up(runs("a", CHEETAH, [1, 2])), plan=plan)
+    )
+    assert len(calls) == 1
 
 
 def test_a_table_with_its_plan_and_the_records_beside_it(tmp_path: Path) -> None:

@@ -48,7 +48,8 @@ def report(
         this title, and only the text between them is replaced. None for none
     :param pictures: folder of its pictures; ``<page>_files`` beside it if None
     :param title: of the report; the sources' names if None
-    :param plan: file of a plan, to list its missing runs; the folder of a study has its own plan
+    :param plan: file of a plan, to list its missing runs; the folder of a study has its own plan. A source's label must
+        then be an agent of the plan
     :param published: additional runs of others, each a name as for :func:`~sb3_sample.study.published_runs` or a file
         of a table. They have intervals; without ``folders`` they are the runs compared
     :param curves: published algorithms whose curves, available only as statistics over seeds, are drawn beside the

@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,12 +10,15 @@ import pandas as pd
 
 from sb3_sample.plots import METRICS, Curve
 from sb3_sample.study.aggregate import Groups, Scores, score_for
+from sb3_sample.study.reporting.absent import holes, missing
 from sb3_sample.study.reporting.curves import Curves, Looks, dressed, task_curves
 from sb3_sample.study.reporting.facts import Facts, compute
 from sb3_sample.study.reporting.laws import scaling
 from sb3_sample.study.reporting.pieces import (
+    BESIDE,
     DASH,
     STEPS,
+    TITLE,
     Agent,
     Cell,
     Count,
@@ -29,11 +32,11 @@ from sb3_sample.study.reporting.pieces import (
     Table,
     Text,
     counted,
-    cut,
+    distinct,
     p_text,
 )
 from sb3_sample.study.reporting.reading import Gathered
-from sb3_sample.study.reporting.summary import holes, missing, summary
+from sb3_sample.study.reporting.summary import summary
 from sb3_sample.study.scaling.result import Laws
 from sb3_sample.study.states import FAILED, STATES, Status
 from sb3_sample.study.table import RUN
@@ -41,8 +44,6 @@ from sb3_sample.version import __version__
 
 #: Most rows of a table of runs that is not folded.
 UNFOLDED = 12
-#: Most letters of an agent's name in a pair.
-PAIR = 12
 #: Circumstances in checkpoints and in records beside tables, in the order of the report's table.
 _MADE_WITH = (
     "sb3_sample", "commit", "torch", "stable_baselines3", "gymnasium", "mujoco", "numpy", "python", "processor",
@@ -99,7 +100,7 @@ def build(
         _training(facts, drawn, looks, scores),
         _tasks(drawn, looks),
         _profiles(facts, looks.runs),
-        _improvement(facts, looks.runs),
+        _improvement(gathered, facts, looks.runs),
         *([] if laws is None else [scaling(laws)]),
         _costs(gathered),
         _settings(gathered, how),
@@ -183,7 +184,11 @@ def _averages(facts: Facts, agents: dict[str, Agent], how: str) -> Section:
         for key, name in _STATISTICS.items():
             prefix = "" if key == "iqm" else f"{key}_"
             dots = [
-                (row["agent"], agents[row["agent"]], Interval(row[key], row[f"{prefix}low"], row[f"{prefix}high"]))
+                (
+                    agents[row["agent"]].short,
+                    agents[row["agent"]],
+                    Interval(row[key], row[f"{prefix}low"], row[f"{prefix}high"]),
+                )
                 for _, row in rows.iterrows()
             ]
             panels.append(Dots(name, dots))
@@ -197,12 +202,16 @@ def _averages(facts: Facts, agents: dict[str, Agent], how: str) -> Section:
 
 def _normalised(facts: Facts) -> str:
     n, of = len(facts.tasks), facts.n_scored
-    which = "all of them" if n == of else f"of {of}: those that every agent has reached {facts.step:,} steps on"
+    number, is_common = facts.number_of_tasks()
+    if is_common:
+        which = "all of them" if n == of else f"of {of}: those that every agent has reached {facts.step:,} steps on"
+    else:
+        which = f"of {of}, each agent over its own"
     return (
         "Scores: DeepMind Control's returns over 1,000; success rates as they are; MuJoCo's returns over a "
         "reference's; those of the games of Atari-100k between random play and a human; others as they were given. "
         "Nothing is clipped. Averages are over "
-        f"{counted(n, 'task')} ({which})."
+        f"{number} ({which})."
     )
 
 
@@ -224,14 +233,14 @@ def _training(facts: Facts, drawn: Sequence[Curves], looks: Looks, scores: Score
     if facts.curves is None:
         return Section("training", "Training", [])
     panels: list[Lines] = []
+    titles = _titles(facts.groups)
     for group in facts.groups:
         rows = facts.curves[facts.curves["group"] == group]
         lines = [
             Line(looks.runs[agent], *(found[name].to_numpy(float) for name in ("step", "iqm", "low", "high")))
             for agent, found in rows.groupby("agent", sort=False)
         ]
-        title = f"{group}: {counted(len(facts.groups[group]), 'task')}"
-        panels.append(Lines(title, STEPS, "IQM of the scores", lines, facts.step))
+        panels.append(Lines(titles[group], STEPS, "IQM of the scores", lines, facts.step))
     shown = list(dict.fromkeys(looks.runs[name] for name in facts.curves["agent"]))
     parts: list[Any] = [Figure("training", "Interquartile mean along the training, with intervals", panels, shown)]
     means, others = _mean_panels(facts, drawn, looks, scores)
@@ -244,6 +253,13 @@ def _training(facts: Facts, drawn: Sequence[Curves], looks: Looks, scores: Score
     return Section("training", "Training", parts)
 
 
+def _titles(groups: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Titles of the panels of groups."""
+    numbers = {group: f": {counted(len(tasks), 'task')}" for group, tasks in groups.items()}
+    names = distinct(groups, TITLE - max(map(len, numbers.values())))
+    return {group: names[group] + number for group, number in numbers.items()}
+
+
 def _mean_panels(
     facts: Facts, drawn: Sequence[Curves], looks: Looks, scores: Scores | None
 ) -> tuple[list[Lines], list[Agent]]:
@@ -254,6 +270,7 @@ def _mean_panels(
         for curve in each.others:
             by_label.setdefault(curve.label, {})[each.task] = curve
     panels, others = [], {}
+    titles = _titles(facts.groups)
     for group, tasks in facts.groups.items():
         rows = facts.curves[facts.curves["group"] == group]
         lines = [
@@ -275,14 +292,14 @@ def _mean_panels(
             if len(steps):
                 others[label] = looks.curves[label]
                 lines.append(Line(looks.curves[label], steps.astype(float), np.mean(values, axis=0)))
-        title = f"{group}: {counted(len(tasks), 'task')}"
-        panels.append(Lines(title, STEPS, "mean of the scores", lines, facts.step))
+        panels.append(Lines(titles[group], STEPS, "mean of the scores", lines, facts.step))
     return panels, list(others.values())
 
 
 def _tasks(drawn: Sequence[Curves], looks: Looks) -> Section:
     panels: list[Lines] = []
     shown: dict[Agent, None] = {}
+    titles = distinct((each.task for each in drawn), TITLE)
     for each in sorted(drawn, key=lambda curves: curves.task):
         ours = [name for name in each.own if not looks.runs[name].published] or list(each.own)
         if not ours:
@@ -301,7 +318,7 @@ def _tasks(drawn: Sequence[Curves], looks: Looks) -> Section:
         ends = [each.own[name].data["env_step"].iloc[-1] for name in ours]
         ends += [run.steps[-1] for name in ours for run in each.under_way[name]]
         y_range = (-0.03, 1.03) if each.metric == "success_rate" else None
-        panels.append(Lines(each.task, STEPS, METRICS[each.metric], lines, float(max(ends)), y_range))
+        panels.append(Lines(titles[each.task], STEPS, METRICS[each.metric], lines, float(max(ends)), y_range))
     if not panels:
         return Section("tasks", "Single tasks", [])
     caption = "Mean and range over seeds; thin: runs that have not got as far; dashed: measured and published by others"
@@ -322,18 +339,18 @@ def _profiles(facts: Facts, agents: dict[str, Agent]) -> Section:
     return Section("profiles", "Performance profiles", [Figure("profiles", caption, [panel], [x.agent for x in lines])])
 
 
-def _improvement(facts: Facts, agents: dict[str, Agent]) -> Section:
+def _improvement(gathered: Gathered, facts: Facts, agents: dict[str, Agent]) -> Section:
     section = Section("improvement", "Probability of improvement", [])
     if facts.averages is None:
         return section
     if facts.improvement is None:
-        n = facts.averages["agent"].nunique()
-        why = "there is one agent" if n == 1 else f"no two agents have a task of the group {facts.group} in common"
-        section.parts.append(f"Left out: {why} to compare." if n == 1 else f"Left out: {why}.")
+        section.parts.append(f"Left out: {facts.why_no_pair(gathered)}.")
         return section
     rows = facts.improvement.to_dict("records")
     values = [Interval(row["probability"], row["low"], row["high"]) for row in rows]
-    names = [f"{cut(row['x'], PAIR)} > {cut(row['y'], PAIR)}" for row in rows]
+    pairs = [(agents[row["x"]].short, agents[row["y"]].short) for row in rows]
+    between = " > " if all(len(x) + len(y) < BESIDE for x, y in pairs) else "\n> "
+    names = [between.join(pair) for pair in pairs]
     dots = [(name, agents[row["x"]], value) for name, row, value in zip(names, rows, values, strict=True)]
     which = "" if facts.all_pairs else ", the best agent with each other one"
     caption = (

@@ -12,7 +12,7 @@ from sb3_sample.plots import Curve, Run, summarize
 from sb3_sample.run_settings import simulator_steps
 from sb3_sample.study.aggregate import Scores, score_for
 from sb3_sample.study.reporting.facts import spacing
-from sb3_sample.study.reporting.pieces import N_COLORS, Agent, counted, range_text
+from sb3_sample.study.reporting.pieces import BESIDE, N_COLORS, Agent, counted, distinct, range_text
 from sb3_sample.study.reporting.published import chosen_curves, differences
 from sb3_sample.study.reporting.reading import Gathered
 from sb3_sample.study.table import RUN
@@ -99,6 +99,7 @@ def dressed(gathered: Gathered, curves: Sequence[Curves]) -> Looks:
         for curve in each.others:
             of_others.setdefault(curve.label, []).append((each, curve))
     looks = Looks({}, {})
+    shorts = distinct(gathered.agents, BESIDE)
     of_ours: dict[str, int] = {}
     free = itertools.count()
 
@@ -107,7 +108,7 @@ def dressed(gathered: Gathered, curves: Sequence[Curves]) -> Looks:
         color = of_ours.pop(base) if published and base in of_ours else next(free)
         if not published:
             of_ours.setdefault(base, color)
-        return Agent(name, color % N_COLORS, color // N_COLORS, published, label)
+        return Agent(name, color % N_COLORS, color // N_COLORS, published, label, shorts.get(name, name))
 
     for name in gathered.agents:
         if name not in gathered.published:

@@ -20,7 +20,8 @@ from sb3_sample.study.aggregate import (
     scored,
     unscored,
 )
-from sb3_sample.study.reporting.pieces import counted
+from sb3_sample.study.reporting.absent import without_runs
+from sb3_sample.study.reporting.pieces import counted, one_line, range_text
 from sb3_sample.study.reporting.reading import Gathered
 from sb3_sample.study.table import RUN
 
@@ -36,7 +37,8 @@ class Facts:
     """
     :param lacking: tasks without a score, with the reason
     :param reason: why there are no averages; empty if there are
-    :param tasks: the tasks averaged over
+    :param tasks: the tasks averaged over, of all agents together
+    :param tasks_of: those of each agent at the last step
     :param n_scored: number of tasks with a score
     :param steps: steps at which averages are reported
     :param groups: of tasks, by name; profiles and improvement are of the first
@@ -53,6 +55,7 @@ class Facts:
     lacking: dict[str, str]
     reason: str = ""
     tasks: list[str] = dataclasses.field(default_factory=list)
+    tasks_of: dict[str, set[str]] = dataclasses.field(default_factory=dict)
     n_scored: int = 0
     steps: list[int] = dataclasses.field(default_factory=list)
     groups: dict[str, list[str]] = dataclasses.field(default_factory=dict)
@@ -84,6 +87,29 @@ class Facts:
         assert self.averages is not None
         rows = self.averages[(self.averages["step"] == step) & (self.averages["group"] == (group or self.group))]
         return rows.sort_values("iqm", ascending=False, kind="stable")
+
+    def number_of_tasks(self, group: str | None = None) -> tuple[str, bool]:
+        """
+        :param group: one of ``groups``; all tasks if None
+        :return: number of tasks that an agent is averaged over at the last step, in words, and whether these are the
+            same tasks for all agents
+        """
+        tasks = set(self.tasks if group is None else self.groups[group])
+        own = [found & tasks for found in self.tasks_of.values() if found & tasks]
+        return range_text(map(len, own), "task"), all(found == tasks for found in own)
+
+    def why_no_pair(self, gathered: Gathered) -> str:
+        """
+        :param gathered: runs
+        :return: why there is no improvement, in words
+        """
+        agents = list(self.at(self.step)["agent"])
+        of_group = f" of the group {self.group}" if len(self.groups[self.group]) < len(self.tasks) else ""
+        if len(agents) > 1:
+            return f"no two agents have a task{of_group} in common"
+        if set(gathered.agents) == set(agents) and not self.left_out:
+            return "there is one agent"
+        return f"only {one_line(agents[0])} has averages{of_group}"
 
 
 def compute(
@@ -124,12 +150,14 @@ def compute(
     reaching = ends[(ends["min"] <= facts.step) & (ends["max"] >= facts.step)]
     if not len(reaching):
         raise ValueError(f"steps must be within those of the runs, up to {own['max'].max():,}, not {facts.step:,}")
-    reaching = _comparable(reaching, own, gathered, facts, all_tasks)
+    reaching = _comparable(reaching, ends, gathered, facts, all_tasks)
     facts.tasks = list(dict.fromkeys(reaching["task"]))
+    facts.tasks_of = {agent: set(found) for agent, found in reaching.groupby("agent")["task"]}
     rows = rows.merge(reaching[RUN], on=RUN)
     agents = [agent for agent in gathered.agents if agent in set(reaching["agent"])]
     rows = rows.sort_values("agent", key=lambda names: names.map(agents.index), kind="stable")
     facts.groups = _groups(groups, facts.tasks)
+    _leave_out(gathered, facts)
     grid = _grid(rows, int(reaching["min"].max()), facts.step)
     shared: dict[str, Any] = {"scores": scores, "reps": reps, "confidence": confidence, "seed": seed}
     with warnings.catch_warnings(record=True) as told:
@@ -142,9 +170,8 @@ def compute(
         facts.profiles = performance_profiles(rows, facts.step, groups=first, **shared)
         facts.all_pairs = len(best) <= ALL_PAIRS
         pairs = itertools.combinations(best, 2) if facts.all_pairs else ((best[0], other) for other in best[1:])
-        of_group = reaching[reaching["task"].isin(facts.groups[facts.group])]
-        tasks_of = {agent: set(found) for agent, found in of_group.groupby("agent")["task"]}
-        chosen = [(x, y) for x, y in pairs if tasks_of[x] & tasks_of[y]]
+        members = set(facts.groups[facts.group])
+        chosen = [(x, y) for x, y in pairs if facts.tasks_of[x] & facts.tasks_of[y] & members]
         if chosen:
             facts.improvement = probability_of_improvement(rows, facts.step, first, pairs=chosen, **shared)
     facts.notes += dict.fromkeys(str(warning.message) for warning in told)
@@ -170,12 +197,12 @@ def _reached(ends: pd.DataFrame) -> int:
 
 
 def _comparable(
-    reaching: pd.DataFrame, own: pd.DataFrame, gathered: Gathered, facts: Facts, all_tasks: bool
+    reaching: pd.DataFrame, ends: pd.DataFrame, gathered: Gathered, facts: Facts, all_tasks: bool
 ) -> pd.DataFrame:
     """Runs on the tasks that all our agents have; agents of others are included if they have all these tasks."""
     tasks = {agent: set(found) for agent, found in reaching.groupby("agent")["task"]}
     ours = [agent for agent in gathered.agents if agent in tasks and agent not in gathered.published]
-    for agent in own["agent"].unique():
+    for agent in ends["agent"].unique():
         if agent not in tasks:
             facts.left_out[agent] = f"no run of it was evaluated around {facts.step:,} steps"
     if all_tasks or not ours:
@@ -188,6 +215,22 @@ def _comparable(
         if not common <= tasks[agent]:
             facts.left_out[agent] = f"it has {len(tasks[agent] & common)} of the {counted(len(common), 'task')}"
     return reaching[reaching["task"].isin(common) & ~reaching["agent"].isin(list(facts.left_out))]
+
+
+def _leave_out(gathered: Gathered, facts: Facts) -> None:
+    """Name the other agents without an average: not evaluated, without a score, or without any run."""
+    evaluated = set(gathered.evaluated["agent"])
+    averaged = set().union(*facts.groups.values())
+    for agent in gathered.agents:
+        if facts.tasks_of.get(agent, set()) & averaged or agent in facts.left_out:
+            continue
+        if agent not in evaluated:
+            facts.left_out[agent] = "no run of it has been evaluated"
+        elif agent not in facts.tasks_of:
+            facts.left_out[agent] = "none of its tasks has a score"
+        else:
+            facts.left_out[agent] = "it has no task of the groups"
+    facts.left_out |= without_runs(gathered)
 
 
 def _groups(groups: Groups | None, tasks: list[str]) -> dict[str, list[str]]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sb3_sample.plots import needing_matplotlib
-from sb3_sample.study.reporting.pieces import LETTERS, N_COLORS, Agent, Dots, Figure, Line, Lines, cut
+from sb3_sample.study.reporting.pieces import BESIDE, N_COLORS, TITLE, Agent, Dots, Figure, Line, Lines, cut
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,8 +30,8 @@ _STYLES, _DASHED = ("-", "-.", ":"), (0, (4, 2))
 _MARKERS = ("o", "s", "D")
 #: Width and height of a panel of lines and width of a panel of dots in inches, and panels side by side in a file.
 WIDTH, HEIGHT, DOTS_WIDTH, COLUMNS = 4.4, 3.1, 5.4, 3
-#: Letters of a name beside dots, letters of a legend per inch, and dots of a file per inch.
-BESIDE, _LETTERS, _DPI = 26, 13, 100
+#: Letters of a legend per inch, and dots of a file per inch.
+_LETTERS, _DPI = 13, 100
 
 
 @contextlib.contextmanager
@@ -50,7 +50,7 @@ def _style(ink: str, grid: str) -> Iterator[None]:
         yield
 
 
-def shortened(name: str, letters: int = LETTERS) -> str:
+def shortened(name: str, letters: int = TITLE) -> str:
     """
     :param name: of an agent or task, from a file
     :param letters: that are kept
@@ -139,7 +139,10 @@ def _drawing(width: float, height: float) -> "Drawing":
 
 
 def _size(panel: Lines | Dots) -> tuple[float, float]:
-    return (WIDTH, HEIGHT) if isinstance(panel, Lines) else (DOTS_WIDTH, 0.75 + 0.3 * len(panel.rows))
+    if isinstance(panel, Lines):
+        return WIDTH, HEIGHT
+    lines = max((label.count("\n") + 1 for label, _, _ in panel.rows), default=1)
+    return DOTS_WIDTH, 0.75 + (0.12 + 0.18 * lines) * len(panel.rows)
 
 
 def _look(agent: Agent) -> dict[str, Any]:
@@ -203,10 +206,15 @@ def _draw_dots(axes: "Axes", panel: Dots) -> None:
     if panel.middle is not None:
         axes.axvline(panel.middle, color=axes.xaxis.label.get_color(), linewidth=0.8)
         axes.set_xlim(-0.03, 1.03)
-    axes.set_yticks(range(len(panel.rows)), [shortened(label, BESIDE) for label, _, _ in panel.rows])
+    labels = ["\n".join(map(_beside, label.split("\n"))) for label, _, _ in panel.rows]
+    axes.set_yticks(range(len(panel.rows)), labels)
     axes.set_ylim(len(panel.rows) - 0.5, -0.5)
     axes.grid(visible=False, axis="y")
     axes.locator_params(axis="x", nbins=5)
+
+
+def _beside(line: str) -> str:
+    return shortened(line, BESIDE + len("> "))
 
 
 def _legend(drawing: "Drawing", agents: Sequence[Agent], labels: Sequence[str], columns: int) -> None:

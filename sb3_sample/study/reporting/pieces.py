@@ -7,6 +7,7 @@ the code that writes them into a file.
 
 import dataclasses
 import math
+import re
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -16,8 +17,10 @@ DASH = "\N{EN DASH}"
 STEPS = "simulator steps"
 #: Number of colours in figures.
 N_COLORS = 8
-#: Most letters of a name in a sentence or a figure.
-LETTERS = 36
+#: Most letters of a name in a sentence, in the title of a panel, and beside dots.
+LETTERS, TITLE, BESIDE = 60, 36, 24
+#: Name of an argument in the name of an agent, as in "SAC (tau=0.01, gamma=0.9)".
+_ARGUMENT = re.compile(r"(?<=[(, ])[\w.]+=")
 
 
 class Interval(NamedTuple):
@@ -81,6 +84,7 @@ class Agent:
     :param turn: how often all colours were taken before
     :param published: whether others have measured it; its lines are then dashed
     :param label: its name with additional words for a legend
+    :param short: its name beside dots, other than that of any other agent
     """
 
     name: str
@@ -88,6 +92,7 @@ class Agent:
     turn: int = 0
     published: bool = False
     label: str = ""
+    short: str = ""
 
 
 class Line(NamedTuple):
@@ -131,7 +136,7 @@ class Lines(NamedTuple):
 class Dots(NamedTuple):
     """
     :param title: of the panel
-    :param rows: label, agent and estimate
+    :param rows: label (lines of a name, as short as :data:`BESIDE` asks), agent and estimate
     :param middle: x of a line, if there is one
     """
 
@@ -232,11 +237,46 @@ def range_text(numbers: Iterable[int], noun: str) -> str:
     return counted(found[0], noun) if found[0] == found[-1] else f"{found[0]:,}{DASH}{found[-1]:,} {noun}s"
 
 
+def one_line(name: str) -> str:
+    """
+    :param name: from a file
+    :return: the name in one line
+    """
+    return " ".join("".join(letter if letter.isprintable() else " " for letter in name).split())
+
+
 def cut(name: str, letters: int = LETTERS) -> str:
     """
     :param name: from a file
     :param letters: that are kept
-    :return: the name in one line, cut if it is too long for a sentence
+    :return: the name in one line, cut at its end if it is too long
     """
-    text = " ".join("".join(letter if letter.isprintable() else " " for letter in name).split())
+    text = one_line(name)
     return text if len(text) <= letters else f"{text[: letters - 1]}…"
+
+
+def distinct(names: Iterable[str], letters: int = LETTERS) -> dict[str, str]:
+    """
+    Shorten names together, so that no two of them become equal. Names of a grid differ at their ends, or in the middle.
+
+    :param names: from files
+    :param letters: most of a short name
+    :return: by each name its short form in one line: whole if all fit, else without the names of the arguments, "SAC
+        (0.01, 0.9)", if necessary cut at the end or in the middle or, if this leaves equal ones, numbered
+    """
+    whole = {name: one_line(name) for name in names}
+    values = {name: _ARGUMENT.sub("", text) for name, text in whole.items()}
+    ends = {name: cut(text, letters) for name, text in values.items()}
+    middles = {name: _without_middle(text, letters) for name, text in values.items()}
+    for found in (whole, values, ends, middles):
+        if max(map(len, found.values()), default=0) <= letters and len(set(found.values())) == len(found):
+            return found
+    tails = {name: f" #{i}" for i, name in enumerate(whole, 1)}
+    return {name: cut(text, letters - len(tails[name])) + tails[name] for name, text in values.items()}
+
+
+def _without_middle(text: str, letters: int) -> str:
+    if len(text) <= letters:
+        return text
+    end = letters // 2
+    return f"{text[: letters - end - 1]}…{text[-end:]}"

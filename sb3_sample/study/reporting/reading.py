@@ -1,6 +1,7 @@
 """Runs for a report: one table of all runs, including others', the states of studies, and how the runs were made."""
 
 import dataclasses
+import functools
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -11,13 +12,15 @@ import pandas as pd
 from sb3_sample.plots import COLUMNS as CURVE_COLUMNS
 from sb3_sample.plots import Curve, find_runs
 from sb3_sample.run_logs import EVALUATIONS
+from sb3_sample.run_settings import study_of
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.study import table as tables
 from sb3_sample.study.aggregate import named_apart
 from sb3_sample.study.plan import Run
 from sb3_sample.study.plan_file import read_plan
 from sb3_sample.study.reporting.pieces import counted
-from sb3_sample.study.runs import LIST, PLAN, checkpointed
+from sb3_sample.study.reporting.planned import missing_runs
+from sb3_sample.study.runs import LIST, PLAN, StudyFolder, checkpointed
 from sb3_sample.study.states import Status, status
 
 #: Path of runs, or a table of them.
@@ -45,6 +48,7 @@ class Gathered:
     :param made_with: for each run that records them: versions, device, processor, commit
     :param notes: what was left out, with the reason
     :param labels: name given to the agents of each of ``states``, None for the names of the plan
+    :param shown: the table's name of each of the sources' agents, by its name there and its arguments
     """
 
     names: list[str]
@@ -60,6 +64,12 @@ class Gathered:
     made_with: list[dict[str, str]]
     notes: list[str]
     labels: list[str | None] = dataclasses.field(default_factory=list)
+    shown: dict[tuple[str, str], str] = dataclasses.field(default_factory=dict)
+
+    @functools.cached_property
+    def missing(self) -> list[Run]:
+        """The given plan's runs that are not among the sources'."""
+        return missing_runs(self.planned, self.runs)
 
     @property
     def agents(self) -> list[str]:
@@ -87,9 +97,10 @@ def gather(
     :param sources: as for :func:`~sb3_sample.study.read`, or tables
     :param published: runs of others: names as for :func:`~sb3_sample.study.published_runs`, or files of tables. Only
         the sources' tasks are kept; without sources, these runs are the ones compared
-    :param plan: file of a plan whose runs are looked for among the sources
+    :param plan: file of a plan whose runs are looked for among the sources; a label must be one of its agents
     :return: runs and states
-    :raises ValueError: there are neither sources nor published runs, a file is damaged, or a name is unknown
+    :raises ValueError: there are neither sources nor published runs, a file is damaged, a name is unknown,
+        or a source's label is no agent of the plan
     :raises OSError: a file cannot be read
     """
     given: list[Source] = [sources] if isinstance(sources, (str, Path, pd.DataFrame)) else list(sources)
@@ -109,6 +120,13 @@ def gather(
         paths += _paths(source, found)
     if plan is not None:
         found.planned = list(read_plan(plan).runs)
+        agents = dict.fromkeys(run.agent for run in found.planned)
+        for label in filter(None, (tables.labelled(source)[0] for source in given if isinstance(source, (str, Path)))):
+            if label not in agents:
+                raise ValueError(
+                    f"plan has the agents {', '.join(agents)}, and {label!r}, the label of a source, is none of them: "
+                    "give the source without a label, or with an agent's name"
+                )
         found.plans[str(plan)] = read_regular(Path(plan), _MAX_PLAN).decode(errors="replace")
     if paths:
         with warnings.catch_warnings(record=True) as told:
@@ -117,8 +135,8 @@ def gather(
         found.notes += [str(warning.message) for warning in told]
     if parts:
         found.runs = pd.concat(parts, ignore_index=True)[tables.RUN].dropna(subset="seed").drop_duplicates()
-    own = _measured(parts, found)
-    theirs = _measured([_published(name, found) for name in published], found)
+    own, found.shown = _measured(parts, found)
+    theirs, _ = _measured([_published(name, found) for name in published], found)
     if given:
         theirs = theirs[theirs["task"].isin(own["task"].unique())]
         theirs = theirs.assign(agent=tables.marked_published(theirs["agent"]))
@@ -148,19 +166,26 @@ def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
     except ValueError:  # there is no run
         if not is_study:
             raise
+    former = _former(folders)
     if is_study:
         found.states.append(status(path))
         found.labels.append(label)
         if (path / PLAN).is_file():
             found.plans[str(source)] = read_regular(path / PLAN, _MAX_PLAN).decode(errors="replace")
         evaluated = [folder for folder in folders if (folder / EVALUATIONS).exists()]
-        if len(evaluated) < len(folders):
-            found.notes.append(
-                f"{counted(len(folders) - len(evaluated), 'run')} of {source} without an evaluation yet: in no figure."
-            )
+        n = len({folder.absolute() for folder in folders} - {folder.absolute() for folder in evaluated} - former)
+        if n:
+            found.notes.append(f"{counted(n, 'run')} of {source} without an evaluation yet: in no figure.")
         folders = evaluated
-    found.made_with += [made for folder in folders if (made := made_with(folder))]
+    kept = [folder for folder in folders if folder.absolute() not in former]
+    found.made_with += [made for folder in kept if (made := made_with(folder))]
     return [folder if label is None else f"{label}={folder}" for folder in folders]
+
+
+def _former(folders: Iterable[Path]) -> set[Path]:
+    """Folders of runs that were removed from the plans of their studies; the table leaves them out."""
+    studies = [StudyFolder(study) for study in {study_of(folder) for folder in folders} if study is not None]
+    return {study.place(run) for study in studies for run in study.former()}
 
 
 def made_with(folder: Path) -> dict[str, str]:
@@ -201,11 +226,13 @@ def _published(name: str | Path, found: Gathered) -> pd.DataFrame:
     return tables.published_runs([str(name)])
 
 
-def _measured(parts: list[pd.DataFrame], found: Gathered) -> pd.DataFrame:
-    """Runs of tables, named apart; rows of statistics over seeds become curves."""
+def _measured(parts: list[pd.DataFrame], found: Gathered) -> tuple[pd.DataFrame, dict[tuple[str, str], str]]:
+    """
+    Runs of tables, named apart, and these names by agent and arguments; rows of statistics over seeds become curves.
+    """
     parts = [part for part in parts if len(part)]
     if not parts:
-        return found.table
+        return found.table, {}
     table = pd.concat(parts, ignore_index=True)
     heads = table["metric"].str.partition("/")
     statistics = table["seed"].isna() & heads[0].isin(_MEASURED) & heads[2].isin(tables.STATISTICS)
@@ -213,4 +240,6 @@ def _measured(parts: list[pd.DataFrame], found: Gathered) -> pd.DataFrame:
         data = rows.assign(name=heads[2]).pivot_table(index="step", columns="name", values="value").reset_index()
         data = data.rename(columns={"step": "env_step"}).rename_axis(columns=None).reindex(columns=CURVE_COLUMNS)
         found.curves.setdefault((task, metric), []).append(Curve(agent, data, published=True))
-    return named_apart(table[~statistics].reset_index(drop=True))
+    runs = table[~statistics].reset_index(drop=True)
+    named = named_apart(runs)
+    return named, dict(zip(zip(runs["agent"], runs["arguments"], strict=True), named["agent"], strict=True))

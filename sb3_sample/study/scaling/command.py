@@ -1,6 +1,7 @@
 """``sb3-sample scaling``: plan a sweep, fit its laws, predict settings, draw the paper's figures."""
 
 import argparse
+import ast
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -93,11 +94,38 @@ def _written(value: float) -> str:
     return short if float(short) == value else repr(value)
 
 
+class _Dicts(ast.NodeTransformer):
+    """Write ``dict(name=value)`` as a literal."""
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        self.generic_visit(node)
+        names = [keyword.arg for keyword in node.keywords]
+        if not isinstance(node.func, ast.Name) or node.func.id != "dict" or node.args or None in names:
+            return node
+        return ast.Dict([ast.Constant(name) for name in names], [keyword.value for keyword in node.keywords])
+
+
+def _pair(text: str) -> tuple[str, str]:
+    """Name and value (in JSON) of NAME:VALUE, as ``sb3-sample train`` takes them; a plan holds plain values only."""
+    name, _, value = text.partition(":")
+    try:
+        if not name.isidentifier():
+            raise ValueError("no name")
+        found = ast.literal_eval(_Dicts().visit(ast.parse(value.lstrip(), mode="eval")))
+        # Every JSON text without NaN is one of YAML too, with texts in quotes.
+        return name, json.dumps(found, allow_nan=False)
+    except (SyntaxError, ValueError, TypeError, MemoryError, RecursionError) as error:
+        raise ValueError(
+            "-params must be NAME:VALUE, the value a number, text, list or dict in Python and a text in quotes of its "
+            f"own (NAME:\"'text'\"), not {text!r:.200} ({type(error).__name__}: {error})"
+        ) from error
+
+
 def plan_text(options: argparse.Namespace) -> str:
     """
     :param options: of ``sb3-sample scaling plan``
     :return: the plan
-    :raises ValueError: a number is out of range
+    :raises ValueError: a number is out of range, or a further argument is no plain Python
     """
     for name in ("evaluations", "episodes", "seeds"):
         if getattr(options, name) < 1:
@@ -108,8 +136,7 @@ def plan_text(options: argparse.Namespace) -> str:
             f"{options.steps:g}"
         )
     every = int(options.steps) // options.evaluations
-    given = [each.partition(":")[::2] for each in options.hyperparams]
-    fixed = "".join(f", {name}: {value}" for name, value in given)
+    fixed = "".join(f", {name}: {value}" for name, value in map(_pair, options.hyperparams))
     lines = [
         "# Sweep of batch size and learning rate by replay ratio. One agent under many names: after",
         f"#   sb3-sample study run {options.output}",
