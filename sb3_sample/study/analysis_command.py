@@ -14,7 +14,7 @@ import pandas as pd
 
 from sb3_sample.envs.scores import Score
 from sb3_sample.exits import refuse
-from sb3_sample.plots import needing_matplotlib
+from sb3_sample.plots import STYLES, needing_matplotlib
 from sb3_sample.study import analysis
 from sb3_sample.study import table as tables
 from sb3_sample.study.aggregate import (
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
 #: Endings of the files that commands write.
 _TABLES, _PICTURES = (".csv", ".parquet", ".md"), (".png", ".svg")
-#: Line styles of agents whose colours were all taken before.
-_STYLES = ("-", "-.", ":")
 
 
 # ---------------------------------------------------------------- arguments
@@ -509,7 +507,7 @@ def _draw_cost(found: pd.DataFrame) -> "Figure":
     groups = list(found["group"].unique())
     figure = new_figure(4.5 * len(groups), 4)
     # An agent has one look in all groups, and not every agent has tasks of every group.
-    looks = {agent: (f"C{i % 10}", _STYLES[i // 10 % len(_STYLES)]) for i, agent in enumerate(found["agent"].unique())}
+    looks = {agent: (f"C{i % 10}", STYLES[i // 10 % len(STYLES)]) for i, agent in enumerate(found["agent"].unique())}
     drawn: dict[str, Any] = {}
     for axes, group in zip(figure.subplots(1, len(groups), squeeze=False)[0], groups, strict=True):
         for agent, rows in found[found["group"] == group].dropna(subset="hours").groupby("agent", sort=False):

@@ -293,6 +293,9 @@ def test_runs_of_a_table_that_have_no_evaluation_yet(tmp_path: Path) -> None:
     assert "1 pair of agent and task has no evaluated run." in text_of(page)
     (rows_of_table,) = [rows for caption, rows in tables_of(page).items() if caption.startswith("Runs that were")]
     assert [row[:3] for row in rows_of_table[1:]] == [["a", CHEETAH, "3"], ["a", WALKER, "0"]]
+    # A group of a plan may have a task that no run has been evaluated on yet.
+    groups = {"both": [CHEETAH, WALKER]}
+    assert "Averages are over 1 task" in text_of(written(tmp_path / "r.html", made_up(rows), groups=groups))
 
 
 def test_agents_that_share_a_task_of_the_second_group_only(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -156,7 +156,7 @@ def compute(
     rows = rows.merge(reaching[RUN], on=RUN)
     agents = [agent for agent in gathered.agents if agent in set(reaching["agent"])]
     rows = rows.sort_values("agent", key=lambda names: names.map(agents.index), kind="stable")
-    facts.groups = _groups(groups, facts.tasks)
+    facts.groups = _groups(groups, facts.tasks, gathered.table["task"].unique())
     _leave_out(gathered, facts)
     grid = _grid(rows, int(reaching["min"].max()), facts.step)
     shared: dict[str, Any] = {"scores": scores, "reps": reps, "confidence": confidence, "seed": seed}
@@ -233,9 +233,9 @@ def _leave_out(gathered: Gathered, facts: Facts) -> None:
     facts.left_out |= without_runs(gathered)
 
 
-def _groups(groups: Groups | None, tasks: list[str]) -> dict[str, list[str]]:
+def _groups(groups: Groups | None, tasks: list[str], in_table: Iterable[str]) -> dict[str, list[str]]:
     """The groups; of the default groups, those that contain all tasks are left out, except the first."""
-    found = group_tasks(groups, tasks)
+    found = group_tasks(groups, tasks, in_table)
     if groups is None:
         all_of_them = found[DEFAULT_GROUPS[0]]
         found = {name: each for name, each in found.items() if name == DEFAULT_GROUPS[0] or each != all_of_them}

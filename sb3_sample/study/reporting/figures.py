@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_sample.plots import needing_matplotlib
+from sb3_sample.plots import STYLES, needing_matplotlib
 from sb3_sample.study.reporting.pieces import BESIDE, N_COLORS, TITLE, Agent, Dots, Figure, Line, Lines, cut
 
 if TYPE_CHECKING:
@@ -25,8 +25,8 @@ DARK = ("#4aa8e8", "#ff8552", "#2fcf9f", "#f0a6cf", "#ffc64d", "#a5dcff", "#b58a
 INK, GRID, BAND = "#222427", "#d9dce1", "#9aa0a8"
 #: The same in an SVG, as placeholders for the page's colours.
 _INK, _GRID, _BAND = "#010203", "#030201", "#020301"
-#: Line styles of agents that share a colour, by how often all colours were taken before; style of published agents.
-_STYLES, _DASHED = ("-", "-.", ":"), (0, (4, 2))
+#: Line style of published agents, and markers of agents that share a colour, by how often all were taken before.
+_DASHED = (0, (4, 2))
 _MARKERS = ("o", "s", "D")
 #: Width and height of a panel of lines and width of a panel of dots in inches, and panels side by side in a file.
 WIDTH, HEIGHT, DOTS_WIDTH, COLUMNS = 4.4, 3.1, 5.4, 3
@@ -146,7 +146,7 @@ def _size(panel: Lines | Dots) -> tuple[float, float]:
 
 
 def _look(agent: Agent) -> dict[str, Any]:
-    style: Any = _DASHED if agent.published else _STYLES[min(agent.turn, len(_STYLES) - 1)]
+    style: Any = _DASHED if agent.published else STYLES[min(agent.turn, len(STYLES) - 1)]
     return {"color": LIGHT[agent.color % N_COLORS], "linestyle": style}
 
 
