@@ -88,8 +88,8 @@ class ConvEncoder(BaseFeaturesExtractor):
         has_offset = isinstance(self.offset, torch.Tensor) or self.offset != 0
         x = observations - self.offset if has_offset else observations
         if x.device.type == "cpu":
-            # On a CPU, convolutions are faster with the channels last in memory, forward and backward; all their outputs
-            # keep it. torch.channels_last is unknown within the step of several learners.
+            # On a CPU, convolutions are faster with the channels last in memory, forward and backward; all their
+            # outputs keep it. Within the step of several learners torch.channels_last is refused.
             x = x.movedim(1, -1).contiguous().movedim(-1, 1)
         return self.layers(x).flatten(start_dim=1)  # type: ignore[no-any-return]
 
