@@ -107,12 +107,17 @@ class CategoricalHead(ValueHead):
         :param positions: positions of these probabilities, (B, K); clipped to the support
         :return: probabilities of the atoms, (B, K)
         """
-        clipped = positions.clamp(self.v_min, self.v_max)
+        clipped = self._clipped(positions)
         # In units of the spacing, where the shares of two neighbours add up to 1.
         place = ((clipped - self.v_min) / self.spacing).clamp(0, self.n_outputs - 1)
         atoms = torch.arange(self.n_outputs, device=place.device, dtype=place.dtype)
         shares = (1 - (place.unsqueeze(-1) - atoms).abs()).clamp(min=0)
         return (probabilities.unsqueeze(-1) * shares).sum(dim=1)
+
+    def _clipped(self, values: torch.Tensor) -> torch.Tensor:
+        # One end after the other: torch refuses a number beside a tensor, which an end that differs between the
+        # learners of a group is.
+        return values.clamp(min=self.v_min).clamp(max=self.v_max)
 
     def loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """
@@ -158,7 +163,7 @@ class HLGaussHead(CategoricalHead):
         value: Callable[[torch.Tensor], torch.Tensor],
         entropy_bonus: torch.Tensor,
     ) -> torch.Tensor:
-        y = td_target(batch, value(self.values(next_q)), entropy_bonus).clamp(self.v_min, self.v_max)
+        y = self._clipped(td_target(batch, value(self.values(next_q)), entropy_bonus))
         edges = torch.cat((self.support - self.spacing / 2, self.support[-1:] + self.spacing / 2))
         below = torch.special.erf((edges - y) / (math.sqrt(2) * self.sigma * self.spacing))
         mass = below.diff(dim=-1)

@@ -97,11 +97,20 @@ class DebiasedRQLearner(Learner):
 
     @property
     def n_encoder_steps_due(self) -> int:
-        """Number of encoder steps, on a batch of windows each, that are due before the next gradient step."""
+        """
+        Number of encoder steps, on a batch of windows each, that are due before the next gradient step, after the reset
+        that :meth:`update` may begin with.
+        """
         period = self.target_update_interval or self.policy_delay
         # After a reset the encoder has learned nothing.
-        is_due = self.n_updates % period == 0 or self.n_updates == self._counts._began_at
+        is_due = self.n_updates % period == 0 or self.n_updates == self._counts._began_at or self._resets_next
         return period if is_due else 0
+
+    @property
+    def _resets_next(self) -> bool:
+        """Whether :meth:`update` resets before its gradient step: its windows are counted, and drawn, before that."""
+        resets = self.plasticity
+        return resets.follows_gradient_steps(self) or (self._heard and resets.follows_environment_steps(self))
 
     def update(
         self,

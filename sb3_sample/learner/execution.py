@@ -608,7 +608,8 @@ NO_SETTINGS = {"arm", "training", "gradients_are_stale"}
 
 class Settings:
     """
-    Numbers and strings that a gradient step may read: the learner's own, its modules' and its optimizers'.
+    Numbers and strings that a gradient step may read: the learner's own, its modules' and its optimizers'; and the
+    learner's own tensors, in whose place a number may be set.
 
     :param learner: the learner
     :param private: whether private attributes of classes from outside of this package count too; settings of this
@@ -617,14 +618,18 @@ class Settings:
 
     def __init__(self, learner: Any, private: bool):
         modules = [module for root in learner.step_modules() for module in root.modules()]
+        # A view in evaluation mode shares its owner's tensors, and has its numbers for itself.
+        views = [view for module in modules if isinstance(view := getattr(module, "at_rest", None), torch.nn.Module)]
+        modules += [module for view in views for module in view.modules()]
         #: Attributes of the owner, or an optimizer's group; name; value at the last call of :meth:`have_changed`.
         self.held: list[tuple[dict[str, Any], str, Any]] = []
         for owner in (learner, *modules):
             of_torch = type(owner).__module__.split(".")[0] == "torch"
             every = private and not of_torch and not _is_ours(type(owner))
             for name, value in vars(owner).items():
-                is_plain = isinstance(value, (int, float, str, type(None)))
-                if is_plain and (every or not name.startswith("_")) and name not in NO_SETTINGS:
+                is_held = isinstance(value, (int, float, str, type(None)))
+                is_held |= owner is learner and isinstance(value, torch.Tensor)
+                if is_held and (every or not name.startswith("_")) and name not in NO_SETTINGS:
                     self.held.append((vars(owner), name, value))
         for optimizer in learner.optimizers().values():
             for group in optimizer.param_groups:
@@ -640,7 +645,7 @@ class Settings:
         changed = [
             (i, values[name])
             for i, (values, name, value) in enumerate(self.held)
-            if (now := values.get(name)) is not value and now != value
+            if _has_changed(value, values.get(name))
         ]
         for i, value in changed:
             self.held[i] = (*self.held[i][:2], value)
@@ -655,3 +660,15 @@ class Settings:
         """Record that the changes since the last call of :meth:`changed_the_step` left the step the same."""
         self._unread |= self._changed
         self._changed = set()
+
+
+def _has_changed(before: Any, now: Any) -> bool:
+    """
+    Compare a setting with what it was. A tensor in the place of a number, or of another tensor, is a change, whatever
+    the values; one that changes in place is read there by compiled and captured steps.
+    """
+    if now is before:
+        return False
+    if isinstance(before, torch.Tensor) or isinstance(now, torch.Tensor):
+        return True
+    return bool(now != before)

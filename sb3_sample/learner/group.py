@@ -301,7 +301,14 @@ class LearnerGroup:
 
         numbers = [number for _, _, number in self._differing]
         mapped: Callable[..., Metrics] = torch.vmap(one)
-        return mapped(self._stacks.by_name(), numbers, tensors_of(inputs))
+        try:
+            return mapped(self._stacks.by_name(), numbers, tensors_of(inputs))
+        except RuntimeError as error:
+            # Of a network or part of one's own, perhaps, that needs a number where it finds a tensor.
+            if numbers:
+                names = sorted({name for _, name, _ in self._differing})
+                error.add_note(f"in the step of learners that differ in {', '.join(names)}")
+            raise
 
     @contextmanager
     def _in_force(self, numbers: Sequence[torch.Tensor]) -> Iterator[None]:
@@ -400,6 +407,10 @@ class LearnerGroup:
             of_each = [value for _, _, value in rows]
             if any(other != name for _, other, _ in rows):
                 raise ValueError(f"learners must have the same settings, and not each has {name}")
+            if any(isinstance(value, torch.Tensor) for value in of_each):
+                if not all(_are_equal(value, first) for value in of_each):
+                    raise ValueError(f"learners must agree in {name} where each task has its own, not {of_each}")
+                continue
             group = groups.get(id(values))
             differ = any(value != first for value in of_each)
             may_differ = group is None or name == "weight_decay"
@@ -474,9 +485,6 @@ def _check_alike(learners: Sequence[Learner]) -> None:
         if _shapes(learner) != _shapes(first):
             raise ValueError("learners must have networks of the same shapes")
         noisy = [m for part in learner.step_modules() for m in part.modules() if isinstance(m, nn.Dropout) and m.p > 0]
-        targets = first.target_entropy, learner.target_entropy
-        if any(isinstance(target, torch.Tensor) for target in targets) and not _are_equal(*targets):
-            raise ValueError(f"learners must agree in target_entropy where each task has its own, not {targets}")
         if noisy:
             raise ValueError("learners whose networks have dropout cannot be batched: their noise is not given")
 

@@ -91,14 +91,32 @@ class Resets(Part):
             raise ValueError(f"resets must be strictly ascending environment steps, not {self.steps}")
 
     def before_updates(self, learner: Learning) -> None:
-        now = learner.environment_steps
-        if self.period is None:
-            due = any(self._reached < step <= now for step in self.steps)
-        else:
-            due = now // self.period > self._reached // self.period
+        now, due = learner.environment_steps, self.follows_environment_steps(learner)
         self._reached = now
         if due:
             self._reset(learner, f"at {now} environment steps")
+
+    def follows_environment_steps(self, learner: Learning) -> bool:
+        """
+        Foresee the reset of :meth:`before_updates`.
+
+        :param learner: the learner
+        :return: whether a reset is due after the environment steps taken so far
+        """
+        now = learner.environment_steps
+        if self.period is None:
+            return any(self._reached < step <= now for step in self.steps)
+        return now // self.period > self._reached // self.period
+
+    def follows_gradient_steps(self, learner: Learning) -> bool:
+        """
+        Foresee the reset of :meth:`before_gradient_steps`.
+
+        :param learner: the learner
+        :return: whether a reset is due after the gradient steps taken so far
+        """
+        taken = learner.n_updates
+        return self.gradient_steps is not None and taken > 0 and taken % self.gradient_steps == 0
 
     def before_gradient_steps(self, learner: Learning, n: int) -> int:
         """
@@ -111,7 +129,7 @@ class Resets(Part):
         if self.gradient_steps is None:
             return n
         taken = learner.n_updates
-        if taken > 0 and taken % self.gradient_steps == 0:
+        if self.follows_gradient_steps(learner):
             self._reset(learner, f"after {taken} gradient steps")
         return min(n, self.gradient_steps - taken % self.gradient_steps)
 

@@ -133,7 +133,9 @@ class SimbaV2Net(UnitNormBlocks):
         :param x: (B, in), or (E, B, in) if there are copies
         :return: (B, width), or (E, B, width) if there are copies; of length 1
         """
-        h = on_sphere(self.scaler(self.dense(on_sphere(F.pad(x, (0, 1), value=self.shift)))))
+        # Not F.pad, which takes no tensor: the constant is one where it differs between the learners of a group.
+        constant = x.new_zeros((*x.shape[:-1], 1)) + self.shift
+        h = on_sphere(self.scaler(self.dense(on_sphere(torch.cat((x, constant), dim=-1)))))
         for block in self.blocks:
             h = block(h)
         return h

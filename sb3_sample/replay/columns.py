@@ -261,9 +261,19 @@ def samples_of(buffer: Any, take: Callable[..., Any]) -> Any:
         take(REWARDS, buffer.rewards),
     )
     if has_own_columns(buffer):
-        columns = {c.name: take(c, getattr(buffer, c.name)) for c in _more(buffer) if c.in_batch}
-        return Samples(*samples, columns=columns)
+        return Samples(*samples, columns=own_columns_of(buffer, take))
     return (DictReplayBufferSamples if isinstance(samples[0], dict) else ReplayBufferSamples)(*samples)
+
+
+def own_columns_of(buffer: Any, take: Callable[[Column, Any], Any]) -> dict[str, Any]:
+    """
+    Assemble the columns of batches that not every buffer has.
+
+    :param buffer: replay buffer
+    :param take: function of a column and the buffer's array of it that returns a tensor of the wanted rows
+    :return: the tensors by name
+    """
+    return {c.name: take(c, getattr(buffer, c.name)) for c in _more(buffer) if c.in_batch}
 
 
 def samples_at(

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_sample.kinds import AT_LEAST_0, UNIT, check_value, integer, number
 from sb3_sample.learner.batch import SLOTS, Windows, for_each
-from sb3_sample.replay.columns import Samples, samples_at
+from sb3_sample.replay.columns import Column, Samples, own_columns_of, samples_at
 from sb3_sample.replay.compact import CompactDictReplayBuffer, CompactReplay, CompactReplayBuffer
 from sb3_sample.replay.next_observations import ONLY, taken
 from sb3_sample.replay.weights import DrawWeights
@@ -299,7 +299,7 @@ class WindowReplay(PrioritizedReplay):
         :param batch_size: B
         :param length: H, steps of each, up to ``horizon``
         :param env: normalises observations and rewards
-        :return: the windows, with the column ``slots``
+        :return: the windows, with the buffer's own columns of their first steps and ``slots``
         :raises ValueError: if there is none
         """
         return self.windows_of(self.draw(batch_size), length, env)
@@ -311,7 +311,7 @@ class WindowReplay(PrioritizedReplay):
         :param slots: where they start, (B,)
         :param length: H, steps of each, up to ``horizon``
         :param env: normalises observations and rewards
-        :return: the windows, with the column ``slots``
+        :return: the windows, with the buffer's own columns of their first steps and ``slots``
         """
         assert isinstance(self, ReplayBuffer)
         first = self.places(slots)
@@ -326,6 +326,10 @@ class WindowReplay(PrioritizedReplay):
         def flat(array: np.ndarray) -> np.ndarray:
             return array.reshape(n, *array.shape[2:])
 
+        def at_start(column: Column, array: np.ndarray) -> torch.Tensor:
+            rows = flat(array)[first]
+            return self.to_torch(rows.reshape(-1, 1) if rows.ndim == 1 else rows)
+
         rewards = self._normalize_reward(flat(self.rewards)[places], env)
         return Windows(
             observations({key: taken(array, first) for key, array in self.stored().items()}, len(slots)),
@@ -334,7 +338,7 @@ class WindowReplay(PrioritizedReplay):
             # A time limit does not end the bootstrap.
             self.to_torch(flat(self.dones)[places] * (1 - flat(self.timeouts)[places])).reshape(steps),
             self.to_torch(rewards).reshape(steps),
-            {SLOTS: self.to_torch(slots).unsqueeze(1)},
+            {**own_columns_of(self, at_start), SLOTS: self.to_torch(slots).unsqueeze(1)},
         )
 
     def changing_state(self) -> dict[str, Any]:

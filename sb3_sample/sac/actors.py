@@ -185,7 +185,9 @@ class Actor(NetworkFeatures, BasePolicy):
         """
         h = self.trunk(features)
         if self.clip_log_std:
-            return self.mean(h), self.log_std(h).clamp(self.log_std_min, self.log_std_max)
+            # One bound after the other: torch refuses a number beside a tensor, which a bound that differs between the
+            # learners of a group is.
+            return self.mean(h), self.log_std(h).clamp(min=self.log_std_min).clamp(max=self.log_std_max)
         half_range = (self.log_std_max - self.log_std_min) / 2
         return self.mean(h), self.log_std_min + half_range * (1 + torch.tanh(self.log_std(h)))
 
@@ -404,7 +406,8 @@ class DeterministicActor(MeanActor):
 
     def gaussian(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         mean = self.mean(self.trunk(features))
-        return mean, torch.full_like(mean, self.log_exploration_noise)
+        # A sum: torch fills with no tensor, which the noise is where it differs between the learners of a group.
+        return mean, torch.zeros_like(mean) + self.log_exploration_noise
 
     def smoothed(self, obs: PyTorchObs, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """

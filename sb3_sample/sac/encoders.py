@@ -84,10 +84,13 @@ class ConvEncoder(BaseFeaturesExtractor):
         :param observations: images as Stable-Baselines3 preprocesses them, (B, C, H, W)
         :return: features, (B, F)
         """
-        x = observations - self.offset if self.offset else observations
+        # A tensor where it differs between the learners of a group, whose value cannot be asked for.
+        has_offset = isinstance(self.offset, torch.Tensor) or self.offset != 0
+        x = observations - self.offset if has_offset else observations
         if x.device.type == "cpu":
-            # On a CPU, convolutions are faster in this format, forward and backward; all their outputs keep it.
-            x = x.contiguous(memory_format=torch.channels_last)
+            # On a CPU, convolutions are faster with the channels last in memory, forward and backward; all their
+            # outputs keep it. Within the step of several learners torch.channels_last is refused.
+            x = x.movedim(1, -1).contiguous().movedim(-1, 1)
         return self.layers(x).flatten(start_dim=1)  # type: ignore[no-any-return]
 
 

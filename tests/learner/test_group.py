@@ -11,10 +11,11 @@ import torch
 
 from sb3_sample.learner.batch import Extra, Noise
 from sb3_sample.learner.execution import CapturedActing, Execution, inputs_like
-from sb3_sample.learner.group import LearnerGroup
+from sb3_sample.learner.group import LearnerGroup, _settings_of
 from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.pessimism import LearnedPessimism
-from tests.sac.common import COMPILES, MAKERS, PIXEL_MAKERS, random_batch, sac, sampled, state
+from sb3_sample.networks import EnsembleLayerNorm
+from tests.sac.common import COMPILES, MAKERS, PIXEL_MAKERS, TINY_RESIDUAL, random_batch, sac, sampled, state
 from tests.sac.test_execution import FEW_STEPS, ROUNDING, TOLERANCE, WITHOUT_GRADIENT, Recorder
 
 
@@ -122,6 +123,8 @@ def differences(a: Any, b: Any) -> tuple[float, float]:
 
 #: Of whose steps something cannot be batched.
 REFUSED = {"RegularizedSAC": "sam_radius"}
+#: Whose explorers act by a method of their own, which is not captured.
+NOT_CAPTURED_ACTING = ("OAC",)
 
 
 def assert_alike(maker: str, ours: Sequence[Any], theirs: Sequence[Any]) -> None:
@@ -151,7 +154,7 @@ def test_each_is_what_it_is_alone(maker: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["eager", "captured"])
-@pytest.mark.parametrize("maker", sampled(name for name in MAKERS if name not in (*REFUSED, "OAC")))
+@pytest.mark.parametrize("maker", sampled(name for name in MAKERS if name not in (*REFUSED, *NOT_CAPTURED_ACTING)))
 def test_actions_are_those_of_each(maker: str, how: str) -> None:
     models = models_of(maker, 3)
     learners = [model.learner for model in models]
@@ -233,6 +236,19 @@ def test_compiled_and_captured_groups(how: str) -> None:
         ("OPLSAC", {"gamma": [0.5, 0.99]}),
         ("BRO", {"weight_decay": [1e-1, 1e-4]}),
         ("BRO", {"weight_decay": [0, 1e-1]}),
+        # Where torch takes a number, or two of a kind.
+        ("BROTD3", {"exploration_noise": [0.1, 0.2]}),
+        ("SAC", {"value_head": ["categorical"] * 2, "value_head_kwargs": [{"v_min": -5.0}, {"v_min": -10.0}]}),
+        ("SAC", {"value_head": ["hl_gauss"] * 2, "value_head_kwargs": [{"v_max": 5.0}, {"v_max": 10.0}]}),
+        ("XQC", {"policy_kwargs": [{"net_arch": [8], "actor_kwargs": {"log_std_min": low}} for low in (0.5, -5.0)]}),
+        (
+            "SimbaV2",
+            {
+                "policy_kwargs": [
+                    {**TINY_RESIDUAL, "critic_network_kwargs": {"width": 8, "shift": shift}} for shift in (2.0, 3.0)
+                ]
+            },
+        ),
     ],
 )
 def test_numbers_may_differ(maker: str, arguments: dict[str, Sequence[Any]]) -> None:
@@ -245,12 +261,69 @@ def test_numbers_may_differ(maker: str, arguments: dict[str, Sequence[Any]]) -> 
         return made
 
     alone, others = models(), models()
+    n = FEW_STEPS.get(maker, 20)
     for model in alone:
-        take(model, 20)
+        take(model, n)
     learners = [model.learner for model in others]
-    together(learners, lambda i: take(others[i], 20))
+    together(learners, lambda i: take(others[i], n))
     assert_alike(maker, alone, others)
     assert differences(alone[0], alone[1])[0] > 1e-4
+
+
+def floats_of(learner: Learner) -> list[tuple[dict[str, Any], str]]:
+    """Fractional numbers that a gradient step reads from attributes, but those that torch's own layers read."""
+    modules = [module for root in learner.step_modules() for module in root.modules()]
+    of_torch = [
+        id(vars(module))
+        for module in modules
+        if type(module).__module__.startswith("torch.") or isinstance(module, EnsembleLayerNorm)
+    ]
+    return [
+        (values, name)
+        for values, name, value in _settings_of(learner).held
+        if type(value) is float and "params" not in values and id(values) not in of_torch
+    ]
+
+
+@pytest.mark.parametrize(
+    "maker", sampled([*(name for name in MAKERS if name not in REFUSED), *PIXEL_MAKERS], ("BROTD3", "XQC", "SimbaV2"))
+)
+def test_every_number_may_differ(maker: str) -> None:
+    """One learner has its numbers, the other 2% more of each: steps and actions are those of each."""
+    alone, others = models_of(maker, 2), models_of(maker, 2)
+    for models in (alone, others):
+        changed = floats_of(models[1].learner)
+        for values, name in changed:
+            values[name] = 1.02 * values[name] or 0.02
+    assert len(changed) > 3
+    for model in alone:
+        take(model, 3)
+    learners = [model.learner for model in others]
+    group = together(learners, lambda i: take(others[i], 3))
+    assert len(group._differing) >= len(changed)
+    assert_alike(maker, alone, others)
+    if maker in NOT_CAPTURED_ACTING:
+        return
+    batches = [random_batch(model, seed=i) for i, model in enumerate(others)]
+    with torch.inference_mode():
+        inputs = [
+            (batch.observations, learner.explorer.draw_noise(learner, batch.observations))
+            for batch, learner in zip(batches, learners, strict=True)
+        ]
+        found = group.act(inputs)
+        for model, own, theirs in zip(alone, inputs, found, strict=True):
+            assert torch.allclose(model.learner.action_step(*own)["actions"], theirs["actions"], atol=1e-4)
+
+
+def test_an_error_names_the_numbers_that_differ() -> None:
+    """A network of one's own may need a number where several learners have a tensor."""
+    models = models_of("BRO", 2)
+    learners = [model.learner for model in models]
+    norm = next(module for module in learners[1].actor.modules() if isinstance(module, torch.nn.LayerNorm))
+    norm.eps = 0.1
+    with pytest.raises(RuntimeError) as raised:
+        together(learners, lambda i: take(models[i], 1))
+    assert raised.value.__notes__ == ["in the step of learners that differ in eps"]
 
 
 def test_numbers_that_differ_are_put_on_the_device_once(monkeypatch: pytest.MonkeyPatch) -> None:

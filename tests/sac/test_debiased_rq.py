@@ -224,6 +224,13 @@ def test_no_warning_of_stable_baselines3() -> None:
 # ---------------------------------------------------------------- the learner alone
 
 
+def random_windows(n: int, g: torch.Generator) -> list[Windows]:
+    return [
+        Windows(torch.randn(8, 3, generator=g), torch.rand(8, 5, 2, generator=g), torch.randn(8, 5, 3, generator=g),
+                torch.zeros(8, 5), torch.randn(8, 5, generator=g)) for _ in range(n)
+    ]  # fmt: skip
+
+
 def test_the_learner_asks_for_windows_where_they_are_due() -> None:
     space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
     kwargs = dict(TINY_DR_Q)
@@ -233,10 +240,7 @@ def test_the_learner_asks_for_windows_where_they_are_due() -> None:
     with pytest.raises(ValueError, match=r"windows must be 5 batches before gradient step 1, .*not 0"):
         learner.update(batch)
     g = torch.Generator().manual_seed(0)
-    windows = [
-        Windows(torch.randn(8, 3, generator=g), torch.rand(8, 5, 2, generator=g), torch.randn(8, 5, 3, generator=g),
-                torch.zeros(8, 5), torch.randn(8, 5, generator=g)) for _ in range(5)
-    ]  # fmt: skip
+    windows = random_windows(5, g)
     before = copies(learner.encoder)
     metrics = learner.update(batch, windows=windows)
     assert {"encoder/loss", "train/critic_loss"} <= metrics.keys() and not same(copies(learner.encoder), before)
@@ -247,6 +251,24 @@ def test_the_learner_asks_for_windows_where_they_are_due() -> None:
     other: Any = DebiasedRQ.learner(space, spaces.Box(-1, 1, (2,), np.float32), seed=5, **kwargs)
     other.load_state_dict(learner.state_dict())
     assert same(copies(other.networks), copies(learner.networks)) and other.n_updates == 2
+
+
+@pytest.mark.parametrize("resets", [{"reset_gradient_steps": 7}, {"resets": (8,)}, {"resets": 8}])
+def test_the_learner_asks_for_windows_where_a_reset_is_due(resets: dict[str, Any]) -> None:
+    """A gradient step after each environment step: the eighth follows a reset, and those before 1, 6 and 11 a block."""
+    space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+    kwargs = {**TINY_DR_Q, **resets}
+    learner: Any = DebiasedRQ.learner(space, spaces.Box(-1, 1, (2,), np.float32), **kwargs)
+    batch, g = random_batch(dr_q()), torch.Generator().manual_seed(0)
+    due, steps = [], []
+    for _ in range(11):
+        learner.on_step(np.zeros(1), np.zeros(1, bool), [{}])
+        due.append(learner.n_encoder_steps_due)
+        learner.update(batch, windows=random_windows(due[-1], g))
+        steps.append(learner.encoder.optimizer.state[learner.encoder.action.weight]["step"].item())
+    assert learner.plasticity.n_done == 1
+    assert due == [5, 0, 0, 0, 0, 5, 0, 5, 0, 0, 5]
+    assert steps == [5] * 5 + [10] * 2 + [5] * 3 + [10]
 
 
 # ---------------------------------------------------------------- arguments

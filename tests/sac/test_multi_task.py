@@ -23,12 +23,14 @@ from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample import DiagnosticsCallback, MultiTaskEvalCallback, evaluate_tasks, multi_task_env, study
 from sb3_sample.learner.batch import Noise
+from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.learner.scalars import TaskLogScalar
 from sb3_sample.learner.target import next_step
 from sb3_sample.networks import MLP, BroNet, Network, widened
 from sb3_sample.sac import BRC, BRO, SAC, BROFast
 from sb3_sample.sac.multi_task import TaskEmbedding, TaskOneHot
 from tests.sac.common import COMPILES, MAKERS, Toy, bro, differing, sac, state, vec
+from tests.sac.test_execution import captured
 
 ROOT = Path(__file__).parents[2]
 PENDULUM, CAR = "Pendulum-v1", "MountainCarContinuous-v0"
@@ -275,6 +277,41 @@ def test_compiled_as_eager() -> None:
     assert found[0].keys() == found[1].keys()
     for name, value in found[0].items():
         torch.testing.assert_close(found[1][name], value, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("how", [pytest.param("compiled", marks=[COMPILES, pytest.mark.slow]), "captured"])
+@pytest.mark.parametrize("targets", [(-0.5, [-5.0, 3.0]), ([-5.0, 3.0], 2.0), ([-5.0, 3.0], [1.0, -1.0])])
+def test_target_entropies_changed_on_the_way_count(how: str, targets: tuple[Any, Any]) -> None:
+    """From one for all tasks to one for each, back, and from one for each to others."""
+    found = []
+    for run in (how, "eager", "unchanged"):
+        kwargs = {"learning_rate": 1e-2, "compile": run == "compiled", "learning_starts": 10}
+        model = make("SAC", task_temperatures=True, target_entropy=targets[0], **kwargs)
+        recorder = captured(model) if run == "captured" else None
+        model.learn(30)
+        model.target_entropy = targets[0 if run == "unchanged" else 1]
+        model.learn(20, reset_num_timesteps=False)
+        found.append(model.log_ent_coef.detach())
+        assert recorder is None or recorder.n_repetitions > 10
+    assert (found[0] - found[1]).abs().max() < 1e-4 < (found[1] - found[2]).abs().min()
+
+
+def test_learners_of_a_group_agree_in_the_target_entropies() -> None:
+    def group_of(*targets: Any) -> tuple[LearnerGroup, list[Any]]:
+        models = [make("SAC", task_temperatures=True, target_entropy=each, compile=False) for each in targets]
+        return LearnerGroup([model.learner for model in models]), models
+
+    with pytest.raises(ValueError, match="learners must agree in target_entropy where each task has its own"):
+        group_of([-1.0, -3.0], [-1.0, -2.0])
+    group, models = group_of(-0.5, -0.75)
+    models[0].learner.set_target_entropy([-1.0, -3.0])
+    with pytest.raises(ValueError, match="learners must agree in target_entropy where each task has its own"):
+        group._take_changes()
+    models[1].learner.set_target_entropy([-1.0, -3.0])
+    group._take_changes()
+    for model in models:
+        model.learner.set_target_entropy(-0.5)
+    group._take_changes()
 
 
 # ---------------------------------------------------------------- predict

@@ -20,6 +20,7 @@ from sb3_sample import (
     WindowReplayBuffer,
 )
 from sb3_sample.learner.batch import SLOTS, Windows
+from sb3_sample.parts import Column
 from sb3_sample.replay.weights import DrawWeights
 from sb3_sample.saving.container import BadFile
 from tests.sac.common import MAKERS, bro, differing, sac, sampled, state, vec
@@ -276,6 +277,28 @@ def test_windows_are_consecutive_and_end_with_the_episodes_own_observation() -> 
     # Both environments, windows over ends among them, and none over a time limit.
     assert 0 < (starts >= 100).sum() < 400 and (~counts).any()
     assert ((starts[starts >= 100] % 100) % 6 <= 3).all()
+
+
+class Labelled(WindowReplayBuffer):
+    more_columns = (
+        Column("label", lambda step: step.reward.astype(np.int64) + 100 * np.arange(len(step.reward)), dtype=np.int64),
+        Column("extent", lambda step: np.stack([step.reward, -step.reward], axis=1), shape=(2,)),
+        Column("inside", lambda step: step.done, in_batch=False),
+    )
+
+
+def test_windows_have_the_buffers_own_columns_of_their_first_steps() -> None:
+    buffer = buffer_of(Labelled, size=8, n_envs=2, horizon=3)
+    for t in range(21):
+        add(buffer, t)
+    windows: Windows = buffer.windows(100, 3)
+    assert windows.columns.keys() == buffer.sample(4).columns.keys() == {"label", "extent", SLOTS}
+    label, extent = windows.columns["label"], windows.columns["extent"]
+    assert (label.dtype, label.shape, extent.shape) == (torch.int64, (100, 1), (100, 2))
+    # Both environments' observations count the steps, the second's from 100 on.
+    assert torch.equal(label, windows.observations.long()) and len(label.unique()) > 6
+    assert torch.equal(extent, torch.cat((windows.rewards[:, :1], -windows.rewards[:, :1]), 1))
+    assert torch.equal(windows.n_step(0.9).columns["label"], label)
 
 
 def test_n_step_returns_by_hand() -> None:
