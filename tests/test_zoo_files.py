@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import cloudpickle
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -89,6 +90,69 @@ def test_statistics_are_those_of_the_run(run, capsys: pytest.CaptureFixture[str]
         str(RUN / "Pendulum-v1/vecnormalize.pkl").replace("_1/", "_2/"), DummyVecEnv([lambda: make_env("Pendulum-v1")])
     )
     assert second.obs_rms.count == pytest.approx(122, abs=0.01)
+
+
+def test_statistics_go_on_with_their_model_whatever_the_settings_say(run, capsys: pytest.CaptureFixture[str]) -> None:
+    run(*TRAIN)
+    later = RUN.with_name("Pendulum-v1_2")
+    *plain, _ = TRAIN
+    run(*plain, "-i", RUN / "Pendulum-v1.zip", "--eval-freq", "-1")
+    env = DummyVecEnv([lambda: make_env("Pendulum-v1")])
+    statistics = later / "Pendulum-v1/vecnormalize.pkl"
+    assert load_vec_normalize(statistics, env).obs_rms.count == pytest.approx(122, abs=0.01)
+    settings = yaml.unsafe_load((later / "Pendulum-v1/config.yml").read_text())
+    assert settings["normalize"] is True
+    capsys.readouterr()
+    run(*SHOW)
+    assert "Loading running average" in capsys.readouterr().out
+    (later / "Pendulum-v1/config.yml").write_text("normalize: false")
+    with pytest.raises(
+        SystemExit, match=r"enjoy: the model has learned in a VecNormalize, .* must say normalize: true"
+    ):
+        run(*SHOW)
+    statistics.unlink()
+    with pytest.raises(SystemExit, match=r"train: -i .* learned in a VecNormalize, whose statistics must be in logs/"):
+        run(*plain, "-i", later / "Pendulum-v1.zip")
+    run(*plain, "normalize:True", "-i", later / "Pendulum-v1.zip", "--eval-freq", "-1")
+
+
+class Drawn(gym.Env):
+    """Draws black pictures."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
+    observation_space = gym.spaces.Box(-1, 1, (3,))
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+    def __init__(self, render_mode: str | None = None):
+        self.render_mode = render_mode
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        return np.zeros(3, np.float32), 0.0, False, False, {}
+
+    def render(self) -> np.ndarray:
+        return np.zeros((16, 16, 3), np.uint8)
+
+
+@pytest.mark.parametrize("algo", ["flash_sac", "simbav2"])
+def test_agents_whose_rates_decay_are_shown(
+    run, algo: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("moviepy")
+    spec = gym.envs.registration.EnvSpec("Drawn-v0", entry_point=Drawn, max_episode_steps=20)
+    monkeypatch.setitem(gym.registry, "Drawn-v0", spec)
+    networks = "{who: dict(width=8, n_blocks=1) for who in ('actor_network_kwargs', 'critic_network_kwargs')}"
+    small = ["learning_starts:20", "buffer_size:500", "batch_size:8", "replay_ratio:0.2", f"policy_kwargs:{networks}"]
+    run("train", "--algo", algo, "--env", "Drawn-v0", "-n", "30", "--eval-freq", "-1", "--device", "cpu", "-params",
+        *small)  # fmt: skip
+    shown = ["--algo", algo, "--env", "Drawn-v0", "-f", "logs", "-n", "20"]
+    run("enjoy", *shown, "--no-render")
+    assert "1 Episodes" in capsys.readouterr().out
+    run("record_video", *shown)
+    assert list(Path("logs").glob(f"{algo}/Drawn-v0_1/videos/*.mp4"))
 
 
 @pytest.mark.usefixtures("no_code")

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import yaml
 
 pytest.importorskip("rl_zoo3")
 
@@ -181,6 +182,30 @@ def test_a_run_that_begins_with_another_ones_model(run) -> None:
     run("--run-dir", "parts", "-n", "80", *begin)
     check_equal(outcome("whole"), outcome("parts"))
     assert outcome("parts")["n_updates"] > 40
+
+
+def test_a_model_keeps_its_settings_but_those_of_the_command(run, capsys: pytest.CaptureFixture[str]) -> None:
+    run("-n", "60", "--save-replay-buffer")
+    first = "logs/sac_sample/Pendulum-v1_1/Pendulum-v1.zip"
+    cli.main([*COMMAND, "-n", "40", "-i", first, "-params", "batch_size:16"])
+    # The entry of the task has others.
+    assert "the model of -i keeps its own, which -params replaces: learning_starts, policy" in capsys.readouterr().out
+    model: Any = ALGOS["sac_sample"].load(first.replace("_1/", "_2/"), device="cpu")
+    assert (model.learning_starts, model.gamma, model.replay_ratio, model.batch_size) == (20, 0.99, 0.5, 16)
+    assert model.buffer_size == 2000 and model._n_updates == 20 + 20
+    settings = yaml.unsafe_load(Path("logs/sac_sample/Pendulum-v1_2/Pendulum-v1/config.yml").read_text())
+    assert dict(settings) == {"batch_size": 16, "n_timesteps": 1e4}
+    with pytest.raises(SystemExit, match="policy_kwargs must be those of the file, or be left out; .*net_arch"):
+        cli.main([*COMMAND, "-n", "40", "-i", first, "-params", "policy_kwargs:dict(net_arch=[16])"])
+    cli.main([*COMMAND, "-n", "40", "-i", first, "-params", "policy:'MlpPolicy'", OFF_POLICY[-1]])
+
+
+def test_networks_of_another_size_than_the_entrys_go_on(run) -> None:
+    bro = [*COMMAND, "--algo", "bro_fast", "--eval-freq", "-1", "-n", "30"]
+    cli.main([*bro, "-params", "model_size:(1, 8)", *OFF_POLICY[:3]])
+    cli.main([*bro, "-i", "logs/bro_fast/Pendulum-v1_1/Pendulum-v1.zip"])
+    second: Any = ALGOS["bro_fast"].load("logs/bro_fast/Pendulum-v1_2/Pendulum-v1.zip", device="cpu")
+    assert (second.model_size, second.num_transitions) == ((1, 8), 60)
 
 
 def test_copies_of_the_model_go_on_and_a_progress_bar_may_come(run) -> None:

@@ -30,7 +30,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat, configure
 from stable_baselines3.common.monitor import Monitor, get_monitor_files
 from stable_baselines3.common.utils import get_latest_run_id
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_sample.diagnostics import DiagnosticsCallback
 from sb3_sample.envs.atari import AtariFrames
@@ -42,6 +43,7 @@ from sb3_sample.run_logs import OFFLINE, monitor_files, monitor_head
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.many import train_together
 from sb3_sample.saving.folders import Folder, is_plain
+from sb3_sample.saving.normalization import lacks_vec_normalize
 from sb3_sample.saving.training_state import argument_names
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.training.seats import all_made
@@ -65,6 +67,8 @@ COMPARED = (
 )  # fmt: skip
 #: Hyperparameters from which the zoo makes ``action_noise``.
 _OF_NOISE = {"noise_type", "noise_std"}
+#: Settings that change the observations, and belong to a trained model as its arguments do.
+_OF_STATISTICS = {"normalize"}
 #: Arguments that the zoo's options set.
 _OF_OPTIONS = {"env", "seed", "verbose", "device", "tensorboard_log"}
 
@@ -490,8 +494,8 @@ def can_train_together(algo: str) -> bool:
 
 class Manager(ExperimentManager):
     """
-    The zoo's manager, extended: it names unknown hyperparameters, does not take an interrupted run for a finished one,
-    can learn from data, and evaluates whole games of Atari.
+    The zoo's manager, extended: it names unknown hyperparameters, trains a model on with the settings of its file, does
+    not take an interrupted run for a finished one, can learn from data, and evaluates whole games of Atari.
 
     :param data: data sets to learn from
     :param args: the command line, as parsed by the zoo
@@ -508,9 +512,26 @@ class Manager(ExperimentManager):
         super().__init__(args, *positional, **named)
         self._data = data
         self._dataset: Dataset | None = None
+        # The names of a stored trial's hyperparameters.
+        self._of_trial: set[str] = set()
+        # Settings of the model that is trained on, for those who read the run's.
+        self._of_agent: dict[str, Any] = {}
+
+    def load_trial(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        found: dict[str, Any] = super().load_trial(*args, **kwargs)
+        self._of_trial = set(found)
+        return found
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         hyperparams, saved = super().read_hyperparameters()
+        if self.continue_training and self.algo in ALGORITHMS:
+            # The entry of the task is not what the model was trained with: its file has that.
+            given = {*(self.custom_hyperparams or {}), *self._of_trial}
+            of_model = argument_names(ALGOS[self.algo]) | _OF_NOISE | _OF_STATISTICS
+            if dropped := sorted((of_model & saved.keys()) - given):
+                print(f"Of these, the model of -i keeps its own, which -params replaces: {', '.join(dropped)}")
+            for name in dropped:
+                del hyperparams[name], saved[name]
         self._sets: dict[str, Dataset] = {}
         for name in "dataset", "prior_data":
             source = getattr(self._data, name)
@@ -576,6 +597,52 @@ class Manager(ExperimentManager):
             return super().create_envs(n_envs, eval_env, no_log)
         finally:
             self.env_wrapper = wrapper
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        model = (
+            self._loaded(hyperparams, env)
+            if self.algo in ALGORITHMS
+            else super()._load_pretrained_agent(hyperparams, env)
+        )
+        # The zoo loads statistics wherever they are, but saves them only if the settings ask for them.
+        if unwrap_vec_normalize(env) is not None and not self.normalize:
+            self.normalize = self._of_agent["normalize"] = True
+        # ``enjoy`` gives a model its environment if this setting says so.
+        if getattr(model, "replay_buffer_class", None) is HerReplayBuffer:
+            self._of_agent["replay_buffer_class"] = HerReplayBuffer.__name__
+        return model
+
+    def _loaded(self, hyperparams: Mapping[str, Any], env: VecEnv) -> Any:
+        """
+        The model of ``-i``. Unlike the zoo, pass on ``policy`` and ``policy_kwargs`` too: our models say in what they
+        differ from the file's.
+        """
+        print("Loading pretrained agent")
+        algorithm: Any = ALGOS[self.algo]
+        model = algorithm.load(
+            self.trained_agent,
+            env=env,
+            seed=self.seed,
+            tensorboard_log=self.tensorboard_log,
+            verbose=self.verbose,
+            device=self.device,
+            **hyperparams,
+        )
+        if lacks_vec_normalize(model):
+            statistics = Path(self.trained_agent).parent / self.env_name / "vecnormalize.pkl"
+            raise RunError(
+                f"-i {self.trained_agent}: the model has learned in a VecNormalize, whose statistics must be in "
+                f"{statistics}, which is not there. -params normalize:True begins new ones"
+            )
+        replay = Path(self.trained_agent).parent / "replay_buffer.pkl"
+        if replay.exists():
+            print("Loading replay buffer")
+            model.load_replay_buffer(replay, truncate_last_traj=self.truncate_last_trajectory)
+        return model
+
+    def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        saved_hyperparams.update(self._of_agent)
+        super()._save_config(saved_hyperparams)
 
     def _train(self, model: Any, total_timesteps: int, **arguments: Any) -> BaseAlgorithm:
         """Call ``learn``, as the zoo does, or its replacement."""

@@ -9,10 +9,11 @@ from typing import Any
 
 import gymnasium as gym
 from rl_zoo3.utils import create_test_env, get_model_path
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_sample.exits import refuse
 from sb3_sample.saving.checkpoint import MODEL
+from sb3_sample.saving.normalization import lacks_vec_normalize
 from sb3_sample.zoo.algorithms import ALGORITHMS
 from sb3_sample.zoo.files import Refused, RunError, add_trust
 from sb3_sample.zoo.patches import make_answering_env, models_checked, reading, reading_settings, watched_with
@@ -149,6 +150,12 @@ class _Watch:
             its, saved = getattr(self._env, name), getattr(model, name)
             if _shapes(its) != _shapes(saved):
                 raise Refused(f"the model is of {saved!r:.200}, the run's environment of {its!r:.200}")
+        is_normalized = self._env is not None and unwrap_vec_normalize(self._env) is not None
+        if lacks_vec_normalize(model) and not is_normalized:
+            raise Refused(
+                "the model has learned in a VecNormalize, which the run's settings do not have: its config.yml must "
+                "say normalize: true, and vecnormalize.pkl, with the statistics, must lie beside it"
+            )
 
 
 def _shapes(space: gym.Space) -> Any:
