@@ -153,6 +153,19 @@ def test_a_run_of_other_arguments_is_not_touched(run) -> None:
     assert before == {path: path.read_bytes() for path in Path("a").rglob("*") if path.is_file()}
 
 
+def test_the_same_settings_in_other_words_are_the_same(run, tmp_path: Path) -> None:
+    run("-n", "40", "--eval-freq", "-1")
+    first = Path("logs/sac_sample/Pendulum-v1_1/Pendulum-v1.zip")
+    start = ["--run-dir", "a", "--checkpoint-freq", "20", "--eval-freq", "-1"]
+    run(*start, "-n", "20", "-i", str(first), "--env-kwargs", "g:9.0", "render_mode:None")
+    run(*start, "-n", "40", "-i", str(first.absolute()), "--env-kwargs", "render_mode:None", "g:9.0")
+    assert steps("a") == [20, 40]
+    other = first.with_name("other.zip")
+    other.write_bytes(first.read_bytes())
+    with pytest.raises(SystemExit, match=r"trained_agent '/.*Pendulum-v1\.zip' \(now 'logs/.*other\.zip'\)"):
+        run(*start, "-i", str(other), "--env-kwargs", "render_mode:None", "g:9.0")
+
+
 def test_resume_goes_on_with_the_run_of_the_latest_checkpoint(run) -> None:
     with pytest.raises(SystemExit, match="no run of sac_sample on Pendulum-v1 below logs has a checkpoint"):
         run("--resume")

@@ -595,6 +595,11 @@ class Manager(ExperimentManager):
             self.env_wrapper = self._evaluated_in
         try:
             return super().create_envs(n_envs, eval_env, no_log)
+        except TypeError as error:
+            kwargs = self.eval_env_kwargs if eval_env else self.env_kwargs
+            if not kwargs:
+                raise
+            raise RunError(f"{self.env_name.gym_id} cannot be made with env_kwargs={kwargs}: {error}") from error
         finally:
             self.env_wrapper = wrapper
 
@@ -706,32 +711,34 @@ class RunManager(Manager):
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         hyperparams, saved = super().read_hyperparameters()
-        settings = {name: repr(getattr(self.args, name)) for name in COMPARED}
-        settings |= {name: repr(value) for name, value in saved.items() if name != "n_timesteps"}
-        settings |= {name: repr(dataset) for name, dataset in self._sets.items()}
+        values = {name: getattr(self.args, name) for name in COMPARED}
+        values |= {name: value for name, value in saved.items() if name != "n_timesteps"}
+        values |= self._sets
         if self._data.offline_steps is not None:
-            settings["offline_steps"] = repr(self._data.offline_steps)
+            values["offline_steps"] = self._data.offline_steps
+        spellings = {name: _spellings(name, value) for name, value in values.items()}
         before = self._start.record
         if before is not None:
-            self._compare(settings, before.settings)
+            self._compare(spellings, before.settings)
         self._record = Record(
             algo=self.algo,
             env=self.env_name.gym_id,
             seed=self.seed,
             n_timesteps=self.args.n_timesteps,
             checkpoint_freq=self._start.checkpoint_freq,
-            settings=settings,
+            settings={name: texts[0] for name, texts in spellings.items()},
             tensorboard=None if self.tensorboard_log is None else self._tensorboard_folder(),
         )
         # Before anything else of the run is written.
         self._record.write(self._folder)
         return hyperparams, saved
 
-    def _compare(self, ours: Mapping[str, str], theirs: Mapping[str, str]) -> None:
+    def _compare(self, ours: Mapping[str, Sequence[str]], theirs: Mapping[str, str]) -> None:
+        nothing = ("not given",)
         differences = [
-            f"{name} {theirs.get(name, 'not given')} (now {ours.get(name, 'not given')})"
+            f"{name} {theirs.get(name, *nothing)} (now {ours.get(name, nothing)[0]})"
             for name in sorted(ours.keys() | theirs.keys())
-            if ours.get(name) != theirs.get(name)
+            if theirs.get(name, *nothing) not in ours.get(name, nothing)
         ]
         if differences:
             raise RunError(
@@ -784,6 +791,20 @@ class RunManager(Manager):
             # This warning comes if a run was interrupted between the two parts.
             warnings.filterwarnings("ignore", "Nothing is left to train")
             super()._learn_first(model, dataset, gradient_steps, **{**arguments, "checkpoint": self._folder / OFFLINE})
+
+
+def _spellings(name: str, value: Any) -> list[str]:
+    """The texts of a setting that mean the same. The first is recorded; a record may have another."""
+    if name == "trained_agent" and value:
+        return [repr(path) for path in (value, os.path.abspath(value), os.path.relpath(value))]
+    return [repr(_in_order(value)), repr(value)]
+
+
+def _in_order(value: Any) -> Any:
+    """Sort dicts, whose order means nothing."""
+    if type(value) is dict:
+        return {key: _in_order(value[key]) for key in sorted(value, key=repr)}
+    return [_in_order(each) for each in value] if type(value) is list else value
 
 
 def _for_evaluation(wrapper: Any) -> Any:
