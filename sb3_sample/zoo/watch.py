@@ -130,8 +130,8 @@ class _Watch:
                 found = get_model_path(exp_id, folder, algo, env_name, *which)
             else:
                 found = model_path(options.run_dir, algo, env_name, *which)
-                folder = Path(found[1]).parent
-                self._checkpoint = folder if is_ours and folder in all_checkpoints(options.run_dir) else None
+                beside = Path(found[1]).parent
+                self._checkpoint = beside if is_ours and beside in all_checkpoints(options.run_dir) else None
             self._is_safe = is_ours and not options.allow_pickle
             if self._is_safe:
                 check_settings(Path(found[2]) / env_name, options.trusted_modules, self._env_kwargs)
