@@ -20,7 +20,9 @@ import yaml
 
 pytest.importorskip("rl_zoo3")
 
+import optuna
 from rl_zoo3 import ALGOS
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
 from sb3_sample import cli, zoo
 from sb3_sample.run_logs import read_monitors
@@ -211,6 +213,21 @@ def test_a_model_keeps_its_settings_but_those_of_the_command(run, capsys: pytest
     with pytest.raises(SystemExit, match="policy_kwargs must be those of the file, or be left out; .*net_arch"):
         cli.main([*COMMAND, "-n", "40", "-i", first, "-params", "policy_kwargs:dict(net_arch=[16])"])
     cli.main([*COMMAND, "-n", "40", "-i", first, "-params", "policy:'MlpPolicy'", OFF_POLICY[-1]])
+
+
+def test_a_model_goes_on_with_the_parameters_of_a_trial(run) -> None:
+    study = optuna.create_study(storage="sqlite:///study.db", study_name="study")
+    for _ in range(2):
+        trial = study.ask()
+        HYPERPARAMS_SAMPLER["sac_sample"](trial, 1, 1, {"using_her_replay_buffer": False, "her_kwargs": {}})
+        study.tell(trial, 0.0)
+    run("-n", "30", "--eval-freq", "-1")
+    of_study = ["--storage", "sqlite:///study.db", "--study-name", "study", "--trial-id", "1", "--eval-freq", "-1"]
+    cli.main([*COMMAND, "-n", "10", "-i", "logs/sac_sample/Pendulum-v1_1/Pendulum-v1.zip", *of_study])
+    model: Any = ALGOS["sac_sample"].load("logs/sac_sample/Pendulum-v1_2/Pendulum-v1.zip", device="cpu")
+    found = study.trials[1].params
+    assert (model.batch_size, model.tau) == (2 ** found["batch_size_pow"], found["tau"])
+    assert (model.learning_starts, model.replay_ratio) == (20, 0.5)
 
 
 def test_networks_of_another_size_than_the_entrys_go_on(run) -> None:

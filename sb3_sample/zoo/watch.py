@@ -19,6 +19,7 @@ from sb3_sample.saving.classes import importing_nothing
 from sb3_sample.saving.encoding import decode
 from sb3_sample.saving.normalization import lacks_vec_normalize
 from sb3_sample.saving.statistics import ARGUMENTS, check_normalization, shapes_of
+from sb3_sample.saving.untrusted import BadFile
 from sb3_sample.zoo.algorithms import ALGORITHMS
 from sb3_sample.zoo.files import Refused, RunError, add_trust
 from sb3_sample.zoo.patches import make_answering_env, models_checked, reading, reading_settings, watched_with
@@ -183,23 +184,26 @@ def _normalized(env: VecEnv, path: Path, arguments: Mapping[str, Any]) -> VecNor
     :param arguments: the run's arguments of ``VecNormalize``
     :return: the environment in the checkpoint's ``VecNormalize``, which learns nothing and leaves rewards as they are
     :raises Refused: if the checkpoint has none that fits
+    :raises BadFile: if the state is damaged or hostile
     """
-    with importing_nothing():
-        state: Any = decode(*container.read(path, KIND), str(path))
     try:
+        with importing_nothing():
+            state: Any = decode(*container.read(path, KIND), str(path))
         wrappers = {wrapper["class"]: wrapper["attributes"] for wrapper in state["env"]["wrappers"]}
         described = wrappers[f"{VecNormalize.__module__}.{VecNormalize.__qualname__}"]
-        wanted = VecNormalize(env, **{**arguments, "norm_obs": described["norm_obs"]["value"]})
+        shown = {"training": False, "norm_reward": False}
+        wanted = VecNormalize(env, **{**arguments, "norm_obs": described["norm_obs"]["value"], **shown})
         before = [shapes_of(getattr(wanted, name, None), name) for name in ("obs_rms", "ret_rms")]
-        names = (*ARGUMENTS, *({"obs_rms", "ret_rms"} & described.keys()))
+        names = ({*ARGUMENTS, "obs_rms", "ret_rms"} & described.keys()) - shown.keys()
         Restorer([env]).attributes(wanted, {name: described[name] for name in names})
         check_normalization(vars(wanted), str(path))
         found = [shapes_of(getattr(wanted, name, None), name) for name in ("obs_rms", "ret_rms")]
-    except (LookupError, TypeError, ValueError, AttributeError, AssertionError) as error:
+    except BadFile:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, AssertionError, OSError) as error:
         raise Refused(f"{path} has no VecNormalize of this run: {type(error).__name__}: {error}") from error
     if found != before:
         raise Refused(f"{path}: the statistics of VecNormalize are of the shapes {found}, not {before}")
-    wanted.training = wanted.norm_reward = False
     return wanted
 
 
