@@ -118,7 +118,13 @@ def _recorded(args: argparse.Namespace) -> Dataset:
         importlib.import_module(package)
     if is_atari_id(args.env):
         register_atari()
-    env: VecEnv = make_vec_env(args.env, env_kwargs=dict(args.env_kwargs))
+    kwargs = dict(args.env_kwargs)
+    try:
+        env: VecEnv = make_vec_env(args.env, env_kwargs=kwargs)
+    except TypeError as error:
+        if not kwargs:
+            raise
+        raise ValueError(f"{args.env} cannot be made with --env-kwargs {kwargs}: {error}") from error
     if args.vecnormalize is not None:
         env = load_vec_normalize(args.vecnormalize, env)
     return record(model, env, args.episodes, deterministic=not args.stochastic, seed=args.seed)

@@ -71,6 +71,10 @@ def test_an_unknown_command_is_refused(run) -> None:
         (["train", "--env-kwargs", "g:x"], "--env-kwargs must be NAME:VALUE.*, not 'g:x' .NameError"),
         (["enjoy", "--env-kwargs", "g:x"], "--env-kwargs must be NAME:VALUE.*, not 'g:x' .NameError"),
         (["record_video", "--env-kwargs", "g:x"], "--env-kwargs must be NAME:VALUE.*, not 'g:x' .NameError"),
+        (
+            ["train", "--env-kwargs", "nope:1"],
+            "Pendulum-v1 cannot be made with env_kwargs={'nope': 1}: .*argument 'nope'",
+        ),
         (["train", "-params", "policy_kwargs:'dict('"], "a hyperparameter that is a text of Python is none"),
         (["train", "-params", "replay_ratio:-1"], "replay_ratio must be at least 0 and finite, or None, not -1"),
         (["train", "--env", "Pendulum-v9"], "Pendulum-v9 not found in gym registry"),

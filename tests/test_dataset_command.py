@@ -63,6 +63,9 @@ def test_the_environment_of_the_training_can_be_made(
     with pytest.raises(SystemExit):
         main([*arguments, "--env-kwargs", "g=0"])
     assert "'g=0' is no name with a value of Python's" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main([*arguments, "--env-kwargs", "nope:1"])
+    assert "MyPendulum-v0 cannot be made with --env-kwargs {'nope': 1}: PendulumEnv" in capsys.readouterr().err
 
 
 def test_a_model_of_normalized_observations_needs_their_statistics(

@@ -127,6 +127,19 @@ def test_trial_zero_is_refused(tmp_path: Path) -> None:
         manager("bro", "Pendulum-v1", tmp_path, trial_id=0)
 
 
+@pytest.mark.parametrize(
+    ("given", "lacking"),
+    [
+        ({}, "--storage and --study-name"),
+        ({"storage": "sqlite:///a.db"}, "--study-name"),
+        ({"study_name": "a"}, "--storage"),
+    ],
+)
+def test_a_trial_without_its_study_is_refused(given: dict[str, Any], lacking: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=f"trial_id=3 is the number of a trial in a study: give {lacking} too"):
+        manager("bro", "Pendulum-v1", tmp_path, trial_id=3, **given)
+
+
 def test_successes_are_recorded_where_they_are_reported() -> None:
     assert ExperimentManager.is_robotics_env("metaworld/push-v3")
     assert ExperimentManager.is_robotics_env("myosuite/pose-v0")
@@ -388,6 +401,27 @@ def test_a_search_keeps_the_replay_ratio(name: str) -> None:
     space = zoo.ALGORITHMS[name].space
     assert "replay_ratio" not in space
     assert "resets" not in space or name == "regularized_sac"  # of which resets are a regularization
+
+
+@pytest.mark.parametrize(
+    ("name", "hyperparams", "words"),
+    [
+        ("bro", {"gradient_steps": 1}, "gradient_steps=1 replaces replay_ratio, which is searched"),
+        ("srspr", {"train_freq": 4}, "train_freq=4 replaces replay_ratio, which is searched"),
+        ("sr_sac", {"reset_gradient_steps": 10}, "reset_gradient_steps=10 replaces resets, which is searched"),
+    ],
+)
+def test_a_search_refuses_what_replaces_a_searched_argument(
+    name: str, hyperparams: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    if name == "srspr":
+        pytest.importorskip("ale_py")
+    env_id = "ALE/Pong-v5" if name == "srspr" else "Pendulum-v1"
+    with pytest.raises(ValueError, match=words):
+        manager(name, env_id, tmp_path, hyperparams=hyperparams, optimize_hyperparameters=True).setup_experiment()
+    # SAC's search has no replay ratio.
+    searched = manager("sac_sample", "Pendulum-v1", tmp_path, hyperparams=hyperparams, optimize_hyperparameters=True)
+    assert searched.read_hyperparameters()[0].items() >= hyperparams.items()
 
 
 def test_vpl_sac_refuses_relabelled_goals(tmp_path: Path) -> None:

@@ -16,7 +16,8 @@ pytest.importorskip("h5py")
 import h5py
 from rl_zoo3 import ALGOS
 
-from sb3_sample import cli, zoo
+from sb3_sample import cli, make_env, zoo
+from sb3_sample.zoo.patches import models_checked
 from sb3_sample.zoo.runs import Record
 from tests.test_zoo_runs import check_equal, outcome, steps
 
@@ -131,6 +132,10 @@ def test_prior_data_of_a_run_in_its_environment(run: Run, capsys: pytest.Capture
     # To act it needs none.
     enjoy = ["enjoy", "--run-dir", "run", "--no-render", "-n", "5", "--device", "cpu", "--num-threads", "1"]
     cli.main(enjoy)
+    # Nor if it is loaded with its environment, as by record_video, and by enjoy with HerReplayBuffer.
+    with models_checked(lambda _: None):
+        shown = ALGOS["sac_sample"].load("run/Pendulum-v1.zip", env=make_env("Pendulum-v1"), device="cpu")
+    assert shown.prior_data is None and shown.num_timesteps == 60
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import cloudpickle
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -19,7 +20,9 @@ import rl_zoo3.exp_manager
 import rl_zoo3.utils
 
 from sb3_sample import cli, make_env, zoo
+from sb3_sample.saving import container
 from sb3_sample.saving.container import BadFile, PickledFile
+from sb3_sample.saving.encoding import decode
 from sb3_sample.saving.normalization import load_vec_normalize
 from sb3_sample.zoo.files import PlottedRuns
 from sb3_sample.zoo.settings import check_settings
@@ -89,6 +92,102 @@ def test_statistics_are_those_of_the_run(run, capsys: pytest.CaptureFixture[str]
         str(RUN / "Pendulum-v1/vecnormalize.pkl").replace("_1/", "_2/"), DummyVecEnv([lambda: make_env("Pendulum-v1")])
     )
     assert second.obs_rms.count == pytest.approx(122, abs=0.01)
+
+
+def test_statistics_go_on_with_their_model_whatever_the_settings_say(run, capsys: pytest.CaptureFixture[str]) -> None:
+    run(*TRAIN)
+    later = RUN.with_name("Pendulum-v1_2")
+    *plain, _ = TRAIN
+    run(*plain, "-i", RUN / "Pendulum-v1.zip", "--eval-freq", "-1")
+    env = DummyVecEnv([lambda: make_env("Pendulum-v1")])
+    statistics = later / "Pendulum-v1/vecnormalize.pkl"
+    assert load_vec_normalize(statistics, env).obs_rms.count == pytest.approx(122, abs=0.01)
+    settings = yaml.unsafe_load((later / "Pendulum-v1/config.yml").read_text())
+    assert settings["normalize"] is True
+    capsys.readouterr()
+    run(*SHOW)
+    assert "Loading running average" in capsys.readouterr().out
+    (later / "Pendulum-v1/config.yml").write_text("normalize: false")
+    with pytest.raises(
+        SystemExit, match=r"enjoy: the model has learned in a VecNormalize, .* must say normalize: true"
+    ):
+        run(*SHOW)
+    statistics.unlink()
+    with pytest.raises(SystemExit, match=r"train: -i .* learned in a VecNormalize, whose statistics must be in logs/"):
+        run(*plain, "-i", later / "Pendulum-v1.zip")
+    run(*plain, "normalize:True", "-i", later / "Pendulum-v1.zip", "--eval-freq", "-1")
+
+
+class Drawn(gym.Env):
+    """Draws black pictures."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
+    observation_space = gym.spaces.Box(-1, 1, (3,))
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+    def __init__(self, render_mode: str | None = None):
+        self.render_mode = render_mode
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        return np.zeros(3, np.float32), 0.0, False, False, {}
+
+    def render(self) -> np.ndarray:
+        return np.zeros((16, 16, 3), np.uint8)
+
+
+@pytest.mark.parametrize("algo", ["flash_sac", "simbav2"])
+def test_agents_whose_rates_decay_are_shown(
+    run, algo: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("moviepy")
+    spec = gym.envs.registration.EnvSpec("Drawn-v0", entry_point=Drawn, max_episode_steps=20)
+    monkeypatch.setitem(gym.registry, "Drawn-v0", spec)
+    networks = "{who: dict(width=8, n_blocks=1) for who in ('actor_network_kwargs', 'critic_network_kwargs')}"
+    small = ["learning_starts:20", "buffer_size:500", "batch_size:8", "replay_ratio:0.2", f"policy_kwargs:{networks}"]
+    run("train", "--algo", algo, "--env", "Drawn-v0", "-n", "30", "--eval-freq", "-1", "--device", "cpu", "-params",
+        *small)  # fmt: skip
+    shown = ["--algo", algo, "--env", "Drawn-v0", "-f", "logs", "-n", "20"]
+    run("enjoy", *shown, "--no-render")
+    assert "1 Episodes" in capsys.readouterr().out
+    run("record_video", *shown)
+    assert list(Path("logs").glob(f"{algo}/Drawn-v0_1/videos/*.mp4"))
+
+
+class Goals(Drawn):
+    """Has goals that are never reached."""
+
+    observation_space = gym.spaces.Dict(  # type: ignore[assignment]
+        {name: gym.spaces.Box(-1, 1, (3,)) for name in ("observation", "achieved_goal", "desired_goal")}
+    )
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        observation, info = super().reset(seed=seed)
+        return dict.fromkeys(self.observation_space, observation), info
+
+    def step(self, action: Any) -> Any:
+        observation, *rest = super().step(action)
+        return (dict.fromkeys(self.observation_space, observation), *rest)
+
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> np.ndarray:
+        return np.zeros(len(achieved))
+
+
+def test_a_model_of_relabelled_goals_goes_on_and_is_shown(
+    run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = gym.envs.registration.EnvSpec("Goals-v0", entry_point=Goals, max_episode_steps=10)
+    monkeypatch.setitem(gym.registry, "Goals-v0", spec)
+    command = ["train", "--algo", "sac_sample", "--env", "Goals-v0", "-n", "40", "--eval-freq", "-1"]
+    run(*command, "-params", *SMALL, "policy:'MultiInputPolicy'", "replay_buffer_class:'HerReplayBuffer'")
+    # The entry, "default", has neither the policy nor the buffer.
+    run(*command, "-i", "logs/sac_sample/Goals-v0_1/Goals-v0.zip")
+    run("enjoy", "--algo", "sac_sample", "--env", "Goals-v0", "-f", "logs", "--no-render", "-n", "10")
+    output = capsys.readouterr().out
+    assert "Loading logs/sac_sample/Goals-v0_2/" in output and "1 Episodes" in output
 
 
 @pytest.mark.usefixtures("no_code")
@@ -233,6 +332,48 @@ def test_a_run_is_shown_by_its_folder(run, capsys: pytest.CaptureFixture[str]) -
         assert f"Loading {file}" in capsys.readouterr().out
     with pytest.raises(SystemExit, match=r"logs is no folder of a run of sb3-sample train: it has no run\.json"):
         run("enjoy", "--run-dir", "logs", "--no-render")
+
+
+def test_the_checkpoint_of_that_many_steps_is_shown(run, capsys: pytest.CaptureFixture[str]) -> None:
+    run(*TRAIN, "--run-dir", "a", "--checkpoint-freq", "20", "--save-freq", "20", "--verbose", "0")
+    assert {path.name for path in Path("a").glob("rl_*")} == {f"rl_model_{n}_steps.zip" for n in (20, 40, 60)}
+    Path("a/rl_model_40_steps.zip").unlink()
+    capsys.readouterr()
+    for steps, file in ((40, "checkpoint-000000000040/model.zip"), (60, "rl_model_60_steps.zip")):
+        run("enjoy", "--run-dir", "a", "--no-render", "-n", "5", "--load-checkpoint", steps)
+        assert f"Loading a/{file}" in capsys.readouterr().out
+    with pytest.raises(
+        SystemExit, match="a has no such model of sac_sample on Pendulum-v1. Its checkpoints: checkpoint"
+    ):
+        run("enjoy", "--run-dir", "a", "--no-render", "--load-checkpoint", "50")
+
+
+def test_a_checkpoint_is_shown_with_its_own_statistics(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(*TRAIN, "--eval-freq", "-1", "--run-dir", "a", "--checkpoint-freq", "20")
+    # As it is before the end.
+    Path("a/Pendulum-v1.zip").unlink()
+    (Path("a") / "Pendulum-v1/vecnormalize.pkl").unlink()
+    seen = []
+    predict = rl_zoo3.utils.ALGOS["sac_sample"].predict
+
+    def spy(self: Any, *args: Any, **kwargs: Any) -> Any:
+        seen.append(args[0])
+        return predict(self, *args, **kwargs)
+
+    monkeypatch.setattr(rl_zoo3.utils.ALGOS["sac_sample"], "predict", spy)
+    run("enjoy", "--run-dir", "a", "--no-render", "-n", "3", "--seed", "1")
+    env = DummyVecEnv([lambda: make_env("Pendulum-v1")])
+    env.seed(1)
+    raw = env.reset()
+    state: Any = decode(*container.read("a/checkpoint-000000000060/state.zip", "checkpoint"), "state")
+    attributes = state["env"]["wrappers"][0]["attributes"]["obs_rms"]["attributes"]
+    mean, var = (attributes[name]["value"] for name in ("mean", "var"))
+    assert attributes["count"]["value"] == pytest.approx(61, abs=0.01)
+    np.testing.assert_allclose(seen[0], (raw - mean) / np.sqrt(var + 1e-8), rtol=1e-5)
+    state = Path("a/checkpoint-000000000060/state.zip")
+    container.write(state, "checkpoint", {"env": {"dict": {}}}, {})
+    with pytest.raises(SystemExit, match=r"enjoy: .*state\.zip"):
+        run("enjoy", "--run-dir", "a", "--no-render", "-n", "3")
 
 
 def test_help_of_enjoy_has_both_kinds_of_options(run, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,10 +16,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import yaml
 
 pytest.importorskip("rl_zoo3")
 
+import optuna
 from rl_zoo3 import ALGOS
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
 from sb3_sample import cli, zoo
 from sb3_sample.run_logs import read_monitors
@@ -152,6 +155,19 @@ def test_a_run_of_other_arguments_is_not_touched(run) -> None:
     assert before == {path: path.read_bytes() for path in Path("a").rglob("*") if path.is_file()}
 
 
+def test_the_same_settings_in_other_words_are_the_same(run, tmp_path: Path) -> None:
+    run("-n", "40", "--eval-freq", "-1")
+    first = Path("logs/sac_sample/Pendulum-v1_1/Pendulum-v1.zip")
+    start = ["--run-dir", "a", "--checkpoint-freq", "20", "--eval-freq", "-1"]
+    run(*start, "-n", "20", "-i", str(first), "--env-kwargs", "g:9.0", "render_mode:None")
+    run(*start, "-n", "40", "-i", str(first.absolute()), "--env-kwargs", "render_mode:None", "g:9.0")
+    assert steps("a") == [20, 40]
+    other = first.with_name("other.zip")
+    other.write_bytes(first.read_bytes())
+    with pytest.raises(SystemExit, match=r"trained_agent '/.*Pendulum-v1\.zip' \(now 'logs/.*other\.zip'\)"):
+        run(*start, "-i", str(other), "--env-kwargs", "render_mode:None", "g:9.0")
+
+
 def test_resume_goes_on_with_the_run_of_the_latest_checkpoint(run) -> None:
     with pytest.raises(SystemExit, match="no run of sac_sample on Pendulum-v1 below logs has a checkpoint"):
         run("--resume")
@@ -181,6 +197,45 @@ def test_a_run_that_begins_with_another_ones_model(run) -> None:
     run("--run-dir", "parts", "-n", "80", *begin)
     check_equal(outcome("whole"), outcome("parts"))
     assert outcome("parts")["n_updates"] > 40
+
+
+def test_a_model_keeps_its_settings_but_those_of_the_command(run, capsys: pytest.CaptureFixture[str]) -> None:
+    run("-n", "60", "--save-replay-buffer")
+    first = "logs/sac_sample/Pendulum-v1_1/Pendulum-v1.zip"
+    cli.main([*COMMAND, "-n", "40", "-i", first, "-params", "batch_size:16"])
+    # The entry of the task has others.
+    assert "the model of -i keeps its own, which -params replaces: learning_starts, policy" in capsys.readouterr().out
+    model: Any = ALGOS["sac_sample"].load(first.replace("_1/", "_2/"), device="cpu")
+    assert (model.learning_starts, model.gamma, model.replay_ratio, model.batch_size) == (20, 0.99, 0.5, 16)
+    assert model.buffer_size == 2000 and model._n_updates == 20 + 20
+    settings = yaml.unsafe_load(Path("logs/sac_sample/Pendulum-v1_2/Pendulum-v1/config.yml").read_text())
+    assert dict(settings) == {"batch_size": 16, "n_timesteps": 1e4}
+    with pytest.raises(SystemExit, match="policy_kwargs must be those of the file, or be left out; .*net_arch"):
+        cli.main([*COMMAND, "-n", "40", "-i", first, "-params", "policy_kwargs:dict(net_arch=[16])"])
+    cli.main([*COMMAND, "-n", "40", "-i", first, "-params", "policy:'MlpPolicy'", OFF_POLICY[-1]])
+
+
+def test_a_model_goes_on_with_the_parameters_of_a_trial(run) -> None:
+    study = optuna.create_study(storage="sqlite:///study.db", study_name="study")
+    for _ in range(2):
+        trial = study.ask()
+        HYPERPARAMS_SAMPLER["sac_sample"](trial, 1, 1, {"using_her_replay_buffer": False, "her_kwargs": {}})
+        study.tell(trial, 0.0)
+    run("-n", "30", "--eval-freq", "-1")
+    of_study = ["--storage", "sqlite:///study.db", "--study-name", "study", "--trial-id", "1", "--eval-freq", "-1"]
+    cli.main([*COMMAND, "-n", "10", "-i", "logs/sac_sample/Pendulum-v1_1/Pendulum-v1.zip", *of_study])
+    model: Any = ALGOS["sac_sample"].load("logs/sac_sample/Pendulum-v1_2/Pendulum-v1.zip", device="cpu")
+    found = study.trials[1].params
+    assert (model.batch_size, model.tau) == (2 ** found["batch_size_pow"], found["tau"])
+    assert (model.learning_starts, model.replay_ratio) == (20, 0.5)
+
+
+def test_networks_of_another_size_than_the_entrys_go_on(run) -> None:
+    bro = [*COMMAND, "--algo", "bro_fast", "--eval-freq", "-1", "-n", "30"]
+    cli.main([*bro, "-params", "model_size:(1, 8)", *OFF_POLICY[:3]])
+    cli.main([*bro, "-i", "logs/bro_fast/Pendulum-v1_1/Pendulum-v1.zip"])
+    second: Any = ALGOS["bro_fast"].load("logs/bro_fast/Pendulum-v1_2/Pendulum-v1.zip", device="cpu")
+    assert (second.model_size, second.num_transitions) == ((1, 8), 60)
 
 
 def test_copies_of_the_model_go_on_and_a_progress_bar_may_come(run) -> None:

@@ -12,7 +12,7 @@ import inspect
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -31,6 +31,7 @@ from sb3_sample.run_logs import monitor_head, read_evaluations, read_monitors
 from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.normalization import load_vec_normalize, save_vec_normalize
 from sb3_sample.saving.replay import SafeReplayBuffers
+from sb3_sample.saving.training_state import argument_names
 from sb3_sample.saving.untrusted import BadFile
 from sb3_sample.zoo.algorithms import ALGORITHMS, BUFFERS, HYPERPARAMS, stored_arguments
 from sb3_sample.zoo.files import PlottedRuns, Refused
@@ -40,6 +41,12 @@ from sb3_sample.zoo.trials import check_storage, stored_params
 
 #: Environments whose ``info`` has ``is_success`` at every step.
 SUCCESS_PREFIXES = ("metaworld/", "myosuite/")
+
+#: Arguments that are searched, and those that put them out of force.
+_REPLACED_BY = {"replay_ratio": ("train_freq", "gradient_steps"), "resets": ("reset_gradient_steps",)}
+
+#: What ``enjoy`` and ``record_video`` replace in every model, since functions pickled by an old Python cannot be read.
+_OF_OLD_PICKLES = ("learning_rate", "lr_schedule", "clip_range")
 
 #: Whether pickles are read: set by ``reading``, and None outside it, in the stock zoo's own commands.
 _allow_pickle: bool | None = None
@@ -104,7 +111,8 @@ def _adapt_experiment_manager(module: Any) -> None:
     original_is_robotics_env = manager.is_robotics_env
     signature = inspect.signature(original_init)
 
-    # ``__init__`` looks for <algorithm>.yml in the zoo's own folder only, and takes trial 0 for none.
+    # ``__init__`` looks for <algorithm>.yml in the zoo's own folder only, takes trial 0 for none, and ignores a trial
+    # whose study is not given.
     @functools.wraps(original_init)
     def init(*args: Any, **kwargs: Any) -> None:
         given = signature.bind(*args, **kwargs)
@@ -115,6 +123,12 @@ def _adapt_experiment_manager(module: Any) -> None:
                 raise ValueError(
                     "trial_id must be at least 1, not 0: the zoo takes 0 for no trial and would train with the "
                     "parameters of the file; pass trial 0's parameters with -params"
+                )
+            lacking = [name for name in ("storage", "study_name") if not given.arguments.get(name)]
+            if given.arguments.get("trial_id") is not None and lacking:
+                options = " and ".join(f"--{name.replace('_', '-')}" for name in lacking)
+                raise ValueError(
+                    f"trial_id={given.arguments['trial_id']} is the number of a trial in a study: give {options} too"
                 )
         original_init(*given.args, **given.kwargs)
 
@@ -132,8 +146,9 @@ def _adapt_experiment_manager(module: Any) -> None:
         original_optimize(self)
 
     # ``read_hyperparameters`` makes environments for evaluation with the ``env_kwargs`` of the command line only, not
-    # those of the file, and passes the parameters stored by a trial with HerReplayBuffer to any other buffer. The zoo
-    # also makes a VecFrameStack from ``frame_stack``, which gives stacks of stacks if an algorithm has an argument of
+    # those of the file, passes the parameters stored by a trial with HerReplayBuffer to any other buffer, and prunes
+    # every trial of a search, or searches in vain, if other arguments put the searched ones out of force. The zoo also
+    # makes a VecFrameStack from ``frame_stack``, which gives stacks of stacks if an algorithm has an argument of
     # that name.
     def read_hyperparameters(self: Any) -> Any:
         hyperparams, saved = original_read(self)
@@ -147,6 +162,11 @@ def _adapt_experiment_manager(module: Any) -> None:
         goals = sorted(HER_SPACE.keys() & buffer.keys()) if isinstance(buffer, dict) else []
         if self.algo in ALGORITHMS and goals and "replay_buffer_class" not in hyperparams:
             raise BadFile(f"{', '.join(goals)} belong to a trial with HerReplayBuffer, which this run has not")
+        if self.algo in ALGORITHMS and self.optimize_hyperparameters:
+            for searched, others in _REPLACED_BY.items():
+                found = [name for name in others if hyperparams.get(name) is not None]
+                if found and searched in ALGORITHMS[self.algo].space:
+                    raise ValueError(f"{found[0]}={hyperparams[found[0]]!r} replaces {searched}, which is searched")
         if self.algo in ALGORITHMS and "env_kwargs" in hyperparams and self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = hyperparams["env_kwargs"]
         return hyperparams, saved
@@ -341,15 +361,19 @@ def watched_with(find: Any, make_env: Any, *modules: ModuleType) -> Iterator[Non
 
 def models_checked(check: Callable[[Any], None]) -> AbstractContextManager[None]:
     """
-    Check the models of our algorithms that are loaded: the zoo does not check whether a model fits the environment that
-    it has made, and calls ``load`` without that environment.
+    Load models of our algorithms to act only, and check them: the zoo replaces schedules, which contradicts a file's
+    other settings, has no argument for prior data, does not check whether a model fits the environment that it has
+    made, and may call ``load`` without that environment.
 
     :param check: raises an error if a model does not fit
     """
     load = vars(SafeFiles)["load"].__func__
 
-    def call(*args: Any, **kwargs: Any) -> Any:
-        model = load(*args, **kwargs)
+    def call(cls: type[SafeFiles], *args: Any, custom_objects: Mapping[str, Any] | None = None, **kwargs: Any) -> Any:
+        kept = {name: value for name, value in (custom_objects or {}).items() if name not in _OF_OLD_PICKLES}
+        if "prior_data" in argument_names(cls):
+            kwargs.setdefault("prior_data", None)
+        model = load(cls, *args, custom_objects=kept, **kwargs)
         check(model)
         return model
 

@@ -30,7 +30,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat, configure
 from stable_baselines3.common.monitor import Monitor, get_monitor_files
 from stable_baselines3.common.utils import get_latest_run_id
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_sample.diagnostics import DiagnosticsCallback
 from sb3_sample.envs.atari import AtariFrames
@@ -42,6 +43,7 @@ from sb3_sample.run_logs import OFFLINE, monitor_files, monitor_head
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.many import train_together
 from sb3_sample.saving.folders import Folder, is_plain
+from sb3_sample.saving.normalization import lacks_vec_normalize
 from sb3_sample.saving.training_state import argument_names
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.training.seats import all_made
@@ -65,6 +67,8 @@ COMPARED = (
 )  # fmt: skip
 #: Hyperparameters from which the zoo makes ``action_noise``.
 _OF_NOISE = {"noise_type", "noise_std"}
+#: Settings that change the observations, and belong to a trained model as its arguments do.
+_OF_STATISTICS = {"normalize"}
 #: Arguments that the zoo's options set.
 _OF_OPTIONS = {"env", "seed", "verbose", "device", "tensorboard_log"}
 
@@ -490,8 +494,8 @@ def can_train_together(algo: str) -> bool:
 
 class Manager(ExperimentManager):
     """
-    The zoo's manager, extended: it names unknown hyperparameters, does not take an interrupted run for a finished one,
-    can learn from data, and evaluates whole games of Atari.
+    The zoo's manager, extended: it names unknown hyperparameters, trains a model on with the settings of its file, does
+    not take an interrupted run for a finished one, can learn from data, and evaluates whole games of Atari.
 
     :param data: data sets to learn from
     :param args: the command line, as parsed by the zoo
@@ -508,9 +512,26 @@ class Manager(ExperimentManager):
         super().__init__(args, *positional, **named)
         self._data = data
         self._dataset: Dataset | None = None
+        # The names of a stored trial's hyperparameters.
+        self._of_trial: set[str] = set()
+        # Settings of the model that is trained on, for those who read the run's.
+        self._of_agent: dict[str, Any] = {}
+
+    def load_trial(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        found: dict[str, Any] = super().load_trial(*args, **kwargs)
+        self._of_trial = set(found)
+        return found
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         hyperparams, saved = super().read_hyperparameters()
+        if self.continue_training and self.algo in ALGORITHMS:
+            # The entry of the task is not what the model was trained with: its file has that.
+            given = {*(self.custom_hyperparams or {}), *self._of_trial}
+            of_model = argument_names(ALGOS[self.algo]) | _OF_NOISE | _OF_STATISTICS
+            if dropped := sorted((of_model & saved.keys()) - given):
+                print(f"Of these, the model of -i keeps its own, which -params replaces: {', '.join(dropped)}")
+            for name in dropped:
+                del hyperparams[name], saved[name]
         self._sets: dict[str, Dataset] = {}
         for name in "dataset", "prior_data":
             source = getattr(self._data, name)
@@ -574,8 +595,59 @@ class Manager(ExperimentManager):
             self.env_wrapper = self._evaluated_in
         try:
             return super().create_envs(n_envs, eval_env, no_log)
+        except TypeError as error:
+            kwargs = self.eval_env_kwargs if eval_env else self.env_kwargs
+            if not kwargs:
+                raise
+            raise RunError(f"{self.env_name.gym_id} cannot be made with env_kwargs={kwargs}: {error}") from error
         finally:
             self.env_wrapper = wrapper
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        model = (
+            self._loaded(hyperparams, env)
+            if self.algo in ALGORITHMS
+            else super()._load_pretrained_agent(hyperparams, env)
+        )
+        # The zoo loads statistics wherever they are, but saves them only if the settings ask for them.
+        if unwrap_vec_normalize(env) is not None and not self.normalize:
+            self.normalize = self._of_agent["normalize"] = True
+        # ``enjoy`` gives a model its environment if this setting says so.
+        if getattr(model, "replay_buffer_class", None) is HerReplayBuffer:
+            self._of_agent["replay_buffer_class"] = HerReplayBuffer.__name__
+        return model
+
+    def _loaded(self, hyperparams: Mapping[str, Any], env: VecEnv) -> Any:
+        """
+        The model of ``-i``. Unlike the zoo, pass on ``policy`` and ``policy_kwargs`` too: our models say in what they
+        differ from the file's.
+        """
+        print("Loading pretrained agent")
+        algorithm: Any = ALGOS[self.algo]
+        model = algorithm.load(
+            self.trained_agent,
+            env=env,
+            seed=self.seed,
+            tensorboard_log=self.tensorboard_log,
+            verbose=self.verbose,
+            device=self.device,
+            **hyperparams,
+        )
+        if lacks_vec_normalize(model):
+            statistics = Path(self.trained_agent).parent / self.env_name / "vecnormalize.pkl"
+            raise RunError(
+                f"-i {self.trained_agent}: the model has learned in a VecNormalize, whose statistics must be in "
+                f"{statistics}, which is not there. -params normalize:True begins new ones"
+            )
+        replay = Path(self.trained_agent).parent / "replay_buffer.pkl"
+        if replay.exists():
+            print("Loading replay buffer")
+            model.load_replay_buffer(replay, truncate_last_traj=self.truncate_last_trajectory)
+        return model
+
+    def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        saved_hyperparams.update(self._of_agent)
+        super()._save_config(saved_hyperparams)
 
     def _train(self, model: Any, total_timesteps: int, **arguments: Any) -> BaseAlgorithm:
         """Call ``learn``, as the zoo does, or its replacement."""
@@ -639,32 +711,34 @@ class RunManager(Manager):
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         hyperparams, saved = super().read_hyperparameters()
-        settings = {name: repr(getattr(self.args, name)) for name in COMPARED}
-        settings |= {name: repr(value) for name, value in saved.items() if name != "n_timesteps"}
-        settings |= {name: repr(dataset) for name, dataset in self._sets.items()}
+        values = {name: getattr(self.args, name) for name in COMPARED}
+        values |= {name: value for name, value in saved.items() if name != "n_timesteps"}
+        values |= self._sets
         if self._data.offline_steps is not None:
-            settings["offline_steps"] = repr(self._data.offline_steps)
+            values["offline_steps"] = self._data.offline_steps
+        spellings = {name: _spellings(name, value) for name, value in values.items()}
         before = self._start.record
         if before is not None:
-            self._compare(settings, before.settings)
+            self._compare(spellings, before.settings)
         self._record = Record(
             algo=self.algo,
             env=self.env_name.gym_id,
             seed=self.seed,
             n_timesteps=self.args.n_timesteps,
             checkpoint_freq=self._start.checkpoint_freq,
-            settings=settings,
+            settings={name: texts[0] for name, texts in spellings.items()},
             tensorboard=None if self.tensorboard_log is None else self._tensorboard_folder(),
         )
         # Before anything else of the run is written.
         self._record.write(self._folder)
         return hyperparams, saved
 
-    def _compare(self, ours: Mapping[str, str], theirs: Mapping[str, str]) -> None:
+    def _compare(self, ours: Mapping[str, Sequence[str]], theirs: Mapping[str, str]) -> None:
+        nothing = ("not given",)
         differences = [
-            f"{name} {theirs.get(name, 'not given')} (now {ours.get(name, 'not given')})"
+            f"{name} {theirs.get(name, *nothing)} (now {ours.get(name, nothing)[0]})"
             for name in sorted(ours.keys() | theirs.keys())
-            if ours.get(name) != theirs.get(name)
+            if theirs.get(name, *nothing) not in ours.get(name, nothing)
         ]
         if differences:
             raise RunError(
@@ -717,6 +791,20 @@ class RunManager(Manager):
             # This warning comes if a run was interrupted between the two parts.
             warnings.filterwarnings("ignore", "Nothing is left to train")
             super()._learn_first(model, dataset, gradient_steps, **{**arguments, "checkpoint": self._folder / OFFLINE})
+
+
+def _spellings(name: str, value: Any) -> list[str]:
+    """The texts of a setting that mean the same. The first is recorded; a record may have another."""
+    if name == "trained_agent" and value:
+        return [repr(path) for path in (value, os.path.abspath(value), os.path.relpath(value))]
+    return [repr(_in_order(value)), repr(value)]
+
+
+def _in_order(value: Any) -> Any:
+    """Sort dicts, whose order means nothing."""
+    if type(value) is dict:
+        return {key: _in_order(value[key]) for key in sorted(value, key=repr)}
+    return [_in_order(each) for each in value] if type(value) is list else value
 
 
 def _for_evaluation(wrapper: Any) -> Any:

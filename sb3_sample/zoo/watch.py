@@ -3,16 +3,23 @@
 import argparse
 import contextlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 from rl_zoo3.utils import create_test_env, get_model_path
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_normalize
 
 from sb3_sample.exits import refuse
-from sb3_sample.saving.checkpoint import MODEL
+from sb3_sample.saving import container
+from sb3_sample.saving.attributes import Restorer
+from sb3_sample.saving.checkpoint import KIND, MODEL, STATE
+from sb3_sample.saving.classes import importing_nothing
+from sb3_sample.saving.encoding import decode
+from sb3_sample.saving.normalization import lacks_vec_normalize
+from sb3_sample.saving.statistics import ARGUMENTS, check_normalization, shapes_of
+from sb3_sample.saving.untrusted import BadFile
 from sb3_sample.zoo.algorithms import ALGORITHMS
 from sb3_sample.zoo.files import Refused, RunError, add_trust
 from sb3_sample.zoo.patches import make_answering_env, models_checked, reading, reading_settings, watched_with
@@ -101,6 +108,8 @@ class _Watch:
         #: Whether only files are read that run no code.
         self._is_safe = False
         self._env: VecEnv | None = None
+        #: The checkpoint that the model is of.
+        self._checkpoint: Path | None = None
 
     def find(self, exp_id: int, folder: str, algo: str, env_name: Any, *which: Any) -> tuple[str, str, str]:
         """
@@ -122,6 +131,8 @@ class _Watch:
                 found = get_model_path(exp_id, folder, algo, env_name, *which)
             else:
                 found = model_path(options.run_dir, algo, env_name, *which)
+                beside = Path(found[1]).parent
+                self._checkpoint = beside if is_ours and beside in all_checkpoints(options.run_dir) else None
             self._is_safe = is_ours and not options.allow_pickle
             if self._is_safe:
                 check_settings(Path(found[2]) / env_name, options.trusted_modules, self._env_kwargs)
@@ -137,11 +148,20 @@ class _Watch:
 
     def make_env(self, env_id: str, *args: Any, **kwargs: Any) -> VecEnv:
         """
-        As ``create_test_env``.
+        As ``create_test_env``, but a checkpoint has its own statistics of ``VecNormalize``.
 
         :raises Refused: if the run's settings make no environment that works
         """
-        self._env = (make_answering_env if self._is_safe else create_test_env)(env_id, *args, **kwargs)
+        make = make_answering_env if self._is_safe else create_test_env
+        settings = kwargs.get("hyperparams") or {}
+        if self._checkpoint is None or not settings.get("normalize"):
+            self._env = make(env_id, *args, **kwargs)
+            return self._env
+        # Without its folder the zoo adds neither statistics nor a stack of frames.
+        env = make(env_id, *args, **{**kwargs, "stats_path": None})
+        self._env = _normalized(env, self._checkpoint / STATE, settings.get("normalize_kwargs", {}))
+        if settings.get("frame_stack"):
+            self._env = VecFrameStack(self._env, settings["frame_stack"])
         return self._env
 
     def _check(self, model: Any) -> None:
@@ -149,6 +169,42 @@ class _Watch:
             its, saved = getattr(self._env, name), getattr(model, name)
             if _shapes(its) != _shapes(saved):
                 raise Refused(f"the model is of {saved!r:.200}, the run's environment of {its!r:.200}")
+        is_normalized = self._env is not None and unwrap_vec_normalize(self._env) is not None
+        if lacks_vec_normalize(model) and not is_normalized:
+            raise Refused(
+                "the model has learned in a VecNormalize, which the run's settings do not have: its config.yml must "
+                "say normalize: true, and vecnormalize.pkl, with the statistics, must lie beside it"
+            )
+
+
+def _normalized(env: VecEnv, path: Path, arguments: Mapping[str, Any]) -> VecNormalize:
+    """
+    :param env: environment of a run
+    :param path: state of a checkpoint of the run
+    :param arguments: the run's arguments of ``VecNormalize``
+    :return: the environment in the checkpoint's ``VecNormalize``, which learns nothing and leaves rewards as they are
+    :raises Refused: if the checkpoint has none that fits
+    :raises BadFile: if the state is damaged or hostile
+    """
+    try:
+        with importing_nothing():
+            state: Any = decode(*container.read(path, KIND), str(path))
+        wrappers = {wrapper["class"]: wrapper["attributes"] for wrapper in state["env"]["wrappers"]}
+        described = wrappers[f"{VecNormalize.__module__}.{VecNormalize.__qualname__}"]
+        shown = {"training": False, "norm_reward": False}
+        wanted = VecNormalize(env, **{**arguments, "norm_obs": described["norm_obs"]["value"], **shown})
+        before = [shapes_of(getattr(wanted, name, None), name) for name in ("obs_rms", "ret_rms")]
+        names = ({*ARGUMENTS, "obs_rms", "ret_rms"} & described.keys()) - shown.keys()
+        Restorer([env]).attributes(wanted, {name: described[name] for name in names})
+        check_normalization(vars(wanted), str(path))
+        found = [shapes_of(getattr(wanted, name, None), name) for name in ("obs_rms", "ret_rms")]
+    except BadFile:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, AssertionError, OSError) as error:
+        raise Refused(f"{path} has no VecNormalize of this run: {type(error).__name__}: {error}") from error
+    if found != before:
+        raise Refused(f"{path}: the statistics of VecNormalize are of the shapes {found}, not {before}")
+    return wanted
 
 
 def _shapes(space: gym.Space) -> Any:
@@ -173,20 +229,35 @@ def model_path(
     :param algo: name of the algorithm
     :param env_name: name of the environment
     :param load_best: whether to load the best model
-    :param load_checkpoint: steps of the zoo's checkpoint to load
+    :param load_checkpoint: steps of the model to load: the zoo's copy (``--save-freq``), or else the run's checkpoint
     :param load_last_checkpoint: whether to load the last checkpoint
     :return: name for a video, the model's file, the run's folder
     :raises Refusal: (a ``SystemExit``) if there is no model yet
+    :raises RunError: if there is no such model
     """
     made = all_checkpoints(run_dir)
-    if load_last_checkpoint and made and not (load_best or load_checkpoint is not None):
-        steps = int(made[-1].name.removeprefix("checkpoint-"))
-        return f"checkpoint-{steps}-{algo}-{env_name}", str(made[-1] / MODEL), str(run_dir)
-    if not (load_best or load_last_checkpoint or load_checkpoint is not None or (run_dir / f"{env_name}.zip").exists()):
+
+    def of_checkpoint(folder: Path) -> tuple[str, str, str]:
+        steps = int(folder.name.removeprefix("checkpoint-"))
+        return f"checkpoint-{steps}-{algo}-{env_name}", str(folder / MODEL), str(run_dir)
+
+    if not load_best and load_checkpoint is not None:
+        wanted = [folder for folder in made if int(folder.name.removeprefix("checkpoint-")) == int(load_checkpoint)]
+        if wanted and not (run_dir / f"rl_model_{load_checkpoint}_steps.zip").exists():
+            return of_checkpoint(wanted[-1])
+    elif load_last_checkpoint and made and not load_best:
+        return of_checkpoint(made[-1])
+    elif not (load_best or load_last_checkpoint or (run_dir / f"{env_name}.zip").exists()):
         if not made:
             refuse("", f"{run_dir} has neither a model of a finished run nor a checkpoint")
         print(f"The run in {run_dir} is not finished: its last checkpoint, {made[-1].name}, is taken")
-        return model_path(run_dir, algo, env_name, load_last_checkpoint=True)
-    # The zoo adds the algorithm's name to the folder.
-    prefix, path, _ = get_model_path(-1, str(run_dir), "", env_name, load_best, load_checkpoint, load_last_checkpoint)
+        return of_checkpoint(made[-1])
+    try:
+        # The zoo adds the algorithm's name to the folder.
+        prefix, path, _ = get_model_path(
+            -1, str(run_dir), "", env_name, load_best, load_checkpoint, load_last_checkpoint
+        )
+    except ValueError as error:
+        names = ", ".join(folder.name for folder in made) or "none"
+        raise RunError(f"{run_dir} has no such model of {algo} on {env_name}. Its checkpoints: {names}") from error
     return prefix.replace(f"-{env_name}", f"{algo}-{env_name}"), path, str(run_dir)
