@@ -14,6 +14,7 @@ program says so.
 
 import argparse
 import functools
+import math
 import os
 import runpy
 import subprocess
@@ -62,19 +63,22 @@ def evaluations(ours: pd.DataFrame, others: pd.DataFrame | None, index: str) -> 
     :param others: None
     :param index: "task" or "agent"
     :return: return, and success where it is recorded, by task or agent at each evaluation, means over the seeds; for
-        tasks with their mean; in Markdown
+        tasks with their mean, if all have got there; in Markdown
     """
     means = ours.pivot_table(index=index, columns=["metric", "step"], values="value")
     if index == "task":
-        means.loc["mean"] = means.mean()
+        means.loc["mean"] = means.mean(skipna=False)
     columns = [column for metric in ("return", "success_rate") for column in means.columns if column[0] == metric]
     lines = [
         f"| {index} | " + " | ".join(f"{metric.removesuffix('_rate')}, {step:,}" for metric, step in columns) + " |",
         "| --- |" + " ---: |" * len(columns),
     ]
     for name, values in means.iterrows():
-        cells = [f"{values[column]:,.{2 if column[0] == 'success_rate' else 0}f}" for column in columns]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        cells = [
+            "" if math.isnan(values[column]) else f"{values[column]:,.{2 if column[0] == 'success_rate' else 0}f}"
+            for column in columns
+        ]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

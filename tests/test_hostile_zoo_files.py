@@ -202,7 +202,7 @@ def test_a_refused_run_is_no_reason_to_ask_a_hub(folder: str, here: Path, monkey
         cli.main(["enjoy", "--run-dir", folder, *STEPS])
     (here / folder / f"{ENV}.zip").unlink()
     (here / folder / ENV / "config.yml").unlink()
-    with pytest.raises(SystemExit, match="No model found"):
+    with pytest.raises(SystemExit, match="has no such model of"):
         cli.main(["enjoy", "--run-dir", folder, "--load-checkpoint", "3", *STEPS])
 
 

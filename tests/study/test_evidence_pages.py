@@ -116,6 +116,14 @@ def test_return_and_success_by_task(module: Any) -> None:
     ]
 
 
+def test_evaluations_that_are_not_there_are_blank(module: Any) -> None:
+    rows = [("a", "{}", "t", 0, 10, "return", 1.0), ("a", "{}", "t", 0, 20, "return", 2.0)]
+    agents = pd.DataFrame([*rows, ("b", "{}", "t", 0, 10, "return", 3.0)], columns=COLUMNS)
+    assert module.by_agent(agents, None).splitlines()[2:] == ["| a | 1 | 2 |", "| b | 3 |  |"]
+    tasks = pd.DataFrame([*rows, ("a", "{}", "u", 0, 10, "return", 3.0)], columns=COLUMNS)
+    assert module.by_task(tasks, None).splitlines()[2:] == ["| t | 1 | 2 |", "| u | 3 |  |", "| mean | 2 |  |"]
+
+
 def test_a_table_in_a_page(module: Any, tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     marks = ["<!-- begin: table: A -->", "<!-- end: table: A -->"]
