@@ -283,7 +283,7 @@ def test_a_plan_is_one_that_study_takes(tmp_path: Path, capsys: pytest.CaptureFi
         "--steps",
         "3e4",
     ]
-    cli.main([*command, "--measure", "1e3", "-params", "model_size:'0.55M'", "resets:[]"])
+    cli.main([*command, "--measure", "1e3", "-params", "model_size:0.55M", "resets:[]"])
     assert capsys.readouterr().out.startswith("45 runs of 30,000 steps")
     runs = study.read_plan(path).runs
     assert {run.measure for run in runs} == {1_000}
@@ -306,7 +306,7 @@ def test_a_plan_is_one_that_study_takes(tmp_path: Path, capsys: pytest.CaptureFi
     assert {run.agent for run in runs} == {"bro B64 lr0.00012345678", "bro B64 lr0.00012345679", "bro B64 lr3e-05"}
     path.unlink()
     with pytest.raises(SystemExit):
-        cli.main([*command, "-params", "model_size:'7M'"])
+        cli.main([*command, "-params", "model_size:7M"])
     assert "model_size" in capsys.readouterr().err and not path.exists()
 
 
@@ -317,17 +317,17 @@ def test_further_arguments_of_a_plan_are_those_of_train(tmp_path: Path, capsys: 
     command += ["--replay-ratios", "1", "--batch-sizes", "64", "--learning-rates", "1e-3"]
     params = [
         "policy_kwargs:dict(net_arch=dict(pi=[64, 64], qf=(32,)))", "action_noise:None", "tau:1e-2",
-        "ent_coef:'auto_0.1'", "compile:False", "resets:[]",
+        "ent_coef:'auto_0.1'", "exploration:actor", "compile:False", "resets:[]",
     ]  # fmt: skip
     cli.main([*command, "-params", *params])
     (arguments,) = {run.seed: run.arguments for run in study.read_plan(path).runs if run.seed == 0}.values()
     assert {name: arguments[name] for name in arguments if name not in ("batch_size", "learning_rate")} == {
         "replay_ratio": 1, "policy_kwargs": {"net_arch": {"pi": [64, 64], "qf": [32]}}, "action_noise": None,
-        "tau": 0.01, "ent_coef": "auto_0.1", "compile": False, "resets": [],
+        "tau": 0.01, "ent_coef": "auto_0.1", "exploration": "actor", "compile": False, "resets": [],
     }  # fmt: skip
     path.unlink()
     capsys.readouterr()
-    for wrong in ("tau:0.55M", "tau", "tau:", ":1", "tau:print(1)", "tau:{1, 2}", "tau:1e999", "tau:dict([1])"):
+    for wrong in ("tau:0.55 M", "tau", "tau:", ":1", "tau:print(1)", "tau:{1, 2}", "tau:1e999", "tau:dict([1])"):
         with pytest.raises(SystemExit) as error:
             cli.main([*command, "-params", wrong])
         said = capsys.readouterr().err

@@ -4,6 +4,7 @@ import argparse
 import ast
 import json
 import math
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -94,6 +95,10 @@ def _written(value: float) -> str:
     return short if float(short) == value else repr(value)
 
 
+#: Value that stands for itself, such as 0.55M or auto.
+_WORD = re.compile(r"(?![\de.+-]+$)\w[\w.+-]*")
+
+
 class _Dicts(ast.NodeTransformer):
     """Write ``dict(name=value)`` as a literal."""
 
@@ -106,7 +111,10 @@ class _Dicts(ast.NodeTransformer):
 
 
 def _pair(text: str) -> tuple[str, str]:
-    """Name and value (in JSON) of NAME:VALUE, as ``sb3-sample train`` takes them; a plan holds plain values only."""
+    """
+    Name and value (in YAML) of NAME:VALUE, as ``sb3-sample train`` takes them; a plan holds plain values only. A single
+    word needs no quotes.
+    """
     name, _, value = text.partition(":")
     try:
         if not name.isidentifier():
@@ -115,9 +123,11 @@ def _pair(text: str) -> tuple[str, str]:
         # Every JSON text without NaN is one of YAML too, with texts in quotes.
         return name, json.dumps(found, allow_nan=False)
     except (SyntaxError, ValueError, TypeError, MemoryError, RecursionError) as error:
+        if name.isidentifier() and _WORD.fullmatch(value):
+            return name, value
         raise ValueError(
-            "-params must be NAME:VALUE, the value a number, text, list or dict in Python and a text in quotes of its "
-            f"own (NAME:\"'text'\"), not {text!r:.200} ({type(error).__name__}: {error})"
+            "-params must be NAME:VALUE, the value a number, word, list or dict in Python and a longer text in quotes "
+            f"of its own (NAME:\"'a text'\"), not {text!r:.200} ({type(error).__name__}: {error})"
         ) from error
 
 
