@@ -272,7 +272,9 @@ def test_rewards_are_divided_by_each_tasks_temperature_and_target() -> None:
 def test_compiled_as_eager() -> None:
     found = []
     for compile in (False, True):
-        model = make("BRC", task_temperatures=True, target_entropy=[-1.0, -0.5], compile=compile).learn(40)
+        # Few steps: sooner or later, rounding puts an input of a ReLU on its other side.
+        model = make("BRC", task_temperatures=True, target_entropy=[-1.0, -0.5], compile=compile).learn(24)
+        assert model._n_updates == 7
         found.append(state(model))
     assert found[0].keys() == found[1].keys()
     for name, value in found[0].items():
