@@ -135,6 +135,7 @@ def test_train_continue_enjoy_and_plot_an_id_with_a_slash(zoo_run, capsys: pytes
     pytest.importorskip("seaborn")
     from matplotlib import pyplot as plt
 
+    plt.close("all")  # of other tests
     zoo_run("plot_train", "--algo", "bro", "--env", ENV, "-f", "logs", "-w", "1")
     assert plt.gca().get_legend_handles_labels()[1] == [f"{NAME}_1"]  # run 2 has no finished episode
     # The zoo's tables need two runs.
