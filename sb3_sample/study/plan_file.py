@@ -45,7 +45,7 @@ from sb3_sample.study.trial_agents import (
     settings_of,
     why_not_acting,
 )
-from sb3_sample.study_list import part_of_path
+from sb3_sample.study_list import part_of_path, short
 
 #: Entries of a plan; those after the first four have defaults.
 ENTRIES = (
@@ -357,6 +357,13 @@ class _Reader:
                 value = self._plain(each)
                 if _key(value) in map(_key, values):
                     raise self._fail(each, f"{name!r} of grid has {value!r} twice: each agent can be there once")
+                for other in values:
+                    if part_of_path(short(other)).lower() == part_of_path(short(value)).lower():
+                        raise self._fail(
+                            each,
+                            f"{name!r} of grid has {other!r} and {value!r}, whose runs would have the same folder: "
+                            "make them two agents with names of their own",
+                        )
                 values.append(value)
             grid[name] = values
         return grid

@@ -159,6 +159,12 @@ BAD = [
     ("  replay_ratio: [1, 2]", "  model_size: [0.55M]", 9, "grid crosses 'model_size', which agent 'BRO Fast'"),
     ("  replay_ratio: [1, 2]", "  weight_decay: [0.1]", 9, "'weight_decay' of grid, for agent 'SAC', is no argument"),
     ("[1, 2]", "[1, 2, 1]", 9, "'replay_ratio' of grid has 1 twice"),
+    (
+        "  replay_ratio: [1, 2]",
+        "  reward_scale_kwargs: [{max_return: 1}, {max_return: [1]}]",
+        9,
+        r"'reward_scale_kwargs' of grid has .* and .*, whose runs would have the same folder",
+    ),
     ("[1, 2]", "[1, two]", 9, "replay_ratio must .*, not 'two'"),
     ("[1, 2]", "1", 9, "'replay_ratio' of grid must be a list that is not empty, not 1"),
     ("dmc/cheetah-run-v0", "dmc/cheetah-ran-v0", 10, "close are dmc/cheetah-run-v0.*Suites are BRO"),
