@@ -40,7 +40,7 @@ def build(agent: str, size: int) -> Any:
 
 
 def seconds_of_training(agent: str) -> float:
-    """What ``EVERY`` environment steps of the training take."""
+    """Time that ``EVERY`` environment steps of the training take."""
     model = build(agent, 1)
     model.learning_starts = 1_000
     model.learn(1_100)

@@ -23,7 +23,7 @@ NAMES = (
     "stable-baselines3", "gymnasium", "cloudpickle", "farama-notifications", "mujoco", "dm-env", "dm-tree", "glfw",
     "pyopengl",
 )  # fmt: skip
-#: What SBX needs besides JAX, Flax and Optax, which the machine has or has not, and what they bring along.
+#: Packages that SBX needs besides JAX, Flax and Optax, which the machine has or has not, and what they bring along.
 OF_SBX = ("sbx-rl", "tfp-nightly", "decorator", "gast")
 #: MiB of all wheels.
 LARGEST = 64

@@ -13,7 +13,7 @@ from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, DICT, TRUE_OR_FALSE, Kind, che
 from sb3_sample.learner import losses
 from sb3_sample.learner.batch import Batch, for_each
 from sb3_sample.learner.parts import Learning, Part
-from sb3_sample.learner.pessimism import TOP, epistemic_std
+from sb3_sample.learner.pessimism import epistemic_std
 from sb3_sample.learner.scalars import BoundedLogScalar, FixedScalar, LogScalar
 from sb3_sample.learner.target import at_rest, values
 from sb3_sample.networks import NETWORKS, Projected, linear, project_weights, widened
@@ -528,7 +528,7 @@ class OptimisticActor(OptimisticExploration):
             # Starts during training: a pessimism that moves may have fallen to minus initial_optimism or below.
             distance = max(distance, self.BARRIER)
         # The arm that a bandit draws first must not decide whether an optimism is allowed.
-        least = min(rule.arms) if isinstance(rule, TOP) and learner.num_transitions == 0 else beta
+        least = rule.smallest_beta() if learner.num_transitions == 0 else beta
         if not 0 < distance < math.inf or (initial_optimism is not None and distance + least - beta <= 0):
             raise ValueError(
                 f"initial_optimism must be above minus the pessimism, {0.0 - least}, not {initial_optimism}"

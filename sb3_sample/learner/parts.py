@@ -28,6 +28,13 @@ class Rule(Protocol):
         :return: the weight in force, at least 0, a number or a scalar tensor without gradient
         """
 
+    def smallest_beta(self) -> float:
+        """
+        Bound the weight at the start of a training.
+
+        :return: the smallest weight that may be in force then
+        """
+
     def value(self, q: torch.Tensor) -> torch.Tensor:
         """
         Value of the ensemble.

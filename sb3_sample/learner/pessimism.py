@@ -77,6 +77,14 @@ class Pessimism(Part):
         """
         return self.constant
 
+    def smallest_beta(self) -> float:
+        """
+        Bound the weight at the start of a training.
+
+        :return: the smallest weight that may be in force then; by default the weight in force
+        """
+        return float(self.beta())
+
     def value(self, q: torch.Tensor) -> torch.Tensor:
         """
         Value of an ensemble under the weight in force.
@@ -415,6 +423,9 @@ class TOP(Pessimism):
 
     def beta(self) -> torch.Tensor:
         return self.weight
+
+    def smallest_beta(self) -> float:
+        return min(self.arms)
 
     def on_step(self, learner: Learning, rewards: Any, dones: Any, infos: list[dict[str, Any]]) -> None:
         for index in np.flatnonzero(dones):

@@ -116,7 +116,7 @@ class StudyFolder:
             known: list[Run] = []
             former: list[Run] = []
             if (self.path / LIST).exists():
-                known, former = self.runs(), self.former()
+                known, former = self.runs(), self._former()
                 _check_same(self.path, [*former, *known], plan.runs)
                 if keep:
                     runs = {run.name: run for run in known} | runs
@@ -149,11 +149,8 @@ class StudyFolder:
         except (ValueError, KeyError, TypeError) as error:
             raise StudyError(f"{self.path / LIST} is not what sb3-sample study run has written: {error}") from error
 
-    def former(self) -> list[Run]:
-        """
-        :return: runs of earlier plans that are not in the last one and whose folders still exist
-        :raises StudyError: there is no list of runs, or it is damaged
-        """
+    def _former(self) -> list[Run]:
+        """Runs of earlier plans that are not in the last one and whose folders still exist."""
         content = self._list()
         try:
             found = [Run.of_json(run) for run in content.get(FORMER, {}).values()]

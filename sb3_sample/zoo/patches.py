@@ -45,7 +45,7 @@ SUCCESS_PREFIXES = ("metaworld/", "myosuite/")
 #: Arguments that are searched, and those that put them out of force.
 _REPLACED_BY = {"replay_ratio": ("train_freq", "gradient_steps"), "resets": ("reset_gradient_steps",)}
 
-#: What ``enjoy`` and ``record_video`` replace in every model, since functions pickled by an old Python cannot be read.
+#: Attributes that ``enjoy`` and ``record_video`` replace in every model, since an old Python's pickles cannot be read.
 _OF_OLD_PICKLES = ("learning_rate", "lr_schedule", "clip_range")
 
 #: Whether pickles are read: set by ``reading``, and None outside it, in the stock zoo's own commands.

@@ -235,29 +235,28 @@ def model_path(
     :raises Refusal: (a ``SystemExit``) if there is no model yet
     :raises RunError: if there is no such model
     """
-    made = all_checkpoints(run_dir)
+    made = {int(folder.name.removeprefix("checkpoint-")): folder for folder in all_checkpoints(run_dir)}
 
-    def of_checkpoint(folder: Path) -> tuple[str, str, str]:
-        steps = int(folder.name.removeprefix("checkpoint-"))
-        return f"checkpoint-{steps}-{algo}-{env_name}", str(folder / MODEL), str(run_dir)
+    def of_checkpoint(steps: int) -> tuple[str, str, str]:
+        return f"checkpoint-{steps}-{algo}-{env_name}", str(made[steps] / MODEL), str(run_dir)
 
     if not load_best and load_checkpoint is not None:
-        wanted = [folder for folder in made if int(folder.name.removeprefix("checkpoint-")) == int(load_checkpoint)]
-        if wanted and not (run_dir / f"rl_model_{load_checkpoint}_steps.zip").exists():
-            return of_checkpoint(wanted[-1])
+        steps = int(load_checkpoint)
+        if steps in made and not (run_dir / f"rl_model_{load_checkpoint}_steps.zip").exists():
+            return of_checkpoint(steps)
     elif load_last_checkpoint and made and not load_best:
-        return of_checkpoint(made[-1])
+        return of_checkpoint(max(made))
     elif not (load_best or load_last_checkpoint or (run_dir / f"{env_name}.zip").exists()):
         if not made:
             refuse("", f"{run_dir} has neither a model of a finished run nor a checkpoint")
-        print(f"The run in {run_dir} is not finished: its last checkpoint, {made[-1].name}, is taken")
-        return of_checkpoint(made[-1])
+        print(f"The run in {run_dir} is not finished: its last checkpoint, {made[max(made)].name}, is taken")
+        return of_checkpoint(max(made))
     try:
         # The zoo adds the algorithm's name to the folder.
         prefix, path, _ = get_model_path(
             -1, str(run_dir), "", env_name, load_best, load_checkpoint, load_last_checkpoint
         )
     except ValueError as error:
-        names = ", ".join(folder.name for folder in made) or "none"
+        names = ", ".join(folder.name for folder in made.values()) or "none"
         raise RunError(f"{run_dir} has no such model of {algo} on {env_name}. Its checkpoints: {names}") from error
     return prefix.replace(f"-{env_name}", f"{algo}-{env_name}"), path, str(run_dir)

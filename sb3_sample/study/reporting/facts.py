@@ -29,7 +29,6 @@ from sb3_sample.study.table import RUN
 POINTS = 40
 #: Most agents for comparing all pairs; with more agents, the best is compared with each other one.
 ALL_PAIRS = 6
-_MEASURED = ("return", "success_rate", "episode_length")
 
 
 @dataclasses.dataclass
@@ -136,7 +135,7 @@ def compute(
     :return: the numbers
     :raises ValueError: an argument is out of range, or no run reaches a step
     """
-    measured = gathered.table[gathered.table["metric"].isin(_MEASURED)]
+    measured = gathered.evaluated
     facts = Facts(unscored(measured, scores), confidence=confidence)
     rows = measured[~measured["task"].isin(list(facts.lacking))]
     if not len(rows):

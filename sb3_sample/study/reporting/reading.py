@@ -20,8 +20,9 @@ from sb3_sample.study.plan import Run
 from sb3_sample.study.plan_file import read_plan
 from sb3_sample.study.reporting.pieces import counted
 from sb3_sample.study.reporting.planned import missing_runs
-from sb3_sample.study.runs import LIST, PLAN, StudyFolder, checkpointed
+from sb3_sample.study.runs import LIST, PLAN, checkpointed
 from sb3_sample.study.states import Status, status
+from sb3_sample.study_list import read_list
 
 #: Path of runs, or a table of them.
 Source: TypeAlias = str | Path | pd.DataFrame
@@ -166,26 +167,22 @@ def _paths(source: str | Path, found: Gathered) -> list[str | Path]:
     except ValueError:  # there is no run
         if not is_study:
             raise
-    former = _former(folders)
+    listed = functools.cache(read_list)
+    former = {
+        folder for folder in folders if (study := study_of(folder)) is not None and listed(study).is_former(folder)
+    }
     if is_study:
         found.states.append(status(path))
         found.labels.append(label)
         if (path / PLAN).is_file():
             found.plans[str(source)] = read_regular(path / PLAN, _MAX_PLAN).decode(errors="replace")
         evaluated = [folder for folder in folders if (folder / EVALUATIONS).exists()]
-        n = len({folder.absolute() for folder in folders} - {folder.absolute() for folder in evaluated} - former)
+        n = len(set(folders) - set(evaluated) - former)
         if n:
             found.notes.append(f"{counted(n, 'run')} of {source} without an evaluation yet: in no figure.")
         folders = evaluated
-    kept = [folder for folder in folders if folder.absolute() not in former]
-    found.made_with += [made for folder in kept if (made := made_with(folder))]
+    found.made_with += [made for folder in folders if folder not in former and (made := made_with(folder))]
     return [folder if label is None else f"{label}={folder}" for folder in folders]
-
-
-def _former(folders: Iterable[Path]) -> set[Path]:
-    """Folders of runs that were removed from the plans of their studies; the table leaves them out."""
-    studies = [StudyFolder(study) for study in {study_of(folder) for folder in folders} if study is not None]
-    return {study.place(run) for study in studies for run in study.former()}
 
 
 def made_with(folder: Path) -> dict[str, str]:
