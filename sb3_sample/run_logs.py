@@ -205,7 +205,9 @@ def _read_monitor(path: Path) -> tuple[pd.DataFrame, float]:
         # In pieces: a table takes many times the bytes of its text.
         parts = [_table(columns, path)]
         while block := file.read(_BLOCK):
-            parts.append(_table(columns + block + file.readline(), path))
+            block += file.readline()
+            # A last line without its end is incomplete.
+            parts.append(_table(columns + block[: block.rfind(b"\n") + 1], path))
     frame = pd.concat([part for part in parts if len(part)] or parts)
     if not {"r", "l", "t"} <= set(frame):
         raise BadFile(f"{path} is no file of Monitor's: it has no columns r, l and t")

@@ -54,9 +54,15 @@ def test_episodes_are_those_that_stable_baselines3_reads(tmp_path: Path, monkeyp
     assert monitor_head(tmp_path / "1.monitor.csv") == {"t_start": 12.0, "env_id": "Pendulum-v1"}
 
 
-def test_what_a_killed_run_has_left_of_a_line_is_left_out(tmp_path: Path) -> None:
+def test_what_a_killed_run_has_left_of_a_line_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_monitor(tmp_path / "0.monitor.csv", 1.0, "-1.5,200,1.0\n-1")
     assert list(read_monitors(tmp_path)["l"]) == [200]
+    whole, last = "-1.5,200,1.0,False\n", "-3.0,100,12.5,True\n"
+    for left in range(len(last)):
+        write_monitor(tmp_path / "0.monitor.csv", 1.0, whole + last[:left], "r,l,t,is_success")
+        for block in (2**20, 7):
+            monkeypatch.setattr(run_logs, "_BLOCK", block)
+            assert read_monitors(tmp_path)[["r", "l", "t", "is_success"]].to_numpy().tolist() == [[-1.5, 200, 1.0, 0]]
     write_monitor(tmp_path / "0.monitor.csv", 1.0, "")
     assert len(read_monitors(tmp_path)) == 0
     (tmp_path / "0.monitor.csv").unlink()

@@ -14,7 +14,7 @@ import functools
 import io
 import operator
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -35,6 +35,8 @@ _NOT_STATE = (
 )  # fmt: skip
 #: Attributes of Monitor that report on all episodes so far. Nothing depends on them, nor on its clock.
 EPISODES = ("episode_returns", "episode_lengths", "episode_times")
+#: Attribute of Monitor that holds the rewards of the episode under way, of which it reports the sum and the number.
+REWARDS = "rewards"
 #: Suffixes of the names of those integer arrays of MuJoCo's model that are masks, switches and classes.
 _SWITCHES = (
     "contype", "conaffinity", "condim", "_priority", "_group", "limited", "_active0", "_active", "_castshadow",
@@ -75,7 +77,7 @@ def save_state(env: gym.Env) -> EnvState:
         data = copy.copy(simulator[1])
         model = model_numbers(simulator[0])
     # Copied together, so that a generator that two of them share is shared in the copy.
-    attributes = copy.deepcopy([state_attributes(layer) for layer in layers])
+    attributes = _copies(layers, [state_attributes(layer) for layer in layers])
     base: Any = env.unwrapped
     return EnvState(attributes, data, model, base.clone_state(include_rng=True) if is_atari(env) else None)
 
@@ -114,7 +116,7 @@ def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None
     if state.console is not None:
         base: Any = env.unwrapped
         base.restore_state(state.console)
-    for layer, attributes in zip(layers, copy.deepcopy(state.layers), strict=True):
+    for layer, attributes in zip(layers, _copies(layers, state.layers), strict=True):
         for name, value in attributes.items():
             if rng is not None and isinstance(value, _GENERATORS):
                 value = type(value)(_bit_generator(value, int(rng.integers(2**63))))
@@ -304,8 +306,25 @@ def state_attributes(layer: Any) -> dict[str, Any]:
     :return: its attributes that consist of data only, by name, not copied; without Monitor's lists of all episodes,
         which grow with the training
     """
-    left_out = (*EPISODES, "t_start") if isinstance(layer, Monitor) else ()
-    return {name: value for name, value in vars(layer).items() if name not in left_out and _is_state(value, set())}
+    known: dict[str, bool] = {}
+    if isinstance(layer, Monitor):
+        # Its rewards of this episode are numbers: looking at each would take the longer, the older the episode is.
+        known = {**dict.fromkeys((*EPISODES, "t_start"), False), REWARDS: True}
+    return {
+        name: value
+        for name, value in vars(layer).items()
+        if (known[name] if name in known else _is_state(value, set()))
+    }
+
+
+def _copies(layers: Sequence[Any], attributes: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Deep copies of the layers' attributes; Monitor's rewards of this episode, which are numbers, as a whole."""
+    rewards = [
+        each[REWARDS]
+        for layer, each in zip(layers, attributes, strict=True)
+        if isinstance(layer, Monitor) and REWARDS in each
+    ]
+    return copy.deepcopy(attributes, {id(each): list(each) for each in rewards})
 
 
 def _is_state(value: Any, seen: set[int]) -> bool:

@@ -175,20 +175,28 @@ def _check_simulation(agent: Any) -> None:
             "use_sde=True draws one noise for all actions at a state, so that simulated actions would be equal: "
             f"leave it out, or pass {agent.plain}"
         )
-    space = agent.action_space
-    if isinstance(space, spaces.Discrete):
-        if space.start != 0:
-            raise ValueError(f"the action space must start at 0, not be {space}")
-    elif not isinstance(space, spaces.Box):
-        raise ValueError(
-            f"the action space must be a Box or Discrete, whose actions can be drawn or enumerated, not {space}: "
-            f"pass {agent.plain} for plain PPO"
-        )
+    check_action_space(agent.action_space, agent.plain)
     cls = agent.rollout_buffer_class
     if cls is not None and cls.get not in (RolloutBuffer.get, DictRolloutBuffer.get):
         raise ValueError(
             f"rollout_buffer_class={cls.__name__} draws its minibatches itself, but here they hold simulated "
             f"samples too: leave it out, or pass {agent.plain}"
+        )
+
+
+def check_action_space(space: spaces.Space, plain: str | None) -> None:
+    """
+    :param space: the action space
+    :param plain: the argument that gives plain PPO, for the error message; None where there is no such argument
+    :raises ValueError: no actions can be simulated in it
+    """
+    if isinstance(space, spaces.Discrete):
+        if space.start != 0:
+            raise ValueError(f"the action space must start at 0, not be {space}")
+    elif not isinstance(space, spaces.Box):
+        advice = "" if plain is None else f": pass {plain} for plain PPO"
+        raise ValueError(
+            f"the action space must be a Box or Discrete, whose actions can be drawn or enumerated, not {space}{advice}"
         )
 
 

@@ -10,7 +10,8 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import CategoricalDistribution, Distribution
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_sample.constructor import argument
 from sb3_sample.kinds import Kind, integer
@@ -121,13 +122,27 @@ class ModelBasedPPO(SimulatedPPO):
     def _check_arguments(self) -> None:
         super()._check_arguments()
         check_network_kwargs("dynamics_kwargs", self.dynamics_kwargs, DYNAMICS_DEFAULTS)
-        normalizer = self._vec_normalize_env
+        self._check_normalizer(self._vec_normalize_env)
+
+    def _check_normalizer(self, normalizer: VecNormalize | None) -> None:
         if self.n_simulated > 0 and normalizer is not None and normalizer.observation_space != self.observation_space:
             raise ValueError(
                 "VecNormalize must be around the wrappers that change observations, so that the model can normalise "
                 f"what it learns from: its observations are {normalizer.observation_space}, the policy's "
                 f"{self.observation_space}. Allowed: VecNormalize(VecFrameStack(env, n))"
             )
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        Set another environment, as in Stable-Baselines3.
+
+        :param env: the environment, with the same spaces and number of environments as the model was made with
+        :param force_reset: whether it is reset before training continues
+        :raises ValueError: if its spaces or its number of environments differ, or a wrapper around its ``VecNormalize``
+            changes observations
+        """
+        self._check_normalizer(unwrap_vec_normalize(env) if isinstance(env, VecEnv) else None)
+        super().set_env(env, force_reset)
 
     def _setup_models(self) -> None:
         if self.predict_termination is None:

@@ -256,6 +256,8 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
 
         :raises TrainingDiverged: if a loss or a parameter is NaN or infinite
         """
+        # Entries of callbacks that are not dumped yet are no losses.
+        before = dict(self.logger.name_to_value)
         try:
             self._train()
         except TrainingDiverged:
@@ -264,16 +266,19 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
             # Possibly from torch's distributions at a mean that is not finite: name the cause.
             self._check_parameters()
             raise
-        self._check_losses()
+        self._check_losses(before)
         self._check_parameters()
 
-    def _check_losses(self) -> None:
-        """Check the losses that this iteration has logged."""
+    def _check_losses(self, before: dict[str, Any]) -> None:
+        """Check the losses that this iteration has logged; ``before`` is what the logger held before it."""
         logged = {
             name: value
             for name, value in self.logger.name_to_value.items()
             # The explained variance is NaN if all returns are equal.
-            if name.startswith(("train/", "dynamics/")) and name != "train/explained_variance"
+            if name.startswith(("train/", "dynamics/"))
+            and name != "train/explained_variance"
+            # Whatever is recorded again is another object.
+            and not (name in before and value is before[name])
         }
         bad = not_finite(logged)
         if bad:

@@ -17,11 +17,11 @@ class FlatObservations:
 
     :param space: a Box of floats, or a Dict of such Boxes
     :param images: whether Boxes of integers, such as images, are also allowed
-    :param plain: the argument that gives plain PPO, for the error message
+    :param plain: the argument that gives plain PPO, for the error message; None where there is no such argument
     :raises ValueError: for any other space
     """
 
-    def __init__(self, space: spaces.Space, images: bool = False, plain: str = "n_simulated=0"):
+    def __init__(self, space: spaces.Space, images: bool = False, plain: str | None = "n_simulated=0"):
         self.keys = list(space.spaces) if isinstance(space, spaces.Dict) else None
         parts = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
         self.shapes: list[tuple[int, ...]] = []
@@ -30,9 +30,9 @@ class FlatObservations:
             if not is_box or (not images and (not np.issubdtype(part.dtype, np.floating) or is_image_space(part))):
                 kind = "Box" if images else "Box of floats"
                 why = "" if images else ", whose next values can be predicted"
+                advice = "" if plain is None else f": pass {plain} for plain PPO"
                 raise ValueError(
-                    f"the observation space must be a {kind} or a Dict of such Boxes{why}, not {space}: pass {plain} "
-                    "for plain PPO"
+                    f"the observation space must be a {kind} or a Dict of such Boxes{why}, not {space}{advice}"
                 )
             assert isinstance(part, spaces.Box)
             self.shapes.append(part.shape)

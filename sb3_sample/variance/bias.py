@@ -15,8 +15,10 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
+from sb3_sample.ppo.arguments import check_action_space
 from sb3_sample.ppo.samples import Rollout, SimulatedSamples, log_prob_of_many
 from sb3_sample.ppo.simulated_ppo import SimulatedPPO
+from sb3_sample.ppo.spaces import FlatObservations
 from sb3_sample.variance.estimate import Interval, check_counts, jackknife, seeded
 from sb3_sample.variance.returns import Agent
 
@@ -217,9 +219,11 @@ def compare_gradients(
     :param on_estimate: called after each estimate, with the number of estimates so far
     :return: the gradients by method: "PPO", the oracle, "MBMA", "QMA", "MBPO"
     :raises TypeError: ``model`` is of another family
-    :raises ValueError: an argument is out of range, or the model is of a kind that :class:`Agent` rejects
+    :raises ValueError: an argument is out of range, the model is of a kind that :class:`Agent` rejects, or its spaces
+        are none that :func:`check_spaces` allows
     """
     Agent(model)
+    check_spaces(model)
     check_counts({"n_estimates": (n_estimates, 4), "n_steps": (n_steps, 2), "n_fits": (n_fits, 1), "seed": (seed, 0)})
     check_counts({"n_simulated": (n_simulated, 1), "simulation_horizon": (simulation_horizon, 2)})
     rng = np.random.default_rng(seed)
@@ -245,7 +249,7 @@ def compare_gradients(
             for rival in (mbma, mbpo, qma):
                 rival.policy = model.policy
             _, callback = mbma._setup_learn(n_steps * (n_fits + n_estimates), None)
-            qma._setup_learn(1, None)
+            qma.set_logger(mbma.logger)
 
             def rollout() -> Rollout:
                 mbma.collect_rollouts(env, callback, mbma.rollout_buffer, n_steps)
@@ -292,6 +296,15 @@ def jackknife_squares(samples: np.ndarray) -> tuple[float, np.ndarray]:
     pairs = total @ total - norms.sum()
     left_out = pairs - 2 * (with_total - norms)
     return pairs / (m * (m - 1)), left_out / ((m - 1) * (m - 2))
+
+
+def check_spaces(model: OnPolicyAlgorithm) -> None:
+    """
+    :param model: model whose gradients are to be compared
+    :raises ValueError: a dynamics model or a Q-network cannot be learned of its observations or actions
+    """
+    FlatObservations(model.observation_space, plain=None)
+    check_action_space(model.action_space, plain=None)
 
 
 def _environment(model: OnPolicyAlgorithm, make_env: Callable[[], gym.Env]) -> VecEnv:

@@ -24,7 +24,7 @@ from sb3_sample.saving import load_vec_normalize
 from sb3_sample.saving.classes import path_of
 from sb3_sample.saving.container import PickledFile
 from sb3_sample.saving.model import SafeFiles, class_of
-from sb3_sample.variance.bias import GradientSamples, compare_gradients
+from sb3_sample.variance.bias import GradientSamples, check_spaces, compare_gradients
 from sb3_sample.variance.decomposition import Components, at_equal_cost, relative_cost
 from sb3_sample.variance.estimate import Estimate, Interval, check_arguments, check_counts, estimate_components
 from sb3_sample.variance.returns import Agent
@@ -352,6 +352,8 @@ def _run(args: argparse.Namespace) -> None:
     check_restorable(make(), make())
     model = _model(args, make, train_steps)
     Agent(model)
+    if args.bias:
+        check_spaces(model)
 
     question = Question(trajectory, args.now, args.action_cost)
     estimate = estimate_components(

@@ -236,7 +236,8 @@ class _RolloutSampler:
         at_once = max(1, len(self.copies) // (self.n_actions * self.n_returns))
         for step in range(n_steps):
             actions = agent.sample(np.stack([observation] * self.n_actions))
-            all_observations.append(observation)
+            # A copy, since an environment may change its observation in place.
+            all_observations.append(np.array(observation))
             all_actions.append(actions)
             states.append(save_state(self.env))
             pending.append(actions)

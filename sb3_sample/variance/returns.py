@@ -78,10 +78,13 @@ class Agent:
     def to_env(self, actions: np.ndarray) -> np.ndarray:
         """
         :param actions: from :meth:`sample`, (B, ...)
-        :return: actions for the environment, as in ``OnPolicyAlgorithm.collect_rollouts``: clipped to the space
+        :return: actions for the environment, as in ``OnPolicyAlgorithm.collect_rollouts``: in the shape of the space
+            and clipped to it
         """
         space = self.model.action_space
-        return np.clip(actions, space.low, space.high) if isinstance(space, spaces.Box) else actions
+        if not isinstance(space, spaces.Box):
+            return actions
+        return np.clip(actions.reshape(-1, *space.shape), space.low, space.high)
 
     def _tensor(self, observations: np.ndarray) -> Any:
         return self.policy.obs_to_tensor(self.normalize_observations(observations))[0]

@@ -259,6 +259,32 @@ def test_methods_stay_those_of_the_environment(kind: str) -> None:
         assert node.parent is each.root and each.count.__self__ is node
 
 
+def test_a_state_late_in_an_episode_is_as_quick_as_an_early_one() -> None:
+    """Monitor's rewards of the episode are copied as a whole, not looked at one by one."""
+
+    class Reward(float):
+        def __deepcopy__(self, memo: Any) -> float:
+            raise AssertionError("copied by itself")
+
+        @property
+        def __dict__(self) -> Any:  # type: ignore[override]
+            raise AssertionError("looked at")
+
+    env = Monitor(make_env("CartPole-v1"))
+    env.reset(seed=0)
+    env.rewards = [Reward(1.0)] * 20_000
+    state = save_state(env)
+    env.step(0)
+    assert len(state.layers[0]["rewards"]) == 20_000
+    for _ in range(2):
+        restore_state(env, state)
+        terminated, n = False, 0
+        while not terminated:
+            _, _, terminated, _, info = env.step(0)
+            n += 1
+        assert info["episode"]["r"] == info["episode"]["l"] == 20_000 + n
+
+
 def test_monitors_past_episodes_are_no_part_of_a_state() -> None:
     env = Monitor(make_env("CartPole-v1"))
     env.reset(seed=0)

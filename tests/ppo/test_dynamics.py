@@ -386,6 +386,27 @@ def test_a_standard_deviation_of_zero_is_a_divergence() -> None:
         model.train()
 
 
+@pytest.mark.parametrize("n_simulated", [0, 2])
+def test_a_callbacks_own_entries_are_no_losses(n_simulated: int) -> None:
+    """With a log_interval above 1 they are still in the logger when the iteration is checked."""
+
+    class Records(BaseCallback):
+        def _on_rollout_end(self) -> None:
+            self.logger.record("train/return", float("nan"))
+            self.logger.record("train/comment", "text")
+
+        def _on_step(self) -> bool:
+            return True
+
+    kwargs = {"dynamics_kwargs": None, "simulation_horizon": 12, "dynamics_buffer_size": 25_000, "warm_up_until": None}
+    model = quiet(tiny(n_simulated=n_simulated, **({} if n_simulated else kwargs)))
+    model.learn(64, Records(), log_interval=10)
+    assert np.isnan(model.logger.name_to_value["train/return"])
+    model._train = lambda: model.logger.record("train/loss", float("nan"))
+    with pytest.raises(TrainingDiverged, match="train/loss"):
+        model.learn(16, Records(), log_interval=10)
+
+
 def test_a_callback_that_stops_the_training() -> None:
     class Stop(BaseCallback):
         def _on_step(self) -> bool:

@@ -212,7 +212,10 @@ def test_observations_that_change_after_they_are_normalised(cls: Any) -> None:
     with pytest.raises(ValueError, match="VecNormalize must be around the wrappers that change observations"):
         tiny(cls, VecFrameStack(VecNormalize(vec(2)), 3))
     cls("MlpPolicy", VecFrameStack(VecNormalize(vec(2)), 3), n_simulated=0, device="cpu")
-    assert tiny(cls, VecNormalize(VecFrameStack(vec(2), 3))).learn(16).transitions.size == 32
+    model = tiny(cls, VecNormalize(VecFrameStack(vec(2), 3)))
+    with pytest.raises(ValueError, match="VecNormalize must be around the wrappers that change observations"):
+        model.set_env(VecFrameStack(VecNormalize(vec(2)), 3))
+    assert model.learn(16).transitions.size == 32
 
 
 def test_simulating_with_nothing_to_simulate_with() -> None:

@@ -198,6 +198,21 @@ def test_comparing_with_normalized_observations() -> None:
     np.testing.assert_array_equal(venv.obs_rms.mean, mean)
 
 
+def test_every_transition_that_the_models_learn_from_has_happened(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept: list[Any] = []
+
+    def keep(model: MBMAPPO) -> None:
+        kept.append(model.transitions.recent(24))
+
+    monkeypatch.setattr(MBMAPPO, "fit_models", keep)
+    compare_gradients(agent(), make, n_estimates=4, n_steps=24, n_fits=1, n_simulated=2, **SMALL)
+    observations, actions, next_observations, rewards, _ = kept[0]
+    assert len(observations) == 24
+    x, u = observations[:, 0], 10 * actions[:, 0]  # kept in the models' scale
+    np.testing.assert_allclose(next_observations[:, 0], 0.9 * x + 0.3 * u, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(rewards, -(x**2) - 0.1 * u**2, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_bias_and_variance_are_ordered_as_in_the_papers_table_3(seed: int) -> None:

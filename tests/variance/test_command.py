@@ -196,6 +196,17 @@ def test_a_space_that_no_policy_takes_is_one_line() -> None:
         run(env="Blackjack-v1")
 
 
+def test_spaces_that_no_model_is_learned_of_are_refused_before_the_rollouts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = ["-o", str(tmp_path / "variance.png")]
+    with pytest.raises(SystemExit, match=r"the observation space must be a Box of floats .*, not Discrete\(16\)$"):
+        run("--bias", "4", *picture, env="FrozenLake-v1")
+    assert not capsys.readouterr().out
+    run(*picture, env="FrozenLake-v1")
+    assert (tmp_path / "variance.png").exists()
+
+
 def test_environments_that_do_not_fit() -> None:
     with pytest.raises(SystemExit, match="sb3-sample variance: env_id 'Nowhere-v0' is not a registered environment"):
         run(env="Nowhere-v0")

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -104,6 +105,51 @@ def test_noise_of_the_returns_adds_no_variance() -> None:
     quantity = QUANTITIES["policy variance"]
     assert biased.interval(quantity).low > 1.5 * truth.policy_variance
     assert unbiased.interval(quantity, 0.99).low <= truth.policy_variance <= unbiased.interval(quantity, 0.99).high
+
+
+class Shaped(gym.Env):
+    """
+    Moves to where its action, of any shape, points.
+
+    :param shape: shape of an action
+    :param in_place: whether the observation is the environment's own array, which the next step changes
+    """
+
+    def __init__(self, shape: tuple[int, ...] = (2,), in_place: bool = False):
+        self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+        self.action_space = spaces.Box(-1, 1, shape, np.float32)
+        self.in_place, self.x = in_place, np.zeros(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.x[:] = self.np_random.normal(size=2)
+        return self._observation(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        assert action.shape == self.action_space.shape
+        assert self.action_space.contains(action)
+        self.x *= 0.9
+        self.x += [action.flat[0], action.flat[-1]]
+        return self._observation(), -float(self.x @ self.x), False, False, {}
+
+    def _observation(self) -> np.ndarray:
+        return self.x if self.in_place else self.x.copy()
+
+
+def components_of(make: Callable[[], gym.Env]) -> Components:
+    model = PPO("MlpPolicy", make(), seed=0, device="cpu", policy_kwargs={"net_arch": [4]}, gamma=0.9)
+    return estimate_components(model, make, n_steps=5, n_rollouts=4, horizon=3, burn_in=2).components
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (1, 3), (2, 1), (3,)])
+def test_actions_have_the_shape_of_their_space(shape: tuple[int, ...]) -> None:
+    assert np.isfinite(components_of(functools.partial(Shaped, shape)).policy_variance)
+
+
+def test_observations_that_are_changed_in_place() -> None:
+    copied, in_place = (components_of(functools.partial(Shaped, in_place=each)) for each in (False, True))
+    for name, values in vars(copied).items():
+        np.testing.assert_array_equal(getattr(in_place, name), values, err_msg=name)
 
 
 def test_lags_beyond_max_lag_are_zero() -> None:
