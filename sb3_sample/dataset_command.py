@@ -20,6 +20,7 @@ import sb3_sample
 from sb3_sample.envs.registration import is_atari_id, register_atari
 from sb3_sample.exits import refuse
 from sb3_sample.replay.dataset import Dataset
+from sb3_sample.replay.dataset_files import minari_target
 from sb3_sample.replay.reading import HDF5, read_dataset
 from sb3_sample.replay.recording import record
 from sb3_sample.saving.classes import path_of
@@ -95,6 +96,9 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _run(args: argparse.Namespace) -> None:
+    if args.command != "info":
+        # Before what may take hours.
+        minari_target(args.output)
     data = _recorded(args) if args.command == "record" else _read(args)
     if args.command != "info":
         folder = data.to_minari(args.output)

@@ -6,7 +6,7 @@ program that made them.
     make evidence-pages
     python studies/evidence_pages.py [PLAN ...] [--grid bro_grid.npz]
 
-The published runs of BRO Fast with critics of 0.55M parameters, which are shown beside ours, are read from
+The published runs of BRO Fast of size 0.55M, which are shown beside ours, are read from
 ``bro_grid.npz`` (see ``published_grid.py``): ``--grid``, else in the folder that ``SB3_SAMPLE_REFERENCE`` names, or in
 ``../shared/reference``. Without this file the pages of ``bro_fast`` and ``bro_fast_seeds`` stay unchanged, and the
 program says so.

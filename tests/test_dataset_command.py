@@ -8,7 +8,7 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_sample import Dataset
+from sb3_sample import Dataset, dataset_command
 from sb3_sample.cli import main
 from sb3_sample.saving import save_vec_normalize
 from tests.sac.common import MAKERS, sac
@@ -31,6 +31,22 @@ def test_record_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert facts["mean_return"] == pytest.approx(float(rows["rewards"].astype(float).sum()) / 2)
     main(["dataset", "info", str(tmp_path / "set")])
     assert "mean length            200.0" in capsys.readouterr().out
+
+
+def test_a_place_that_is_taken_is_refused_before_the_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def record(*args: object, **kwargs: object) -> None:
+        raise AssertionError("recorded")
+
+    monkeypatch.setattr(dataset_command, "record", record)
+    monkeypatch.setattr(dataset_command, "read_dataset", record)
+    sac("Pendulum-v1").save(tmp_path / "model")
+    (tmp_path / "set" / "data").mkdir(parents=True)
+    for source in (["record", str(tmp_path / "model.zip")], ["convert", str(tmp_path / "d4rl.hdf5")]):
+        with pytest.raises(SystemExit):
+            main(["dataset", *source, str(tmp_path / "set"), "--env", "Pendulum-v1"])
+        assert "must be new" in capsys.readouterr().err
 
 
 def test_models_of_all_algorithms_are_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -63,6 +79,7 @@ def test_the_environment_of_the_training_can_be_made(
     with pytest.raises(SystemExit):
         main([*arguments, "--env-kwargs", "g=0"])
     assert "'g=0' is no name with a value of Python's" in capsys.readouterr().err
+    arguments[3] = str(tmp_path / "other")
     with pytest.raises(SystemExit):
         main([*arguments, "--env-kwargs", "nope:1"])
     assert "MyPendulum-v0 cannot be made with --env-kwargs {'nope': 1}: PendulumEnv" in capsys.readouterr().err

@@ -15,6 +15,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from sb3_sample.envs.registration import ATARI, is_atari_id, make_env
 from sb3_sample.kinds import TRUE_OR_FALSE, check_value, integer
+from sb3_sample.warn import warn
 
 #: Arguments of ``gym.make`` for the game inside :class:`AtariFrames`: every frame, the gray screen.
 ENV_KWARGS: dict[str, Any] = {
@@ -148,4 +149,10 @@ def _check_game(env: gym.Env) -> None:
         raise ValueError(
             f"env must be made with obs_type='grayscale', for the console's own gray screen; its observations are "
             f"{space}: gym.make(..., **{ENV_KWARGS})"
+        )
+    sticky = game.ale.getFloat("repeat_action_probability")
+    if sticky != 0:
+        warn(
+            f"the game repeats its last action with probability {sticky:g} in every frame (repeat_action_probability): "
+            f"for the published games, without sticky actions, make it with gym.make(..., **{ENV_KWARGS})"
         )

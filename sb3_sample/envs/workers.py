@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, Ve
 from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker as serve
 
+from sb3_sample.envs.monitors import appending, go_on
 from sb3_sample.warn import warn
 
 #: Seconds within which a worker that has closed its connection must end.
@@ -287,15 +288,23 @@ def _close(venv: SubprocVecEnv) -> None:
         remote.finish()
 
 
-def _supervised(remote: Connection, parent_remote: Connection, env_fn: CloudpickleWrapper, parent: int | None) -> None:
-    """Run Stable-Baselines3's worker; report when its environment is made and, if an exception ends it, why."""
+def _supervised(
+    remote: Connection, parent_remote: Connection, env_fn: CloudpickleWrapper, parent: int | None, is_replacement: bool
+) -> None:
+    """
+    Run Stable-Baselines3's worker; report when its environment is made and, if an exception ends it, why. The Monitors
+    of a worker that replaces another go on in the files of that one's.
+    """
     # A terminal's Ctrl-C goes to every process, but only the training is to end its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Workers that are not forked have a parent that ends with the training's process.
     _end_with(os.getppid() if parent is None else parent)
 
     def make() -> gym.Env:
-        env = env_fn.var()
+        with appending() if is_replacement else contextlib.nullcontext():
+            env = env_fn.var()
+        if is_replacement:
+            go_on(env)
         remote.send(_Made())
         return env
 
@@ -316,7 +325,7 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
     environment is made anew, with its own seed that follows from the one given to ``seed``, and its episode ends as if
     by a time limit: reward 0, ``TimeLimit.truncated``, the last observation that it gave as ``terminal_observation``,
     and ``info["worker_died"]`` with the reason, which is also given as a warning. ``Monitor`` does not count the
-    episode. Values set by ``set_attr`` or ``env_method`` in the old environment are lost.
+    episode, and its file goes on. Values set by ``set_attr`` or ``env_method`` in the old environment are lost.
 
     :param env_fns: functions that make the environments, each in its own process
     :param start_method: how processes are started, as in ``SubprocVecEnv``
@@ -372,10 +381,10 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
             _close(self)
             raise
 
-    def _start(self, index: int) -> tuple[Any, WatchedConnection]:
+    def _start(self, index: int, is_replacement: bool = False) -> tuple[Any, WatchedConnection]:
         ours, theirs = self._context.Pipe()
         parent = os.getpid() if self._context.get_start_method() == "fork" else None
-        arguments = (theirs, ours, CloudpickleWrapper(self._env_fns[index]), parent)
+        arguments = (theirs, ours, CloudpickleWrapper(self._env_fns[index]), parent, is_replacement)
         # A daemon ends with this process when that exits; after SIGKILL :func:`_end_with` ends it.
         process = self._context.Process(target=_supervised, args=arguments, daemon=True)  # type: ignore[attr-defined]
         process.start()
@@ -447,7 +456,7 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
             self.n_restarts += 1
             warn(f"{error} It is restarted, as {self.n_restarts} of at most {self.max_restarts}.")
             self.remotes[index].finish()
-            self.processes[index], self.remotes[index] = self._start(index)
+            self.processes[index], self.remotes[index] = self._start(index, is_replacement=True)
             seed = None
             if self._base_seed is not None:
                 seed = int(np.random.SeedSequence([self._base_seed, index, self.n_restarts]).generate_state(1)[0])

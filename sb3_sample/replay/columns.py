@@ -76,9 +76,11 @@ class Column:
 
         :param buffer: the buffer, to which the function keeps no reference
         :return: function from a step to its values in the form in which they are stored, (n_envs, ...). It raises a
-            ValueError if they have another shape, are a single value, or not finite
+            ValueError if they have another shape, are a single value, not finite, no flags where the column has flags,
+            or no whole numbers that its type of integers holds
         """
         name, read, shape, dtype = self.name, self.read, (buffer.n_envs, *self.shape), np.dtype(self.dtype)
+        is_flag = self.is_flag
         assert read is not None
 
         where = f"the column {name!r} of {type(buffer).__name__}"
@@ -94,6 +96,10 @@ class Column:
             row = as_row(name, values, shape, dtype)
             if row.dtype.kind == "f" and not np.isfinite(row).all():
                 raise ValueError(f"the column {name!r} must be finite, not {row[~np.isfinite(row)][0]}")
+            if is_flag and not np.isin(values, (0, 1)).all():
+                raise ValueError(f"the column {name!r} must be 0 or 1, not {values[~np.isin(values, (0, 1))][0]}")
+            if row.dtype.kind in "iu" and row.dtype != values.dtype and (row != values.reshape(row.shape)).any():
+                raise ValueError(f"the column {name!r} must be whole numbers within {row.dtype}, not {values.tolist()}")
             return row
 
         return write
@@ -276,6 +282,38 @@ def own_columns_of(buffer: Any, take: Callable[[Column, Any], Any]) -> dict[str,
     return {c.name: take(c, getattr(buffer, c.name)) for c in _more(buffer) if c.in_batch}
 
 
+def observations_at(
+    buffer: ReplayBuffer, positions: np.ndarray, env_indices: np.ndarray, column: Column = OBSERVATIONS
+) -> Any:
+    """
+    Gather observations of a replay buffer at given places.
+
+    :param buffer: Stable-Baselines3's replay buffer or a subclass
+    :param positions: places in the buffer, (N,)
+    :param env_indices: which environment's transition, (N,)
+    :param column: ``OBSERVATIONS`` or ``NEXT_OBSERVATIONS``
+    :return: as they are stored, (N, O), or a dict of such arrays
+    """
+    is_next = column is NEXT_OBSERVATIONS
+    if is_next and buffer.optimize_memory_usage:
+        is_next, positions = False, (positions + 1) % buffer.buffer_size
+    array: Any = buffer.next_observations if is_next else buffer.observations
+    return for_each(lambda part: part[positions, env_indices], array)
+
+
+def rows_at(array: Any, positions: np.ndarray, env_indices: np.ndarray) -> Any:
+    """
+    Gather values of a column other than the observations.
+
+    :param array: the column's, (buffer_size, n_envs, ...)
+    :param positions: places in the buffer, (N,)
+    :param env_indices: which environment's transition, (N,)
+    :return: (N, ...), or (N, 1) if it is one number
+    """
+    rows = array[positions, env_indices]
+    return rows.reshape(-1, 1) if rows.ndim == 1 else rows
+
+
 def samples_at(
     buffer: ReplayBuffer, positions: np.ndarray, env_indices: np.ndarray, vec_normalize: VecNormalize | None = None
 ) -> Any:
@@ -291,17 +329,12 @@ def samples_at(
     """
 
     def take(column: Column, array: Any, but: Any = None) -> Any:
-        at = positions
-        if column is NEXT_OBSERVATIONS and buffer.optimize_memory_usage:
-            array, at = buffer.observations, (positions + 1) % buffer.buffer_size
         if isinstance(column, _Observations):
-            given = for_each(lambda part: part[at, env_indices], array)
+            given = observations_at(buffer, positions, env_indices, column)
             return for_each(buffer.to_torch, buffer._normalize_obs(given, vec_normalize))
-        rows = array[at, env_indices]
+        rows = rows_at(array, positions, env_indices)
         if but is not None:
-            rows = rows * (1 - but[at, env_indices])
-        if rows.ndim == 1:
-            rows = rows.reshape(-1, 1)
+            rows = rows * (1 - rows_at(but, positions, env_indices))
         return buffer.to_torch(buffer._normalize_reward(rows, vec_normalize) if column is REWARDS else rows)
 
     return samples_of(buffer, take)

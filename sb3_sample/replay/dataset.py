@@ -1,5 +1,6 @@
 """Fixed data sets of transitions as a source of batches."""
 
+import functools
 import os
 from collections.abc import Callable, Iterator, Mapping
 from hashlib import sha256
@@ -11,7 +12,14 @@ import torch
 from gymnasium import spaces
 
 from sb3_sample.learner.batch import Batch, for_each
-from sb3_sample.replay.columns import samples_at
+from sb3_sample.replay.columns import (
+    NEXT_OBSERVATIONS,
+    OBSERVATIONS,
+    Column,
+    observations_at,
+    own_columns_of,
+    rows_at,
+)
 from sb3_sample.replay.dataset_files import opened_hdf5, read_minari, write_minari
 from sb3_sample.replay.memory_map import check_folder, n_bytes, zeros
 from sb3_sample.replay.steps import (
@@ -21,11 +29,15 @@ from sb3_sample.replay.steps import (
     check_action_space,
     check_actions,
     observation_dtypes,
+    pieces,
     put,
 )
 from sb3_sample.warn import warn
 
 Arrays = np.ndarray | dict[str, np.ndarray]
+#: Parts of a step that every data set has: all but the observations, and all.
+_PLAIN = ("actions", "rewards", "terminations", "truncations")
+_OWN_NAMES = ("observations", *_PLAIN, "next_observations")
 
 
 class Dataset:
@@ -85,7 +97,8 @@ class Dataset:
 
         Observations and actions are held in the types of their spaces, floats of observations as float32.
 
-        :param observations: (N, O), or a dict of such arrays; NumPy's, ``numpy.memmap`` included, or h5py's data sets
+        :param observations: (N, O), or (N,) of a Discrete ``observation_space``, or a dict of such arrays; NumPy's,
+            ``numpy.memmap`` included, or h5py's data sets
         :param actions: (N, A), in the environment's units, within the bounds of ``action_space``
         :param rewards: (N,)
         :param terminations: whether the episode terminated with the step, (N,)
@@ -94,14 +107,16 @@ class Dataset:
         :param observation_space: of the observations; None: unbounded, of their shape
         :param action_space: of the actions; None: [-1, 1]
         :param seed: of the generator that the batches are drawn from
-        :param columns: further columns of the batches by name, such as the number of a task: numbers, (N,) or (N, ...)
+        :param columns: further columns of the batches by name, such as the number of a task: numbers, (N,) or (N, ...).
+            No name may be one of the other arrays'
         :param memory_map: folder whose disk holds the observations and actions, if they are larger than the memory; the
             files are unnamed and vanish with the data set. None: memory
         :return: the data set
         :raises ValueError: if the arrays differ in length, do not match the spaces or are not finite, or a space of
             integers cannot hold their numbers
         """
-        observations, actions = _arrays("observations", observations, 2), _arrays("actions", actions, 1)
+        observations = _arrays("observations", observations, 2, observation_space)
+        actions = _arrays("actions", actions, 1)
         if len(actions.shape) < 2:
             raise ValueError(f"actions must be of shape (N, A), not {actions.shape}")
         rewards = _column("rewards", rewards)
@@ -109,7 +124,10 @@ class Dataset:
         flags["truncations"] = _column("truncations", truncations)
         given = {}
         if next_observations is not None:
-            given["next_observations"] = _arrays("next_observations", next_observations, 2)
+            given["next_observations"] = _arrays("next_observations", next_observations, 2, observation_space)
+        taken = sorted({*_OWN_NAMES} & {*(columns or {})})
+        if taken:
+            raise ValueError(f"columns must have names of their own, not {', '.join(taken)}, which every data set has")
         more = {name: _arrays(f"columns[{name!r}]", values, 1) for name, values in (columns or {}).items()}
         n = len(rewards)
         if n == 0:
@@ -174,8 +192,7 @@ class Dataset:
             if plain is None:
                 steps = steps._replace(truncations=truncated)
             else:
-                names = ("actions", "rewards", "terminations", "truncations")
-                steps = steps._replace(**dict(zip(names, plain, strict=True)))
+                steps = steps._replace(**dict(zip(_PLAIN, plain, strict=True)))
         return cls(steps, observation_space, action_space, seed, n_left_out)
 
     @classmethod
@@ -246,25 +263,28 @@ class Dataset:
             raise ValueError("buffer must have at least one transition, not 0")
         positions = np.tile((first + np.arange(size)) % buffer.buffer_size, buffer.n_envs)
         env_indices = np.repeat(np.arange(buffer.n_envs), size)
-        samples = samples_at(buffer, positions, env_indices)
-        timeouts = buffer.timeouts[positions, env_indices]
-        columns = {name: _numpy(values) for name, values in getattr(samples, "columns", {}).items()}
-        truncations = _numpy(timeouts).astype(bool)
-        truncations[size - 1 :: size] |= _numpy(samples.dones)[size - 1 :: size, 0] == 0  # of each environment
+
+        def taken(array: Any) -> np.ndarray:
+            return _numpy(rows_at(array, positions, env_indices))
+
+        truncations = taken(buffer.timeouts)[:, 0].astype(bool)
+        # A time limit does not end the bootstrap.
+        terminations = taken(buffer.dones)[:, 0].astype(bool) & ~truncations
+        truncations[size - 1 :: size] |= ~terminations[size - 1 :: size]  # of each environment
         space = buffer.action_space
         low, high = space.low.astype(np.float64).ravel(), space.high.astype(np.float64).ravel()
-        actions = low + 0.5 * (_numpy(samples.actions).astype(np.float64) + 1) * (high - low)
+        actions = low + 0.5 * (taken(buffer.actions).astype(np.float64) + 1) * (high - low)
         return cls.from_arrays(
-            for_each(_numpy, samples.observations),
+            _places(buffer, positions, env_indices, OBSERVATIONS),
             np.clip(actions, low, high).astype(np.float32).reshape(-1, *space.shape),
-            _numpy(samples.rewards),
-            _numpy(samples.dones),
+            taken(buffer.rewards),
+            terminations,
             truncations,
-            next_observations=for_each(_numpy, samples.next_observations),
+            next_observations=_places(buffer, positions, env_indices, NEXT_OBSERVATIONS),
             observation_space=buffer.observation_space,
             action_space=space,
             seed=seed,
-            columns=columns,
+            columns=own_columns_of(buffer, lambda column, array: taken(array)),
             memory_map=memory_map,
         )
 
@@ -324,8 +344,8 @@ class Dataset:
         ends = np.flatnonzero(terminated | _numpy(steps.truncations))
         goes_on = np.zeros(len(self), bool)
         cut_off = ends[~terminated[ends] & (ends < len(self) - 1)]
-        for first in range(0, len(cut_off), CHUNK):
-            rows = cut_off[first : first + CHUNK]
+        for piece in pieces(len(cut_off), steps.observations, steps.observations):
+            rows = cut_off[piece]
             following, then = _take(steps.observations, steps.at[rows + 1]), self._next_observations(rows)
             # Where they are equal, the end of the episode is the data set's own.
             goes_on[rows] = _rows_agree(then, following, np.isclose) & ~_rows_agree(then, following, np.equal)
@@ -337,12 +357,15 @@ class Dataset:
         if not self._fingerprint:
             digest = sha256()
             for first in range(0, len(self), CHUNK):
-                rows = slice(first, min(first + CHUNK, len(self)))
-                for name, values in self.rows(rows).items():
-                    inside = sorted(values.items()) if isinstance(values, dict) else [("", values)]
-                    for key, part in inside:
-                        digest.update(f"{name}/{key} {part.dtype} {part.shape} ".encode())
-                        digest.update(np.ascontiguousarray(part).data)
+                last = min(first + CHUNK, len(self))
+                for name, read in self._readers().items():
+                    one = read(slice(first, first + 1))
+                    for key in sorted(one) if isinstance(one, dict) else [""]:
+                        part = _numpy(one[key] if key else one)
+                        digest.update(f"{name}/{key} {part.dtype} {(last - first, *part.shape[1:])} ".encode())
+                        for piece in pieces(last - first, part):
+                            found = read(slice(first + piece.start, first + piece.stop))
+                            digest.update(np.ascontiguousarray(_numpy(found[key] if key else found)).data)
             self._fingerprint = digest.hexdigest()
         return self._fingerprint
 
@@ -354,14 +377,18 @@ class Dataset:
         :return: ``observations``, ``actions``, ``rewards``, ``terminations``, ``truncations``, ``next_observations``
             and the further columns by name, arrays
         """
+        return {name: for_each(_numpy, read(rows)) for name, read in self._readers().items()}
+
+    def _readers(self) -> dict[str, Callable[[Any], Any]]:
+        """Functions from rows to a part of the transitions there, by the names of :meth:`rows`."""
         steps = self._steps
-        found = {
-            "observations": _take(steps.observations, steps.at[rows]),
-            **self.plain(rows),
-            "next_observations": self._next_observations(rows),
-            **_take(steps.columns, rows),
+        columns = {name: values.__getitem__ for name, values in steps.columns.items()}
+        return {
+            "observations": lambda rows: _take(steps.observations, steps.at[rows]),
+            **{name: getattr(steps, name).__getitem__ for name in _PLAIN},
+            "next_observations": self._next_observations,
+            **columns,
         }
-        return {name: for_each(_numpy, values) for name, values in found.items()}
 
     def plain(self, rows: slice | np.ndarray) -> dict[str, np.ndarray]:
         """
@@ -370,8 +397,7 @@ class Dataset:
         :param rows: which of them
         :return: ``actions``, ``rewards``, ``terminations``, ``truncations``
         """
-        names = ("actions", "rewards", "terminations", "truncations")
-        return {name: _numpy(getattr(self._steps, name)[rows]) for name in names}
+        return {name: _numpy(getattr(self._steps, name)[rows]) for name in _PLAIN}
 
     def episodes(self) -> Iterator[slice]:
         """
@@ -433,6 +459,37 @@ class Dataset:
         return _take(steps.observations, steps.next_at[rows])
 
 
+class _Places:
+    """
+    Observations at places of a replay buffer, gathered as they are read: as a whole they would take several times the
+    buffer's memory.
+
+    :param gather: returns those at some of the places, (n, O)
+    :param n: number of places, at least one
+    """
+
+    def __init__(self, gather: Callable[[slice], np.ndarray], n: int):
+        first = gather(slice(0, 1))
+        self._gather, self.shape, self.dtype = gather, (n, *first.shape[1:]), first.dtype
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        return self._gather(rows)
+
+
+def _places(buffer: Any, positions: np.ndarray, env_indices: np.ndarray, column: Column) -> Any:
+    def gather(rows: slice, key: str | None) -> np.ndarray:
+        found = observations_at(buffer, positions[rows], env_indices[rows], column)
+        return _numpy(found if key is None else found[key])
+
+    n, space = len(positions), buffer.observation_space
+    if isinstance(space, spaces.Dict):
+        return {key: _Places(functools.partial(gather, key=key), n) for key in space.spaces}
+    return _Places(functools.partial(gather, key=None), n)
+
+
 def _map(function: Callable[[Any], Any], steps: Steps) -> Steps:
     changed: dict[str, Any] = {
         name: None if value is None else for_each(function, value) for name, value in steps._asdict().items()
@@ -458,13 +515,17 @@ def _parts(arrays: Any) -> list[Any]:
     return list(arrays.values()) if isinstance(arrays, dict) else [arrays]
 
 
-def _arrays(name: str, values: Any, least_axes: int) -> Any:
+def _arrays(name: str, values: Any, least_axes: int, space: spaces.Space | None = None) -> Any:
     """Arrays, or objects that are read like arrays in pieces; nothing is copied."""
     if isinstance(values, Mapping):
-        return {key: _arrays(f"{name}[{key!r}]", value, least_axes) for key, value in values.items()}
+        inside = space.spaces if isinstance(space, spaces.Dict) else {}
+        return {key: _arrays(f"{name}[{key!r}]", value, least_axes, inside.get(key)) for key, value in values.items()}
     array = values if hasattr(values, "shape") and hasattr(values, "dtype") else np.asarray(values)
     if isinstance(array, torch.Tensor):
         array = _numpy(array)
+    if isinstance(space, spaces.Discrete) and len(array.shape) == 1:
+        # The number of a Discrete space is a row of one.
+        array = np.asarray(array)[:, None]
     if array.dtype.kind not in "fiub" or len(array.shape) < least_axes:
         raise ValueError(f"{name} must be numbers of shape (N, ...), not {array.dtype} of shape {array.shape}")
     return array
@@ -495,9 +556,8 @@ def _breaks(steps: Steps) -> np.ndarray:
     """Steps whose next observation is not the observation of the following step, (N,)."""
     n = len(steps.actions)
     breaks = np.ones(n, bool)
-    for first in range(0, n - 1, CHUNK):
-        last = min(first + CHUNK, n - 1)
-        rows, following = slice(first, last), slice(first + 1, last + 1)
+    for rows in pieces(n - 1, steps.observations, steps.next_observations):
+        following = slice(rows.start + 1, rows.stop + 1)
         then, now = _take(steps.next_observations, rows), _take(steps.observations, following)
         breaks[rows] = ~_rows_agree(then, now, np.equal)
     return breaks

@@ -3,6 +3,8 @@
 import contextlib
 import os
 import re
+import secrets
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -138,8 +140,11 @@ def read_minari(id_or_path: Any, memory_map: Any) -> tuple[Steps, spaces.Space, 
                 raise ValueError(f"{where}: {name} must be of shape {(length, *array.shape[1:])}, not {values.shape}")
             sets.put(name if name == "actions" else f"{where}: {name}", values, array[rows])
         ended, cut = (np.asarray(getattr(episode, name)) for name in ("terminations", "truncations"))
-        if ended.shape != (length,) or cut.shape != (length,) or (ended | cut)[:-1].any():
-            raise ValueError(f"{where}: terminations and truncations must be one a step, and none before the last step")
+        is_one_a_step = ended.shape == cut.shape == (length,) and np.isin((ended, cut), (0, 1)).all()
+        if not is_one_a_step or (ended[:-1] != 0).any() or (cut[:-1] != 0).any():
+            raise ValueError(
+                f"{where}: terminations and truncations must be one a step, 0 or 1, and none before the last step"
+            )
         steps.terminations[rows], steps.truncations[rows] = ended, cut
         # An episode that has no end in the data was cut off.
         steps.truncations[first + length - 1] |= not ended[-1]
@@ -172,21 +177,16 @@ def _found(id_or_path: Any, minari: Any) -> Path:
     raise ValueError(f"id_or_path={os.fspath(id_or_path)!r} must be a data set of Minari's: there is none in {places}")
 
 
-def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> Path:
+def minari_target(id_or_path: Any) -> tuple[str, Path]:
     """
-    Write a data set in Minari's format.
+    Find where a data set is to be written in Minari's format; nothing is made.
 
-    :param data: the data set
     :param id_or_path: new folder, or an id
-    :param metadata: further entries that Minari keeps
-    :return: the folder
+    :return: the id, and the new folder of the data, inside that of the data set
     :raises ValueError: if the target exists already, or an id is also the path of a folder here
+    :raises ImportError: if Minari is not installed
     """
     minari = _minari()
-    if data.column_names:
-        warn(f"Minari's format has no place for columns={data.column_names}: they are not among what is written")
-    storage_class = minari.dataset.minari_storage.MinariStorage
-    buffer_class = minari.data_collector.episode_buffer.EpisodeBuffer
     if _is_id(id_or_path):
         name, folder = str(id_or_path), Path(minari.storage.get_dataset_path(id_or_path)) / "data"
         as_path = Path(id_or_path)
@@ -204,29 +204,53 @@ def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> Path:
         name = name if _is_id(name) else f"{name}-v0"
     if folder.exists():
         raise ValueError(f"id_or_path={os.fspath(id_or_path)!r} must be new, but {folder} is there")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    storage = storage_class.new(
-        folder, observation_space=data.observation_space, action_space=data.action_space, jpeg_encoding=False
-    )
+    return name, folder
+
+
+def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> Path:
+    """
+    Write a data set in Minari's format.
+
+    :param data: the data set
+    :param id_or_path: new folder, or an id
+    :param metadata: further entries that Minari keeps
+    :return: the folder
+    :raises ValueError: if the target exists already, or an id is also the path of a folder here
+    """
+    name, target = minari_target(id_or_path)
+    minari = _minari()
+    if data.column_names:
+        warn(f"Minari's format has no place for columns={data.column_names}: they are not among what is written")
     for key in {"author", "author_email"} & metadata.keys():
         metadata[key] = {metadata[key]} if isinstance(metadata[key], str) else set(metadata[key])
-    storage.update_metadata({**metadata, "dataset_id": name, "minari_version": minari.__version__})
+    target.parent.mkdir(parents=True, exist_ok=True)
+    # Under another name until it is whole.
+    folder = target.with_name(f".{target.name}-{secrets.token_hex(8)}")
+    try:
+        storage = minari.dataset.minari_storage.MinariStorage.new(
+            folder, observation_space=data.observation_space, action_space=data.action_space, jpeg_encoding=False
+        )
+        storage.update_metadata({**metadata, "dataset_id": name, "minari_version": minari.__version__})
+        storage.update_episodes(_episodes(data, minari.data_collector.episode_buffer.EpisodeBuffer))
+        folder.rename(target)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return target.parent
 
-    def buffers() -> Iterator[Any]:
-        for rows in data.episodes():
-            found = data.rows(rows)
-            now, following = found["observations"], found["next_observations"]
-            if isinstance(now, dict):
-                observations: Any = {key: np.concatenate((now[key], following[key][-1:])) for key in now}
-            else:
-                observations = np.concatenate((now, following[-1:]))
-            yield buffer_class(
-                observations=observations,
-                actions=found["actions"],
-                rewards=found["rewards"],
-                terminations=found["terminations"],
-                truncations=found["truncations"],
-            )
 
-    storage.update_episodes(buffers())
-    return folder.parent
+def _episodes(data: Any, buffer_class: Any) -> Iterator[Any]:
+    for rows in data.episodes():
+        found = data.rows(rows)
+        now, following = found["observations"], found["next_observations"]
+        if isinstance(now, dict):
+            observations: Any = {key: np.concatenate((now[key], following[key][-1:])) for key in now}
+        else:
+            observations = np.concatenate((now, following[-1:]))
+        yield buffer_class(
+            observations=observations,
+            actions=found["actions"],
+            rewards=found["rewards"],
+            terminations=found["terminations"],
+            truncations=found["truncations"],
+        )

@@ -44,8 +44,8 @@ def check_folder(folder: Any, needed: int) -> str:
         ) from error
     if needed > free:
         raise ValueError(
-            f"memory_map={os.fspath(folder)!r} has {free / 1e9:.2f} GB free, and the replay buffer takes "
-            f"{needed / 1e9:.2f} GB: name a folder on another disk, or pass a smaller buffer_size"
+            f"memory_map={os.fspath(folder)!r} has {free / 1e9:.2f} GB free, and {needed / 1e9:.2f} GB are needed: "
+            "name a folder on another disk, or keep less (a replay buffer's buffer_size)"
         )
     return str(path)
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
@@ -11,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 from sb3_sample.kinds import check_value, integer
 from sb3_sample.learner.batch import for_each
 from sb3_sample.replay.dataset import Dataset
+from sb3_sample.replay.steps import check_action_space
 from sb3_sample.saving.normalization import lacks_vec_normalize
 from sb3_sample.warn import warn
 
@@ -28,8 +30,9 @@ def record(
     :param deterministic: whether the policy's mean action is taken instead of a sample
     :param seed: of the environment; None: as it is
     :return: the data set
-    :raises ValueError: if ``episodes`` is not a number above 0, if the model's spaces are not the environment's, or if
-        the model learned from observations that a ``VecNormalize`` normalised and ``env`` is in none
+    :raises ValueError: if ``episodes`` is not a number above 0, if the model's spaces are not the environment's, if the
+        actions are not of a bounded Box, or if the model learned from observations that a ``VecNormalize`` normalised
+        and ``env`` is in none
     """
     check_value("episodes", episodes, integer(1))
     made: Any = make_vec_env(env) if isinstance(env, str) else env
@@ -38,6 +41,10 @@ def record(
         theirs, of_model = getattr(venv, name), getattr(model, name, None)
         if of_model is not None and of_model != theirs:
             raise ValueError(f"env: its {name} is {theirs}, and the model's is {of_model}")
+    actions_of = venv.action_space
+    if not isinstance(actions_of, spaces.Box):
+        raise ValueError(f"env: its actions must be of a Box, as those of a data set are, not of {actions_of}")
+    check_action_space(actions_of.shape, actions_of)
     normalize = unwrap_vec_normalize(venv)
     if normalize is None and isinstance(model, BaseAlgorithm):
         _check_not_normalized(model)
@@ -80,7 +87,7 @@ def record(
     return Dataset.from_arrays(
         **arrays,
         observation_space=venv.observation_space,
-        action_space=venv.action_space,  # type: ignore[arg-type]
+        action_space=actions_of,
     )
 
 

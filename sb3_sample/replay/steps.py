@@ -1,12 +1,16 @@
 """Steps of a data set, and the checks that they pass."""
 
+import math
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from gymnasium import spaces
 
-#: Rows that are checked or copied at a time, so that data larger than the memory are never in it as a whole.
-CHUNK = 65_536
+#: Most rows, and most bytes, that are checked or copied at a time, so that data larger than the memory are never in it
+#: as a whole.
+CHUNK, CHUNK_BYTES = 65_536, 64 * 2**20
 
 
 class Steps(NamedTuple):
@@ -49,6 +53,25 @@ def action_dtype(space: spaces.Box) -> Any:
     return dtype if dtype.kind == "f" else np.dtype(np.float32)
 
 
+def pieces(n: int, *arrays: Any) -> Iterator[slice]:
+    """
+    Divide rows into pieces that fit in memory.
+
+    :param n: number of rows
+    :param arrays: what is read of them: arrays with the rows as their first axis, or dicts of such arrays
+    :return: the rows of each piece, in order
+    """
+    parts = [part for each in arrays for part in (each.values() if isinstance(each, dict) else (each,))]
+    of_a_row = sum(math.prod(part.shape[1:]) * _item_size(part) for part in parts)
+    size = max(1, min(CHUNK, CHUNK_BYTES // max(of_a_row, 1)))
+    for first in range(0, n, size):
+        yield slice(first, min(first + size, n))
+
+
+def _item_size(part: Any) -> int:
+    return part.element_size() if isinstance(part, torch.Tensor) else np.dtype(part.dtype).itemsize
+
+
 def put(name: str, values: Any, out: np.ndarray) -> None:
     """
     Convert values to the type in which they are stored.
@@ -59,8 +82,8 @@ def put(name: str, values: Any, out: np.ndarray) -> None:
     :raises ValueError: if they are not finite in the type of ``out`` (for actions :func:`check_actions` raises it), or
         if that is a type of integers that cannot hold them
     """
-    for first in range(0, len(out), CHUNK):
-        given = np.asarray(values[first : first + CHUNK])
+    for rows in pieces(len(out), values, out):
+        given = np.asarray(values[rows])
         with np.errstate(over="ignore", invalid="ignore"):
             piece = given.astype(out.dtype)
         if name != "actions" and piece.dtype.kind == "f" and not np.isfinite(piece).all():
@@ -68,7 +91,7 @@ def put(name: str, values: Any, out: np.ndarray) -> None:
         if piece.dtype != given.dtype and piece.dtype.kind in "iu" and (piece != given).any():
             wrong = given[piece != given][0]
             raise ValueError(f"{name} must be whole numbers within {out.dtype}, as their space has them, not {wrong}")
-        out[first : first + CHUNK] = piece
+        out[rows] = piece
 
 
 def check_action_space(shape: tuple[int, ...], action_space: Any) -> None:

@@ -6,6 +6,7 @@ The learner does the update (``sb3_sample/learner/learner.py``).
 
 import collections
 import contextlib
+import copy
 import pathlib
 import time
 import warnings
@@ -554,18 +555,29 @@ class SAC(  # type: ignore[misc]  # actor
         checks.check_offline(self)
         self._tell_of(dataset)
         data = DatasetSource(self, dataset)
+        # Before anything is put in a place: it may take minutes, and be interrupted.
+        self._take_statistics(data)
         self._learns_from, self._source = dataset, data
-        norm = self.learner.observation_norm
-        if norm is not None and norm.count < 1:
-            # A model that has acted keeps its statistics.
-            for observations in data.observations():
-                norm.update(observations)
         if env is None:
             self.env = NoEnvironment(self.observation_space, self.action_space)
         try:
             yield
         finally:
             self._learns_from, self._source, self.env = None, source, env
+
+    def _take_statistics(self, data: DatasetSource) -> None:
+        """Normalise observations by all of the data; a model that has acted keeps its statistics."""
+        norm = self.learner.observation_norm
+        if norm is None or norm.count >= 1:
+            return
+        before = copy.deepcopy(norm.state_dict())
+        try:
+            for observations in data.observations():
+                norm.update(observations)
+        except BaseException:
+            # Statistics of a part would be taken for those of all.
+            norm.load_state_dict(before)
+            raise
 
     def _set_up_training(
         self, total_timesteps: int, callback: MaybeCallback, reset_num_timesteps: bool, name: str, progress_bar: bool

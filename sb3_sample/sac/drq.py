@@ -90,6 +90,8 @@ class DrQ(_FromPixels):
     """transitions per gradient step"""
     ent_coef: str | float = argument(default="auto_0.1", kw_only=False)
     """temperature: "auto" learns it from 1, "auto_0.1" from that start, a number fixes it"""
+    target_entropy: str | float = argument(default="auto", kw_only=False)
+    """entropy that the learned temperature aims at; "auto" is -|A|"""
     target_update_interval: int | None = argument(default=2, kw_only=False)
     """gradient steps between two updates of the targets; None: ``policy_delay``"""
     replay_ratio: float | None = argument(default=1)

@@ -358,7 +358,16 @@ class SRSPR(  # type: ignore[misc]
     def _after_turns(self) -> None:
         """Warn if no gradient step was taken because there were too few steps."""
         wanted = self.gradient_steps if self.replay_ratio is None else self.replay_ratio
-        if self._n_updates == 0 and wanted != 0 and 0 < self.num_transitions <= self.learning_starts:
+        if self._n_updates > 0 or wanted == 0 or self.num_transitions == 0:
+            return
+        assert isinstance(self.replay_buffer, SPRReplayBuffer)
+        if self.num_transitions > self.learning_starts and self.replay_buffer.n_drawable == 0:
+            warn(
+                "learn ended without a single gradient step: no episode had more than "
+                f"{max(self.n_steps, self.n_predictions)} decisions before a time limit, which the windows of n_steps "
+                "and n_predictions need"
+            )
+        if self.num_transitions <= self.learning_starts:
             warn(
                 f"learn ended without a single gradient step: learning_starts={self.learning_starts} decisions come "
                 f"before the first, and this model has taken {self.num_transitions}. Train for more, or pass a smaller "

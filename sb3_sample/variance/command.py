@@ -272,7 +272,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("--env", required=True, help="id of the environment: dmc/, Gymnasium's MuJoCo, classic control")
+    suites = "dmc/, metaworld/, myosuite/, Gymnasium's MuJoCo, classic control"
+    parser.add_argument("--env", required=True, help=f"id of the environment: {suites}")
     parser.add_argument("--env-kwargs", nargs="+", default=[], metavar="NAME=VALUE", help="such as action_repeat=4")
     parser.add_argument("--model", type=Path, help="saved model; without one a model is trained")
     parser.add_argument(

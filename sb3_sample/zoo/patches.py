@@ -9,8 +9,6 @@ import contextlib
 import functools
 import importlib
 import inspect
-import json
-import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -26,8 +24,9 @@ from rl_zoo3.utils import create_test_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from sb3_sample.envs.monitors import go_on
 from sb3_sample.errors import ParametersDoNotFit
-from sb3_sample.run_logs import monitor_head, read_evaluations, read_monitors
+from sb3_sample.run_logs import read_evaluations, read_monitors
 from sb3_sample.saving.model import SafeFiles
 from sb3_sample.saving.normalization import load_vec_normalize, save_vec_normalize
 from sb3_sample.saving.replay import SafeReplayBuffers
@@ -258,16 +257,7 @@ def monitors_go_on(module: ModuleType) -> AbstractContextManager[None]:
 
     def make_vec_env(*args: Any, monitor_kwargs: dict[str, Any], wrapper_class: Any, **kwargs: Any) -> Any:
         def wrap(env: Monitor) -> gym.Env:
-            if env.results_writer is not None:
-                writer, path = env.results_writer, env.results_writer.file_handler.name
-                if os.path.getsize(path):
-                    # Times count from the beginning recorded in the file's head.
-                    env.t_start = monitor_head(path)["t_start"]
-                else:  # one of several files was removed
-                    head = {"t_start": env.t_start, "env_id": str(env.spec and env.spec.id)}
-                    writer.file_handler.write(f"#{json.dumps(head)}\n")
-                    writer.logger.writeheader()
-                    writer.file_handler.flush()
+            go_on(env)
             return env if wrapper_class is None else wrapper_class(env)
 
         return make(*args, monitor_kwargs={**monitor_kwargs, "override_existing": False}, wrapper_class=wrap, **kwargs)

@@ -1,5 +1,6 @@
 """Workers that die: killed, by an exception, at every request, and put back in place."""
 
+import functools
 import multiprocessing
 import os
 import pickle
@@ -11,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import psutil
 import pytest
@@ -300,6 +302,32 @@ def test_a_worker_is_replaced_within_a_step(
     observations, rewards, dones, _ = venv.step(ACTIONS)
     np.testing.assert_array_equal(observations[:, 0], [0, 1, 0])
     np.testing.assert_array_equal(dones, [True, False, True])
+
+
+def test_the_file_of_its_monitor_goes_on(make: Any, tmp_path: Path) -> None:
+    wrap = functools.partial(gym.wrappers.TransformReward, func=float)  # a Monitor need not be the outermost wrapper
+
+    def env_fns(**kwargs: Any) -> list[Callable[[], Any]]:
+        return [
+            lambda i=i: wrap(Monitor(Fragile(**(kwargs if i == 1 else {})), str(tmp_path / str(i)))) for i in range(3)
+        ]
+
+    venv = make(SupervisedSubprocVecEnv, env_fns(step=8, marker=tmp_path / "broke"), restart_envs=True)
+    run(venv, 7)
+    path = tmp_path / "1.monitor.csv"
+    before = path.read_text()
+    assert len(before.splitlines()) == 3
+    with pytest.warns(UserWarning, match="environment 1 died"):
+        venv.step(ACTIONS)
+    for _ in range(10):
+        venv.step(ACTIONS)
+    after = path.read_text()
+    assert after.startswith(before) and len(after.splitlines()) == 5
+    seconds = [float(line.split(",")[2]) for line in after.splitlines()[2:]]
+    assert seconds == sorted(seconds)
+    # A new object begins new files, as Stable-Baselines3's do.
+    make(SupervisedSubprocVecEnv, env_fns())
+    assert len(path.read_text().splitlines()) == 2
 
 
 def test_its_seed_is_another_and_always_the_same(make: Any, tmp_path: Path) -> None:

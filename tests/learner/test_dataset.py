@@ -8,6 +8,7 @@ import torch
 from gymnasium import spaces
 
 from sb3_sample import Dataset
+from sb3_sample.replay import steps
 
 #: Two episodes: one of three steps that terminates, one of three that is cut off; then two steps of a third.
 OBSERVATIONS = np.arange(8, dtype=np.float64)[:, None] * 10
@@ -135,6 +136,8 @@ def test_dict_and_image_observations() -> None:
         ),
         ({"observation_space": spaces.Box(0, 9, (1,), np.uint8), "observations": ACTIONS}, "not -1.0"),
         ({"observation_space": spaces.Discrete(9), "observations": np.full((8, 1), np.nan)}, "whole numbers"),
+        ({"columns": {"task": REWARDS, "rewards": REWARDS}}, "columns must have names of their own, not rewards,"),
+        ({"columns": {"next_observations": REWARDS}}, "names of their own, not next_observations,"),
         ({"next_observations": np.zeros((7, 1))}, "next_observations must have as many steps"),
         ({"next_observations": np.zeros((8, 2))}, "are none of observation_space"),
         ({"truncations": np.ones(8), "terminations": np.zeros(8)}, "next_observations must be given"),
@@ -144,6 +147,43 @@ def test_dict_and_image_observations() -> None:
 def test_what_is_refused(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         Dataset.from_arrays(**arrays(**changes))
+
+
+def test_numbers_of_a_discrete_space() -> None:
+    space = spaces.Dict({"task": spaces.Discrete(8), "x": spaces.Box(0, 70, (1,), np.float64)})
+    alone, inside = np.arange(8), {"task": np.arange(8), "x": OBSERVATIONS}
+    for given, of in ((alone, space["task"]), (inside, space)):
+        rows = Dataset.from_arrays(**arrays(observations=given, observation_space=of)).rows(slice(None))
+        seen = rows["observations"]["task"] if of is space else rows["observations"]
+        assert seen.tolist() == [[0], [1], [2], [3], [4], [6]]
+
+
+def test_wide_rows_are_read_in_small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At most so many bytes at a time, and with the same fingerprint."""
+    rng = np.random.default_rng(0)
+    pictures, ends = rng.integers(0, 255, (301, 3, 20, 20)).astype(np.uint8), np.arange(300) % 50 == 49
+    given = (rng.uniform(-1, 1, (300, 2)), np.zeros(300), ends, ~ends & False)
+    whole = Dataset.from_arrays(pictures[:-1], *given, next_observations=pictures[1:])
+    largest = []
+
+    class Read:
+        """Pictures that are read from a file."""
+
+        def __init__(self, array: np.ndarray):
+            self.array, self.shape, self.dtype = array, array.shape, array.dtype
+
+        def __len__(self) -> int:
+            return len(self.array)
+
+        def __getitem__(self, rows: slice) -> np.ndarray:
+            largest.append(self.array[rows].nbytes)
+            return self.array[rows]
+
+    monkeypatch.setattr(steps, "CHUNK_BYTES", 10_000)
+    monkeypatch.setattr(np, "equal", lambda a, b, equal=np.equal: (largest.append(a.nbytes), equal(a, b))[1])
+    pieced = Dataset.from_arrays(Read(pictures[:-1]), *given, next_observations=Read(pictures[1:]))
+    assert pieced.fingerprint == whole.fingerprint and pieced.n_episodes == whole.n_episodes
+    assert len(largest) > 150 and max(largest) <= 10_000
 
 
 @pytest.mark.parametrize("size", [0, -3])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from stable_baselines3 import HerReplayBuffer
+from stable_baselines3 import PPO, HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -126,6 +126,45 @@ def test_a_lying_episode_of_minari_is_refused(tmp_path: Path) -> None:
         file[f"episode_{longest}"]["terminations"][0] = True
     with pytest.raises(ValueError, match=f"episode {longest} of .*none before the last step"):
         Dataset.from_minari(tmp_path / "set")
+
+
+def test_flags_of_minari_that_are_numbers(tmp_path: Path) -> None:
+    pytest.importorskip("minari", reason="needs the extra [offline]")
+    h5py = pytest.importorskip("h5py")
+    made().to_minari(tmp_path / "set")
+    with h5py.File(tmp_path / "set" / "data" / "main_data.hdf5", "a") as file:
+        for episode in file.values():
+            for name in ("terminations", "truncations"):
+                flags = episode[name][:].astype(np.float64)
+                del episode[name]
+                episode[name] = flags
+    assert_same(made(), Dataset.from_minari(tmp_path / "set"))
+    with h5py.File(tmp_path / "set" / "data" / "main_data.hdf5", "a") as file:
+        file["episode_0"]["terminations"][-1] = 0.5
+    with pytest.raises(ValueError, match="episode 0 of .*must be one a step, 0 or 1"):
+        Dataset.from_minari(tmp_path / "set")
+
+
+def test_nothing_is_left_of_a_set_that_was_not_written_to_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("minari", reason="needs the extra [offline]")
+    data, read, n_read = made(), Dataset.rows, 0
+
+    def interrupted(self: Dataset, rows: Any) -> Any:
+        nonlocal n_read
+        n_read += 1
+        if n_read == 3:
+            raise KeyboardInterrupt
+        return read(self, rows)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Dataset, "rows", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            data.to_minari(tmp_path / "set")
+    assert not list((tmp_path / "set").iterdir())
+    data.to_minari(tmp_path / "set")
+    assert_same(data, Dataset.from_minari(tmp_path / "set"))
 
 
 def test_a_minari_folder_never_makes_an_environment(tmp_path: Path) -> None:
@@ -294,6 +333,14 @@ class Numbered(gym.Env):
     def step(self, action: Any) -> tuple[int, float, bool, bool, dict]:
         self.at += 1
         return self.at, 1.0, self.at == 3, False, {}
+
+
+def test_record_refuses_other_actions_before_the_first_step() -> None:
+    model = PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8, device="cpu")
+    env = DummyVecEnv([lambda: gym.make("CartPole-v1")])
+    env.step = env.reset = None  # type: ignore[assignment, method-assign]  # called by nobody
+    with pytest.raises(ValueError, match=r"env: its actions must be of a Box, .*, not of Discrete\(2\)"):
+        record(model, env, 1)
 
 
 def test_record_numbers_as_observations() -> None:

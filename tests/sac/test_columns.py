@@ -237,8 +237,9 @@ def test_names_that_are_taken(column: Column, words: str) -> None:
 
 
 def test_values_that_are_none() -> None:
-    def with_values(read: Any) -> Any:
-        return make(type("Local", (CompactReplayBuffer,), {"more_columns": (Column("x", read),)}), vec()).learn
+    def with_values(read: Any, **kwargs: Any) -> Any:
+        columns = (Column("x", read, **kwargs),)
+        return make(type("Local", (CompactReplayBuffer,), {"more_columns": columns}), vec()).learn
 
     with pytest.raises(ValueError, match="read of the column 'x' of Local must give a list, one value .* not 1"):
         with_values(lambda step: 1.0)(5)
@@ -247,6 +248,14 @@ def test_values_that_are_none() -> None:
     assert raised.value.__notes__ == ["in read of the column 'x' of Local"]
     with pytest.raises(ValueError, match="the column 'x' must be finite, not nan"):
         with_values(lambda step: [np.nan])(5)
+    for dtype in (np.float32, bool, np.uint8):
+        with pytest.raises(ValueError, match="the column 'x' must be 0 or 1, not 2"):
+            with_values(lambda step: [2], dtype=dtype, is_flag=True)(5)
+        with_values(lambda step: [True], dtype=dtype, is_flag=True)(5)
+    for value in (300, 1.5, -1):
+        with pytest.raises(ValueError, match=rf"the column 'x' must be whole numbers within uint8, not \[{value}\]"):
+            with_values(lambda step, value=value: [value], dtype=np.uint8)(5)
+    with_values(lambda step: [255.0], dtype=np.uint8)(5)
     with pytest.raises(ValueError, match=r"could not broadcast the x of shape \(2,\) into shape \(1,\)"):
         with_values(lambda step: [1.0, 2.0])(5)
 

@@ -129,7 +129,7 @@ def test_folders_that_will_not_do(tmp_path: Path) -> None:
             pair(BOX, 10, 1, memory_map=bad)
     with pytest.raises(ValueError, match=r"memory_map must be a folder, or None for the memory, not 3"):
         pair(BOX, 10, 1, memory_map=3)
-    with pytest.raises(ValueError, match=r"GB free, and the replay buffer takes 36000000.*smaller buffer_size"):
+    with pytest.raises(ValueError, match=r"GB free, and 36000000.* GB are needed: .*buffer_size"):
         CompactReplayBuffer(10**15, BOX, ACTIONS, memory_map=tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 

@@ -209,6 +209,9 @@ def test_td3_bc_moves_its_actor_every_second_step_towards_value_and_data() -> No
         (BC, {"ent_coef": 0.1}, "ent_coef=0.1 means nothing with BC"),
         (BC, {"target_entropy": -7}, "target_entropy=-7 means nothing with BC"),
         (BC, {"n_quantiles": 5}, "n_quantiles=5 means nothing with BC"),
+        (BC, {"pessimism": 0.7}, "pessimism=0.7 means nothing with BC"),
+        (BC, {"actor_pessimism": 0.3}, "actor_pessimism=0.3 means nothing with BC"),
+        (BC, {"redo_period": 2}, "redo_period=2 means nothing with BC"),
         (BC, {"exploration": "oac"}, "exploration='oac'"),
         (BC, {"policy_kwargs": {"n_critics": 2}}, r"describe critics \(n_critics\), which BC has not"),
         (BC, {"deterministic": "no"}, "deterministic must be True or False, not 'no'"),
@@ -525,6 +528,27 @@ def test_observations_are_normalised_by_the_data_and_then_by_what_is_acted_on_to
     assert norm.count == pytest.approx(200 + 1e-4)
     model.learn(8)
     assert 205 < norm.count < 209
+
+
+def test_statistics_that_were_interrupted_leave_the_model_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    transitions, model = data(), offline(IQL, vec(), normalize_observations=True)
+    norm = model.policy.observation_norm
+    before, update = copy.deepcopy(norm.state_dict()), type(norm).update
+
+    def interrupted(self: Any, values: torch.Tensor) -> None:
+        update(self, values)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(norm), "update", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            model.learn_offline(transitions, 2)
+    assert not differing(before, norm.state_dict())
+    # It acts again, and learns from the data when asked once more.
+    model.learn(12)
+    assert model.num_transitions == 12 and model.replay_buffer.size() == 12
+    fresh = offline(IQL, vec(), normalize_observations=True).learn_offline(transitions, 2)
+    assert fresh.policy.observation_norm.count == pytest.approx(200 + 1e-4)
 
 
 def test_a_schedule_of_the_learning_rate_counts_the_steps_offline() -> None:

@@ -255,5 +255,7 @@ def test_games_that_there_are_not() -> None:
         AtariFrames(make_env("ALE/Pong-v5"))
     with pytest.raises(ValueError, match="obs_type='grayscale'"):
         AtariFrames(make_env("ALE/Pong-v5", **{**ENV_KWARGS, "obs_type": "rgb"}))
+    with pytest.warns(UserWarning, match=r"repeats its last action with probability 0\.25 in every frame"):
+        AtariFrames(make_env("ALE/Pong-v5", frameskip=1, obs_type="grayscale"))
     with pytest.raises(ValueError, match="noop_max must be"):
         make_atari_env("ALE/Pong-v5", noop_max=0)
