@@ -97,7 +97,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _run(args: argparse.Namespace) -> None:
     if args.command != "info":
-        # Before what may take hours.
+        # Checked first: recording may take hours.
         minari_target(args.output)
     data = _recorded(args) if args.command == "record" else _read(args)
     if args.command != "info":

@@ -9,14 +9,16 @@ import re
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 from stable_baselines3.common.monitor import LoadMonitorResultsError, Monitor
 
 from sb3_sample.saving.container import check_table
 from sb3_sample.saving.untrusted import BadFile, open_regular, parse_json
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 EVALUATIONS = "evaluations.npz"
 #: Subfolder of a run's folder, with the checkpoints and the log of its steps on a data set, if other steps follow.
@@ -169,7 +171,7 @@ def _head(file: IO[bytes], path: str | Path) -> dict[str, Any]:
     return {"t_start": start, "env_id": None if env_id == "None" else env_id}
 
 
-def read_monitors(folder: str | Path) -> pd.DataFrame:
+def read_monitors(folder: str | Path) -> "pd.DataFrame":
     """
     The episodes of all Monitor files in a folder, as Stable-Baselines3's ``load_results`` gives them. An incomplete
     last line, of a run that was killed, is left out.
@@ -182,6 +184,9 @@ def read_monitors(folder: str | Path) -> pd.DataFrame:
     :raises BadFile: (a ``ValueError``) if one is no such file
     :raises OSError: if one cannot be read
     """
+    # Not above: plots need it, training does not.
+    import pandas as pd
+
     files = monitor_files(folder)
     if not files:
         raise LoadMonitorResultsError(f"no files of the form *{Monitor.EXT} found in {folder}")
@@ -197,7 +202,9 @@ def read_monitors(folder: str | Path) -> pd.DataFrame:
     return episodes
 
 
-def _read_monitor(path: Path) -> tuple[pd.DataFrame, float]:
+def _read_monitor(path: Path) -> "tuple[pd.DataFrame, float]":
+    import pandas as pd
+
     with open_regular(path) as file:
         head = _head(file, path)
         columns = _columns(file, path)
@@ -238,7 +245,9 @@ def _check_size(file: IO[bytes], path: Path) -> None:
     file.seek(start)
 
 
-def _table(data: bytes, path: Path) -> pd.DataFrame:
+def _table(data: bytes, path: Path) -> "pd.DataFrame":
+    import pandas as pd
+
     try:
         frame = pd.read_csv(io.BytesIO(data), index_col=False, usecols=lambda name: name in _COLUMNS, low_memory=False)
         return frame.astype(float)

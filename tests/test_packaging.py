@@ -3,8 +3,11 @@
 import configparser
 import importlib.metadata
 import re
+import subprocess
+import sys
 from pathlib import Path
 
+import packaging.requirements
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -85,3 +88,45 @@ def test_without_labmaze_the_extra_is_all_that_dm_control_asks_for() -> None:
     later = [line for line in setup_cfg()["options.extras_require"]["dmc"].splitlines() if '>= "3.13"' in line]
     installed = setup_cfg()["options"]["install_requires"].splitlines()
     assert {name_of(line) for line in later} == asked - {name_of(line) for line in installed if line}
+
+
+def installed_without_extras() -> set[str]:
+    """Distributions that an installation without extras has."""
+    asked = [*setup_cfg()["options"]["install_requires"].split(), "sb3-sample"]
+    found: set[str] = set()
+    while asked:
+        name = name_of(asked.pop())
+        if name in found:
+            continue
+        try:
+            requirements = importlib.metadata.requires(name) or []
+        except importlib.metadata.PackageNotFoundError:  # of another system
+            continue
+        found.add(name)
+        parsed = [packaging.requirements.Requirement(each) for each in requirements if name != "sb3-sample"]
+        asked += [each.name for each in parsed if each.marker is None or each.marker.evaluate({"extra": ""})]
+    return found
+
+
+def test_an_installation_without_extras_trains(tmp_path: Path) -> None:
+    plain = installed_without_extras()
+    modules = importlib.metadata.packages_distributions()
+    absent = sorted(module for module, owners in modules.items() if not {name_of(owner) for owner in owners} & plain)
+    assert {"pandas", "matplotlib", "rl_zoo3", "dm_control", "tqdm"} & set(modules) <= set(absent)
+    assert not {"torch", "numpy", "stable_baselines3", "gymnasium", "sb3_sample"} & set(absent)
+    program = f"""
+import sys
+
+sys.modules.update(dict.fromkeys({absent!r}))
+from sb3_sample import BRO, MBMAPPO, SAC, SupervisedSubprocVecEnv, make_env
+from sb3_sample.cli import main
+
+env = make_env("Pendulum-v1")
+model = SAC("MlpPolicy", env, learning_starts=5, policy_kwargs=dict(net_arch=[8])).learn(12, checkpoint="run")
+model.save("model")
+assert SAC.load("model", env=env).num_timesteps == 12
+MBMAPPO("MlpPolicy", env, n_steps=16, batch_size=8, dynamics_kwargs=dict(width=8)).learn(32)
+main(["--help"])
+"""
+    result = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr

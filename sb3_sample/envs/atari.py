@@ -95,7 +95,8 @@ class AtariFrames(gym.Wrapper[np.ndarray, int, np.ndarray, int]):
     frames, episodes that end with a life, 84 x 84 pixels, rewards clipped to their sign, four frames stacked.
 
     A lost life does not restart the game: ``reset`` continues from there with one no-op (``EpisodicLifeEnv``). Frames
-    from before an episode's start, or before the life was lost, are zero.
+    from before an episode's start, or before the life was lost, are zero. Sticky actions of the game, which repeat in
+    every frame here, are warned of.
 
     :param env: a game made with :data:`ENV_KWARGS`
     :param size: pixels of a frame's sides

@@ -10,7 +10,7 @@ import gymnasium as gym
 from stable_baselines3.common import monitor
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
 
-from sb3_sample.run_logs import monitor_head
+from sb3_sample.run_logs import MAX_LINE, monitor_head
 
 
 class _Appending(ResultsWriter):
@@ -21,7 +21,8 @@ class _Appending(ResultsWriter):
 @contextlib.contextmanager
 def appending() -> Iterator[None]:
     """
-    Make the Monitors that are made meanwhile append to their files. :func:`go_on` belongs to it.
+    Make Monitors constructed inside this context append to their files. Call :func:`go_on` on each environment
+    afterwards.
     """
     theirs, monitor.ResultsWriter = monitor.ResultsWriter, _Appending  # type: ignore[misc]
     try:
@@ -32,11 +33,12 @@ def appending() -> Iterator[None]:
 
 def go_on(env: gym.Env) -> None:
     """
-    Let Monitors that append to their files go on there: seconds count from the beginning in the file's head. A file
-    that is empty gets its head.
+    Continue the files of Monitors that append: time counts from the start recorded in the head, an incomplete last
+    line, of a process that was killed, is removed, and an empty file gets a head.
 
     :param env: an environment, with Monitors anywhere among its wrappers
-    :raises BadFile: (a ``ValueError``) if a file that is appended to is none of Monitor's
+    :raises BadFile: (a ``ValueError``) if a file is not a Monitor file
+    :raises OSError: if one cannot be read
     """
     while isinstance(env, gym.Wrapper):
         if isinstance(env, Monitor) and env.results_writer is not None:
@@ -45,9 +47,20 @@ def go_on(env: gym.Env) -> None:
 
 
 def _go_on(env: Monitor, writer: ResultsWriter) -> None:
-    if os.path.getsize(writer.file_handler.name):
-        env.t_start = monitor_head(writer.file_handler.name)["t_start"]
+    path = writer.file_handler.name
+    if os.path.getsize(path):
+        env.t_start = monitor_head(path)["t_start"]
+        _remove_incomplete_line(path)
         return
     writer.file_handler.write(f"#{json.dumps({'t_start': env.t_start, 'env_id': str(env.spec and env.spec.id)})}\n")
     writer.logger.writeheader()
     writer.file_handler.flush()
+
+
+def _remove_incomplete_line(path: str) -> None:
+    with open(path, "rb+") as file:
+        start = max(0, file.seek(0, os.SEEK_END) - MAX_LINE)
+        file.seek(start)
+        end = file.read()
+        if not end.endswith(b"\n") and b"\n" in end:
+            file.truncate(start + end.rindex(b"\n") + 1)

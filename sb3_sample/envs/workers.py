@@ -27,6 +27,7 @@ from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker as serve
 
 from sb3_sample.envs.monitors import appending, go_on
+from sb3_sample.saving.untrusted import BadFile
 from sb3_sample.warn import warn
 
 #: Seconds within which a worker that has closed its connection must end.
@@ -292,8 +293,8 @@ def _supervised(
     remote: Connection, parent_remote: Connection, env_fn: CloudpickleWrapper, parent: int | None, is_replacement: bool
 ) -> None:
     """
-    Run Stable-Baselines3's worker; report when its environment is made and, if an exception ends it, why. The Monitors
-    of a worker that replaces another go on in the files of that one's.
+    Run Stable-Baselines3's worker; report when its environment is made and, if an exception ends it, why. A worker that
+    replaces another continues the files of that worker's Monitors.
     """
     # A terminal's Ctrl-C goes to every process, but only the training is to end its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -304,7 +305,11 @@ def _supervised(
         with appending() if is_replacement else contextlib.nullcontext():
             env = env_fn.var()
         if is_replacement:
-            go_on(env)
+            try:
+                go_on(env)
+            except (BadFile, OSError) as error:
+                # Its rows are appended as they are.
+                warn(f"a Monitor's file cannot be continued: {error}")
         remote.send(_Made())
         return env
 

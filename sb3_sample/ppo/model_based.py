@@ -122,10 +122,10 @@ class ModelBasedPPO(SimulatedPPO):
     def _check_arguments(self) -> None:
         super()._check_arguments()
         check_network_kwargs("dynamics_kwargs", self.dynamics_kwargs, DYNAMICS_DEFAULTS)
-        self._check_normalizer(self._vec_normalize_env)
+        self._check_normalizer(self._vec_normalize_env, self.observation_space)
 
-    def _check_normalizer(self, normalizer: VecNormalize | None) -> None:
-        if self.n_simulated > 0 and normalizer is not None and normalizer.observation_space != self.observation_space:
+    def _check_normalizer(self, normalizer: VecNormalize | None, space: spaces.Space) -> None:
+        if self.n_simulated > 0 and normalizer is not None and normalizer.observation_space != space:
             raise ValueError(
                 "VecNormalize must be around the wrappers that change observations, so that the model can normalise "
                 f"what it learns from: its observations are {normalizer.observation_space}, the policy's "
@@ -141,7 +141,7 @@ class ModelBasedPPO(SimulatedPPO):
         :raises ValueError: if its spaces or its number of environments differ, or a wrapper around its ``VecNormalize``
             changes observations
         """
-        self._check_normalizer(unwrap_vec_normalize(env) if isinstance(env, VecEnv) else None)
+        self._check_normalizer(unwrap_vec_normalize(env) if isinstance(env, VecEnv) else None, env.observation_space)
         super().set_env(env, force_reset)
 
     def _setup_models(self) -> None:

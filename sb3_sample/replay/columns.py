@@ -93,12 +93,13 @@ class Column:
                 raise
             if values.ndim == 0:
                 raise ValueError(f"read of {where} must give a list, one value for each environment, not {values}")
-            row = as_row(name, values, shape, dtype)
+            with np.errstate(invalid="ignore"):  # refused below
+                row = as_row(name, values, shape, dtype)
             if row.dtype.kind == "f" and not np.isfinite(row).all():
                 raise ValueError(f"the column {name!r} must be finite, not {row[~np.isfinite(row)][0]}")
-            if is_flag and not np.isin(values, (0, 1)).all():
-                raise ValueError(f"the column {name!r} must be 0 or 1, not {values[~np.isin(values, (0, 1))][0]}")
-            if row.dtype.kind in "iu" and row.dtype != values.dtype and (row != values.reshape(row.shape)).any():
+            if is_flag and (wrong := (values != 0) & (values != 1)).any():
+                raise ValueError(f"the column {name!r} must be 0 or 1, not {values[wrong][0]}")
+            if row.dtype.kind in "iu" and row.dtype != values.dtype and (row != values).any():
                 raise ValueError(f"the column {name!r} must be whole numbers within {row.dtype}, not {values.tolist()}")
             return row
 
@@ -276,14 +277,18 @@ def own_columns_of(buffer: Any, take: Callable[[Column, Any], Any]) -> dict[str,
     Assemble the columns of batches that not every buffer has.
 
     :param buffer: replay buffer
-    :param take: function of a column and the buffer's array of it that returns a tensor of the wanted rows
-    :return: the tensors by name
+    :param take: function of a column and the buffer's array of it that returns the wanted rows
+    :return: these rows by name
     """
     return {c.name: take(c, getattr(buffer, c.name)) for c in _more(buffer) if c.in_batch}
 
 
 def observations_at(
-    buffer: ReplayBuffer, positions: np.ndarray, env_indices: np.ndarray, column: Column = OBSERVATIONS
+    buffer: ReplayBuffer,
+    positions: np.ndarray,
+    env_indices: np.ndarray,
+    column: Column = OBSERVATIONS,
+    key: str | None = None,
 ) -> Any:
     """
     Gather observations of a replay buffer at given places.
@@ -292,12 +297,15 @@ def observations_at(
     :param positions: places in the buffer, (N,)
     :param env_indices: which environment's transition, (N,)
     :param column: ``OBSERVATIONS`` or ``NEXT_OBSERVATIONS``
+    :param key: of dict observations, which part; None for all
     :return: as they are stored, (N, O), or a dict of such arrays
     """
     is_next = column is NEXT_OBSERVATIONS
     if is_next and buffer.optimize_memory_usage:
         is_next, positions = False, (positions + 1) % buffer.buffer_size
     array: Any = buffer.next_observations if is_next else buffer.observations
+    if key is not None:
+        array = array[key]
     return for_each(lambda part: part[positions, env_indices], array)
 
 

@@ -22,6 +22,7 @@ from sb3_sample.replay.columns import (
 )
 from sb3_sample.replay.dataset_files import opened_hdf5, read_minari, write_minari
 from sb3_sample.replay.memory_map import check_folder, n_bytes, zeros
+from sb3_sample.replay.next_observations import ONLY
 from sb3_sample.replay.steps import (
     CHUNK,
     Steps,
@@ -253,7 +254,7 @@ class Dataset:
         :param seed: of the generator that the batches are drawn from
         :param memory_map: as in :meth:`from_arrays`
         :return: the data set, environment after environment
-        :raises ValueError: if the buffer is empty
+        :raises ValueError: if the buffer is empty, or one of its own columns has the name of a part of every step
         """
         size, first = buffer.size(), int(buffer.pos) if buffer.full else 0
         if buffer.full and getattr(buffer, "optimize_memory_usage", False):
@@ -358,14 +359,13 @@ class Dataset:
             digest = sha256()
             for first in range(0, len(self), CHUNK):
                 last = min(first + CHUNK, len(self))
-                for name, read in self._readers().items():
-                    one = read(slice(first, first + 1))
-                    for key in sorted(one) if isinstance(one, dict) else [""]:
-                        part = _numpy(one[key] if key else one)
-                        digest.update(f"{name}/{key} {part.dtype} {(last - first, *part.shape[1:])} ".encode())
-                        for piece in pieces(last - first, part):
-                            found = read(slice(first + piece.start, first + piece.stop))
-                            digest.update(np.ascontiguousarray(_numpy(found[key] if key else found)).data)
+                for name, readers in self._readers().items():
+                    for key, read in sorted(readers.items()):
+                        one = _numpy(read(slice(first, first + 1)))
+                        digest.update(f"{name}/{key} {one.dtype} {(last - first, *one.shape[1:])} ".encode())
+                        for piece in pieces(last - first, one):
+                            found = _numpy(read(slice(first + piece.start, first + piece.stop)))
+                            digest.update(np.ascontiguousarray(found).data)
             self._fingerprint = digest.hexdigest()
         return self._fingerprint
 
@@ -377,17 +377,31 @@ class Dataset:
         :return: ``observations``, ``actions``, ``rewards``, ``terminations``, ``truncations``, ``next_observations``
             and the further columns by name, arrays
         """
-        return {name: for_each(_numpy, read(rows)) for name, read in self._readers().items()}
+        found = {
+            name: {key: _numpy(read(rows)) for key, read in readers.items()}
+            for name, readers in self._readers().items()
+        }
+        return {name: parts[ONLY] if ONLY in parts else parts for name, parts in found.items()}
 
-    def _readers(self) -> dict[str, Callable[[Any], Any]]:
-        """Functions from rows to a part of the transitions there, by the names of :meth:`rows`."""
+    def _readers(self) -> dict[str, dict[str, Callable[[Any], Any]]]:
+        """
+        Functions from rows to a part of the transitions there, by the names of :meth:`rows` and the keys of dict
+        observations, or ``ONLY``: each reads that part alone.
+        """
         steps = self._steps
-        columns = {name: values.__getitem__ for name, values in steps.columns.items()}
+
+        def readers(parts: Any, places: Any) -> dict[str, Callable[[Any], Any]]:
+            by_key = parts if isinstance(parts, dict) else {ONLY: parts}
+            if places is None:
+                return {key: part.__getitem__ for key, part in by_key.items()}
+            return {key: lambda rows, part=part: part[places[rows]] for key, part in by_key.items()}
+
+        following = steps.observations if steps.next_observations is None else steps.next_observations
         return {
-            "observations": lambda rows: _take(steps.observations, steps.at[rows]),
-            **{name: getattr(steps, name).__getitem__ for name in _PLAIN},
-            "next_observations": self._next_observations,
-            **columns,
+            "observations": readers(steps.observations, steps.at),
+            **{name: readers(getattr(steps, name), None) for name in _PLAIN},
+            "next_observations": readers(following, steps.next_at if steps.next_observations is None else None),
+            **{name: readers(values, None) for name, values in steps.columns.items()},
         }
 
     def plain(self, rows: slice | np.ndarray) -> dict[str, np.ndarray]:
@@ -481,8 +495,7 @@ class _Places:
 
 def _places(buffer: Any, positions: np.ndarray, env_indices: np.ndarray, column: Column) -> Any:
     def gather(rows: slice, key: str | None) -> np.ndarray:
-        found = observations_at(buffer, positions[rows], env_indices[rows], column)
-        return _numpy(found if key is None else found[key])
+        return _numpy(observations_at(buffer, positions[rows], env_indices[rows], column, key))
 
     n, space = len(positions), buffer.observation_space
     if isinstance(space, spaces.Dict):
@@ -516,7 +529,7 @@ def _parts(arrays: Any) -> list[Any]:
 
 
 def _arrays(name: str, values: Any, least_axes: int, space: spaces.Space | None = None) -> Any:
-    """Arrays, or objects that are read like arrays in pieces; nothing is copied."""
+    """Arrays, or objects that are read like arrays in pieces; only numbers of a Discrete space are read at once."""
     if isinstance(values, Mapping):
         inside = space.spaces if isinstance(space, spaces.Dict) else {}
         return {key: _arrays(f"{name}[{key!r}]", value, least_axes, inside.get(key)) for key, value in values.items()}

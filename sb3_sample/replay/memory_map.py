@@ -45,7 +45,7 @@ def check_folder(folder: Any, needed: int) -> str:
     if needed > free:
         raise ValueError(
             f"memory_map={os.fspath(folder)!r} has {free / 1e9:.2f} GB free, and {needed / 1e9:.2f} GB are needed: "
-            "name a folder on another disk, or keep less (a replay buffer's buffer_size)"
+            "name a folder on another disk, or store less (for a replay buffer: a smaller buffer_size)"
         )
     return str(path)
 

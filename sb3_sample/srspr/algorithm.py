@@ -356,16 +356,16 @@ class SRSPR(  # type: ignore[misc]
             say(f"Reset at {now} decisions")
 
     def _after_turns(self) -> None:
-        """Warn if no gradient step was taken because there were too few steps."""
+        """Warn if no gradient step was taken because there were too few decisions, or none in a row."""
         wanted = self.gradient_steps if self.replay_ratio is None else self.replay_ratio
         if self._n_updates > 0 or wanted == 0 or self.num_transitions == 0:
             return
         assert isinstance(self.replay_buffer, SPRReplayBuffer)
         if self.num_transitions > self.learning_starts and self.replay_buffer.n_drawable == 0:
             warn(
-                "learn ended without a single gradient step: no episode had more than "
-                f"{max(self.n_steps, self.n_predictions)} decisions before a time limit, which the windows of n_steps "
-                "and n_predictions need"
+                "learn ended without a single gradient step: a window of n_steps and n_predictions needs "
+                f"{max(self.n_steps, self.n_predictions)} decisions of an episode, and one more, or a termination: no "
+                "episode has had them. Train for more, or pass smaller ones"
             )
         if self.num_transitions <= self.learning_starts:
             warn(

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium import spaces
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
@@ -219,11 +220,10 @@ def compare_gradients(
     :param on_estimate: called after each estimate, with the number of estimates so far
     :return: the gradients by method: "PPO", the oracle, "MBMA", "QMA", "MBPO"
     :raises TypeError: ``model`` is of another family
-    :raises ValueError: an argument is out of range, the model is of a kind that :class:`Agent` rejects, or its spaces
-        are none that :func:`check_spaces` allows
+    :raises ValueError: an argument is out of range, :class:`Agent` rejects the model, or :func:`check_spaces` its spaces
     """
     Agent(model)
-    check_spaces(model)
+    check_spaces(model.observation_space, model.action_space)
     check_counts({"n_estimates": (n_estimates, 4), "n_steps": (n_steps, 2), "n_fits": (n_fits, 1), "seed": (seed, 0)})
     check_counts({"n_simulated": (n_simulated, 1), "simulation_horizon": (simulation_horizon, 2)})
     rng = np.random.default_rng(seed)
@@ -298,13 +298,14 @@ def jackknife_squares(samples: np.ndarray) -> tuple[float, np.ndarray]:
     return pairs / (m * (m - 1)), left_out / ((m - 1) * (m - 2))
 
 
-def check_spaces(model: OnPolicyAlgorithm) -> None:
+def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
     """
-    :param model: model whose gradients are to be compared
-    :raises ValueError: a dynamics model or a Q-network cannot be learned of its observations or actions
+    :param observation_space: of the task in which gradients are to be compared
+    :param action_space: likewise
+    :raises ValueError: a dynamics model or a Q-network cannot learn from its observations or actions
     """
-    FlatObservations(model.observation_space, plain=None)
-    check_action_space(model.action_space, plain=None)
+    FlatObservations(observation_space, plain=None)
+    check_action_space(action_space, plain=None)
 
 
 def _environment(model: OnPolicyAlgorithm, make_env: Callable[[], gym.Env]) -> VecEnv:

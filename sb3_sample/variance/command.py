@@ -350,11 +350,12 @@ def _run(args: argparse.Namespace) -> None:
     if args.vecnormalize is not None and args.model is None:
         raise ValueError("vecnormalize must come with the model that it belongs to: give --model")
     make = partial(make_env, args.env, **_keyword_arguments(args.env_kwargs))
-    check_restorable(make(), make())
+    env = make()
+    if args.bias:
+        check_spaces(env.observation_space, env.action_space)
+    check_restorable(env, make())
     model = _model(args, make, train_steps)
     Agent(model)
-    if args.bias:
-        check_spaces(model)
 
     question = Question(trajectory, args.now, args.action_cost)
     estimate = estimate_components(

@@ -330,6 +330,35 @@ def test_the_file_of_its_monitor_goes_on(make: Any, tmp_path: Path) -> None:
     assert len(path.read_text().splitlines()) == 2
 
 
+def test_what_of_a_monitors_file_cannot_be_continued(make: Any, tmp_path: Path) -> None:
+    def env_fns(name: str, **kwargs: Any) -> list[Callable[[], Any]]:
+        return [
+            lambda i=i: Monitor(Fragile(**(kwargs if i == 1 else {})), str(tmp_path / f"{name}{i}"), **more)
+            for i in range(3)
+        ]
+
+    # A line that a killed worker has begun.
+    more: dict[str, Any] = {}
+    path = tmp_path / "a1.monitor.csv"
+    venv = make(SupervisedSubprocVecEnv, env_fns("a", step=8, marker=tmp_path / "broke"), restart_envs=True)
+    run(venv, 7)
+    before = path.read_text()
+    path.write_text(before + "3.0,3,0")
+    with pytest.warns(UserWarning, match="environment 1 died"):
+        run(venv, 1)
+    run(venv, 5)
+    assert path.read_text().startswith(before) and len(path.read_text().splitlines()) == 4
+    # Stable-Baselines3 writes no head to a new file that is to be appended to: rows follow, as without a death.
+    more = {"override_existing": False}
+    venv = make(SupervisedSubprocVecEnv, env_fns("b", step=8, marker=tmp_path / "broke too"), restart_envs=True)
+    run(venv, 7)
+    with pytest.warns(UserWarning, match="environment 1 died"):
+        run(venv, 1)
+    run(venv, 5)
+    assert venv.n_restarts == 1
+    assert [line.split(",")[1] for line in (tmp_path / "b1.monitor.csv").read_text().splitlines()] == ["5", "5"]
+
+
 def test_its_seed_is_another_and_always_the_same(make: Any, tmp_path: Path) -> None:
     draws = []
     for i, seed in enumerate((7, 7, 8)):

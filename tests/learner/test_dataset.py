@@ -158,13 +158,23 @@ def test_numbers_of_a_discrete_space() -> None:
         assert seen.tolist() == [[0], [1], [2], [3], [4], [6]]
 
 
-def test_wide_rows_are_read_in_small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At most so many bytes at a time, and with the same fingerprint."""
+@pytest.mark.parametrize("as_dict", [False, True])
+def test_wide_rows_are_read_in_small_pieces(as_dict: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At most so many bytes at a time, each once, and with the same fingerprint."""
     rng = np.random.default_rng(0)
     pictures, ends = rng.integers(0, 255, (301, 3, 20, 20)).astype(np.uint8), np.arange(300) % 50 == 49
     given = (rng.uniform(-1, 1, (300, 2)), np.zeros(300), ends, ~ends & False)
-    whole = Dataset.from_arrays(pictures[:-1], *given, next_observations=pictures[1:])
-    largest = []
+    largest: list[int] = []
+
+    def seen(rows: slice, wrap: Any = lambda array: array) -> Any:
+        parts = {"picture": wrap(pictures[rows]), "number": wrap(np.arange(301.0)[rows, None])}
+        return parts if as_dict else parts["picture"]
+
+    def made(wrap: Any = lambda array: array) -> Dataset:
+        now, then = seen(slice(0, -1), wrap), seen(slice(1, None), wrap)
+        return Dataset.from_arrays(now, *given, next_observations=then)
+
+    whole = made()
 
     class Read:
         """Pictures that are read from a file."""
@@ -181,9 +191,27 @@ def test_wide_rows_are_read_in_small_pieces(monkeypatch: pytest.MonkeyPatch) -> 
 
     monkeypatch.setattr(steps, "CHUNK_BYTES", 10_000)
     monkeypatch.setattr(np, "equal", lambda a, b, equal=np.equal: (largest.append(a.nbytes), equal(a, b))[1])
-    pieced = Dataset.from_arrays(Read(pictures[:-1]), *given, next_observations=Read(pictures[1:]))
-    assert pieced.fingerprint == whole.fingerprint and pieced.n_episodes == whole.n_episodes
+    pieced = made(Read)
+    assert pieced.n_episodes == whole.n_episodes
     assert len(largest) > 150 and max(largest) <= 10_000
+    # The fingerprint reads each part alone.
+    largest.clear()
+    readers = pieced._readers
+    monkeypatch.setattr(
+        pieced,
+        "_readers",
+        lambda: {
+            name: {key: lambda rows, read=read: noted(read(rows)) for key, read in parts.items()}
+            for name, parts in readers().items()
+        },
+    )
+
+    def noted(values: torch.Tensor) -> torch.Tensor:
+        largest.append(values.nbytes)
+        return values
+
+    assert pieced.fingerprint == whole.fingerprint
+    assert max(largest) <= 10_000 and sum(largest) < 1.1 * 2 * pictures[1:].nbytes
 
 
 @pytest.mark.parametrize("size", [0, -3])

@@ -13,6 +13,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_sample import SAC, Dataset, multi_task_env, record
+from sb3_sample.replay import dataset, steps
 from tests.sac.common import Toy, sac, vec
 
 BOX = spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 6.0], np.float32))
@@ -274,6 +275,33 @@ def test_from_a_replay_buffer(kind: str) -> None:
     np.testing.assert_allclose(np.sort(batch.actions.numpy(), 0), np.sort(stored, 0)[-2 * n :], atol=1e-6) if (
         kind != "memory"
     ) else None
+
+
+def test_a_replay_buffer_of_pictures_is_read_in_small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each key of dict observations alone."""
+    parts = {"picture": spaces.Box(0, 255, (1, 30, 30), np.uint8), "vector": spaces.Box(-1, 1, (2,), np.float64)}
+    space = spaces.Dict(parts)
+    buffer = DictReplayBuffer(200, space, BOX, "cpu")
+    rng = np.random.default_rng(0)
+    for part in (buffer.observations, buffer.next_observations):
+        part["picture"][:] = rng.integers(0, 255, part["picture"].shape)
+        part["vector"][:] = rng.uniform(-1, 1, part["vector"].shape)
+    buffer.pos, buffer.full = 0, True
+    monkeypatch.setattr(steps, "CHUNK_BYTES", 10_000)
+    gathered: list[int] = []
+    gather = dataset.observations_at
+
+    def noted(*args: Any) -> Any:
+        found = gather(*args)
+        gathered.append(sum(part.nbytes for part in found.values()) if isinstance(found, dict) else found.nbytes)
+        return found
+
+    monkeypatch.setattr(dataset, "observations_at", noted)
+    with pytest.warns(UserWarning, match="are not the following observations"):
+        data = Dataset.from_replay_buffer(buffer)
+    seen = data.rows(slice(None))["next_observations"]
+    assert np.array_equal(seen["picture"], buffer.next_observations["picture"][:, 0])
+    assert max(gathered) <= 10_000 and sum(gathered) < 2.2 * buffer.observations["picture"].nbytes
 
 
 class Goals(Toy):

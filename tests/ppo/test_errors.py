@@ -215,6 +215,8 @@ def test_observations_that_change_after_they_are_normalised(cls: Any) -> None:
     model = tiny(cls, VecNormalize(VecFrameStack(vec(2), 3)))
     with pytest.raises(ValueError, match="VecNormalize must be around the wrappers that change observations"):
         model.set_env(VecFrameStack(VecNormalize(vec(2)), 3))
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        model.set_env(VecNormalize(VecFrameStack(vec(2), 2)))
     assert model.learn(16).transitions.size == 32
 
 

@@ -256,6 +256,12 @@ def test_values_that_are_none() -> None:
         with pytest.raises(ValueError, match=rf"the column 'x' must be whole numbers within uint8, not \[{value}\]"):
             with_values(lambda step, value=value: [value], dtype=np.uint8)(5)
     with_values(lambda step: [255.0], dtype=np.uint8)(5)
+    with pytest.raises(ValueError, match=r"whole numbers within int32, not \[nan\]"):
+        with_values(lambda step: [np.nan], dtype=np.int32)(5)
+    for given in ([3], [[1, 2]]):  # repeated or without the first axis, as assignment to an array does
+        column = (Column("task", lambda step, given=given: given, dtype=np.int32),)
+        model = make(type("Local", (CompactReplayBuffer,), {"more_columns": column}), vec(2)).learn(10)
+        assert np.broadcast_to(given, (1, 2)).tolist() == model.replay_buffer.task[:1].tolist()
     with pytest.raises(ValueError, match=r"could not broadcast the x of shape \(2,\) into shape \(1,\)"):
         with_values(lambda step: [1.0, 2.0])(5)
 
