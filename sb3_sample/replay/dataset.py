@@ -377,11 +377,11 @@ class Dataset:
         :return: ``observations``, ``actions``, ``rewards``, ``terminations``, ``truncations``, ``next_observations``
             and the further columns by name, arrays
         """
-        found = {
-            name: {key: _numpy(read(rows)) for key, read in readers.items()}
-            for name, readers in self._readers().items()
-        }
-        return {name: parts[ONLY] if ONLY in parts else parts for name, parts in found.items()}
+        found: dict[str, Any] = {}
+        for name, readers in self._readers().items():
+            parts = {key: _numpy(read(rows)) for key, read in readers.items()}
+            found[name] = parts.get(ONLY, parts)
+        return found
 
     def _readers(self) -> dict[str, dict[str, Callable[[Any], Any]]]:
         """
@@ -394,7 +394,7 @@ class Dataset:
             by_key = parts if isinstance(parts, dict) else {ONLY: parts}
             if places is None:
                 return {key: part.__getitem__ for key, part in by_key.items()}
-            return {key: lambda rows, part=part: part[places[rows]] for key, part in by_key.items()}
+            return {key: functools.partial(_at, part, places) for key, part in by_key.items()}
 
         following = steps.observations if steps.next_observations is None else steps.next_observations
         return {
@@ -501,6 +501,10 @@ def _places(buffer: Any, positions: np.ndarray, env_indices: np.ndarray, column:
     if isinstance(space, spaces.Dict):
         return {key: _Places(functools.partial(gather, key=key), n) for key in space.spaces}
     return _Places(functools.partial(gather, key=None), n)
+
+
+def _at(part: Any, places: Any, rows: Any) -> Any:
+    return part[places[rows]]
 
 
 def _map(function: Callable[[Any], Any], steps: Steps) -> Steps:

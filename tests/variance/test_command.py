@@ -201,12 +201,11 @@ def test_spaces_that_no_model_is_learned_of_are_refused_before_the_rollouts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     picture = ["-o", str(tmp_path / "variance.png")]
-    with (
-        monkeypatch.context() as patched,
-        pytest.raises(SystemExit, match=r"the observation space must be a Box of floats .*, not Discrete\(16\)$"),
-    ):
+    refused = r"the observation space must be a Box of floats .*, not Discrete\(16\)$"
+    with monkeypatch.context() as patched:
         patched.delattr(command, "_model")  # and before the training
-        run("--bias", "4", *picture, env="FrozenLake-v1")
+        with pytest.raises(SystemExit, match=refused):
+            run("--bias", "4", *picture, env="FrozenLake-v1")
     run(*picture, env="FrozenLake-v1")
     assert (tmp_path / "variance.png").exists()
 
