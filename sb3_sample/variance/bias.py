@@ -220,8 +220,8 @@ def compare_gradients(
     :param on_estimate: called after each estimate, with the number of estimates so far
     :return: the gradients by method: "PPO", the oracle, "MBMA", "QMA", "MBPO"
     :raises TypeError: ``model`` is of another family
-    :raises ValueError: an argument is out of range, :class:`Agent` rejects the model, or :func:`check_spaces` rejects its
-        spaces
+    :raises ValueError: an argument is out of range, :class:`Agent` rejects the model, or :func:`check_spaces` rejects
+        its spaces
     """
     Agent(model)
     check_spaces(model.observation_space, model.action_space)
