@@ -229,8 +229,20 @@ def _record_video(arguments: list[str]) -> None:
         runpy.run_module("rl_zoo3.record_video", run_name="__main__")  # it has no function to call
 
 
+@contextlib.contextmanager
+def _importing(command: str, extra: str) -> Iterator[None]:
+    """Report a library of an extra that a command imports, and that is not installed, without a traceback."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "sb3_sample").split(".")[0] == "sb3_sample":
+            raise
+        sys.exit(f"sb3-sample: {command} needs {error.name}. Install it with: {install(extra)}")
+
+
 def _plot(arguments: list[str]) -> None:
-    from sb3_sample.plots import main as plot
+    with _importing("plot", "plots"):
+        from sb3_sample.plots import main as plot
 
     plot(arguments)
 
@@ -259,21 +271,24 @@ def _dataset(arguments: list[str]) -> None:
 
 
 def _study(arguments: list[str]) -> None:
-    from sb3_sample.study.command import main as study
+    with _importing("study", "study"):
+        from sb3_sample.study.command import main as study
 
     with _extras():
         study(arguments)
 
 
 def _scaling(arguments: list[str]) -> None:
-    from sb3_sample.study.scaling.command import main as scaling
+    with _importing("scaling", "study"):
+        from sb3_sample.study.scaling.command import main as scaling
 
     with _extras():
         scaling(arguments)
 
 
 def _advise(arguments: list[str]) -> None:
-    from sb3_sample.study.advice_command import main as advise
+    with _importing("advise", "study"):
+        from sb3_sample.study.advice_command import main as advise
 
     with _extras():
         advise(arguments)

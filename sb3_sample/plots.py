@@ -5,7 +5,6 @@ The runs of one task, mean and range over seeds, beside the curves that others h
 """
 
 import argparse
-import contextlib
 import functools
 import itertools
 import os
@@ -21,7 +20,7 @@ import pandas as pd
 
 from sb3_sample.envs import published_key
 from sb3_sample.exits import refuse
-from sb3_sample.extras import install
+from sb3_sample.extras import needing_matplotlib
 from sb3_sample.run_logs import EVALUATIONS, is_truncated, monitor_files, read_evaluations, read_monitors
 from sb3_sample.run_settings import read_settings, run_env_id, study_of
 from sb3_sample.study_list import is_evaluated, read_list
@@ -311,19 +310,6 @@ def summarize(runs: Sequence[Run]) -> pd.DataFrame:
 
 
 # ---------------------------------------------------------------- picture and table
-
-
-@contextlib.contextmanager
-def needing_matplotlib() -> Iterator[None]:
-    """
-    Context for imports of matplotlib.
-
-    :raises ImportError: it is not installed; says of which extra it is
-    """
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        raise ImportError(f"plots need matplotlib ({error}). Install it with: {install('plots')}") from error
 
 
 def draw(env_id: str, curves: Sequence[Curve], metric: str, xlim: tuple[float, float] | None = None) -> "Figure":

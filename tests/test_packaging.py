@@ -127,6 +127,18 @@ model.save("model")
 assert SAC.load("model", env=env).num_timesteps == 12
 MBMAPPO("MlpPolicy", env, n_steps=16, batch_size=8, dynamics_kwargs=dict(width=8)).learn(32)
 main(["--help"])
+for command, extra in dict(plot="plots", study="study", scaling="study", advise="study", train="zoo").items():
+    try:
+        main([command, "--help"])
+    except SystemExit as end:
+        assert f'pip install -e ".[{{extra}}' in str(end), (command, end)
+    else:
+        raise AssertionError(command)
+for command in ("variance", "dataset"):
+    try:
+        main([command, "--help"])
+    except SystemExit as end:
+        assert not end.code, (command, end)
 """
     result = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr

@@ -14,7 +14,8 @@ import pandas as pd
 
 from sb3_sample.envs.scores import Score
 from sb3_sample.exits import refuse
-from sb3_sample.plots import STYLES, needing_matplotlib
+from sb3_sample.extras import needing_matplotlib
+from sb3_sample.plots import STYLES
 from sb3_sample.study import analysis
 from sb3_sample.study import table as tables
 from sb3_sample.study.aggregate import (

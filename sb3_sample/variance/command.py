@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_sample.envs import make_env
 from sb3_sample.envs.states import check_restorable
 from sb3_sample.exits import refuse
-from sb3_sample.plots import needing_matplotlib
+from sb3_sample.extras import needing_matplotlib
 from sb3_sample.ppo import MBMAPPO, MBPOPPO, QMAPPO
 from sb3_sample.saving import load_vec_normalize
 from sb3_sample.saving.classes import path_of

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_sample.plots import STYLES, needing_matplotlib
+from sb3_sample.extras import needing_matplotlib
+from sb3_sample.plots import STYLES
 from sb3_sample.study.reporting.pieces import BESIDE, N_COLORS, TITLE, Agent, Dots, Figure, Line, Lines, cut
 
 if TYPE_CHECKING:
