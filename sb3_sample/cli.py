@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from sb3_sample.envs.base import select_gl_backend
 from sb3_sample.exits import interrupt, refuse
-from sb3_sample.extras import install
+from sb3_sample.extras import install, needing
 from sb3_sample.version import __version__
 
 
@@ -73,14 +73,21 @@ def _usage() -> str:
     )
 
 
-def _zoo_module(name: str) -> ModuleType:
-    """Import a module of the zoo, with our algorithms and environments registered in the zoo."""
+@contextlib.contextmanager
+def _extras() -> Iterator[None]:
+    """Report an extra that is not installed without a traceback."""
     try:
-        from sb3_sample import zoo
+        yield
     except ImportError as error:
         if isinstance(error.__cause__, ModuleNotFoundError):
             sys.exit(f"sb3-sample: {error}")
         raise
+
+
+def _zoo_module(name: str) -> ModuleType:
+    """Import a module of the zoo, with our algorithms and environments registered in the zoo."""
+    with _extras():
+        from sb3_sample import zoo
     zoo.register()
     try:
         return importlib.import_module(name)
@@ -229,19 +236,8 @@ def _record_video(arguments: list[str]) -> None:
         runpy.run_module("rl_zoo3.record_video", run_name="__main__")  # it has no function to call
 
 
-@contextlib.contextmanager
-def _importing(command: str, extra: str) -> Iterator[None]:
-    """Report a library of an extra that a command imports, and that is not installed, without a traceback."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        if (error.name or "sb3_sample").split(".")[0] == "sb3_sample":
-            raise
-        sys.exit(f"sb3-sample: {command} needs {error.name}. Install it with: {install(extra)}")
-
-
 def _plot(arguments: list[str]) -> None:
-    with _importing("plot", "plots"):
+    with _extras(), needing("plots need pandas", "plots"):
         from sb3_sample.plots import main as plot
 
     plot(arguments)
@@ -253,17 +249,6 @@ def _variance(arguments: list[str]) -> None:
     variance(arguments)
 
 
-@contextlib.contextmanager
-def _extras() -> Iterator[None]:
-    """Report an extra that is not installed without a traceback."""
-    try:
-        yield
-    except ImportError as error:
-        if isinstance(error.__cause__, ModuleNotFoundError):
-            sys.exit(f"sb3-sample: {error}")
-        raise
-
-
 def _dataset(arguments: list[str]) -> None:
     from sb3_sample.dataset_command import main as dataset
 
@@ -271,7 +256,7 @@ def _dataset(arguments: list[str]) -> None:
 
 
 def _study(arguments: list[str]) -> None:
-    with _importing("study", "study"):
+    with _extras(), needing("studies need pandas", "study"):
         from sb3_sample.study.command import main as study
 
     with _extras():
@@ -279,7 +264,7 @@ def _study(arguments: list[str]) -> None:
 
 
 def _scaling(arguments: list[str]) -> None:
-    with _importing("scaling", "study"):
+    with _extras(), needing("scaling laws need pandas", "study"):
         from sb3_sample.study.scaling.command import main as scaling
 
     with _extras():
@@ -287,7 +272,7 @@ def _scaling(arguments: list[str]) -> None:
 
 
 def _advise(arguments: list[str]) -> None:
-    with _importing("advise", "study"):
+    with _extras(), needing("advice needs pandas", "study"):
         from sb3_sample.study.advice_command import main as advise
 
     with _extras():

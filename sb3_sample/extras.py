@@ -13,13 +13,22 @@ def install(*extras: str) -> str:
 
 
 @contextlib.contextmanager
-def needing_matplotlib() -> Iterator[None]:
+def needing(what: str, extra: str) -> Iterator[None]:
     """
-    Context for imports of matplotlib.
+    Context for imports of optional dependencies.
 
-    :raises ImportError: it is not installed; says of which extra it is
+    :param what: what needs which of them, for the error
+    :param extra: the extra that they are of
+    :raises ImportError: one is not installed
     """
     try:
         yield
     except ModuleNotFoundError as error:
-        raise ImportError(f"plots need matplotlib ({error}). Install it with: {install('plots')}") from error
+        raise ImportError(f"{what} ({error}). Install it with: {install(extra)}") from error
+
+
+def needing_matplotlib() -> contextlib.AbstractContextManager[None]:
+    """
+    :return: context for imports of matplotlib
+    """
+    return needing("plots need matplotlib", "plots")

@@ -1,9 +1,8 @@
 """Monitors that go on where those of an earlier process ended, in the same files."""
 
-import contextlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -11,6 +10,8 @@ from stable_baselines3.common import monitor
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
 
 from sb3_sample.run_logs import MAX_LINE, monitor_head
+from sb3_sample.saving.untrusted import BadFile
+from sb3_sample.warn import warn
 
 
 class _Appending(ResultsWriter):
@@ -18,17 +19,25 @@ class _Appending(ResultsWriter):
         super().__init__(*args, **{**kwargs, "override_existing": False})
 
 
-@contextlib.contextmanager
-def appending() -> Iterator[None]:
+def made_again(make: Callable[[], gym.Env]) -> gym.Env:
     """
-    Make Monitors constructed inside this context append to their files. Call :func:`go_on` on each environment
-    afterwards.
+    Make an environment whose Monitors continue the files of those of an earlier one. A file that cannot be continued is
+    warned of, and appended to as it is.
+
+    :param make: makes the environment, as it made the earlier one
+    :return: the environment
     """
+    # Monitors have no way to be told from outside.
     theirs, monitor.ResultsWriter = monitor.ResultsWriter, _Appending  # type: ignore[misc]
     try:
-        yield
+        env = make()
     finally:
         monitor.ResultsWriter = theirs  # type: ignore[misc]
+    try:
+        go_on(env)
+    except (BadFile, OSError) as error:
+        warn(f"a Monitor's file cannot be continued: {error}")
+    return env
 
 
 def go_on(env: gym.Env) -> None:

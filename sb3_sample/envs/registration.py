@@ -16,7 +16,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_sample.extras import install
+from sb3_sample.extras import install, needing
 
 PACKAGE = "sb3_sample"
 #: Prefix of the ids of Atari games, which are ale-py's own.
@@ -149,12 +149,8 @@ def register_atari() -> None:
 
     :raises ImportError: ``ale-py`` is not installed; the message says how to install it
     """
-    try:
+    with needing(f"the {ATARI}... environments need ale-py", "atari"):
         import ale_py
-    except ModuleNotFoundError as error:
-        raise ImportError(
-            f"the {ATARI}... environments need ale-py ({error}). Install it with: {install('atari')}"
-        ) from error
     gym.register_envs(ale_py)
 
 

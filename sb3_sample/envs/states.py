@@ -306,14 +306,14 @@ def state_attributes(layer: Any) -> dict[str, Any]:
     :return: its attributes that consist of data only, by name, not copied; without Monitor's lists of all episodes,
         which grow with the training
     """
-    known: dict[str, bool] = {}
-    if isinstance(layer, Monitor):
-        # Its rewards of this episode are numbers: looking at each would take the longer, the older the episode is.
-        known = {**dict.fromkeys((*EPISODES, "t_start"), False), REWARDS: True}
+    is_monitor = isinstance(layer, Monitor)
+    left_out = (*EPISODES, "t_start") if is_monitor else ()
+    # Numbers: looking at each would take the longer, the older the episode is.
+    numbers = (REWARDS,) if is_monitor else ()
     return {
         name: value
         for name, value in vars(layer).items()
-        if (known[name] if name in known else _is_state(value, set()))
+        if name not in left_out and (name in numbers or _is_state(value, set()))
     }
 
 

@@ -26,8 +26,7 @@ from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, Ve
 from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker as serve
 
-from sb3_sample.envs.monitors import appending, go_on
-from sb3_sample.saving.untrusted import BadFile
+from sb3_sample.envs.monitors import made_again
 from sb3_sample.warn import warn
 
 #: Seconds within which a worker that has closed its connection must end.
@@ -302,14 +301,7 @@ def _supervised(
     _end_with(os.getppid() if parent is None else parent)
 
     def make() -> gym.Env:
-        with appending() if is_replacement else contextlib.nullcontext():
-            env = env_fn.var()
-        if is_replacement:
-            try:
-                go_on(env)
-            except (BadFile, OSError) as error:
-                # Its rows are appended as they are.
-                warn(f"a Monitor's file cannot be continued: {error}")
+        env = made_again(env_fn.var) if is_replacement else env_fn.var()
         remote.send(_Made())
         return env
 

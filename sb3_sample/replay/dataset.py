@@ -12,14 +12,7 @@ import torch
 from gymnasium import spaces
 
 from sb3_sample.learner.batch import Batch, for_each
-from sb3_sample.replay.columns import (
-    NEXT_OBSERVATIONS,
-    OBSERVATIONS,
-    Column,
-    observations_at,
-    own_columns_of,
-    rows_at,
-)
+from sb3_sample.replay.dataset_buffers import arrays_of
 from sb3_sample.replay.dataset_files import opened_hdf5, read_minari, write_minari
 from sb3_sample.replay.memory_map import check_folder, n_bytes, zeros
 from sb3_sample.replay.next_observations import ONLY
@@ -27,6 +20,7 @@ from sb3_sample.replay.steps import (
     CHUNK,
     Steps,
     action_dtype,
+    as_numpy,
     check_action_space,
     check_actions,
     observation_dtypes,
@@ -256,38 +250,7 @@ class Dataset:
         :return: the data set, environment after environment
         :raises ValueError: if the buffer is empty, or one of its own columns has the name of a part of every step
         """
-        size, first = buffer.size(), int(buffer.pos) if buffer.full else 0
-        if buffer.full and getattr(buffer, "optimize_memory_usage", False):
-            # The observation of the oldest row was overwritten by the newest next observation.
-            size, first = size - 1, first + 1
-        if size < 1:
-            raise ValueError("buffer must have at least one transition, not 0")
-        positions = np.tile((first + np.arange(size)) % buffer.buffer_size, buffer.n_envs)
-        env_indices = np.repeat(np.arange(buffer.n_envs), size)
-
-        def taken(array: Any) -> np.ndarray:
-            return _numpy(rows_at(array, positions, env_indices))
-
-        truncations = taken(buffer.timeouts)[:, 0].astype(bool)
-        # A time limit does not end the bootstrap.
-        terminations = taken(buffer.dones)[:, 0].astype(bool) & ~truncations
-        truncations[size - 1 :: size] |= ~terminations[size - 1 :: size]  # of each environment
-        space = buffer.action_space
-        low, high = space.low.astype(np.float64).ravel(), space.high.astype(np.float64).ravel()
-        actions = low + 0.5 * (taken(buffer.actions).astype(np.float64) + 1) * (high - low)
-        return cls.from_arrays(
-            _places(buffer, positions, env_indices, OBSERVATIONS),
-            np.clip(actions, low, high).astype(np.float32).reshape(-1, *space.shape),
-            taken(buffer.rewards),
-            terminations,
-            truncations,
-            next_observations=_places(buffer, positions, env_indices, NEXT_OBSERVATIONS),
-            observation_space=buffer.observation_space,
-            action_space=space,
-            seed=seed,
-            columns=own_columns_of(buffer, lambda column, array: taken(array)),
-            memory_map=memory_map,
-        )
+        return cls.from_arrays(**arrays_of(buffer), seed=seed, memory_map=memory_map)
 
     def to_minari(self, id_or_path: str | os.PathLike[str], **metadata: Any) -> Path:
         """
@@ -326,7 +289,7 @@ class Dataset:
 
         :raises ValueError: if most steps are episodes of one step that did not terminate, as in shuffled data
         """
-        rewards, last = _numpy(self._steps.rewards).astype(np.float64), -1
+        rewards, last = as_numpy(self._steps.rewards).astype(np.float64), -1
         returns, n_alone = [], 0
         for end in self._last_steps():
             returns.append(rewards[last + 1 : end + 1].sum())
@@ -341,8 +304,8 @@ class Dataset:
 
     def _last_steps(self) -> np.ndarray:
         """Last steps of the episodes, except where a next observation equals the following one but for rounding."""
-        steps, terminated = self._steps, _numpy(self._steps.terminations)
-        ends = np.flatnonzero(terminated | _numpy(steps.truncations))
+        steps, terminated = self._steps, as_numpy(self._steps.terminations)
+        ends = np.flatnonzero(terminated | as_numpy(steps.truncations))
         goes_on = np.zeros(len(self), bool)
         cut_off = ends[~terminated[ends] & (ends < len(self) - 1)]
         for piece in pieces(len(cut_off), steps.observations, steps.observations):
@@ -357,14 +320,15 @@ class Dataset:
         """SHA-256 of the transitions, independent of the data set's source; of their numbers, not of the spaces."""
         if not self._fingerprint:
             digest = sha256()
+            # Of so many rows each, whatever is read at a time: checkpoints hold the fingerprints of their data sets.
             for first in range(0, len(self), CHUNK):
                 last = min(first + CHUNK, len(self))
                 for name, readers in self._readers().items():
                     for key, read in sorted(readers.items()):
-                        one = _numpy(read(slice(first, first + 1)))
+                        one = as_numpy(read(slice(first, first + 1)))
                         digest.update(f"{name}/{key} {one.dtype} {(last - first, *one.shape[1:])} ".encode())
                         for piece in pieces(last - first, one):
-                            found = _numpy(read(slice(first + piece.start, first + piece.stop)))
+                            found = as_numpy(read(slice(first + piece.start, first + piece.stop)))
                             digest.update(np.ascontiguousarray(found).data)
             self._fingerprint = digest.hexdigest()
         return self._fingerprint
@@ -379,7 +343,7 @@ class Dataset:
         """
         found: dict[str, Any] = {}
         for name, readers in self._readers().items():
-            parts = {key: _numpy(read(rows)) for key, read in readers.items()}
+            parts = {key: as_numpy(read(rows)) for key, read in readers.items()}
             found[name] = parts.get(ONLY, parts)
         return found
 
@@ -411,7 +375,7 @@ class Dataset:
         :param rows: which of them
         :return: ``actions``, ``rewards``, ``terminations``, ``truncations``
         """
-        return {name: _numpy(getattr(self._steps, name)[rows]) for name in _PLAIN}
+        return {name: as_numpy(getattr(self._steps, name)[rows]) for name in _PLAIN}
 
     def episodes(self) -> Iterator[slice]:
         """
@@ -420,7 +384,7 @@ class Dataset:
         :return: the rows of each
         """
         first = 0
-        for end in np.flatnonzero(_numpy(self._steps.terminations | self._steps.truncations)):
+        for end in np.flatnonzero(as_numpy(self._steps.terminations | self._steps.truncations)):
             yield slice(first, int(end) + 1)
             first = int(end) + 1
 
@@ -473,36 +437,6 @@ class Dataset:
         return _take(steps.observations, steps.next_at[rows])
 
 
-class _Places:
-    """
-    Observations at places of a replay buffer, gathered as they are read: as a whole they would take several times the
-    buffer's memory.
-
-    :param gather: returns those at some of the places, (n, O)
-    :param n: number of places, at least one
-    """
-
-    def __init__(self, gather: Callable[[slice], np.ndarray], n: int):
-        first = gather(slice(0, 1))
-        self._gather, self.shape, self.dtype = gather, (n, *first.shape[1:]), first.dtype
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def __getitem__(self, rows: slice) -> np.ndarray:
-        return self._gather(rows)
-
-
-def _places(buffer: Any, positions: np.ndarray, env_indices: np.ndarray, column: Column) -> Any:
-    def gather(rows: slice, key: str | None) -> np.ndarray:
-        return _numpy(observations_at(buffer, positions[rows], env_indices[rows], column, key))
-
-    n, space = len(positions), buffer.observation_space
-    if isinstance(space, spaces.Dict):
-        return {key: _Places(functools.partial(gather, key=key), n) for key in space.spaces}
-    return _Places(functools.partial(gather, key=None), n)
-
-
 def _at(part: Any, places: Any, rows: Any) -> Any:
     return part[places[rows]]
 
@@ -524,10 +458,6 @@ def _as_column(values: torch.Tensor) -> torch.Tensor:
     return values.unsqueeze(1) if values.dim() == 1 else values
 
 
-def _numpy(values: Any) -> np.ndarray:
-    return values.cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
-
-
 def _parts(arrays: Any) -> list[Any]:
     return list(arrays.values()) if isinstance(arrays, dict) else [arrays]
 
@@ -539,7 +469,7 @@ def _arrays(name: str, values: Any, least_axes: int, space: spaces.Space | None 
         return {key: _arrays(f"{name}[{key!r}]", value, least_axes, inside.get(key)) for key, value in values.items()}
     array = values if hasattr(values, "shape") and hasattr(values, "dtype") else np.asarray(values)
     if isinstance(array, torch.Tensor):
-        array = _numpy(array)
+        array = as_numpy(array)
     if isinstance(space, spaces.Discrete) and len(array.shape) == 1:
         # The number of a Discrete space is a row of one.
         array = np.asarray(array)[:, None]
@@ -582,7 +512,7 @@ def _breaks(steps: Steps) -> np.ndarray:
 
 def _rows_agree(then: Any, now: Any, agree: Callable[..., np.ndarray]) -> np.ndarray:
     """Whether observations agree in all their numbers, (N,)."""
-    pairs = [(_numpy(a), _numpy(b)) for a, b in zip(_parts(then), _parts(now), strict=True)]
+    pairs = [(as_numpy(a), as_numpy(b)) for a, b in zip(_parts(then), _parts(now), strict=True)]
     return np.logical_and.reduce([agree(a, b).reshape(len(a), -1).all(1) for a, b in pairs])  # type: ignore[no-any-return]
 
 

@@ -53,6 +53,14 @@ def action_dtype(space: spaces.Box) -> Any:
     return dtype if dtype.kind == "f" else np.dtype(np.float32)
 
 
+def as_numpy(values: Any) -> np.ndarray:
+    """
+    :param values: an array, a tensor on any device, or a list
+    :return: the same as an array
+    """
+    return values.cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
+
+
 def pieces(n: int, *arrays: Any) -> Iterator[slice]:
     """
     Divide rows into pieces that fit in memory.
@@ -62,14 +70,10 @@ def pieces(n: int, *arrays: Any) -> Iterator[slice]:
     :return: the rows of each piece, in order
     """
     parts = [part for each in arrays for part in (each.values() if isinstance(each, dict) else (each,))]
-    of_a_row = sum(math.prod(part.shape[1:]) * _item_size(part) for part in parts)
+    of_a_row = sum(math.prod(part.shape[1:]) * part.dtype.itemsize for part in parts)
     size = max(1, min(CHUNK, CHUNK_BYTES // max(of_a_row, 1)))
     for first in range(0, n, size):
         yield slice(first, min(first + size, n))
-
-
-def _item_size(part: Any) -> int:
-    return part.element_size() if isinstance(part, torch.Tensor) else np.dtype(part.dtype).itemsize
 
 
 def put(name: str, values: Any, out: np.ndarray) -> None:
@@ -117,11 +121,11 @@ def check_actions(actions: np.ndarray, action_space: spaces.Box) -> None:
     low, high = (bound.astype(np.float64) for bound in (action_space.low, action_space.high))
     # float32 rounds a bound given in float64.
     margin = 1e-5 * (high - low)
-    for first in range(0, len(actions), CHUNK):
-        piece = actions[first : first + CHUNK]
+    for rows in pieces(len(actions), actions):
+        piece = actions[rows]
         wrong = ~((piece >= low - margin) & (piece <= high + margin)).reshape(len(piece), -1).all(1)
         if wrong.any():
-            step = first + int(np.flatnonzero(wrong)[0])
+            step = rows.start + int(np.flatnonzero(wrong)[0])
             raise ValueError(
                 f"actions must lie within the bounds of action_space={action_space}, in the environment's units, not "
                 f"{actions[step]} as in step {step}: pass the environment's action_space, of arrays [-1, 1] otherwise"

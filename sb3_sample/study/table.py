@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_sample.envs.suites import published_id, published_key
-from sb3_sample.extras import install
+from sb3_sample.extras import needing
 from sb3_sample.plots import DATA, all_published_curves, find_runs, named_algorithms
 from sb3_sample.run_logs import EVALUATIONS, OFFLINE, is_truncated, read_evaluations, read_monitors
 from sb3_sample.run_settings import RECORD, RunSettings, plain_id, read_settings, study_of
@@ -479,7 +479,5 @@ def load(path: str | Path) -> pd.DataFrame:
 
 
 def _check_parquet() -> None:
-    try:
+    with needing(".parquet needs pyarrow", "study"):
         import pyarrow  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise ImportError(f".parquet needs pyarrow ({error}). Install it with: {install('study')}") from error

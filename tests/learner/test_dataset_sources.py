@@ -13,7 +13,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_sample import SAC, Dataset, multi_task_env, record
-from sb3_sample.replay import dataset, steps
+from sb3_sample.replay import dataset_buffers, steps
 from tests.sac.common import Toy, sac, vec
 
 BOX = spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 6.0], np.float32))
@@ -289,14 +289,14 @@ def test_a_replay_buffer_of_pictures_is_read_in_small_pieces(monkeypatch: pytest
     buffer.pos, buffer.full = 0, True
     monkeypatch.setattr(steps, "CHUNK_BYTES", 10_000)
     gathered: list[int] = []
-    gather = dataset.observations_at
+    gather = dataset_buffers.observations_at
 
     def noted(*args: Any) -> Any:
         found = gather(*args)
         gathered.append(sum(part.nbytes for part in found.values()) if isinstance(found, dict) else found.nbytes)
         return found
 
-    monkeypatch.setattr(dataset, "observations_at", noted)
+    monkeypatch.setattr(dataset_buffers, "observations_at", noted)
     with pytest.warns(UserWarning, match="are not the following observations"):
         data = Dataset.from_replay_buffer(buffer)
     seen = data.rows(slice(None))["next_observations"]

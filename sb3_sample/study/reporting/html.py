@@ -5,7 +5,7 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from sb3_sample.extras import install
+from sb3_sample.extras import needing
 from sb3_sample.study.reporting import figures
 from sb3_sample.study.reporting.pieces import (
     DASH,
@@ -32,11 +32,9 @@ def page(report: Report) -> str:
         requests and only its own script
     :raises ImportError: Jinja or matplotlib is not installed
     """
-    try:
+    with needing("reports need Jinja", "study"):
         import jinja2
         import markupsafe
-    except ModuleNotFoundError as error:
-        raise ImportError(f"reports need Jinja ({error}). Install it with: {install('study')}") from error
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_HERE),
         autoescape=True,
