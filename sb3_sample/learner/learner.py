@@ -253,6 +253,11 @@ class Learner(Executable):
         return self.networks.critic_target
 
     @property
+    def has_critic_targets(self) -> bool:
+        """Whether TD targets come from target networks of the critics, and not from the critics themselves."""
+        return bool(self.critic.trunk.stacks_rows != "online")
+
+    @property
     def observation_norm(self) -> Any:
         """Running normalisation of the networks' observations; None for none."""
         return self.networks.observation_norm
@@ -872,7 +877,7 @@ class Learner(Executable):
             metrics[_TD_ERRORS] = self._errors(batch, q, step, prepared)
 
         # Targets, by Polyak averaging.
-        if moves_targets:
+        if moves_targets and self.has_critic_targets:
             self._follow(self.critic_target, self.critic)
         return step, metrics
 

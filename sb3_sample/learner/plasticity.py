@@ -210,10 +210,17 @@ class ReDo(Part):
         :raises ValueError: if the critics' network lists no neurons that can be recycled
         """
         trunk = learner.critic.trunk
-        if all(units.outgoing is None for units in trunk.hidden_units(learner.critic.head)):
+        listed = trunk.hidden_units(learner.critic.head)
+        if not listed:
             raise ValueError(
                 f"redo_period={self.period} recycles hidden neurons that a network lists in hidden_units(head), and "
                 f"{type(trunk).__name__} lists none: define it, or leave redo_period out"
+            )
+        if all(units.outgoing is None for units in listed):
+            raise ValueError(
+                f"redo_period={self.period} recycles hidden neurons, and none of {type(trunk).__name__} can be: their "
+                "weights have unit norm, or a norm stands between them and the next layer (hidden_units(head) lists "
+                "no outgoing layer). Leave redo_period out"
             )
 
     def after_update(self, learner: Learning, batch: Batch) -> dict[str, torch.Tensor]:

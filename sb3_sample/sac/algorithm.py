@@ -148,6 +148,9 @@ class SAC(  # type: ignore[misc]  # actor
             # A class's default resets give way. Compared by identity: resets that are passed, even equal ones, are
             # another object.
             given["resets"] = ()
+        if given["backbone"] == "td3" and "ent_coef" not in given.passed:
+            # A class's default weighs an entropy, which this actor has not.
+            given["ent_coef"] = "auto"
         for name in "train_freq", "gradient_steps":
             given[name] = 1 if given[name] is None else given[name]
         is_set_up = given.pop("_init_setup_model")
@@ -209,6 +212,7 @@ class SAC(  # type: ignore[misc]  # actor
         self._source: ReplaySource | DatasetSource = ReplaySource(self)
         self.learner = self._make_learner(networks=self.policy, counts=self)
         checks.check_rule(self)
+        checks.check_targets(self)
         checks.check_sampling(self, self.replay_buffer)
         self._plain_attributes = plain_attributes(self)
         self._watch = MetricWatch(self.device)

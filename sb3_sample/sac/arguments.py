@@ -162,7 +162,8 @@ class SACArguments(Resumable):
         kind=Kind(f"be one of {list(SCHEDULES)}", lambda value: value in SCHEDULES).or_none("no such schedule"),
     )
     """"linear" or "cosine": decay from ``learning_rate``, a number, to ``final_learning_rate`` over the planned
-    gradient steps, for each optimizer by its own number of steps; the final rate thereafter"""
+    gradient steps, for each optimizer by its own number of steps; the final rate thereafter. ``learning_rate=0`` stays
+    0, as when the zoo loads a model to watch it"""
     final_learning_rate: float = argument(default=0.0, kind=AT_LEAST_0)
     """rate at the end of the schedule"""
     schedule_steps: int | None = argument(default=None, kind=integer(1).or_none("those of the first learn"))

@@ -294,7 +294,7 @@ def _check_schedule(agent: Any) -> None:
             f"learning_rate={agent.learning_rate!r} is a schedule, and so is "
             f"learning_rate_schedule={agent.learning_rate_schedule!r}: pass a number, or learning_rate_schedule=None"
         )
-    if agent.final_learning_rate > agent.learning_rate:
+    if 0 < agent.learning_rate < agent.final_learning_rate:
         raise ValueError(
             f"final_learning_rate={agent.final_learning_rate} lies above learning_rate={agent.learning_rate}, from "
             f"which learning_rate_schedule={agent.learning_rate_schedule!r} decays: pass final_learning_rate= too, at "
@@ -584,6 +584,19 @@ def check_sampling(agent: Any, buffer: Any) -> None:
         raise ValueError(
             f"replay_buffer_kwargs: sampling='device' has the gradient step draw its batch itself, but {reason}: pass "
             "sampling='host'"
+        )
+
+
+def check_targets(agent: Any) -> None:
+    """
+    :param agent: an algorithm with its networks
+    :raises ValueError: if arguments say how targets follow, and neither critics nor actor have any
+    """
+    if agent.policy.actor_target is None and not agent.learner.has_critic_targets:
+        check_unused(
+            agent,
+            ["tau", "target_update_interval"],
+            f"critics without target networks ({type(agent.policy.critic.trunk).__name__})",
         )
 
 

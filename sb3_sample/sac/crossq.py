@@ -4,9 +4,10 @@ from typing import Any, ClassVar
 
 import torch
 from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import ConstantSchedule
 
 from sb3_sample.constructor import Given, argument
-from sb3_sample.kinds import AT_LEAST_0, TRUE_OR_FALSE
+from sb3_sample.kinds import AT_LEAST_0, TRUE_OR_FALSE, is_number
 from sb3_sample.learner.heads import ValueHead
 from sb3_sample.optim import AdamW
 from sb3_sample.sac import checks
@@ -27,8 +28,8 @@ class CrossQ(SAC):
     ``weight_norm=True`` is CrossQ+WN in the version that XQC's authors compare with: weights of unit norm, weight decay
     of the other parameters, batch norm in the place of renormalisation, target networks, smaller critics, two gradient
     steps a transition, and a learning rate that falls linearly. Arguments that are not passed then have other defaults:
-    ``learning_rate=3e-4``, ``learning_rate_schedule="linear"``, ``final_learning_rate=3e-5``, ``ent_coef="auto_0.01"``,
-    ``replay_ratio=2``, ``actor_at_once=True``, ``weight_decay=0.01``.
+    ``learning_rate=3e-4``, ``learning_rate_schedule="linear"``, ``final_learning_rate`` a tenth of ``learning_rate``,
+    ``ent_coef="auto_0.01"``, ``replay_ratio=2``, ``actor_at_once=True``, ``weight_decay=0.01``.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -70,9 +71,20 @@ class CrossQ(SAC):
                 default = type(self).constructor_arguments[name].default
                 if name in given.passed or default != CrossQ.constructor_arguments[name].default:
                     continue
-                if name != "final_learning_rate" or given["learning_rate_schedule"] is not None:
-                    given[name] = value
+                if name == "final_learning_rate":
+                    if given["learning_rate_schedule"] is None:
+                        continue
+                    value *= self._share_of_published(given["learning_rate"])
+                given[name] = value
         super()._construct(given)
+
+    def _share_of_published(self, learning_rate: Any) -> float:
+        """
+        :param learning_rate: the argument
+        :return: it over the published rate; 1 if it is no number, which is refused later
+        """
+        value = learning_rate.val if isinstance(learning_rate, ConstantSchedule) else learning_rate
+        return value / self.WITH_WEIGHT_NORM["learning_rate"] if is_number(value) else 1.0
 
     def _check_arguments(self) -> None:
         super()._check_arguments()

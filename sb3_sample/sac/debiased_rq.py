@@ -245,6 +245,7 @@ class DebiasedRQ(SAC):
         assert isinstance(self.replay_buffer, WindowReplay)
         if self._n_updates == 0 and not self._is_warming_up() and self.replay_buffer.n_drawable == 0:
             warn(
-                f"learn ended without a single gradient step: no episode had more than {self._horizon} steps before a "
-                "time limit, which the windows of encoder_horizon and n_steps need"
+                "learn ended without a single gradient step: a window of encoder_horizon and n_steps needs more than "
+                f"{self._horizon} steps of an episode, or a termination: no episode has had them. Train for more, or "
+                "pass smaller ones"
             )

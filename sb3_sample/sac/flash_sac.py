@@ -5,7 +5,7 @@ from typing import Any
 
 from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_sample.arguments import default_of
+from sb3_sample.arguments import check_unused, default_of
 from sb3_sample.constructor import Given, argument
 from sb3_sample.kinds import ABOVE_0
 from sb3_sample.learner.categorical import VALUE_HEADS, CategoricalHead
@@ -90,6 +90,11 @@ class FlashSAC(SAC):
                 f"target_std={passed['target_std']!r} means nothing with target_entropy="
                 f"{passed['target_entropy']!r}: leave one of them out"
             )
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        if self.backbone == "td3":
+            check_unused(self, ["target_std"], "backbone='td3', which has no entropy")
 
     @classmethod
     def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:

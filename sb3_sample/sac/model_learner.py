@@ -378,9 +378,9 @@ class HasLearner:
         return own_classes.make("reward_scale", self.reward_scale, make, RewardScale, learner, kwargs=kwargs)  # type: ignore[no-any-return]
 
     def _make_schedule(self: Any) -> LearningRateSchedule | None:
-        if self.learning_rate_schedule is None:
-            return None
         peak, start = self.lr_schedule(1), self.warm_up_learning_rate
+        if self.learning_rate_schedule is None or peak == 0:
+            return None
         return LearningRateSchedule(
             self.learning_rate_schedule,
             peak,

@@ -1,6 +1,7 @@
 """Learning rates over the planned gradient steps: by hand, in training, resumed and continued."""
 
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,39 @@ def test_the_zoos_numbers_are_numbers(tmp_path: Path) -> None:
     assert model.learning_rate == 1e-3 and model.learner.scheduled_rate == pytest.approx(1e-3 * 30 / 60)
     model.save(tmp_path / "model")
     assert SAC.load(tmp_path / "model", env=vec(), learning_rate=ConstantSchedule(2e-3)).learning_rate == 2e-3
+
+
+def test_no_learning(tmp_path: Path) -> None:
+    """The zoo, and scripts that follow it, load a model to watch with a learning rate of 0."""
+    model = sac(learning_rate_schedule="cosine", final_learning_rate=1e-5, warm_up_steps=5, schedule_steps=60).learn(40)
+    model.save(tmp_path / "model")
+    to_watch = {"learning_rate": 0.0, "lr_schedule": lambda _: 0.0, "clip_range": lambda _: 0.0}
+    loaded = SAC.load(tmp_path / "model", env=vec(), custom_objects=to_watch)
+    learned = loaded.get_parameters()["policy"]
+    loaded.learn(20, reset_num_timesteps=False)
+    assert loaded.learner.n_updates > model.learner.n_updates and loaded._rate_in_force() == 0
+    actors = {name: value for name, value in loaded.get_parameters()["policy"].items() if name.startswith("actor.")}
+    assert actors and all(torch.equal(value, learned[name]) for name, value in actors.items())
+
+
+def test_a_plan_that_is_over(tmp_path: Path) -> None:
+    model = sac(learning_rate_schedule="linear").learn(40).learn(10, reset_num_timesteps=False)
+    assert model._n_updates == model.planned_updates == 40
+    with pytest.warns(UserWarning, match="the 40 planned gradient steps .* are taken, and final_learning_rate=0: noth"):
+        model.learn(10, reset_num_timesteps=False)
+    model.save(tmp_path / "model")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        SAC.load(tmp_path / "model", env=vec(), final_learning_rate=1e-5).learn(10, reset_num_timesteps=False)
+        SAC.load(tmp_path / "model", env=vec(), schedule_steps=100).learn(10, reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("rate", [3e-4, 1e-5, ConstantSchedule(2e-5), 0.0])
+def test_the_final_rate_of_crossq_with_weight_norm(rate: Any) -> None:
+    model = MAKERS["CrossQ+WN"](learning_rate=rate)
+    assert model.final_learning_rate == pytest.approx(model.learning_rate / 10, rel=1e-12)
+    assert MAKERS["CrossQ+WN"]().final_learning_rate == 3e-5
+    assert MAKERS["CrossQ+WN"](learning_rate=rate, final_learning_rate=0.0).final_learning_rate == 0
 
 
 def test_resumed(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ class Wrong(CrossQ):
 
 
 def crossq(cls: Any = CrossQ, **kwargs: Any) -> Any:
-    settings = dict(seed=1, ent_coef=0.2, learning_rate=1e-2, tau=0.1)
+    settings = dict(seed=1, ent_coef=0.2, learning_rate=1e-2) | ({} if cls is CrossQ else {"tau": 0.1})
     return sac(
         policy_kwargs={"critic_network": cls, "net_arch": None} | kwargs.pop("policy_kwargs", {}), **settings | kwargs
     )

@@ -29,13 +29,14 @@ from sb3_sample import (
     Dataset,
     DebiasedRQ,
     FadedReplayBuffer,
+    FlashSAC,
     PrioritizedReplayBuffer,
     RegularizedSAC,
     SimBa,
     SimbaV2,
 )
 from sb3_sample.parts import ValueHead
-from tests.sac.common import TINY_BRO, TINY_RESIDUAL, TINY_SAC, vec
+from tests.sac.common import MAKERS, TINY_BRO, TINY_FLASH, TINY_RESIDUAL, TINY_SAC, vec
 
 DOCS = Path(__file__).parents[2] / "docs" / "parts.md"
 NOISE = NormalActionNoise(np.zeros(2), np.ones(2))
@@ -81,8 +82,10 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
         (DAC, {"uncertainty": "aleatoric"}, ("uncertainty='aleatoric'", "quantiles")),
         (DAC, {"uncertainty": "both"}, ("uncertainty='both'", "quantiles")),
     ],
-    '`ent_coef`, `target_entropy` with `backbone="td3"`': [
+    '`ent_coef`, `target_entropy`, `target_std` of `FlashSAC` with `backbone="td3"`': [
         (SAC, {"backbone": "td3", "ent_coef": 0.1}, ("ent_coef=0.1", "td3")),
+        (BRC, {"backbone": "td3", "ent_coef": "auto_0.1"}, ("ent_coef='auto_0.1'", "td3")),
+        (FlashSAC, {"backbone": "td3", "target_std": 0.3, "policy_kwargs": TINY_FLASH}, ("target_std=0.3", "td3")),
         (SAC, {"backbone": "td3", "target_entropy": -1.0}, ("target_entropy=-1.0", "td3")),
     ],
     "`initial_optimism` of DAC not above -β": [(DAC, {"initial_optimism": -1.0}, ("initial_optimism", "-1.0"))],
@@ -133,6 +136,17 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
         (BRO, {"resets_to": "fresh", "resets": ()}, ("resets_to='fresh'", "no resets")),
         (SAC, {"reset_shrink": 0.5}, ("reset_shrink=0.5", "no resets")),
         (SAC, {"redo_threshold": 0.5}, ("redo_threshold=0.5", "redo_period=None")),
+    ],
+    '`redo_period` with `critic_network` `"crossq"`, `"flash"`, `"simbav2"`, `"xqc"`': [
+        (CrossQ, {"redo_period": 5}, ("redo_period=5", "none of CrossQNet can be")),
+        (XQC, {"redo_period": 5}, ("redo_period=5", "none of XQCNet can be")),
+        (SimbaV2, {"redo_period": 5, "policy_kwargs": TINY_RESIDUAL}, ("redo_period=5", "none of SimbaV2Net can be")),
+        (FlashSAC, {"redo_period": 5, "policy_kwargs": TINY_FLASH}, ("redo_period=5", "none of FlashNet can be")),
+    ],
+    '`tau`, `target_update_interval` with `critic_network="crossq"`, as in `CrossQ` without `weight_norm`': [
+        (CrossQ, {"tau": 0.9}, ("tau=0.9", "CrossQNet")),
+        (CrossQ, {"target_update_interval": 7}, ("target_update_interval=7", "CrossQNet")),
+        (SAC, {"policy_kwargs": {"critic_network": "crossq"}, "tau": 0.9}, ("tau=0.9", "CrossQNet")),
     ],
     "a setting both as an argument and in `exploration_kwargs`, `pessimism_kwargs` or `policy_kwargs`": [
         (DAC, {"exploration_kwargs": {"kl_target": 0.1}}, ("exploration_kwargs", "kl_target")),
@@ -337,6 +351,19 @@ def test_the_rest_of_each_row_is_allowed() -> None:
         {"target_subset": 2},
     ):
         SAC("MlpPolicy", vec(), **{**TINY_SAC, **arguments})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["SimBa", "SimbaV2", "BRC", "XQC", "CrossQ", "CrossQ+WN", "FlashSAC"])
+def test_a_deterministic_actor_of_every_agent(name: str) -> None:
+    """The temperature that a class begins with is not taken for one that was passed."""
+    model = MAKERS[name](backbone="td3").learn(40)
+    assert model.ent_coef == "auto" and model._n_updates > 0
+
+
+def test_targets_that_there_are() -> None:
+    """CrossQ+WN has target critics, and a deterministic CrossQ a target actor."""
+    for arguments in ({"weight_norm": True}, {"backbone": "td3"}):
+        CrossQ("MlpPolicy", vec(), tau=0.01, **TINY_SAC, **arguments)  # type: ignore[arg-type]
 
 
 def test_her_holds_nothing_out() -> None:

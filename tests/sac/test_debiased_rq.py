@@ -210,9 +210,12 @@ def test_normalised_windows() -> None:
 
 
 def test_episodes_too_short_for_windows_are_told_of() -> None:
-    with pytest.warns(UserWarning, match="no episode had more than 5 steps before a time limit"):
+    needed = "needs more than 5 steps of an episode, or a termination: no episode has had them"
+    with pytest.warns(UserWarning, match=needed):
         model = dr_q(vec(length=4, truncate=True)).learn(60)
     assert model._n_updates == 0
+    with pytest.warns(UserWarning, match=needed):
+        dr_q(learning_starts=2).learn(4)
 
 
 def test_no_warning_of_stable_baselines3() -> None:
