@@ -92,6 +92,7 @@ $(GPU_FOLDER)/site: $(wildcard $(GPU_FOLDER)/wheels/*.whl)
 gpu: $(GPU_FOLDER)/site
 	$(GPU_RUN) -m pytest -q -rs -m gpu -n 8 tests/test_gpu.py
 	$(GPU_RUN) benchmarks/gpu.py
+	$(GPU_RUN) benchmarks/gpu.py --parts simba,simbav2,brc,crossq,xqc,flash,dr_q
 
 gpu-evidence: $(GPU_FOLDER)/site
 	$(GPU_RUN) benchmarks/gpu_evidence.py $(GPU_FOLDER)/evidence

@@ -46,6 +46,8 @@ def main(given: list[str] | None = None) -> None:
         log_path=folder / "tasks",
     )
     shared: dict[str, Any] = {
+        # Up to a million transitions of each task, as published.
+        "buffer_size": min(args.steps, 1_000_000) * env.num_envs,
         "learning_starts": args.random_steps * env.num_envs,
         "seed": args.seed,
         "verbose": 1,

@@ -89,7 +89,7 @@ def multi_task_env(
     in [-1, 1] and scaled to the bounds of each task; a single task keeps its own spaces and actions. Each environment
     is wrapped in ``Monitor``, and ``env.get_attr("task_id")`` gives the ids in their order.
 
-    :param ids: ids of environments and names of ``sb3_sample.envs.suites``, such as "MT10", "MT50" and "DMC_HARD"; one
+    :param ids: ids of environments and names of ``sb3_sample.envs.suites``, such as "MT10", "MT50" and "DMC_DOGS"; one
         of them, or a list
     :param seed: seed of the first task; the others have the following ones, as in ``make_vec_env``; None for none
     :param env_kwargs: arguments of ``make_env`` for each task, e.g. ``{"max_episode_steps": 500}``

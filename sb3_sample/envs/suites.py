@@ -162,8 +162,11 @@ MBMA = _dmc(
 #: MBMA, table 4: four harder tasks, 3M (quadruped) and 6M (humanoid) environment steps, action repeat 4.
 MBMA_HARD = _dmc("quadruped-walk", "quadruped-run", "humanoid-stand", "humanoid-walk")
 
-#: Dogs and humanoids, the seven hard tasks of DeepMind Control that BRC learns with one agent.
-DMC_HARD = DAC_NAMED
+#: DeepMind Control's dogs and its humanoids; BRC's published code learns each of the two with one agent.
+DMC_DOGS = _dmc("dog-stand", "dog-walk", "dog-trot", "dog-run")
+DMC_HUMANOIDS = _dmc("humanoid-stand", "humanoid-walk", "humanoid-run")
+#: The seven of both, over which the papers after BRO average.
+DMC_HARD = DMC_DOGS + DMC_HUMANOIDS
 #: Meta-World's MT10 and MT50, tasks for one agent, in the order of the library (``metaworld.env_dict``): a task's
 #: position is its number.
 MT10 = _metaworld(

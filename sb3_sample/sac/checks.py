@@ -370,6 +370,8 @@ def check_target_entropy(agent: Any) -> None:
     :param agent: an algorithm
     :raises ValueError: if its ``target_entropy`` is neither finite nor "auto", or a number where there is no entropy
     """
+    if isinstance(agent.target_entropy, np.ndarray):
+        agent.target_entropy = agent.target_entropy.tolist()
     if agent.backbone == "td3":
         _check_no_entropy(agent, "target_entropy")
     value = agent.target_entropy

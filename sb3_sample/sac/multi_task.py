@@ -120,7 +120,7 @@ def told_task(space: spaces.Dict, observation: Mapping[str, Any]) -> dict[str, A
     :param space: space of observations that contain the task
     :param observation: "observation", (O,) or (B, O), and "task", a number, or (B,) of them
     :return: the same with a task for each observation
-    :raises ValueError: if it has other entries, or a task is no number of one
+    :raises ValueError: if it has other entries, a task is no number of one, or there are more or fewer than observations
     """
     if observation.keys() != {"observation", "task"}:
         raise ValueError(f"observation must have the entries 'observation' and 'task', not {sorted(observation)}")
@@ -132,6 +132,10 @@ def told_task(space: spaces.Dict, observation: Mapping[str, Any]) -> dict[str, A
             f"{observation['task']!r}"
         )
     vectors = np.asarray(observation["observation"])
-    if vectors.ndim > len(space["observation"].shape) and task.size == 1:  # type: ignore[arg-type]
+    batched = vectors.ndim > len(space["observation"].shape)  # type: ignore[arg-type]
+    if task.size != 1 and task.shape != (vectors.shape[:1] if batched else ()):
+        rows = f"{len(vectors)} observations" if batched else "one observation"
+        raise ValueError(f"{rows} must have one task, or one each, not tasks of the shape {task.shape}")
+    if batched and task.size == 1:
         task = np.full(len(vectors), task.item())
     return {"observation": vectors, "task": task}

@@ -20,6 +20,9 @@ SIZES = {
     "VPL_ADDITIONAL": 4,
     "MBMA": 14,
     "MBMA_HARD": 4,
+    "DMC_DOGS": 4,
+    "DMC_HUMANOIDS": 3,
+    "DMC_HARD": 7,
 }
 
 

@@ -256,7 +256,8 @@ def test_the_actors_loss_weighs_each_tasks_entropy() -> None:
 
 
 def test_rewards_are_divided_by_each_tasks_temperature_and_target() -> None:
-    model = make("BRC", task_temperatures=True, target_entropy=[-1.0, -3.0]).learn(30)
+    model = make("BRC", task_temperatures=True, target_entropy=np.array([-1.0, -3.0])).learn(30)
+    assert model.target_entropy == [-1.0, -3.0]
     scaler = model.reward_scaler
     with torch.no_grad():
         model.temperature.log_value.copy_(torch.tensor([math.log(0.2), math.log(3.0)]))
@@ -328,6 +329,9 @@ def test_predict_is_told_the_task() -> None:
     assert batch.shape == (4, 1) and np.array_equal(batch, each)
     one_of_batch, _ = model.predict(told(np.array([1]), 1), deterministic=True)
     assert one_of_batch.shape == (1, 1)
+    for tasks_told, n in ((np.array([1, 1]), 4), (np.array([1, 1]), None), (np.ones((4, 1), int), 4)):
+        with pytest.raises(ValueError, match="must have one task, or one each, not tasks of the shape"):
+            model.predict(told(tasks_told, n))
     for task in (2, -1, 1.0, "car"):
         with pytest.raises(ValueError, match="task of an observation must be its number, an integer from 0 to 1, not"):
             model.predict(told(task))
@@ -640,6 +644,7 @@ def test_the_example(tmp_path: Path) -> None:
     model = BRC.load(tmp_path / "seed_0" / "final_model")
     # Two for each step of both tasks after the random ones.
     assert model._n_updates == 2 * 15 and model.learning_starts == 10
+    assert model.buffer_size == 2 * 20, "no transition of a task is lost before its millionth"
 
 
 @pytest.mark.slow
