@@ -400,7 +400,9 @@ def run_part(name: str, device: str, turn: Turn) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     usual = [name for name in (*PARTS, *OTHERS) if name not in AFTER_BRO]
-    parser.add_argument("--parts", default=",".join(usual), help="what to measure, in this order (default: %(default)s)")
+    parser.add_argument(
+        "--parts", default=",".join(usual), help="what to measure, in this order (default: %(default)s)"
+    )
     parser.add_argument("--seconds", type=float, default=200, help="for all parts")
     parser.add_argument("--device", default="cuda", help="of the models")
     parser.add_argument("--part", help=argparse.SUPPRESS)

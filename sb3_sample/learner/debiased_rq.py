@@ -174,6 +174,8 @@ class DebiasedRQLearner(Learner):
             (networks.critic_target, networks.critic),
             (networks.encoder_target, networks.encoder),
         ):
+            if target is None:
+                continue  # A tanh-Gaussian actor has no target.
             for ours, theirs in zip(target.state_dict().values(), online.state_dict().values(), strict=True):
                 ours.copy_(theirs)
 

@@ -105,13 +105,18 @@ class Actor(NetworkFeatures, BasePolicy):
         self.log_std = self.trunk.make_head(self.action_dim, gain=1.0)
         if initial_std is not None:
             self._network_args["initial_std"] = initial_std
-            self._start_from(initial_std)
+            self.start_from(initial_std)
         #: Distribution of the actions, for Stable-Baselines3's own use: nothing here reads it.
         self.action_dist = SquashedDiagGaussianDistribution(self.action_dim)
         keep_at_rest(self)
 
-    def _start_from(self, initial_std: float) -> None:
-        """Initialise the log standard deviation to nearly the same value for all observations, however large."""
+    def start_from(self, initial_std: float) -> None:
+        """
+        Initialise the log standard deviation to nearly the same value for all observations, however large.
+
+        :param initial_std: standard deviation of the pre-tanh Gaussian
+        :raises ValueError: if the output layer is no plain one, or the value does not lie between the bounds
+        """
         if type(self.log_std) is not nn.Linear:
             raise ValueError(
                 f"initial_std={initial_std} is set by a plain output layer, and that of actor_network="

@@ -10,6 +10,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 
+from sb3_sample.arguments import check_unused
 from sb3_sample.constructor import Given, argument
 from sb3_sample.kinds import ABOVE_0, AT_LEAST_0, Kind, integer, is_number
 from sb3_sample.learner.debiased_rq import DebiasedRQLearner, EmbeddingLoss
@@ -42,7 +43,6 @@ _EMBEDDING_LOSS = EmbeddingLoss._fields
 #: Arguments of the family that are fixed: their values, and why.
 _FIXED: dict[str, tuple[Any, str]] = {
     "tau": (1.0, "its targets are copies, made every target_update_interval gradient steps"),
-    "backbone": ("td3", "its actor is TD3's"),
     "exploration": ("actor", "it explores with its actor and noise"),
     "validation_proportion": (0.0, "its windows of several steps would carry held-out transitions into training"),
     "batch_transforms": ((), "they would change single transitions, and not the windows of the encoder"),
@@ -70,7 +70,8 @@ class DebiasedRQ(SAC):
     specification of the update; docs/dr_q.md names it, and the difference: if a transition ends an episode by
     termination, its next observation is the episode's last one, also within the windows.
 
-    ``ent_coef`` and ``target_entropy`` have no meaning here.
+    With ``backbone="sac"``, which is not published, the actor on these embeddings is SAC's. Only then do ``ent_coef``
+    and ``target_entropy`` have a meaning.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -132,7 +133,8 @@ class DebiasedRQ(SAC):
     reward_range: Sequence[float] = argument(default=(-10.0, 10.0), kind=_RANGE)
     """ends of the predicted rewards on the scale of symlog; (-10, 10) is ±22,025"""
     backbone: str = argument(default="td3")
-    """"td3"; no other"""
+    """"td3", or "sac": a tanh-Gaussian actor with a temperature, without the three kinds of noise and without a target
+    actor: TD targets sample its actions, on the encoder's embeddings, and take the target encoder's for the values"""
 
     def _construct(self, given: Given) -> None:
         #: Transitions and ends of episodes that were stored over the model's life, each in a slot of the buffer.
@@ -162,6 +164,8 @@ class DebiasedRQ(SAC):
                 f"derived from it, not {getattr(self.replay_buffer_class, '__name__', self.replay_buffer_class)}"
             )
         super()._check_arguments()
+        if self.backbone == "sac":
+            check_unused(self, _NOISE, "backbone='sac', whose actor has its own standard deviation")
         noise = {name: name for name in _NOISE}
         checks.check_once("policy_kwargs['actor_kwargs']", self.policy_kwargs.get("actor_kwargs"), noise)
         checks.check_once("replay_buffer_kwargs", self.replay_buffer_kwargs, {"horizon": "encoder_horizon, or n_steps"})
@@ -178,7 +182,7 @@ class DebiasedRQ(SAC):
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         kwargs = with_weight_decay(super()._full_policy_kwargs(), self.weight_decay)
-        noise = {name: getattr(self, name) for name in _NOISE}
+        noise = {name: getattr(self, name) for name in _NOISE} if self.backbone == "td3" else {}
         return {**kwargs, "actor_kwargs": {**noise, **(kwargs.get("actor_kwargs") or {})}}
 
     def _make_head(self) -> ValueHead:

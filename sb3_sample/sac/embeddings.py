@@ -19,17 +19,19 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_sample.arguments import check_net_arch
-from sb3_sample.kinds import DICT, check_value, integer
+from sb3_sample.kinds import DICT, check_value, integer, one_of
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.networks import RunningNorm
 from sb3_sample.networks.modes import ModeSwitch, evaluated
 from sb3_sample.networks.normed_mlp import NormedMLP, xavier_linear
 from sb3_sample.optim import AdamW
-from sb3_sample.sac.actors import DeterministicActor
+from sb3_sample.sac.actors import BACKBONES, Actor
 from sb3_sample.sac.critics import CriticEnsemble
 from sb3_sample.sac.features import TensorFeatures
 from sb3_sample.sac.multi_task import dict_extractor
 from sb3_sample.sac.policies import SACPolicy
+
+_ACTORS: dict[str, type[Actor]] = {name: BACKBONES[name] for name in ("sac", "td3")}
 
 
 class Encoder(BaseFeaturesExtractor):
@@ -167,8 +169,9 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
     :param features_extractor_class: features extractor, the first part of the encoder
     :param features_extractor_kwargs: its arguments
     :param normalize_images: whether images are divided by 255
-    :param backbone: "td3"
-    :param actor_kwargs: ``exploration_noise``, ``target_noise``, ``target_noise_clip``
+    :param backbone: "td3" for a deterministic actor with a target actor, "sac" for a tanh-Gaussian one without
+    :param actor_kwargs: with "td3" ``exploration_noise``, ``target_noise``, ``target_noise_clip``; with "sac"
+        ``log_std_min``, ``log_std_max``, ``clip_log_std``, ``initial_std``
     :param optimizer_class: optimizer of encoder, actor and critics
     :param optimizer_kwargs: its arguments, except the learning rate
     :param width_factor: factor on the widths of all hidden layers and embeddings
@@ -226,7 +229,13 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
         check_value("n_reward_atoms", n_reward_atoms, integer(2))
         check_value("n_critics", n_critics, integer(1))
         check_value("n_outputs", n_outputs, integer(1))
+        check_value("backbone", backbone, one_of(_ACTORS))
         check_value("actor_kwargs", actor_kwargs, DICT)
+        for name in actor_kwargs or {}:
+            if name not in _ACTORS[backbone].ARGUMENTS:
+                raise ValueError(
+                    f"actor_kwargs has {name!r}, but backbone={backbone!r} takes {_ACTORS[backbone].ARGUMENTS}"
+                )
         check_net_arch(net_arch, ("pi", "qf"), both=True)
         pi_arch, qf_arch = [512] * 2, [512] * 3
         if net_arch is not None:
@@ -240,15 +249,18 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
             **sizes_of_encoder,
             n_reward_atoms=n_reward_atoms,
         )
+        self._actor_class = _ACTORS[backbone]
         self._actor_args: Any = (pi_arch, dict(actor_kwargs or {}))
         self.actor = self.make_actor()
         self.critic = EmbeddedCritics(
             observation_space, action_space, self.encoder, qf_arch, n_critics, n_outputs, normalize_images
         )
-        # Copied together, so that the copies read the encoder's copy.
         online: Any = (self.encoder, self.actor, self.critic)
+        # Copied together, so that the copies read the encoder's copy.
         targets = copy.deepcopy(online)
         self.encoder_target, self.actor_target, self.critic_target = targets
+        if self.actor.has_entropy:
+            self.actor_target = None
         for target in targets:
             target.requires_grad_(False)
             target.train(False)
@@ -274,12 +286,12 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
             width_factor=width_factor,
         )
 
-    def make_actor(self) -> DeterministicActor:
+    def make_actor(self) -> Actor:
         """
         :return: an actor with the policy's settings and its own parameters, which reads the encoder's embeddings
         """
         hidden_sizes, kwargs = self._actor_args
-        actor = DeterministicActor(
+        actor = self._actor_class(
             self.observation_space,
             self.action_space,
             NormedMLP,
@@ -290,6 +302,10 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
             **kwargs,
         )
         actor.mean = xavier_linear(actor.trunk.out_features, actor.action_dim)
+        if actor.has_entropy:
+            actor.log_std = xavier_linear(actor.trunk.out_features, actor.action_dim)
+            if kwargs.get("initial_std") is not None:
+                actor.start_from(kwargs["initial_std"])
         return actor
 
     def embedded(self, obs: Any, target: bool = False) -> torch.Tensor:

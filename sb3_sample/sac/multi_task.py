@@ -120,7 +120,7 @@ def told_task(space: spaces.Dict, observation: Mapping[str, Any]) -> dict[str, A
     :param space: space of observations that contain the task
     :param observation: "observation", (O,) or (B, O), and "task", a number, or (B,) of them
     :return: the same with a task for each observation
-    :raises ValueError: if it has other entries, a task is no number of one, or there are more or fewer than observations
+    :raises ValueError: if it has other entries, a task is no number of one, or their numbers differ
     """
     if observation.keys() != {"observation", "task"}:
         raise ValueError(f"observation must have the entries 'observation' and 'task', not {sorted(observation)}")

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample import DebiasedRQ, WindowDictReplayBuffer, WindowReplayBuffer
-from sb3_sample.learner.batch import Windows
+from sb3_sample.learner.batch import Noise, Windows
 from sb3_sample.learner.embedding_losses import infonce, symexp_atoms, two_hot
 from sb3_sample.sac.embeddings import DebiasedRQPolicy
 from tests.sac.common import MAKERS, TINY_DR_Q, differing, random_batch, state, vec
@@ -281,7 +281,13 @@ def test_the_learner_asks_for_windows_where_a_reset_is_due(resets: dict[str, Any
     ("kwargs", "words"),
     [
         ({"tau": 0.005}, "DebiasedRQ has tau=1.0, not 0.005"),
-        ({"backbone": "sac"}, "DebiasedRQ has backbone='td3', not 'sac'"),
+        ({"backbone": "mean"}, r"backbone must be one of \['sac', 'td3'\], not 'mean'"),
+        ({"backbone": "sac", "target_noise": 0.1}, "target_noise=0.1 means nothing with backbone='sac'"),
+        (
+            {"policy_kwargs": {"actor_kwargs": {"log_std_min": -5}}},
+            "actor_kwargs has 'log_std_min', but backbone='td3' takes",
+        ),
+        ({"backbone": "sac", "task_temperatures": True}, "task_temperatures=True needs observations that tell the"),
         ({"exploration": "oac"}, "DebiasedRQ has exploration='actor', not 'oac'"),
         ({"validation_proportion": 0.1}, "DebiasedRQ has validation_proportion=0.0, not 0.1"),
         ({"batch_transforms": [int]}, "DebiasedRQ has batch_transforms"),
@@ -366,15 +372,88 @@ def test_parts_of_the_family(kwargs: dict[str, Any]) -> None:
     assert model._n_updates > 30 and all(torch.isfinite(p).all() for p in model.policy.parameters())
 
 
+# ---------------------------------------------------------------- SAC's actor
+
+
+def test_a_step_of_sacs_actor_by_hand() -> None:
+    """Losses and entropy, written out: target actor and noise are gone, and the entropy is there."""
+    model = dr_q(backbone="sac", ent_coef="auto_0.5", gamma=0.9)
+    policy: Any = model.policy
+    assert policy.actor_target is None
+    with torch.no_grad():
+        # A block of the encoder has been: it is no longer its target.
+        for parameter in policy.encoder.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)))
+    batch, noise = random_batch(model, 16), torch.randn(16, 2, generator=torch.Generator().manual_seed(2))
+    encoder = copies(policy.encoder)
+
+    def action(observations: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        hidden = policy.actor.trunk(policy.encoder(observations))
+        low, high = policy.actor.log_std_min, policy.actor.log_std_max
+        log_std = low + (high - low) / 2 * (1 + torch.tanh(policy.actor.log_std(hidden)))
+        normal = torch.distributions.Normal(policy.actor.mean(hidden), log_std.exp())
+        x = normal.mean + normal.stddev * noise
+        log_prob = normal.log_prob(x) - torch.log(1 - torch.tanh(x).square())
+        return torch.tanh(x), log_prob.sum(1, keepdim=True)
+
+    def value(critic: Any, of: Any, observations: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        return critic.head(critic.trunk(of.pair(of(observations), actions))).squeeze(2)  # type: ignore[no-any-return]
+
+    with torch.no_grad():
+        actions, log_prob = action(batch.next_observations)
+        following = value(policy.critic_target, policy.encoder_target, batch.next_observations, actions)
+        soft = following.amin(0).unsqueeze(1) - 0.5 * log_prob
+        target = batch.rewards + 0.9 * (1 - batch.dones) * soft
+        error = value(policy.critic, policy.encoder, batch.observations, batch.actions) - target.T
+        critic_loss = torch.nn.functional.huber_loss(error, torch.zeros_like(error))
+        actions, log_prob = action(batch.observations)
+
+    metrics = model.learner.step(batch, Noise(noise, noise, noise), eager=True)
+    torch.testing.assert_close(metrics["train/critic_loss"], critic_loss, rtol=1e-4, atol=0)
+    torch.testing.assert_close(metrics["train/entropy"], -log_prob.mean(), rtol=1e-4, atol=1e-4)
+    with torch.no_grad():
+        # The actor learns on the new critics.
+        mean_value = value(policy.critic, policy.encoder, batch.observations, actions).mean(0).unsqueeze(1)
+    torch.testing.assert_close(metrics["train/actor_loss"], (0.5 * log_prob - mean_value).mean(), rtol=1e-4, atol=1e-4)
+    assert same(copies(policy.encoder), encoder) and model.temperature() != 0.5
+
+
+def test_sacs_actor_trains_saves_and_resumes(tmp_path: Path) -> None:
+    def make() -> DebiasedRQ:
+        return dr_q(
+            backbone="sac",
+            resets=40,
+            policy_kwargs={**TINY_DR_Q["policy_kwargs"], "actor_kwargs": {"initial_std": 0.5}},
+        )
+
+    model = make()
+    observation = torch.randn(64, 3, generator=torch.Generator().manual_seed(0))
+    policy: Any = model.policy
+    _, log_std = policy.actor.gaussian(policy.encoder(observation))
+    torch.testing.assert_close(log_std.exp(), torch.full_like(log_std, 0.5), rtol=0.1, atol=0)
+    model.learn(60, checkpoint=tmp_path / "a", checkpoint_freq=100)
+    assert model.plasticity.n_done == 1
+    make().learn(33, checkpoint=tmp_path / "b", checkpoint_freq=100)
+    assert not differing(state(model), state(make().learn(60, checkpoint=tmp_path / "b", checkpoint_freq=100)))
+    model.save(tmp_path / "m")
+    loaded = DebiasedRQ.load(tmp_path / "m", env=vec())
+    assert loaded.backbone == "sac" and not differing(state(model), state(loaded))
+    acted = [each.predict(observation.numpy(), deterministic=True)[0] for each in (model, loaded)]
+    np.testing.assert_array_equal(*acted)
+    again = [model.predict(observation.numpy())[0] for _ in range(2)]
+    assert not np.array_equal(*again)
+
+
 # ---------------------------------------------------------------- learning
 
 
 @pytest.mark.slow
-def test_it_learns_pendulum() -> None:
+@pytest.mark.parametrize("backbone", ["td3", "sac"])
+def test_it_learns_pendulum(backbone: str) -> None:
     """A random policy has about -1200, a good one about -150."""
     model = DebiasedRQ(
         "MlpPolicy", "Pendulum-v1", gamma=0.95, learning_rate=1e-3, learning_starts=500, batch_size=128,
-        target_update_interval=50, buffer_size=5_000, seed=0, device="cpu",
+        target_update_interval=50, buffer_size=5_000, seed=0, device="cpu", backbone=backbone,
         policy_kwargs={"net_arch": [64, 64], "encoder_width": 64, "state_embedding": 32, "action_embedding": 16,
                        "pair_embedding": 32},
     )  # fmt: skip
