@@ -60,9 +60,11 @@ SB3 = "SAC (stable_baselines3)"
 CONTRIB = "CrossQ (sb3_contrib)"
 
 
-def environment(args: argparse.Namespace, seed: int, training: bool) -> VecEnv:
+def environment(args: argparse.Namespace, seed: int, folder: Path | None = None) -> VecEnv:
+    """The environment for training, with Monitor files in ``folder``, or for evaluation."""
     kwargs = {} if args.action_repeat is None else {"action_repeat": args.action_repeat}
-    env = make_vec_env(args.env, seed=seed, env_kwargs=kwargs)
+    training = folder is not None
+    env = make_vec_env(args.env, seed=seed, env_kwargs=kwargs, monitor_dir=str(folder) if training else None)
     return VecNormalize(env, training=training, norm_reward=training) if args.agent in ON_POLICY else env
 
 
@@ -91,15 +93,16 @@ def main() -> None:
     parser.add_argument("--action-repeat", type=int, help="of dmc/ environments; steps are decisions")
     parser.add_argument("--steps", type=int, default=30_000)
     parser.add_argument("--eval-freq", type=int, default=5_000)
+    parser.add_argument("--eval-episodes", type=int, default=5)
     parser.add_argument("--output", type=Path, default=Path("runs"))
     args = parser.parse_args()
     torch.set_num_threads(1)
 
     folder = args.output / args.agent / f"seed_{args.seed}"
     folder.mkdir(parents=True, exist_ok=True)
-    model = build(args.agent, environment(args, args.seed, training=True), args.seed)
+    model = build(args.agent, environment(args, args.seed, folder), args.seed)
     evaluation = EvalCallback(
-        environment(args, args.seed + 1_000, training=False), n_eval_episodes=5, eval_freq=args.eval_freq,
+        environment(args, args.seed + 1_000), n_eval_episodes=args.eval_episodes, eval_freq=args.eval_freq,
         log_path=str(folder), verbose=0,
     )  # fmt: skip
     model.set_logger(configure(str(folder), ["csv"]))

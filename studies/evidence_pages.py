@@ -126,6 +126,7 @@ PAGES = {
         "after_bro.md", "SimBa, XQC and DR.Q", ("--groups", "all", "--curves", "SimBa (RR=2)", "XQC", "DR.Q")
     ),
     "crossq": Page("after_bro.md", "CrossQ", ("--groups", "all", "--curves", "CrossQ")),
+    "crossq_contrib": Page("after_bro.md", "CrossQ of sb3_contrib", ("--groups", "all", "--curves", "CrossQ")),
     "brc": Page("after_bro.md", "BRC, 512 wide", ("--groups", "all", "--curves", "BRO Fast")),
     "simbav2": Page("after_bro.md", "SimbaV2", ("--groups", "all", "--curves", "SimbaV2 (RR=2)")),
     "flash_sac": Page("after_bro.md", "FlashSAC", ("--groups", "all", "--curves", "FlashSAC")),
@@ -138,7 +139,7 @@ PAGES = {
     "brc_mt10": Page("multi_task.md", "BRC on MT10", ("--groups", "metaworld", "--curves", "none"), table=by_task),
 }
 #: Results without a plan.
-BY_PROGRAM = ["brc_mt10"]
+BY_PROGRAM = ["crossq_contrib", "brc_mt10"]
 #: Plans whose page needs more than a report, and where this is described.
 ELSEWHERE = {"scaling": "docs/scaling.md has the commands, which fit its laws first"}
 
