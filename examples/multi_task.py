@@ -29,6 +29,7 @@ def main(given: list[str] | None = None) -> None:
     parser.add_argument("--agent", choices=["brc", "bro_fast", "sac"], default="brc")
     parser.add_argument("--critic-width", type=int, help="of brc (default: 512)")
     parser.add_argument("--batch-size", type=int, help="default: 1024 for brc, 128 for bro_fast, 256 for sac")
+    parser.add_argument("--buffer-size", type=int, default=1_000_000, help="transitions kept of each task")
     parser.add_argument("--max-episode-steps", type=int, help="time limit; that of the environments if left out")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folder", default="runs/multi_task", help="where results go")
@@ -46,8 +47,7 @@ def main(given: list[str] | None = None) -> None:
         log_path=folder / "tasks",
     )
     shared: dict[str, Any] = {
-        # Up to a million transitions of each task, as published.
-        "buffer_size": min(args.steps, 1_000_000) * env.num_envs,
+        "buffer_size": args.buffer_size * env.num_envs,
         "learning_starts": args.random_steps * env.num_envs,
         "seed": args.seed,
         "verbose": 1,

@@ -1,4 +1,4 @@
-"""Learner of DR.Q: TD3's gradient step on fixed embeddings, with blocks of encoder steps in between."""
+"""Learner of DR.Q: TD3's (or SAC's) gradient step on fixed embeddings, with blocks of encoder steps in between."""
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple

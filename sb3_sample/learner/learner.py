@@ -877,7 +877,7 @@ class Learner(Executable):
             metrics[_TD_ERRORS] = self._errors(batch, q, step, prepared)
 
         # Targets, by Polyak averaging.
-        if moves_targets and self.has_critic_targets:
+        if moves_targets:
             self._follow(self.critic_target, self.critic)
         return step, metrics
 

@@ -218,9 +218,9 @@ class ReDo(Part):
             )
         if all(units.outgoing is None for units in listed):
             raise ValueError(
-                f"redo_period={self.period} recycles hidden neurons, and none of {type(trunk).__name__} can be: their "
-                "weights have unit norm, or a norm stands between them and the next layer (hidden_units(head) lists "
-                "no outgoing layer). Leave redo_period out"
+                f"redo_period={self.period} recycles hidden neurons, and no neuron of {type(trunk).__name__} can be "
+                "recycled: weights have unit norm, or a norm stands before the next layer (hidden_units(head) lists no "
+                "outgoing layer). Leave redo_period out"
             )
 
     def after_update(self, learner: Learning, batch: Batch) -> dict[str, torch.Tensor]:

@@ -191,6 +191,7 @@ class SAC(  # type: ignore[misc]  # actor
         self._metrics: dict[str, torch.Tensor] = {}
         if is_set_up and hasattr(self, "observation_space"):
             self._setup_model()
+            checks.check_targets(self, self.learner, given.passed)
         elif is_set_up:
             # A model that is to learn from data: its networks are made once the spaces are known.
             check_every(self, needs_spaces=False)
@@ -212,7 +213,6 @@ class SAC(  # type: ignore[misc]  # actor
         self._source: ReplaySource | DatasetSource = ReplaySource(self)
         self.learner = self._make_learner(networks=self.policy, counts=self)
         checks.check_rule(self)
-        checks.check_targets(self)
         checks.check_sampling(self, self.replay_buffer)
         self._plain_attributes = plain_attributes(self)
         self._watch = MetricWatch(self.device)

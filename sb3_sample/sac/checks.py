@@ -1,7 +1,7 @@
 """Checks of the off-policy family's arguments: combinations, and conditions beyond the kind of a value."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from sb3_sample.kinds import (
 )
 from sb3_sample.learner.augmentation import AUGMENTATIONS
 from sb3_sample.learner.exploration import EXPLORATIONS
+from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
 from sb3_sample.learner.reward_scale import LinearScale
 from sb3_sample.replay.buffers import DeviceReplayBuffer, DeviceValidationReplayBuffer, ValidationSplit
@@ -370,11 +371,9 @@ def check_target_entropy(agent: Any) -> None:
     :param agent: an algorithm
     :raises ValueError: if its ``target_entropy`` is neither finite nor "auto", or a number where there is no entropy
     """
-    if isinstance(agent.target_entropy, np.ndarray):
-        agent.target_entropy = agent.target_entropy.tolist()
     if agent.backbone == "td3":
         _check_no_entropy(agent, "target_entropy")
-    value = agent.target_entropy
+    value = agent.target_entropy.tolist() if isinstance(agent.target_entropy, np.ndarray) else agent.target_entropy
     if isinstance(value, Sequence) and not isinstance(value, str):
         n_tasks = agent.n_tasks
         if not agent.task_temperatures or len(value) != n_tasks:
@@ -403,9 +402,10 @@ def check_use_sde(use_sde: bool) -> None:
 
 
 def _check_no_entropy(agent: Any, name: str) -> None:
-    if getattr(agent, name) != "auto":
+    value = getattr(agent, name)
+    if not (isinstance(value, str) and value == "auto"):
         raise ValueError(
-            f"{name}={getattr(agent, name)!r} asks for an entropy, which a deterministic actor (backbone='td3') has "
+            f"{name}={value!r} asks for an entropy, which a deterministic actor (backbone='td3') has "
             f"not: leave {name} out"
         )
 
@@ -589,17 +589,19 @@ def check_sampling(agent: Any, buffer: Any) -> None:
         )
 
 
-def check_targets(agent: Any) -> None:
+def check_targets(agent: Any, learner: Learner, passed: Collection[str]) -> None:
     """
-    :param agent: an algorithm with its networks
-    :raises ValueError: if arguments say how targets follow, and neither critics nor actor have any
+    :param agent: an algorithm
+    :param learner: its learner
+    :param passed: names of the arguments that were passed; files may hold others, which nothing reads
+    :raises ValueError: if they say how targets follow, and there are none
     """
-    if agent.policy.actor_target is None and not agent.learner.has_critic_targets:
-        check_unused(
-            agent,
-            ["tau", "target_update_interval"],
-            f"critics without target networks ({type(agent.policy.critic.trunk).__name__})",
-        )
+    if learner.has_critic_targets:
+        return
+    unused = (
+        {"target_update_interval"} if learner.networks.actor_target is not None else {"tau", "target_update_interval"}
+    )
+    check_unused(agent, sorted(unused.intersection(passed)), "critics without target networks")
 
 
 def check_rule(agent: Any) -> None:

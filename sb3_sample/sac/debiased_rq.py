@@ -43,7 +43,7 @@ _EMBEDDING_LOSS = EmbeddingLoss._fields
 #: Arguments of the family that are fixed: their values, and why.
 _FIXED: dict[str, tuple[Any, str]] = {
     "tau": (1.0, "its targets are copies, made every target_update_interval gradient steps"),
-    "exploration": ("actor", "it explores with its actor and noise"),
+    "exploration": ("actor", "it explores with its actor"),
     "validation_proportion": (0.0, "its windows of several steps would carry held-out transitions into training"),
     "batch_transforms": ((), "they would change single transitions, and not the windows of the encoder"),
     "augmentation": (None, "it would change single transitions, and not the windows of the encoder"),
@@ -113,11 +113,11 @@ class DebiasedRQ(SAC):
     actor_pessimism: float | None = argument(default=0.0)
     """weight of the spread in the actor's objective; None: as in the target"""
     exploration_noise: float = argument(default=0.2, kind=ABOVE_0)
-    """standard deviation of the noise while exploring, in actions of [-1, 1]"""
+    """with ``backbone="td3"``, standard deviation of the noise while exploring, in actions of [-1, 1]"""
     target_noise: float = argument(default=0.2, kind=AT_LEAST_0)
-    """standard deviation of the noise on the target's action"""
+    """with ``backbone="td3"``, standard deviation of the noise on the target's action"""
     target_noise_clip: float = argument(default=0.3, kind=AT_LEAST_0)
-    """bound of the noise on the target's action"""
+    """with ``backbone="td3"``, bound of the noise on the target's action"""
     weight_decay: float = argument(default=0.01, kind=AT_LEAST_0)
     """decoupled weight decay of encoder, critics and actor"""
     encoder_horizon: int = argument(default=5, kind=integer(1))
@@ -166,8 +166,9 @@ class DebiasedRQ(SAC):
         super()._check_arguments()
         if self.backbone == "sac":
             check_unused(self, _NOISE, "backbone='sac', whose actor has its own standard deviation")
-        noise = {name: name for name in _NOISE}
-        checks.check_once("policy_kwargs['actor_kwargs']", self.policy_kwargs.get("actor_kwargs"), noise)
+        else:
+            noise = {name: name for name in _NOISE}
+            checks.check_once("policy_kwargs['actor_kwargs']", self.policy_kwargs.get("actor_kwargs"), noise)
         checks.check_once("replay_buffer_kwargs", self.replay_buffer_kwargs, {"horizon": "encoder_horizon, or n_steps"})
         checks.check_weight_decay(self)
 
@@ -250,6 +251,6 @@ class DebiasedRQ(SAC):
         if self._n_updates == 0 and not self._is_warming_up() and self.replay_buffer.n_drawable == 0:
             warn(
                 "learn ended without a single gradient step: a window of encoder_horizon and n_steps needs more than "
-                f"{self._horizon} steps of an episode, or a termination: no episode has had them. Train for more, or "
-                "pass smaller ones"
+                f"{self._horizon} steps of an episode, or a termination, which no episode has had. Train for more "
+                "steps, or pass a smaller encoder_horizon and n_steps"
             )

@@ -1,8 +1,8 @@
 """Networks of DR.Q as Stable-Baselines3 policies: an encoder, and values and policy that read its embeddings."""
 
 import copy
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -19,7 +19,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_sample.arguments import check_net_arch
-from sb3_sample.kinds import DICT, check_value, integer, one_of
+from sb3_sample.kinds import check_value, integer
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.networks import RunningNorm
 from sb3_sample.networks.modes import ModeSwitch, evaluated
@@ -30,8 +30,6 @@ from sb3_sample.sac.critics import CriticEnsemble
 from sb3_sample.sac.features import TensorFeatures
 from sb3_sample.sac.multi_task import dict_extractor
 from sb3_sample.sac.policies import SACPolicy
-
-_ACTORS: dict[str, type[Actor]] = {name: BACKBONES[name] for name in ("sac", "td3")}
 
 
 class Encoder(BaseFeaturesExtractor):
@@ -152,7 +150,7 @@ class EmbeddedCritics(CriticEnsemble):
 
 class DebiasedRQPolicy(TensorFeatures, SACPolicy):
     """
-    The networks of DR.Q: encoder, actor and critics, and the targets of all three.
+    The networks of DR.Q: encoder, actor and critics, and the targets of encoder, critics and, with "td3", actor.
 
     :param observation_space: observation space
     :param action_space: action space, a bounded Box
@@ -178,6 +176,7 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
     :raises ValueError: if an argument is out of range
     """
 
+    backbones: ClassVar[Mapping[str, type[Actor]]] = {name: BACKBONES[name] for name in ("sac", "td3")}
     encoder: Encoder
     encoder_target: Encoder
     observation_norm: RunningNorm | None = None
@@ -229,13 +228,7 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
         check_value("n_reward_atoms", n_reward_atoms, integer(2))
         check_value("n_critics", n_critics, integer(1))
         check_value("n_outputs", n_outputs, integer(1))
-        check_value("backbone", backbone, one_of(_ACTORS))
-        check_value("actor_kwargs", actor_kwargs, DICT)
-        for name in actor_kwargs or {}:
-            if name not in _ACTORS[backbone].ARGUMENTS:
-                raise ValueError(
-                    f"actor_kwargs has {name!r}, but backbone={backbone!r} takes {_ACTORS[backbone].ARGUMENTS}"
-                )
+        self._actor_class, actor_args = self._chosen_actor(backbone, actor_kwargs)
         check_net_arch(net_arch, ("pi", "qf"), both=True)
         pi_arch, qf_arch = [512] * 2, [512] * 3
         if net_arch is not None:
@@ -249,14 +242,13 @@ class DebiasedRQPolicy(TensorFeatures, SACPolicy):
             **sizes_of_encoder,
             n_reward_atoms=n_reward_atoms,
         )
-        self._actor_class = _ACTORS[backbone]
-        self._actor_args: Any = (pi_arch, dict(actor_kwargs or {}))
+        self._actor_args: Any = (pi_arch, actor_args)
         self.actor = self.make_actor()
         self.critic = EmbeddedCritics(
             observation_space, action_space, self.encoder, qf_arch, n_critics, n_outputs, normalize_images
         )
-        online: Any = (self.encoder, self.actor, self.critic)
         # Copied together, so that the copies read the encoder's copy.
+        online: Any = (self.encoder, self.actor, self.critic)
         targets = copy.deepcopy(online)
         self.encoder_target, self.actor_target, self.critic_target = targets
         if self.actor.has_entropy:

@@ -5,7 +5,7 @@ from typing import Any
 
 from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_sample.arguments import check_unused, default_of
+from sb3_sample.arguments import default_of
 from sb3_sample.constructor import Given, argument
 from sb3_sample.kinds import ABOVE_0
 from sb3_sample.learner.categorical import VALUE_HEADS, CategoricalHead
@@ -81,6 +81,11 @@ class FlashSAC(SAC):
         # stood for.
         if "target_std" in given.passed and given["target_std"] != default_of(type(self), "target_std"):
             self._check_one_target({name: value for name, value in given.items() if name in given.passed})
+            if given["backbone"] == "td3":
+                raise ValueError(
+                    f"target_std={given['target_std']!r} means nothing with backbone='td3', which has no entropy: "
+                    "leave one of them out"
+                )
         super()._construct(given)
 
     @staticmethod
@@ -90,11 +95,6 @@ class FlashSAC(SAC):
                 f"target_std={passed['target_std']!r} means nothing with target_entropy="
                 f"{passed['target_entropy']!r}: leave one of them out"
             )
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        if self.backbone == "td3":
-            check_unused(self, ["target_std"], "backbone='td3', which has no entropy")
 
     @classmethod
     def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:

@@ -105,7 +105,9 @@ def _maker(cls: Any) -> Callable[..., Learner]:
         counts = Counts()
         counts.compiled = None if model.compile == "auto" else bool(model.compile)
         counts.planned_updates = model.schedule_steps
-        return model._make_learner(counts=counts, generators=generators)  # type: ignore[no-any-return]
+        learner: Learner = model._make_learner(counts=counts, generators=generators)
+        checks.check_targets(model, learner, arguments)
+        return learner
 
     learner.__qualname__ = f"{cls.__name__}.learner"
     return learner
@@ -280,6 +282,8 @@ class HasLearner:
     def _take_target_entropy(self: Any) -> None:
         """Resolve ``target_entropy``, which is then a number, or a list of numbers, one per task."""
         checks.check_target_entropy(self)
+        if isinstance(self.target_entropy, np.ndarray):
+            self.target_entropy = self.target_entropy.tolist()
         if self.target_entropy == "auto":
             self._target_entropy = self._auto_target_entropy(get_action_dim(self.action_space))
         elif isinstance(self.target_entropy, Sequence) and not isinstance(self.target_entropy, str):

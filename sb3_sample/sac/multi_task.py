@@ -133,9 +133,13 @@ def told_task(space: spaces.Dict, observation: Mapping[str, Any]) -> dict[str, A
         )
     vectors = np.asarray(observation["observation"])
     batched = vectors.ndim > len(space["observation"].shape)  # type: ignore[arg-type]
-    if task.size != 1 and task.shape != (vectors.shape[:1] if batched else ()):
-        rows = f"{len(vectors)} observations" if batched else "one observation"
-        raise ValueError(f"{rows} must have one task, or one each, not tasks of the shape {task.shape}")
-    if batched and task.size == 1:
-        task = np.full(len(vectors), task.item())
+    if task.size == 1:
+        task = np.full(len(vectors) if batched else (), task.item())
+    elif not batched or task.shape != (len(vectors),):
+        rows = (
+            f"{len(vectors)} observations must have one task, or one each"
+            if batched
+            else "one observation has one task"
+        )
+        raise ValueError(f"{rows}, not tasks of the shape {task.shape}")
     return {"observation": vectors, "task": task}

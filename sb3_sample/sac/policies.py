@@ -176,16 +176,9 @@ class SACPolicy(BasePolicy):
             self._share_norm(made)
             return made
 
-        if not isinstance(backbone, str) or backbone not in self.backbones:
-            raise ValueError(f"backbone must be one of {sorted(self.backbones)}, not {backbone!r}")
-        check_value("actor_kwargs", actor_kwargs, DICT)
         check_value("critic_optimizer_kwargs", critic_optimizer_kwargs, DICT)
-        actor_kwargs = dict(actor_kwargs or {})
-        allowed = self.backbones[backbone].ARGUMENTS
-        for name in actor_kwargs:
-            if name not in allowed:
-                raise ValueError(f"actor_kwargs has {name!r}, but backbone={backbone!r} takes {allowed}")
-        self._actor_class, self._actor_args = self.backbones[backbone], (actor_args, actor_kwargs)
+        self._actor_class, actor_kwargs = self._chosen_actor(backbone, actor_kwargs)
+        self._actor_args = (actor_args, actor_kwargs)
         self._critic_args = critic_args
         self.share_features_extractor = share_features_extractor
         self.encodes_once, self.encodes_next_once = actor_features == "before", target_encoder == "online"
@@ -279,6 +272,17 @@ class SACPolicy(BasePolicy):
             for each in (network, getattr(network, "at_rest", None)):
                 if each is not None:
                     vars(each)["observation_norm"] = self.observation_norm
+
+    def _chosen_actor(self, backbone: str, actor_kwargs: dict[str, Any] | None) -> tuple[type[Actor], dict[str, Any]]:
+        """The actor's class and arguments, once they are checked."""
+        if not isinstance(backbone, str) or backbone not in self.backbones:
+            raise ValueError(f"backbone must be one of {sorted(self.backbones)}, not {backbone!r}")
+        check_value("actor_kwargs", actor_kwargs, DICT)
+        chosen, kwargs = self.backbones[backbone], dict(actor_kwargs or {})
+        for name in kwargs:
+            if name not in chosen.ARGUMENTS:
+                raise ValueError(f"actor_kwargs has {name!r}, but backbone={backbone!r} takes {chosen.ARGUMENTS}")
+        return chosen, kwargs
 
     def make_actor(self) -> Actor:
         """

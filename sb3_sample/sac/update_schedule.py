@@ -33,18 +33,24 @@ class UpdateSchedule(DecidesCompiling, UpdatesOwed):
                     f"schedule_steps must be given, as learning_rate_schedule={self.learning_rate_schedule!r} needs to "
                     "know how many gradient steps are planned, and the arguments do not say it"
                 )
-        if self.planned_updates is not None and self._n_updates >= self.planned_updates:
-            self._warn_of_rate_zero(n_steps)
         n_of_warm_up = 0 if self._learns_from is not None else max(self.learning_starts - self.num_transitions, 0)
-        self._decide_compiling(self._updates_in(n_steps - n_of_warm_up))
+        coming = self._updates_in(n_steps - n_of_warm_up)
+        self._warn_of_rate_zero(coming)
+        self._decide_compiling(coming)
 
-    def _warn_of_rate_zero(self: Any, n_steps: int) -> None:
-        """Warn that nothing is learned after the planned gradient steps if the final rate is 0."""
-        if self.learner.schedule is not None and self.learner.schedule.end == 0 and self._updates_in(n_steps) > 0:
+    def _warn_of_rate_zero(self: Any, coming: float) -> None:
+        """Warn if the critics' learning rate is 0 in some of the coming gradient steps, since the plan ends before."""
+        schedule, planned = self.learner.schedule, self.planned_updates
+        if schedule is None or planned is None or schedule.end > 0:
+            return
+        # A part of a step, that a replay ratio leaves over, is none.
+        at_zero = int(min(self._n_updates + coming - planned, coming))
+        if at_zero > 1:
             warn(
-                f"the {self.planned_updates} planned gradient steps of learning_rate_schedule="
-                f"{self.learning_rate_schedule!r} are taken, and final_learning_rate=0: nothing more is learned. Pass "
-                "schedule_steps=, the gradient steps of all training, or final_learning_rate= to load"
+                f"in {at_zero:,} of the {int(coming):,} coming gradient steps the critics' learning rate is "
+                f"final_learning_rate=0: they come after the {planned:,} planned ones of learning_rate_schedule="
+                f"{self.learning_rate_schedule!r}. Pass schedule_steps=, the gradient steps of all training, or "
+                "final_learning_rate=, to the constructor or to load"
             )
 
     @property

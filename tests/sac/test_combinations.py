@@ -138,15 +138,21 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
         (SAC, {"redo_threshold": 0.5}, ("redo_threshold=0.5", "redo_period=None")),
     ],
     '`redo_period` with `critic_network` `"crossq"`, `"flash"`, `"simbav2"`, `"xqc"`': [
-        (CrossQ, {"redo_period": 5}, ("redo_period=5", "none of CrossQNet can be")),
-        (XQC, {"redo_period": 5}, ("redo_period=5", "none of XQCNet can be")),
-        (SimbaV2, {"redo_period": 5, "policy_kwargs": TINY_RESIDUAL}, ("redo_period=5", "none of SimbaV2Net can be")),
-        (FlashSAC, {"redo_period": 5, "policy_kwargs": TINY_FLASH}, ("redo_period=5", "none of FlashNet can be")),
+        (CrossQ, {"redo_period": 5}, ("redo_period=5", "no neuron of CrossQNet can be")),
+        (XQC, {"redo_period": 5}, ("redo_period=5", "no neuron of XQCNet can be")),
+        (
+            SimbaV2,
+            {"redo_period": 5, "policy_kwargs": TINY_RESIDUAL},
+            ("redo_period=5", "no neuron of SimbaV2Net can be"),
+        ),
+        (FlashSAC, {"redo_period": 5, "policy_kwargs": TINY_FLASH}, ("redo_period=5", "no neuron of FlashNet can be")),
     ],
-    '`tau`, `target_update_interval` with `critic_network="crossq"`, as in `CrossQ` without `weight_norm`': [
-        (CrossQ, {"tau": 0.9}, ("tau=0.9", "CrossQNet")),
-        (CrossQ, {"target_update_interval": 7}, ("target_update_interval=7", "CrossQNet")),
-        (SAC, {"policy_kwargs": {"critic_network": "crossq"}, "tau": 0.9}, ("tau=0.9", "CrossQNet")),
+    '`target_update_interval`, and without `backbone="td3"`, whose actor has a target, `tau`, with '
+    '`critic_network="crossq"`, as in `CrossQ` without `weight_norm`': [
+        (CrossQ, {"tau": 0.9}, ("tau=0.9", "without target networks")),
+        (CrossQ, {"target_update_interval": 7}, ("target_update_interval=7", "without target networks")),
+        (CrossQ, {"target_update_interval": 7, "backbone": "td3"}, ("target_update_interval=7", "without target")),
+        (SAC, {"policy_kwargs": {"critic_network": "crossq"}, "tau": 0.9}, ("tau=0.9", "without target networks")),
     ],
     "a setting both as an argument and in `exploration_kwargs`, `pessimism_kwargs` or `policy_kwargs`": [
         (DAC, {"exploration_kwargs": {"kl_target": 0.1}}, ("exploration_kwargs", "kl_target")),
@@ -360,10 +366,21 @@ def test_a_deterministic_actor_of_every_agent(name: str) -> None:
     assert model.ent_coef == "auto" and model._n_updates > 0
 
 
-def test_targets_that_there_are() -> None:
-    """CrossQ+WN has target critics, and a deterministic CrossQ a target actor."""
-    for arguments in ({"weight_norm": True}, {"backbone": "td3"}):
-        CrossQ("MlpPolicy", vec(), tau=0.01, **TINY_SAC, **arguments)  # type: ignore[arg-type]
+def test_targets_that_there_are(tmp_path: Path) -> None:
+    """CrossQ+WN has target critics, and a deterministic CrossQ a target actor; files may hold any number."""
+    for arguments, target in (({"weight_norm": True}, "critic_target"), ({"backbone": "td3"}, "actor_target")):
+        first = {}
+        for tau in (0.01, 0.5):
+            model: Any = CrossQ("MlpPolicy", vec(), tau=tau, **TINY_SAC, **arguments)  # type: ignore[arg-type]
+            model.learn(40)
+            first[tau] = next(iter(getattr(model.policy, target).parameters())).clone()
+        assert not torch.equal(first[0.01], first[0.5])
+    model = CrossQ("MlpPolicy", vec(), **TINY_SAC)
+    model.tau = 0.01
+    model.save(tmp_path / "model")
+    assert CrossQ.load(tmp_path / "model").tau == 0.01
+    with pytest.raises(ValueError, match=r"tau=0\.9 means nothing with critics without target networks"):
+        CrossQ.learner(model.observation_space, model.action_space, tau=0.9)
 
 
 def test_her_holds_nothing_out() -> None:

@@ -210,7 +210,7 @@ def test_normalised_windows() -> None:
 
 
 def test_episodes_too_short_for_windows_are_told_of() -> None:
-    needed = "needs more than 5 steps of an episode, or a termination: no episode has had them"
+    needed = "needs more than 5 steps of an episode, or a termination, which no episode has had"
     with pytest.warns(UserWarning, match=needed):
         model = dr_q(vec(length=4, truncate=True)).learn(60)
     assert model._n_updates == 0

@@ -327,10 +327,14 @@ def test_predict_is_told_the_task() -> None:
     batch, _ = model.predict(told(1, 4), deterministic=True)
     each, _ = model.predict(told(np.array([1, 1, 1, 1]), 4), deterministic=True)
     assert batch.shape == (4, 1) and np.array_equal(batch, each)
+    single, _ = model.predict(told(np.array([[1]])), deterministic=True)
+    assert single.shape == (1,)
     one_of_batch, _ = model.predict(told(np.array([1]), 1), deterministic=True)
     assert one_of_batch.shape == (1, 1)
     for tasks_told, n in ((np.array([1, 1]), 4), (np.array([1, 1]), None), (np.ones((4, 1), int), 4)):
-        with pytest.raises(ValueError, match="must have one task, or one each, not tasks of the shape"):
+        with pytest.raises(
+            ValueError, match="(must have one task, or one each|one observation has one task), not tasks of the shape"
+        ):
             model.predict(told(tasks_told, n))
     for task in (2, -1, 1.0, "car"):
         with pytest.raises(ValueError, match="task of an observation must be its number, an integer from 0 to 1, not"):
@@ -644,7 +648,11 @@ def test_the_example(tmp_path: Path) -> None:
     model = BRC.load(tmp_path / "seed_0" / "final_model")
     # Two for each step of both tasks after the random ones.
     assert model._n_updates == 2 * 15 and model.learning_starts == 10
-    assert model.buffer_size == 2 * 20, "no transition of a task is lost before its millionth"
+    assert model.buffer_size == 2_000_000, "a million transitions of each task"
+    # Further steps go on from there.
+    given = given.replace("--steps 20", "--steps 24")
+    example.main([*given.split(), PENDULUM, CAR, "--random-steps", "5", "--max-episode-steps", "5"])
+    assert BRC.load(tmp_path / "seed_0" / "final_model")._n_updates == 2 * 19
 
 
 @pytest.mark.slow
