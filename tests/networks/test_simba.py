@@ -170,7 +170,9 @@ def test_for_any_agent(network: str) -> None:
     if network == "simba":
         sac(**kwargs).learn(20)
     else:
-        with pytest.raises(ValueError, match="SimbaV2Net lists none"):
+        with pytest.raises(
+            ValueError, match="redo_period=5 recycles hidden neurons, and no neuron of SimbaV2Net can be recycled"
+        ):
             sac(**kwargs)
 
 
