@@ -48,13 +48,14 @@ class Learning(Protocol):
     """
     Interface of the learner to its parts.
 
-    ``actor``, ``critic`` and ``critic_target`` are the networks, ``temperature()`` the entropy's weight, a scalar, or
-    (n_tasks,) where each task has its own, ``temperature_of(batch)`` the temperature of transitions,
-    ``head`` gives the meaning of the critics' outputs, ``gamma`` is the discount factor, ``target_entropy`` the target
-    of the learned temperature, ``observation_norm`` the networks' running normalisation, None for none. ``n_updates``
-    counts gradient steps; ``num_transitions`` counts the environments' transitions over the learner's life, of which
-    the first ``learning_starts`` have random actions; ``environment_steps`` counts the same for each task, if several
-    tasks take a step together.
+    ``actor``, ``critic`` and ``critic_target`` are the networks; ``has_critic_targets`` says whether TD targets come
+    from ``critic_target``, and not from ``critic`` itself. ``temperature()`` is the entropy's weight, a scalar, or
+    (n_tasks,) where each task has its own, ``temperature_of(batch)`` the temperature of transitions, ``head`` gives the
+    meaning of the critics' outputs, ``gamma`` is the discount factor, ``target_entropy`` the target of the learned
+    temperature, ``observation_norm`` the networks' running normalisation, None for none. ``n_updates`` counts gradient
+    steps; ``num_transitions`` counts the environments' transitions over the learner's life, of which the first
+    ``learning_starts`` have random actions; ``environment_steps`` counts the same for each task, if several tasks take
+    a step together.
     """
 
     @property
@@ -65,6 +66,9 @@ class Learning(Protocol):
 
     @property
     def critic_target(self) -> Any: ...
+
+    @property
+    def has_critic_targets(self) -> bool: ...
 
     @property
     def temperature(self) -> Any: ...

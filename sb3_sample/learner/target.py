@@ -139,7 +139,7 @@ def bootstrap(
     """
     actions, entropy_bonus = next_step(learner, batch, alpha, noise)
     with torch.no_grad():
-        critics = learner.critic if learner.critic.trunk.stacks_rows == "online" else learner.critic_target
+        critics = learner.critic_target if learner.has_critic_targets else learner.critic
         next_q = evaluate(at_rest(critics), batch.next_observations, actions)
         return next_q if subset is None else next_q[subset], entropy_bonus
 

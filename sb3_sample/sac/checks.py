@@ -281,15 +281,21 @@ def check_scale_is_known(agent: Any) -> None:
         )
 
 
+def plain_rate(learning_rate: Any) -> Any:
+    """
+    :param learning_rate: the argument
+    :return: the number, if it is one in the form in which the zoo passes it on; else the argument
+    """
+    return learning_rate.val if isinstance(learning_rate, ConstantSchedule) else learning_rate
+
+
 def _check_schedule(agent: Any) -> None:
     """Check that a schedule over planned gradient steps goes with the learning rate."""
     if agent.learning_rate_schedule is None:
         names = ["final_learning_rate", "schedule_steps", "warm_up_steps", "warm_up_learning_rate"]
         check_unused(agent, names, "learning_rate_schedule=None")
         return
-    if isinstance(agent.learning_rate, ConstantSchedule):
-        # A number, in the form in which the zoo passes it on.
-        agent.learning_rate = agent.learning_rate.val
+    agent.learning_rate = plain_rate(agent.learning_rate)
     if callable(agent.learning_rate):
         raise ValueError(
             f"learning_rate={agent.learning_rate!r} is a schedule, and so is "
@@ -598,10 +604,8 @@ def check_targets(agent: Any, learner: Learner, passed: Collection[str]) -> None
     """
     if learner.has_critic_targets:
         return
-    unused = (
-        {"target_update_interval"} if learner.networks.actor_target is not None else {"tau", "target_update_interval"}
-    )
-    check_unused(agent, sorted(unused.intersection(passed)), "critics without target networks")
+    unused = ["target_update_interval", *(["tau"] if learner.networks.actor_target is None else [])]
+    check_unused(agent, [name for name in unused if name in passed], "critics without target networks")
 
 
 def check_rule(agent: Any) -> None:

@@ -4,7 +4,6 @@ from typing import Any, ClassVar
 
 import torch
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import ConstantSchedule
 
 from sb3_sample.constructor import Given, argument
 from sb3_sample.kinds import AT_LEAST_0, TRUE_OR_FALSE, is_number
@@ -74,17 +73,11 @@ class CrossQ(SAC):
                 if name == "final_learning_rate":
                     if given["learning_rate_schedule"] is None:
                         continue
-                    value *= self._share_of_published(given["learning_rate"])
+                    rate = checks.plain_rate(given["learning_rate"])
+                    if is_number(rate):  # Others are refused later.
+                        value *= rate / self.WITH_WEIGHT_NORM["learning_rate"]
                 given[name] = value
         super()._construct(given)
-
-    def _share_of_published(self, learning_rate: Any) -> float:
-        """
-        :param learning_rate: the argument
-        :return: it over the published rate; 1 if it is no number, which is refused later
-        """
-        value = learning_rate.val if isinstance(learning_rate, ConstantSchedule) else learning_rate
-        return value / self.WITH_WEIGHT_NORM["learning_rate"] if is_number(value) else 1.0
 
     def _check_arguments(self) -> None:
         super()._check_arguments()

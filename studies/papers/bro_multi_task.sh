@@ -3,8 +3,8 @@
 # a one-hot vector in the inputs, all networks twice as wide, three seeds each; all else as in its main experiments, so
 # that SAC is the tuned one of table 5, two gradient steps for a step of all tasks, as BRO Fast.
 # Substitutes for what the text leaves open: a million steps of each task, as in the main experiments, of which 2,500
-# (BRO Fast) and 10,000 (SAC) are random, those experiments' numbers; the last million transitions of each task are kept,
-# some 10 GB for MT50.
+# (BRO Fast) and 10,000 (SAC) are random, those experiments' numbers; the last million transitions of each task are
+# kept, some 10 GB for MT50.
 #   sh studies/papers/bro_multi_task.sh [MT50|MT10|DMC_DOGS|TASK [FURTHER ARGUMENTS OF examples/multi_task.py]]
 #   sb3-sample study aggregate runs/bro_multi_task_MT50.csv
 # AGENTS="sac", SEEDS="0 1" and PYTHON=... choose agents, seeds and interpreter. Interrupted and started again, each run
