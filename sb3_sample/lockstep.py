@@ -8,6 +8,7 @@ CUDA, NumPy, Python) are exchanged with the thread, so that each training draws 
 """
 
 import copy
+import os
 import random
 import threading
 from collections.abc import Callable, Sequence
@@ -88,7 +89,9 @@ class Seat:
     """
 
     def __init__(self, name: str, body: Callable[[], None], folder: Path | None = None):
-        self.name, self.body, self.folder = name, body, folder
+        self.name, self.body = name, body
+        # Absolute, as the runs themselves name their folders.
+        self.folder = None if folder is None else Path(os.path.abspath(folder))
         #: Called each time that it is this training's turn.
         self.on_turn: Callable[[], None] = lambda: None
         self.at = _READY

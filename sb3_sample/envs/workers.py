@@ -22,7 +22,12 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import (
+    CloudpickleWrapper,
+    VecEnvIndices,
+    VecEnvObs,
+    VecEnvStepReturn,
+)
 from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker as serve
 
@@ -145,14 +150,17 @@ class WatchedConnection:
         :return: the worker's answer
         :raises EnvironmentDied: it has died, or was killed since it gave none
         """
-        request, asked = self._asked.pop(0) if self._asked else ("start", self._began)
+        request, asked = self._asked[0] if self._asked else ("start", self._began)
+        # Until it is here the answer is outstanding, also after a Ctrl-C: the next question reads it first.
         if self._error is not None:
+            del self._asked[:1]
             raise self._error
         try:
             answer = self._receive(request, asked)
             while isinstance(answer, _Made):
                 self._made = time.monotonic()
                 answer = self._receive(request, asked)
+            del self._asked[:1]
         except (EOFError, OSError):
             raise self._died(request, None) from None
         if isinstance(answer, _Failure):
@@ -364,6 +372,8 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
         self._context = multiprocessing.get_context(start_method)
         self.processes: list[Any] = []
         self.remotes: Any = []
+        #: What the environments are wrapped in, by class, as their workers last answered.
+        self._wrapped_in: dict[type, list[bool | None]] = {}
         #: The last observation of each environment.
         self.last_observations: list[Any] = [None] * len(self._env_fns)
         try:
@@ -399,6 +409,28 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
         self._base_seed = seeds[0]
         return seeds
 
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """
+        Check for a wrapper, as in Stable-Baselines3, whose evaluations begin with this question.
+
+        :param wrapper_class: class of the wrapper
+        :param indices: of the environments; all if None
+        :return: whether each is wrapped in it. A worker that has died since it was last asked, and that ``reset`` will
+            replace, is given its last answer
+        :raises EnvironmentDied: if another worker died
+        """
+        asked = list(self._get_indices(indices))
+        for index in asked:
+            self.remotes[index].send(("is_wrapped", wrapper_class))
+        known = self._wrapped_in.setdefault(wrapper_class, [None] * self.num_envs)
+        for index in asked:
+            try:
+                known[index] = self.remotes[index].recv()
+            except EnvironmentDied:
+                if known[index] is None or not self.restart_envs:
+                    raise
+        return [bool(known[index]) for index in asked]
+
     def reset(self) -> VecEnvObs:
         """
         :return: the first observations
@@ -411,7 +443,7 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
             try:
                 results.append(self.remotes[index].recv())
             except EnvironmentDied as error:
-                results.append(self._replace(index, error))
+                results.append(self._replace(index, error, self._options[index]))
         self.waiting = False
         self.last_observations, self.reset_infos = map(list, zip(*results, strict=True))
         self._reset_seeds()
@@ -440,12 +472,15 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
         self.last_observations, self.reset_infos = list(observations), list(reset_infos)
         return _stack_obs(self.last_observations, self.observation_space), np.stack(rewards), np.stack(dones), infos  # type: ignore[return-value]
 
-    def _replace(self, index: int, error: EnvironmentDied) -> tuple[Any, dict[str, Any]]:
+    def _replace(
+        self, index: int, error: EnvironmentDied, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """
         Replace a dead worker.
 
         :param index: of its environment
         :param error: how it died
+        :param options: of its first ``reset``
         :return: first observation and info of the new environment
         :raises EnvironmentDied: replacement is not wanted, or no more is allowed
         """
@@ -457,7 +492,7 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
             seed = None
             if self._base_seed is not None:
                 seed = int(np.random.SeedSequence([self._base_seed, index, self.n_restarts]).generate_state(1)[0])
-            self.remotes[index].send(("reset", (seed, {})))
+            self.remotes[index].send(("reset", (seed, options or {})))
             try:
                 return self.remotes[index].recv()
             except EnvironmentDied as next_error:

@@ -28,6 +28,15 @@ except ImportError:
 
 #: Prefix in files of the names of state that changes in rows already stored; no column's name has it.
 _CHANGING = "changing/"
+#: Prefix in files of the numbers that a subclass keeps.
+_OWN = "own/"
+#: Numbers that follow from arguments or rows.
+_GIVEN = frozenset(
+    (
+        "buffer_size", "n_envs", "action_dim", "pos", "full", "optimize_memory_usage", "handle_timeout_termination",
+        "frame_stack", "n_steps", "gamma", "fade", "fade_floor", "horizon", "validation_proportion", "_first", "_last",
+    )
+)  # fmt: skip
 
 
 def _file_name(column: str, key: str) -> str:
@@ -399,17 +408,39 @@ class CompactReplay(HasColumns):
         """
         Collect the buffer's state.
 
-        :return: the numbers ``pos``, ``full``, ``buffer_size`` and ``n_envs``, and arrays: the filled part of each of
-            the :meth:`columns`, not copied, and the next observations in the form of :meth:`new_rows`, with
-            ``next_index`` naming places of the buffer
+        :return: the numbers ``pos``, ``full``, ``buffer_size`` and ``n_envs``, those of a subclass, and arrays: the
+            filled part of each of the :meth:`columns`, not copied, and the next observations in the form of
+            :meth:`new_rows`, with ``next_index`` naming places of the buffer
         """
         assert isinstance(self, ReplayBuffer)
         size = self.size()
         index = np.flatnonzero(self.slot[:size] != NEXT_ROW)
         numbers = {name: getattr(self, name) for name in ("pos", "full", "buffer_size", "n_envs")}
+        numbers |= {f"{_OWN}{name}": value for name, value in self.own_numbers().items()}
         changing = {f"{_CHANGING}{name}": value for name, value in self.changing_state().items()}
         rows = {name: array[:size] for name, array in self.columns().items()}
         return numbers | rows | self._apart(index, index) | self._older(np.arange(size)) | changing
+
+    def own_numbers(self) -> dict[str, float]:
+        """
+        Collect the numbers that a subclass of one's own keeps, such as an exponent that changes in the training.
+
+        :return: attributes that are numbers or true or false, by name
+        """
+        return {name: value for name, value in vars(self).items() if is_number(value) and name not in _GIVEN}
+
+    def load_own_numbers(self, numbers: dict[str, Any]) -> None:
+        """
+        Restore the numbers that a subclass keeps.
+
+        :param numbers: from :meth:`own_numbers`
+        :raises ValueError: if this buffer has none of a name, or something else is given for it
+        """
+        own = self.own_numbers()
+        for name, value in numbers.items():
+            if name not in own or not is_number(value) or isinstance(value, bool) != isinstance(own[name], bool):
+                raise ValueError(f"the buffer's {name:.50} cannot be {value!r:.50}")
+        vars(self).update(numbers)
 
     def changing_state(self) -> dict[str, Any]:
         """
@@ -445,8 +476,9 @@ class CompactReplay(HasColumns):
         if type(pos) is not int or type(full) is not bool or not 0 <= pos < self.buffer_size:
             raise ValueError(f"no state of a replay buffer: pos={pos!r}, full={full!r}")
         changing = {name.removeprefix(_CHANGING): state[name] for name in state if name.startswith(_CHANGING)}
+        numbers = {name.removeprefix(_OWN): state[name] for name in state if name.startswith(_OWN)}
         others = ("pos", "full", "buffer_size", "n_envs")
-        piece = {name: state[name] for name in state if name not in others and not name.startswith(_CHANGING)}
+        piece = {name: state[name] for name in state if name not in others and not name.startswith((_CHANGING, _OWN))}
         size = self.buffer_size if full else pos
         newest = (pos - 1) % self.buffer_size
         self._check_rows(piece, size, newest)
@@ -456,6 +488,15 @@ class CompactReplay(HasColumns):
         self.pos, self.full = pos, full
         self._restored()
         self.load_changing_state(changing)
+        self.load_own_numbers(numbers)
+
+
+def is_number(value: Any) -> bool:
+    """
+    :param value: any value
+    :return: whether it is a number, or true or false
+    """
+    return isinstance(value, (bool, int, float))
 
 
 def _n_frames(frame_stack: Any, space: spaces.Space) -> int | None:

@@ -47,7 +47,7 @@ class Apart:
         self._lock = threading.Lock()
         self._handed_over_at = -1
         self._pairs = self._all_pairs()
-        self._hand_over()
+        self.hand_over()
         #: Gradient steps that are due.
         self.n_due = 0
         self._n_lapsed = self._n_taken = self._n_stored = 0
@@ -83,7 +83,8 @@ class Apart:
         ]
         return [ours[name].data for name in names], [theirs[name].data for name in names]
 
-    def _hand_over(self) -> None:
+    def hand_over(self) -> None:
+        """Copy the learned parameters to the acting networks."""
         with self._lock, torch.no_grad():
             torch._foreach_copy_(*self._pairs)
             self._handed_over_at = self._model._n_updates
@@ -101,7 +102,7 @@ class Apart:
         """
         self._n_taken += n
         if self.age >= MAX_AGE:
-            self._hand_over()
+            self.hand_over()
 
     # ---------------------------------------------------------------- acting, in the thread
 
@@ -253,9 +254,11 @@ class ActsApart:
             self._apart.thread.start()
         apart = self._apart
         apart.thread.go_on()
-        for step in apart.thread.taken(wait=apart.n_due == 0):
-            if not self._take_over(step, callback, log_interval):
-                return False
+        if not self._take_over_all(apart.thread.taken(wait=apart.n_due == 0), callback, log_interval):
+            return False
+        if apart.age >= MAX_AGE:
+            # A callback has taken gradient steps.
+            apart.hand_over()
         n_updates = min(apart.n_due, MAX_AGE - apart.age)
         if n_updates > 0:
             apart.n_due -= n_updates
@@ -267,7 +270,14 @@ class ActsApart:
         if self._apart is None:
             return True
         self._apart.thread.rest()
-        return all(self._take_over(step, callback, log_interval) for step in self._apart.thread.taken(wait=False))
+        return self._take_over_all(self._apart.thread.taken(wait=False), callback, log_interval)
+
+    def _take_over_all(self: Any, steps: list[Step], callback: BaseCallback, log_interval: int) -> bool:
+        """Treat steps in their order. Where a callback ends the training, acting ends too, before anything else."""
+        if all(self._take_over(step, callback, log_interval) for step in steps):
+            return True
+        self._apart.thread.stop()
+        return False
 
     def _take_over(self: Any, step: Step, callback: BaseCallback, log_interval: int) -> bool:
         """Treat a step as Stable-Baselines3 treats its own; callbacks read these names among the local variables."""

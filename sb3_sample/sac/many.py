@@ -165,6 +165,9 @@ def train_together(seats: Sequence[Seat], folder: str | Path | None) -> None:
     for seat in seats:
         if seat.error is not None:
             raise seat.error
+    if signals is not None and signals.received is not None:
+        # The signal came when no further turn followed.
+        signals.leave()
 
 
 # ---------------------------------------------------------------- arguments

@@ -20,6 +20,7 @@ from sb3_sample.saving.attributes import (
     Node,
     Opaque,
     Restorer,
+    attributes_of,
     class_name,
     same,
     with_what_they_refer_to,
@@ -100,7 +101,7 @@ class CallbackStates:
 
     def __init__(self, callback: BaseCallback):
         self._callbacks = dict(walk(without_progress_bar(callback)))
-        self._before = {path: self._attributes(each)[0] for path, each in self._callbacks.items()}
+        self._before = {path: _each_apart(each) for path, each in self._callbacks.items()}
         # Paths of the callbacks for which a warning was given that something is lost.
         self._told: set[str] = set()
         # Attributes that an earlier part of the run has changed belong to the state as well.
@@ -131,18 +132,22 @@ class CallbackStates:
     def note_changes(self) -> None:
         """Add the attributes that have changed since these states were made to the state in every training."""
         for path, callback in self._callbacks.items():
-            self._note(path, self._attributes(callback)[0])
+            self._note(path, callback)
 
-    def _note(self, path: str, now: dict[str, Node]) -> None:
+    def _note(self, path: str, callback: BaseCallback) -> None:
         before = self._before[path]
         self._changed[path] |= {
-            name for name, node in now.items() if name not in before or not same(node, before[name])
+            name for name, node in _each_apart(callback).items() if name not in before or not same(node, before[name])
         }
 
     def _save(self, path: str, callback: BaseCallback) -> dict[str, Any]:
         now = self._attributes(callback)[0]
-        self._note(path, now)
+        self._note(path, callback)
         state, opaque = _state_of(callback)
+        saved = {}
+        for name, env in environments(callback):
+            saved[name], reasons = _save_env(env)
+            opaque += [f"{name}, {reason}" for reason in reasons]
         if opaque and path not in self._told:
             self._told.add(path)
             warn(f"A checkpoint does not hold the state of {type(callback).__name__} ({path}): {opaque[0]}")
@@ -150,7 +155,7 @@ class CallbackStates:
             "class": class_name(callback),
             "attributes": with_what_they_refer_to(self._changed[path], now),
             "state": state,
-            "environments": {name: _save_env(env)[0] for name, env in environments(callback)},
+            "environments": saved,
         }
 
     def restore(self, states: dict[str, Any]) -> None:
@@ -201,6 +206,17 @@ def _skipped(callback: BaseCallback) -> Set[str]:
         return vars(callback).keys() - {"n_calls", "num_timesteps"}
     children = {name for name, value in vars(callback).items() if _is_or_holds_callbacks(value)}
     return {*_NOT_OWN, *children, *(name for name, _ in environments(callback))}
+
+
+def _each_apart(callback: BaseCallback) -> dict[str, Node]:
+    """
+    Describe each attribute by itself, to be compared at another time: in a common description an attribute that grows
+    changes the numbers of those after it.
+    """
+    names, described = attributes_of(callback).keys(), dict[str, Node]()
+    for name in names - _skipped(callback):
+        described |= Describer().attributes(callback, names - {name})[0]
+    return described
 
 
 def _arguments(callback: BaseCallback) -> set[str]:

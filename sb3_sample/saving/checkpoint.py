@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.console import LossyLog
 from sb3_sample.envs.no_environment import NoEnvironment
-from sb3_sample.envs.workers import EnvironmentDied, end_with_this_process
+from sb3_sample.envs.workers import EnvironmentDied, watch_workers
 from sb3_sample.faults import HoldBack, check_finite_parameters
 from sb3_sample.lockstep import Seat, seat_of
 from sb3_sample.saving import container, run_folder, training_state, vec_envs
@@ -120,6 +120,7 @@ class Checkpointer:
         self._left_out: set[str] = set()
         self._whole_at: int | None = None
         self._interrupts: Interrupts | None = None
+        self._progress: ProgressFile | None = None
         # Completed periods of ``every`` steps at the end of the last turn.
         self._period = 0
 
@@ -197,6 +198,9 @@ class Checkpointer:
                 _TRAINED.setdefault(self._model, set()).add(os.path.realpath(self._folder.path))
         finally:
             self._close(orderly=kind is None)
+        if kind is None and self._interrupts is not None and self._interrupts.received is not None:
+            # The signal came when no further turn followed.
+            self._interrupts.leave(saved_at=self._saved_at)
 
     def _save_if_whole(self) -> None:
         # A callback that ends the training does so in the middle of a turn, when nothing can be saved.
@@ -208,6 +212,7 @@ class Checkpointer:
         if self._interrupts is not None:
             self._interrupts.restore(orderly)
             self._console.close()
+        if self._progress is not None:
             logger = self._model.logger
             logger.output_formats = [each for each in logger.output_formats if each is not self._progress]
             self._progress.close()
@@ -240,6 +245,9 @@ class Checkpointer:
         :param total_timesteps: steps that the training is to have at its end; a warning is given if it has them already
         """
         if self._resumed is None:
+            if self._folder is not None:
+                # What callbacks log before the first turn belongs to the run's log too.
+                self._open_log({"size": 0, "pending": []})
             return
         if self._manifest["steps"] >= total_timesteps:
             warn(
@@ -320,12 +328,10 @@ class Checkpointer:
             return
         model = self._model
         self._states = CallbackStates(self._callback)
-        self._progress = ProgressFile(self._folder.path)
         for env in self._environments()[1:]:
-            end_with_this_process(env)
+            watch_workers(env)
         self._interrupts = Interrupts(self._environments(), self._folder.path, self._seat)
         self._console = LossyLog(model.logger)
-        model.logger.output_formats.append(self._progress)
         self._period = model.num_timesteps // self._every
         self._warn_of_losses()
         if self._seat is not None:
@@ -334,11 +340,16 @@ class Checkpointer:
             self._restore_rest(self._resumed)
             self._resumed = None
             return
-        self._progress.restore({"size": 0, "pending": []})
         try:
             self._save()
         except OSError as error:
             raise ValueError(f"checkpoint={str(self._name)!r} cannot be written to: {error}") from error
+
+    def _open_log(self, state: dict[str, Any]) -> None:
+        assert self._folder is not None
+        self._progress = ProgressFile(self._folder.path)
+        self._progress.restore(state)
+        self._model.logger.output_formats.append(self._progress)
 
     def _warn_of_losses(self) -> None:
         missing = self._missing = vec_envs.save(self._env)[1]
@@ -363,7 +374,7 @@ class Checkpointer:
             self._start_episodes_anew([*reasons, *missing])
         with self._restoring(state):
             self._states.restore(state["callbacks"])
-            self._progress.restore(state["progress"])
+            self._open_log(state["progress"])
             training_state.restore_logger(self._model.logger, state["logger"])
             training_state.restore_generators(state["generators"], self._model.device)
 
@@ -395,10 +406,12 @@ class Checkpointer:
         due = self._model.num_timesteps // self._every > self._period
         return due or self._interrupts.received is not None or self._held.has_raised()
 
-    def after_turn(self) -> None:
+    def after_turn(self, is_due: bool) -> None:
         """
         Save if a checkpoint is due, and leave if the process was asked to.
 
+        :param is_due: answer of :meth:`is_due`. After a signal that came since then, what runs beside the turns is not
+            paused: the training ends after the next turn
         :raises Exception: what a callback raised during the turn
         :raises TrainingDiverged: something that would be saved is not finite
         :raises KeyboardInterrupt: after SIGINT
@@ -409,7 +422,7 @@ class Checkpointer:
             return
         assert self._interrupts is not None and self._held is not None
         now = self._whole_at = self._model.num_timesteps
-        leaves = self._interrupts.leaves(now)
+        leaves = self._interrupts.leaves(now) and (is_due or self._seat is not None)
         due = now // self._every > self._period
         self._period = now // self._every
         try:
@@ -468,14 +481,14 @@ class Checkpointer:
             ring.n_written = ring.n_rows
 
     def _save_rest(self, segments: dict[str, Any]) -> None:
-        assert self._folder is not None
+        assert self._folder is not None and self._progress is not None
         model = self._model
         state = {
             "identity": self._identity,
             "attributes": training_state.save_attributes(model),
             "elapsed_ns": time.time_ns() - model.start_time,
             "rings": {name: ring.small() for name, ring in self._rings.items()},
-            "env": vec_envs.save(self._env)[0],
+            "env": self._save_env(),
             "callbacks": self._states.save(),
             "progress": self._progress.state(),
             "logger": training_state.save_logger(model.logger),
@@ -493,6 +506,18 @@ class Checkpointer:
                 raise
             self._folder.write(model.num_timesteps, files, segments, about)
 
+    def _save_env(self) -> dict[str, Any]:
+        state, missing = vec_envs.save(self._env)
+        if missing and not self._missing:
+            self._warn_of_missing("env", "episodes in progress", "; ".join(missing))
+        return state
+
+    def _warn_of_missing(self, name: str, what: str, why: str) -> None:
+        """Warn once that a checkpoint lacks something."""
+        if name not in self._left_out:
+            self._left_out.add(name)
+            warn(f"A checkpoint does not hold the {what}: {why}. They start anew when the run goes on")
+
     def _leave_out(self, state: dict[str, Any]) -> bool:
         """
         Remove from a state the episodes in progress and the callbacks that no file can hold, with one warning: a
@@ -504,10 +529,8 @@ class Checkpointer:
         if reason := _refusal(state["env"]["environments"], "env"):
             reasons["env"] = reason
             state["env"]["environments"] = None
-        for name in reasons.keys() - self._left_out:
-            what = "episodes in progress" if name == "env" else f"state of {name}"
-            warn(f"A checkpoint does not hold the {what}: {reasons[name]}. They start anew when the run goes on")
-        self._left_out |= reasons.keys()
+        for name, reason in reasons.items():
+            self._warn_of_missing(name, "episodes in progress" if name == "env" else f"state of {name}", reason)
         return bool(reasons)
 
     def _save_rows(self, name: str, ring: Ring, known: dict[str, Any]) -> dict[str, Any]:

@@ -6,16 +6,19 @@ that rows ``first`` to ``last`` are a piece of the run that never changes once i
 rows of the run are needed.
 """
 
+import enum
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_sample.replay.columns import HasColumns, columns_of
 from sb3_sample.replay.compact import CompactReplay
 from sb3_sample.replay.endings import end_episodes
+from sb3_sample.saving.attributes import is_inert
 from sb3_sample.saving.untrusted import BadFile
 
 #: Attributes that hindsight keeps for each row besides the columns.
@@ -27,6 +30,25 @@ _DERIVED = (
     "infos", "obs_shape", "device", "observation_space", "action_space", "env", "slot", "_ring", "_drawable",
     "_next_row",
 )  # fmt: skip
+
+
+#: Numbers of Stable-Baselines3's buffers.
+_COUNTS = (
+    "buffer_size", "n_envs", "optimize_memory_usage", "handle_timeout_termination", "action_dim", "pos", "full",
+)  # fmt: skip
+
+
+#: Values that numbers and settings have.
+_SETTINGS = (
+    bool, int, float, str, bytes, type(None), type, enum.Enum, torch.device, torch.dtype, np.dtype, spaces.Space,
+)  # fmt: skip
+
+
+def _is_kept(value: Any) -> bool:
+    """Whether a buffer's attribute is in checkpoints, or has no state: this package's objects save their own."""
+    if isinstance(value, tuple):
+        return all(map(_is_kept, value))
+    return isinstance(value, _SETTINGS) or is_inert(value) or type(value).__module__.partition(".")[0] == "sb3_sample"
 
 
 def check_values(columns: Mapping[str, Any], name: str, buffer: Any) -> None:
@@ -95,10 +117,11 @@ class Ring:
             )
         known = (*columns_of(buffer), *_OF_HINDSIGHT, *_SMALL, *_DERIVED)
         for name, value in vars(buffer).items():
-            if name not in known and isinstance(value, (np.ndarray, torch.Tensor, list, dict, set)):
+            if name not in known and not _is_kept(value):
                 raise ValueError(
-                    f"replay_buffer_class={kind} keeps {name!r}, of which checkpoints know nothing: use one of "
-                    "Stable-Baselines3's or this package's buffers, or train without checkpoint"
+                    f"replay_buffer_class={kind} keeps {name!r} ({type(value).__name__}), of which checkpoints know "
+                    "nothing: they have declared columns (more_columns) and numbers. Use one of Stable-Baselines3's or "
+                    "this package's buffers, or train without checkpoint"
                 )
         #: Rows added over the run, and how many of them the files have.
         self.n_rows = self.size() + (int(buffer.pos) if buffer.full else 0)
@@ -156,8 +179,8 @@ class Ring:
         """
         small: dict[str, Any] = {"n_rows": self.n_rows, "size": self.size()}
         if isinstance(self.buffer, CompactReplay):
-            changing = self.buffer.changing_state()
-            return {**small, "changing": changing} if changing else small
+            parts = {"changing": self.buffer.changing_state(), "own": self.buffer.own_numbers()}
+            return small | {name: part for name, part in parts.items() if part}
         own = vars(self.buffer)
         small["numbers"] = {name: value for name, value in own.items() if isinstance(value, (bool, int, float))}
         small["arrays"] = {name: own[name] for name in _SMALL if name in own}
@@ -178,11 +201,12 @@ class Ring:
             raise ValueError(f"of the buffer's rows {size!r:.50} of {n_rows!r:.50} are to be there")
         followed = _Followed(pieces, self.buffer)
         if isinstance(self.buffer, CompactReplay):
-            changing = small.get("changing", {})
-            if not isinstance(changing, dict):
-                raise ValueError(f"what changes in the buffer's rows cannot be {changing!r:.50}")
+            changing, own = small.get("changing", {}), small.get("own", {})
+            if not (isinstance(changing, dict) and isinstance(own, dict)):
+                raise ValueError(f"what changes in the buffer cannot be {changing!r:.50} and {own!r:.50}")
             self.buffer.restore_rows(followed)
             self.buffer.load_changing_state(changing)
+            self.buffer.load_own_numbers(own)
         else:
             self._restore(small, followed)
         complete = followed.end == n_rows and n_rows - followed.begin >= size
@@ -197,7 +221,11 @@ class Ring:
         numbers = small["numbers"]
         for name, value in numbers.items():
             fixed = name in ("buffer_size", "n_envs", "optimize_memory_usage")
-            if name not in own or type(value) is not type(own[name]) or (fixed and value != own[name]):
+            # A subclass's number may begin as 0 and become 0.5.
+            like = type(value) is type(own.get(name)) or (
+                name not in _COUNTS and {type(value), type(own.get(name))} == {int, float}
+            )
+            if name not in own or not like or (fixed and value != own[name]):
                 raise ValueError(f"the buffer's {name:.50} cannot be {value!r:.50}")
         if numbers["pos"] != small["n_rows"] % self.capacity:
             raise ValueError(f"the buffer's pos cannot be {numbers['pos']} after {small['n_rows']} rows")

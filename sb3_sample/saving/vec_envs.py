@@ -18,7 +18,7 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_sample.envs.portable_states import HELPER, pack, pack_all, unpack, unpack_all
-from sb3_sample.envs.workers import SupervisedSubprocVecEnv
+from sb3_sample.envs.workers import EnvironmentDied, SupervisedSubprocVecEnv
 from sb3_sample.learner.randomness import checked_state
 from sb3_sample.saving.attributes import Describer, DoesNotFit, Restorer, class_name
 from sb3_sample.saving.statistics import ARGUMENTS, check_normalization, shapes_of
@@ -204,7 +204,12 @@ def save(venv: VecEnv) -> tuple[dict[str, Any], list[str]]:
         # Last observations, which end a worker's episode if it dies.
         "last": innermost.last_observations if isinstance(innermost, SupervisedSubprocVecEnv) else None,
     }
-    packed, opaque = _pack(innermost)
+    try:
+        packed, opaque = _pack(innermost)
+    except (EnvironmentDied, EOFError, OSError) as error:
+        # The next step or reset raises the error, or replaces the worker.
+        missing.append(f"a worker does not answer ({type(error).__name__}: {error})")
+        return state, missing
     if packed is None:
         kind = class_name(innermost)
         reason = "an environment in a worker needs a wrapper, such as Monitor, to be reached"

@@ -173,9 +173,10 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
             while self.num_timesteps < total_timesteps:
                 if not self._whole_turn(checkpointer.callback, log_interval, not learns_from):
                     break
-                if checkpointer.is_due() and not self._rest(checkpointer.callback, log_interval):
+                is_due = checkpointer.is_due()
+                if is_due and not self._rest(checkpointer.callback, log_interval):
                     break
-                checkpointer.after_turn()
+                checkpointer.after_turn(is_due)
             else:
                 self._after_turns()
             check_finite_parameters(self)

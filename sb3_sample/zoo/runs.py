@@ -446,7 +446,7 @@ def train_seeds(options: argparse.Namespace, arguments: Sequence[str]) -> None:
         command = [*arguments, "--seed", str(seed)]
         start = plan(argparse.Namespace(**{**vars(options), "run_dir": folder}), command)
         own = functools.partial(body, seed, start, command if start is None else start.arguments)
-        seats.append(Seat(f"the run of seed {seed}", own, folder))
+        seats.append(Seat(f"the run of seed {seed}", own, start.folder if folder is None and start else folder))
     saves = options.run_dir is not None or options.checkpoint_freq is not None or options.resume
     with training() as make:
         try:

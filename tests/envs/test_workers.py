@@ -17,6 +17,7 @@ import numpy as np
 import psutil
 import pytest
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
@@ -386,6 +387,61 @@ def test_a_worker_is_replaced_within_a_reset(make: Any, tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="environment 0 died at 'step'"):
         dones = venv.step(ACTIONS)[2]
     np.testing.assert_array_equal(dones, [True, False, False])
+
+
+def test_a_worker_that_is_replaced_within_a_reset_has_its_options(make: Any, tmp_path: Path) -> None:
+    class Told(Fragile):
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            return super().reset(seed=seed)[0], {"options": options}
+
+    venv = make(SupervisedSubprocVecEnv, [lambda: Monitor(Told(reset=1, marker=tmp_path / "broke"))], restart_envs=True)
+    venv.set_options({"level": 3})
+    with pytest.warns(UserWarning, match="It is restarted"):
+        venv.reset()
+    assert venv.reset_infos == [{"options": {"level": 3}}]
+
+
+def test_a_worker_that_dies_between_two_evaluations_is_replaced(make: Any) -> None:
+    venv = make(SupervisedSubprocVecEnv, fns(n=2), restart_envs=True)
+    model = sac(compile=False)
+    evaluate_policy(model, venv, n_eval_episodes=2)
+    os.kill(venv.processes[1].pid, signal.SIGKILL)
+    venv.processes[1].join()
+    with pytest.warns(UserWarning, match="environment 1 died at 'is_wrapped'.*It is restarted"):
+        evaluate_policy(model, venv, n_eval_episodes=2)
+    # Nobody can know it of a class that was not asked for before, and without restart_envs it is an error.
+    os.kill(venv.processes[1].pid, signal.SIGKILL)
+    venv.processes[1].join()
+    with pytest.raises(EnvironmentDied, match="environment 1 died at 'is_wrapped'"):
+        venv.env_is_wrapped(gym.wrappers.TimeLimit)
+    venv.restart_envs = False
+    with pytest.raises(EnvironmentDied, match="environment 1 died at"):
+        venv.env_is_wrapped(Monitor)
+
+
+@BOTH
+def test_after_an_interrupted_wait_answers_belong_to_their_questions(cls: Any, make: Any) -> None:
+    class Slow(Fragile):
+        def step(self, action: np.ndarray) -> Any:
+            time.sleep(0.2)
+            return super().step(action)
+
+    venv = make(cls, [lambda: Monitor(Slow()) for _ in range(2)])
+    venv.reset()
+
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        venv.step_async(ACTIONS[:2])
+        signal.setitimer(signal.ITIMER_REAL, 0.05)
+        with pytest.raises(KeyboardInterrupt):
+            venv.step_wait()
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    np.testing.assert_array_equal(venv.reset(), np.zeros((2, 3)))
+    assert len(venv.step(ACTIONS[:2])) == 4
 
 
 @pytest.mark.parametrize("kwargs", [{"step": 2}, {"reset": 1}])

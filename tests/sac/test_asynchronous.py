@@ -1,5 +1,7 @@
 """Acting in a thread while learning: order, age of parameters, replay ratio, stopping. By clocks of the tests' own."""
 
+import os
+import signal
 import threading
 import time
 from collections.abc import Callable
@@ -12,6 +14,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -265,6 +268,45 @@ def test_parameters_are_handed_over_at_a_bounded_age(monkeypatch: pytest.MonkeyP
     assert len({sum(float(each.sum()) for each in tensors) for tensors in learned.values()}) > 100
 
 
+def test_learning_goes_on_after_gradient_steps_of_a_callback(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = asynchronous()
+    paced(model, monkeypatch)
+
+    def callback(local: Any, _: Any) -> bool:
+        if local["self"].num_timesteps == 30:
+            local["self"].train(2 * MAX_AGE)
+        return True
+
+    model.learn(60, callback, asynchronous=True, control_frequency=20)
+    # Two a transition after the warm-up, but for the last ones, and the callback's.
+    assert model._n_updates >= 2 * 38 + 2 * MAX_AGE
+
+
+def test_a_signal_while_it_acts_is_saved_at_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the signal comes just after it was asked whether the turn is to be saved."""
+    model = asynchronous()
+    paced(model, monkeypatch)
+    resting: list[bool] = []
+    plain_save, plain_due = Checkpointer._save, Checkpointer.is_due
+
+    def save(self: Any) -> None:
+        thread = None if self._model._apart is None else self._model._apart.thread
+        resting.append(thread is None or thread._at_rest or not thread._thread.is_alive())
+        plain_save(self)
+
+    def is_due(self: Any) -> bool:
+        due = plain_due(self)
+        if self._model.num_timesteps == 33 and not due and self._interrupts.received is None:
+            os.kill(os.getpid(), signal.SIGINT)
+        return due
+
+    monkeypatch.setattr(Checkpointer, "_save", save)
+    monkeypatch.setattr(Checkpointer, "is_due", is_due)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(300, checkpoint=tmp_path / "run", asynchronous=True, control_frequency=20)
+    assert resting == [True, True]
+
+
 def test_it_does_not_act_during_a_capture() -> None:
     """A GPU's generator and memory are the capture's meanwhile; what acts is never captured itself."""
     model = sac().learn(24)
@@ -340,10 +382,18 @@ def test_it_ends_with_the_training(ends: str, monkeypatch: pytest.MonkeyPatch) -
     model = asynchronous(DummyVecEnv([lambda: Counter(fails_at)]))
     paced(model, monkeypatch)
 
-    def callback(local: Any, _: Any) -> bool:
-        if ends == "interrupt" and local["self"].num_timesteps == 30:
-            raise KeyboardInterrupt
-        return ends != "callback" or local["self"].num_timesteps < 30
+    class Ends(BaseCallback):
+        acts_at_the_end = False
+
+        def _on_step(self) -> bool:
+            if ends == "interrupt" and self.num_timesteps == 30:
+                raise KeyboardInterrupt
+            return ends != "callback" or self.num_timesteps < 30
+
+        def _on_training_end(self) -> None:
+            self.acts_at_the_end = "acting" in {thread.name for thread in threading.enumerate()}
+
+    callback = Ends()
 
     def learn() -> None:
         model.learn(300, callback, asynchronous=True, control_frequency=20)
@@ -353,7 +403,7 @@ def test_it_ends_with_the_training(ends: str, monkeypatch: pytest.MonkeyPatch) -
     else:
         with pytest.raises(KeyboardInterrupt if ends == "interrupt" else OSError):
             learn()
-    assert "acting" not in {thread.name for thread in threading.enumerate()}
+    assert "acting" not in {thread.name for thread in threading.enumerate()} and not callback.acts_at_the_end
     assert model.num_timesteps == (34 if ends == "environment" else 30)
     n = env_of(model).n
     # Steps that nobody stored are behind the next training, which begins an episode.
@@ -469,7 +519,7 @@ def test_running_statistics_of_an_explorer_are_handed_over(clock: Made) -> None:
     apart = Apart(model, None)
     for value in model.explorer.actor.buffers():
         value += 1
-    apart._hand_over()
+    apart.hand_over()
     theirs, ours = (dict(each.explorer.actor.named_buffers()) for each in (model.learner, apart._learner))
     assert any("running_mean" in name for name in theirs)
     assert ours.keys() == theirs.keys() and all(torch.equal(ours[name], theirs[name]) for name in theirs)

@@ -1,6 +1,7 @@
 """``train_many``: each learner is the training that it is alone, bit by bit."""
 
 import collections
+import contextlib
 import functools
 import os
 import random
@@ -487,6 +488,27 @@ def test_all_go_on_from_the_newest_step_that_every_folder_has(tmp_path: Path, jo
     models = trained(tmp_path, lambda i: First(seen))
     assert seen == [41, 41, 41]
     assert all(same(learned(model), own) for model, own in zip(models, whole, strict=True))
+
+
+@pytest.mark.parametrize("joint", ["together"], indirect=True)
+def test_a_relative_folder_goes_on_together_too(tmp_path: Path, joint: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for at in (33, 0):
+        joint.made.clear()
+        with pytest.raises(KeyboardInterrupt) if at else contextlib.nullcontext():
+            trained(Path("runs"), lambda i, at=at: Signal(at if i == 0 else 0, signal.SIGINT))
+        # Ten random steps come first.
+        assert sum(each.n_steps for each in joint.made) == (23 if at else 27)
+
+
+def test_a_signal_after_the_last_turn_ends_the_program(tmp_path: Path) -> None:
+    class Late(Signal):
+        def _on_training_end(self) -> None:
+            os.kill(os.getpid(), self.number)
+
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path, lambda i: Late(0, signal.SIGINT) if i == 2 else Signal(0, 0), total_timesteps=20)
+    assert {each[-1] for each in saved(tmp_path)} == {20}
 
 
 class First(Signal):

@@ -26,7 +26,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, Every
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from sb3_sample import MBMAPPO, SAC
+from sb3_sample import MBMAPPO, SAC, CompactReplayBuffer
 from sb3_sample.replay.buffers import DeviceReplayBuffer
 from sb3_sample.sac.policies import MlpPolicy
 from sb3_sample.saving import container, run_folder, training_state
@@ -404,6 +404,40 @@ def test_buffers_that_no_checkpoint_can_hold(tmp_path: Path) -> None:
     assert model.num_timesteps == 0 and not steps_of(tmp_path)
 
 
+class Annealed(CompactReplayBuffer):
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.exponent, self.n_added, self.mean = 0.5, 0, 0
+
+    def add(self, *args: Any) -> None:
+        super().add(*args)
+        self.exponent, self.n_added, self.mean = self.exponent + 0.125, self.n_added + 1, 0.25
+
+
+class Drawing(CompactReplayBuffer):
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.rng = np.random.default_rng(0)
+
+
+def test_numbers_of_a_buffer_of_ones_own(tmp_path: Path) -> None:
+    sac(replay_buffer_class=Annealed).learn(20, checkpoint=tmp_path / "run")
+    buffer = sac(replay_buffer_class=Annealed).learn(30, checkpoint=tmp_path / "run").replay_buffer
+    assert (buffer.exponent, buffer.n_added, buffer.mean) == (4.25, 30, 0.25)
+    model = sac(replay_buffer_class=Annealed)
+    model.replay_buffer = buffer
+    model.save_replay_buffer(tmp_path / "buffer")
+    again = sac(replay_buffer_class=Annealed)
+    again.load_replay_buffer(tmp_path / "buffer")
+    assert (again.replay_buffer.exponent, again.replay_buffer.n_added) == (4.25, 30)
+    with pytest.raises(ValueError, match="the buffer's missing cannot be 1"):
+        again.replay_buffer.load_own_numbers({"missing": 1})
+    with pytest.raises(ValueError, match="the buffer's exponent cannot be True"):
+        again.replay_buffer.load_own_numbers({"exponent": True})
+    with pytest.raises(ValueError, match=r"replay_buffer_class=Drawing keeps 'rng' \(Generator\)"):
+        sac(replay_buffer_class=Drawing).learn(10, checkpoint=tmp_path / "other")
+
+
 class OwnPolicy(MlpPolicy):
     """A policy class of the user's own."""
 
@@ -661,6 +695,26 @@ def test_what_a_callback_changed_is_restored_and_its_arguments_are_the_programs(
     assert first.seen == list(range(1, 31)) and first.n_calls == 30 and first.best == {"step": 30.0}
     assert inner.seen == [5, 10, 15, 20, 25, 30]
     assert first.bound == 2.0
+
+
+class Curriculum(BaseCallback):
+    """Has an argument behind an attribute that grows."""
+
+    def __init__(self, levels: list[int]):
+        super().__init__()
+        self.seen: list[dict[str, int]] = []
+        self.levels = list(levels)
+
+    def _on_step(self) -> bool:
+        self.seen.append({"step": self.num_timesteps})
+        return True
+
+
+def test_arguments_behind_what_grows_come_from_the_program(tmp_path: Path) -> None:
+    sac().learn(20, Curriculum([1, 2]), checkpoint=tmp_path)
+    callback = Curriculum([5, 6, 7])
+    sac().learn(30, callback, checkpoint=tmp_path)
+    assert callback.levels == [5, 6, 7] and len(callback.seen) == 30
 
 
 class Writes(BaseCallback):

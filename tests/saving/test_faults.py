@@ -195,6 +195,45 @@ def test_a_dead_worker_leaves_the_last_checkpoint(family: str, cls: Any, tmp_pat
         each.get_env().close()
 
 
+@pytest.mark.parametrize("cls", [SubprocVecEnv, SupervisedSubprocVecEnv])
+def test_a_dead_worker_of_an_evaluation_costs_no_checkpoint(cls: Any, tmp_path: Path) -> None:
+    evaluated = cls([lambda: Monitor(Toy())], start_method="fork")
+
+    def kill(model: Any) -> None:
+        os.kill(evaluated.processes[0].pid, signal.SIGKILL)
+        evaluated.processes[0].join()
+
+    evaluation = EvalCallback(evaluated, eval_freq=37, n_eval_episodes=1, verbose=0)
+    model = sac(compile=False)
+    with (
+        pytest.warns(UserWarning, match="does not hold the state of EvalCallback.*eval_env, a worker does not answer"),
+        pytest.raises(EnvironmentDied, match="environment 0 died"),
+    ):
+        model.learn(64, [at(15, kill), evaluation], checkpoint=tmp_path, checkpoint_freq=10)
+    # That at which the evaluation raises is the last.
+    assert sorted(int(path.name[-12:]) for path in tmp_path.glob("checkpoint-*"))[-2:] == [30, 37]
+    evaluated.close()
+
+
+def test_a_worker_that_dies_between_two_turns_costs_no_checkpoint(tmp_path: Path) -> None:
+    def envs() -> Any:
+        return SupervisedSubprocVecEnv([lambda: Monitor(Toy())] * 2, start_method="fork", restart_envs=True)
+
+    def kill(model: Any) -> None:
+        process = model.get_env().unwrapped.processes[1]
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+
+    model = sac(envs(), compile=False)
+    with (
+        pytest.warns(UserWarning, match="does not hold the episodes in progress: a worker does not answer"),
+        pytest.warns(UserWarning, match="It is restarted"),
+    ):
+        model.learn(40, at(20, kill), checkpoint=tmp_path, checkpoint_freq=20)
+    assert model.num_timesteps == 40 and model.get_env().unwrapped.n_restarts == 1
+    model.get_env().close()
+
+
 def test_a_worker_that_dies_just_after_the_run_went_on(tmp_path: Path) -> None:
     """Its episode is cut off with what it had observed before the checkpoint."""
 

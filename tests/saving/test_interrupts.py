@@ -116,6 +116,33 @@ def test_a_line_says_where_the_run_was_saved(number: int, tmp_path: Path) -> Non
     )
 
 
+class Late(BaseCallback):
+    """Sends this process a signal when no further turn follows."""
+
+    def __init__(self, number: int, ends_at: int | None):
+        super().__init__()
+        self.number, self.ends_at = number, ends_at
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.ends_at:
+            os.kill(os.getpid(), self.number)
+        return self.num_timesteps != self.ends_at
+
+    def _on_training_end(self) -> None:
+        if self.ends_at is None:
+            os.kill(os.getpid(), self.number)
+
+
+@pytest.mark.parametrize(("ends_at", "saved_at"), [(None, 40), (35, 30)])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_after_the_last_turn_ends_the_program(
+    number: int, ends_at: int | None, saved_at: int, tmp_path: Path
+) -> None:
+    with pytest.raises(KeyboardInterrupt if number == signal.SIGINT else SystemExit):
+        sac().learn(40, Late(number, ends_at), checkpoint=tmp_path, checkpoint_freq=10)
+    assert max(int(path.name.split("-")[1]) for path in tmp_path.glob("checkpoint-*")) == saved_at
+
+
 def test_the_standard_error_is_known(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert standard_error() == sys.__stderr__.fileno()  # type: ignore[union-attr]
     monkeypatch.setattr(sys, "__stderr__", None)

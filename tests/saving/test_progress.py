@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sample.saving import progress
 from sb3_sample.saving.folders import Folder
@@ -106,6 +107,23 @@ def test_a_new_run_without_a_log(code: int, tmp_path: Path, monkeypatch: pytest.
     failing.on = False
     learn(tmp_path, 30)
     assert lines_of(tmp_path) == [7, 14, 21, 28]
+
+
+def test_what_is_logged_before_the_first_turn(tmp_path: Path) -> None:
+    class First(BaseCallback):
+        def _on_training_start(self) -> None:
+            self.logger.record("eval/first", self.num_timesteps)
+            self.logger.dump(self.num_timesteps)
+
+        def _on_step(self) -> bool:
+            return True
+
+    for steps in (20, 30):
+        sac().learn(steps, First(), checkpoint=tmp_path, log_interval=1)
+    lines = [json.loads(line) for line in (tmp_path / "progress.jsonl").read_text().splitlines()]
+    # That of the run's beginning, and not that of the program that went on with it.
+    assert [line["step"] for line in lines] == [0, 7, 14, 21, 28]
+    assert [line.get("eval/first") for line in lines] == [0, None, None, None, None]
 
 
 def test_a_log_that_is_read_only_for_real(tmp_path: Path) -> None:
