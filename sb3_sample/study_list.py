@@ -83,6 +83,22 @@ def variant_of(agent: str, grid: Mapping[str, Any]) -> str:
     return part_of_path(",".join([agent, *(f"{name}={short(value)}" for name, value in grid.items())]))
 
 
+def to_json(arguments: Mapping[str, Any]) -> str:
+    """
+    :param arguments: plain values by name
+    :return: their text in tables of runs, equal for equal arguments: 2.0 is 2
+    """
+    return json.dumps(_plain(arguments), sort_keys=True)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(each) for each in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
 def part_of_path(name: str) -> str:
     """
     :param name: any name

@@ -112,6 +112,8 @@ class SAC(  # type: ignore[misc]  # actor
     policy_base: ClassVar[type[SACPolicy]] = SACPolicy
     #: Whether there is ``learn_offline`` only.
     learns_from_data_only: ClassVar[bool] = False
+    #: Whether there is ``learn_offline``, and ``prior_data``.
+    learns_from_data: ClassVar[bool] = True
     #: Whether batches are windows of several steps of the replay buffer, and single steps otherwise.
     draws_windows: ClassVar[bool] = False
     _kept: ClassVar[dict[str, Kept]] = {

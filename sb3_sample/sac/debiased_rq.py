@@ -84,6 +84,7 @@ class DebiasedRQ(SAC):
     policy_base: ClassVar[type[SACPolicy]] = DebiasedRQPolicy
     learner_class: ClassVar[type[Learner]] = DebiasedRQLearner
     draws_windows: ClassVar[bool] = True
+    learns_from_data: ClassVar[bool] = False
     encoder = OfLearner[Encoder]()
     """encoder of states and actions, with the model of dynamics and rewards"""
     encoder_target = OfLearner[Encoder]()

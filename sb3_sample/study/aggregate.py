@@ -17,7 +17,7 @@ import pandas as pd
 from sb3_sample.envs.scores import SCORED, Score, score_of
 from sb3_sample.envs.suites import DAC_NAMED
 from sb3_sample.extras import install
-from sb3_sample.study.table import RUN
+from sb3_sample.study.table import RUN, plain_texts
 from sb3_sample.warn import warn
 
 #: Scores of tasks without a common score, or in place of it; the other tasks have ``score_of``.
@@ -66,9 +66,8 @@ def scored(table: pd.DataFrame, scores: Scores | None = None) -> pd.DataFrame:
     if not parts:
         raise ValueError("table must have returns or success rates of runs, and has none")
     columns = [*RUN, "step", "score"]
-    found = pd.concat(parts)[columns].sort_index(kind="stable")
-    texts = {text: _plain_numbers(text) for text in found["arguments"].unique()}
-    twice = found.assign(arguments=found["arguments"].map(texts)).duplicated([*RUN, "step"])
+    found = plain_texts(pd.concat(parts)[columns].sort_index(kind="stable"))
+    twice = found.duplicated([*RUN, "step"])
     if twice.any():
         row = found[twice].iloc[0]
         raise ValueError(
@@ -82,15 +81,6 @@ def scored(table: pd.DataFrame, scores: Scores | None = None) -> pd.DataFrame:
             f"{row['step']:,}"
         )
     return found.reset_index(drop=True)
-
-
-def _plain_numbers(arguments: str) -> str:
-    """Arguments with 2.0 as 2: both are one agent, since equal arguments do not tell agents apart."""
-    return json.dumps(json.loads(arguments, parse_float=lambda number: _whole(float(number))), sort_keys=True)
-
-
-def _whole(number: float) -> float | int:
-    return int(number) if number.is_integer() else number
 
 
 def unscored(table: pd.DataFrame, scores: Scores | None = None) -> dict[str, str]:
@@ -156,6 +146,7 @@ def named_apart(table: pd.DataFrame) -> pd.DataFrame:
     :param table: columns agent, arguments, task and any others
     :return: the same table, where agents whose arguments differ on the same task have these in their names
     """
+    table = plain_texts(table)
     kinds = table[["agent", "task", "arguments"]].drop_duplicates()
     names: dict[tuple[str, str], str] = {}
     for agent, rows in kinds.groupby("agent", sort=False):
@@ -163,7 +154,7 @@ def named_apart(table: pd.DataFrame) -> pd.DataFrame:
         if differing:
             for text in rows["arguments"].unique():
                 arguments = json.loads(text)
-                words = ", ".join(f"{name}={_word(arguments.get(name))}" for name in differing)
+                words = ", ".join(f"{name}={word(arguments.get(name))}" for name in differing)
                 names[agent, text] = f"{agent} ({words})"
     if not names:
         return table
@@ -180,12 +171,24 @@ def differing_arguments(runs: pd.DataFrame) -> list[str]:
     for _, texts in runs.groupby("task")["arguments"]:
         found = [json.loads(text) for text in texts.unique()]
         names = set().union(*found)
-        differing |= {name for name in names if any(each.get(name) != found[0].get(name) for each in found)}
+        # As texts: true is not 1.
+        differing |= {name for name in names if len({json.dumps(each.get(name), sort_keys=True) for each in found}) > 1}
     return sorted(differing)
 
 
-def _word(value: Any) -> str:
-    return value if isinstance(value, str) else "default" if value is None else json.dumps(value)
+def word(value: Any) -> str:
+    """
+    :param value: of an argument; None if it was not given
+    :return: its text in names; a text that reads as another value, such as "2", is in quotation marks
+    """
+    if value is None:
+        return "default"
+    if not isinstance(value, str):
+        return json.dumps(value)
+    try:
+        return json.dumps(value) if json.loads(value) is not None else value
+    except ValueError:
+        return value
 
 
 def group_tasks(groups: Groups | None, tasks: Sequence[str], in_table: Iterable[str] = ()) -> dict[str, list[str]]:

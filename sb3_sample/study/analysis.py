@@ -30,8 +30,9 @@ from sb3_sample.study.aggregate import (
     iqm,
     named_apart,
     scored,
+    word,
 )
-from sb3_sample.study.table import RUN
+from sb3_sample.study.table import RUN, plain_texts
 from sb3_sample.warn import warn
 
 #: Evaluations at the end of a run that are averaged (the regularization study, appendix A).
@@ -100,6 +101,7 @@ def argument(runs: pd.DataFrame, name: str) -> list[str]:
     """
     if name == "agent":
         return list(runs["agent"])
+    runs = plain_texts(runs)
     values: dict[str, Any] = {}
     for text in runs["arguments"].unique():
         value: Any = json.loads(text)
@@ -111,10 +113,7 @@ def argument(runs: pd.DataFrame, name: str) -> list[str]:
         raise ValueError(
             f"arguments must be of those of the runs, {', '.join(known) or 'which have none'}, not {name!r}"
         )
-    texts = {
-        text: DEFAULT if value is None else value if isinstance(value, str) else json.dumps(value)
-        for text, value in values.items()
-    }
+    texts = {text: DEFAULT if value is None else word(value) for text, value in values.items()}
     return [texts[text] for text in runs["arguments"]]
 
 

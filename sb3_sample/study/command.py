@@ -40,7 +40,11 @@ def main(argv: Sequence[str]) -> None:
     options = parser.parse_args(argv)
     try:
         COMMANDS[options.command][2](options)
-    except (PlanError, StudyError, PermissionError) as error:
+    except (PlanError, StudyError) as error:
+        refuse(f"study {options.command}", error)
+    except OSError as error:
+        if error.errno is None:
+            raise
         refuse(f"study {options.command}", error)
 
 

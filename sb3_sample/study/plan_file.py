@@ -313,7 +313,7 @@ class _Reader:
         if not any(_has_data_on(data, task) for task in tasks):
             raise self._fail(agent.node, f"agent {agent.name!r} has no task for which all of its data are named")
         algorithm = algorithms()[agent.algo].algorithm
-        if data and not hasattr(algorithm, "learn_offline"):
+        if data and not getattr(algorithm, "learns_from_data", False):
             raise self._fail(entries[next(iter(data))].key, f"{next(iter(data))} is nothing for {agent.algo}")
         if getattr(algorithm, "learns_from_data_only", False) and data.keys() != {"dataset"}:
             raise self._fail(agent.node, f"agent {agent.name!r}: {agent.algo} learns from a dataset only, and needs it")

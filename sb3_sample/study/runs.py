@@ -11,7 +11,7 @@ import os
 import re
 import socket
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from sb3_sample.saving import temporary
 from sb3_sample.saving.locks import Lock, is_taken, take
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.study.plan import Comparison, Plan, Run
-from sb3_sample.study_list import FORMER, MAX_LIST
+from sb3_sample.study_list import FORMER, MAX_LIST, to_json
 
 #: Content of a study's folder: its runs, their outcomes, the list of runs and the plan as read.
 RUNS, STATE, LIST, PLAN = STUDY_RUNS, "state", STUDY_LIST, "plan.yml"
@@ -117,7 +117,10 @@ class StudyFolder:
             former: list[Run] = []
             if (self.path / LIST).exists():
                 known, former = self.runs(), self._former()
-                _check_same(self.path, [*former, *known], plan.runs)
+                # What was never begun, or was removed, has no settings to keep.
+                there = [*former, *(run for run in known if self.place(run).is_dir())]
+                _check_same(self.path, there, plan.runs)
+                _check_names(self.path, there, plan.runs)
                 if keep:
                     runs = {run.name: run for run in known} | runs
                     comparison = comparison if any(comparison) else self.comparison()
@@ -234,8 +237,10 @@ class StudyFolder:
         if not isinstance(found, dict) or not {"done"} <= found.keys() <= set(Outcome._fields):
             raise StudyError(f"{path} is not what sb3-sample study run has written: remove it, and the run goes on")
         outcome = Outcome(**found)
-        if outcome.done and (outcome.steps < run.steps or not self.place(run).is_dir()):
+        if outcome.done and not self.place(run).is_dir():
             return Outcome(False)
+        if outcome.done and outcome.steps < run.steps:
+            return Outcome(False, steps=outcome.steps)
         return outcome
 
     def write_outcome(self, run: Run, outcome: Outcome) -> Outcome:
@@ -257,6 +262,11 @@ class StudyFolder:
         """
         folder = self.place(run)
         logged, timed_steps, seconds = _logged(folder / _LOG)
+        if "dataset" in run.data:
+            # The steps on a data set come first, and have a log and a clock of their own.
+            first_logged, first_steps, first_seconds = _logged(folder / OFFLINE / _LOG)
+            logged, timed_steps = max(logged, first_logged), max(timed_steps, first_steps)
+            seconds += first_seconds
         steps = max(checkpointed(folder), logged)
         try:
             found = read_evaluations(folder / EVALUATIONS)
@@ -311,19 +321,41 @@ def _write(path: Path, text: str) -> None:
         file.write(text.encode())
 
 
+#: Settings of a run that may differ when it goes on.
+_FREE = frozenset({"checkpoint_freq", "gym_packages"})
+
+
 def _check_same(path: Path, before: Iterable[Run], now: Iterable[Run]) -> None:
     known = {run.name: run.as_json() for run in before}
     for run in now:
         if (there := known.get(run.name)) is None:
             continue
         here = run.as_json()
-        free = {"checkpoint_freq", "gym_packages"} | ({"steps"} if run.steps >= there["steps"] else set())
+        free = _FREE | ({"steps"} if run.steps >= there["steps"] else set())
         for name in (here.keys() | there.keys()) - free:
             if here.get(name) != there.get(name):
                 raise StudyError(
                     f"{path} has {run.title}, with {_pair(name, there, here)}. Nothing was changed: run the plan as it "
                     "was, or in another --folder"
                 )
+
+
+def _check_names(path: Path, before: Iterable[Run], now: Sequence[Run]) -> None:
+    """Refuse runs that are there under another name: with the grid in another order, or 1.0 in it for 1."""
+    names = {run.name for run in now}
+    renamed = {_settings(run): run for run in before if run.name not in names}
+    known = {run.name for run in before}
+    for run in now:
+        if run.name not in known and (there := renamed.get(_settings(run))) is not None:
+            raise StudyError(
+                f"{path} has {there.title}, in {RUNS}/{there.name}, which the plan now names {run.name}: its grid is "
+                "written in another order, or its numbers are. Nothing was changed: write the grid as it was, or use "
+                "another --folder"
+            )
+
+
+def _settings(run: Run) -> str:
+    return to_json({name: value for name, value in run.as_json().items() if name not in _FREE | {"steps"}})
 
 
 def _pair(name: str, there: dict[str, Any], here: dict[str, Any]) -> str:

@@ -289,7 +289,9 @@ def _batches(runs: Sequence[Run]) -> list[tuple[Run, ...]]:
     found: dict[str, list[Run]] = {}
     for run in runs:
         alike = {name: value for name, value in run.as_json().items() if name != "seed"}
-        key = json.dumps(alike, sort_keys=True) if can_train_together(run.algo) else run.name
+        # Learning from a data set has no steps of an environment, at which trainings in lockstep wait for each other.
+        together = can_train_together(run.algo) and "dataset" not in run.data
+        key = json.dumps(alike, sort_keys=True) if together else run.name
         found.setdefault(key, []).append(run)
     return [tuple(each) for each in found.values()]
 

@@ -150,6 +150,6 @@ def status(folder: str | Path) -> Status:
         elif place.is_claimed(run):
             state = RUNNING
         else:
-            state = FAILED if outcome.attempts else WAITING
+            state = FAILED if outcome.traceback else WAITING
         found.append(RunStatus(run, state, outcome))
     return Status(place, found)

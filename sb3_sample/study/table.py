@@ -10,7 +10,7 @@ import functools
 import itertools
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ from sb3_sample.plots import DATA, all_published_curves, find_runs, named_algori
 from sb3_sample.run_logs import EVALUATIONS, OFFLINE, is_truncated, read_evaluations, read_monitors
 from sb3_sample.run_settings import RECORD, RunSettings, plain_id, read_settings, study_of
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
-from sb3_sample.study_list import is_evaluated, read_list
+from sb3_sample.study_list import is_evaluated, read_list, to_json
 from sb3_sample.warn import warn
 
 COLUMNS = ["agent", "arguments", "task", "seed", "step", "metric", "value"]
@@ -78,12 +78,16 @@ class _Rows:
         return table.astype({"seed": "Int64"})[COLUMNS]
 
 
-def to_json(arguments: Mapping[str, Any]) -> str:
+def plain_texts(table: pd.DataFrame) -> pd.DataFrame:
     """
-    :param arguments: plain values by name
-    :return: their text in the table
+    :param table: with a column ``arguments``
+    :return: the same table with these texts as :func:`to_json` writes them: 2.0 is 2, since equal arguments do not tell
+        agents apart
     """
-    return json.dumps(arguments, sort_keys=True)
+    texts = {text: to_json(json.loads(text)) for text in table["arguments"].unique()}
+    if all(text == plain for text, plain in texts.items()):
+        return table
+    return table.assign(arguments=table["arguments"].map(texts))
 
 
 # ---------------------------------------------------------------- runs
@@ -475,7 +479,7 @@ def load(path: str | Path) -> pd.DataFrame:
         raise BadFile(f"{path} is no table of runs: {error}. It must have {', '.join(COLUMNS)}") from error
     except (ValueError, TypeError) as error:
         raise BadFile(f"{path} is no table of runs: {error}") from error
-    return table
+    return plain_texts(table)
 
 
 def _check_parquet() -> None:

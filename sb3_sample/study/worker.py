@@ -179,6 +179,9 @@ def attempt(
         place, start = folder.place(run), time.monotonic()
         first = checkpointed(place)
         outcome = Outcome(False, earlier.attempts, threads=threads)
+        if earlier.traceback:
+            # If this attempt is interrupted, the run waits for the next one.
+            folder.write_outcome(run, earlier._replace(traceback=""))
         with _printing_to(folder.output(run), before):
             try:
                 make(run, place, options)

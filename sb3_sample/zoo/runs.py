@@ -827,8 +827,8 @@ def _check_data(data: Data, args: argparse.Namespace) -> None:
             raise RunError(f"--algo {args.algo} learns from data only: give --dataset")
         return
     option = "--dataset" if data.dataset is not None else "--prior-data"
-    if not hasattr(algorithm, "learn_offline"):
-        able = [name for name, each in ALGORITHMS.items() if hasattr(each.algorithm, "learn_offline")]
+    if not getattr(algorithm, "learns_from_data", False):
+        able = [name for name, each in ALGORITHMS.items() if getattr(each.algorithm, "learns_from_data", False)]
         raise RunError(f"{option} is for {', '.join(able)}, not for {args.algo}")
     if needs_data and data.dataset is None:
         raise RunError(f"--algo {args.algo} learns from data only: give --dataset in the place of --prior-data")

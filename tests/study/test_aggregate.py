@@ -10,6 +10,7 @@ import pytest
 from sb3_sample import study
 from sb3_sample.envs.scores import score_of
 from sb3_sample.study.aggregate import iqm, scored
+from sb3_sample.study.analysis import argument
 from tests.study.made_up import made_up
 
 library = pytest.importorskip("rliable.library")
@@ -203,6 +204,20 @@ def test_agents_with_several_settings_are_kept_apart() -> None:
     with pytest.warns(UserWarning, match="not the same tasks"):
         found = study.aggregate(made_up(rows), [10], ["all"], reps=5)
     assert list(found["agent"]) == ["a (replay_ratio=2)", "a (replay_ratio=10)", "b"]
+
+
+def test_equal_numbers_are_one_setting_and_true_is_not_one() -> None:
+    rows = made_up(
+        [*runs_of("A", CHEETAH, [0.1, 0.3, 0.2], replay_ratio=2), *runs_of("A", CHEETAH, [0.5], replay_ratio=1)]
+    )
+    rows.loc[rows["seed"] == 2, "arguments"] = '{"replay_ratio": 2.0}'
+    found = study.aggregate(rows, reps=5)
+    assert dict(zip(found["agent"], found["runs"], strict=True)) == {"A (replay_ratio=2)": 3, "A (replay_ratio=1)": 1}
+    assert argument(rows, "replay_ratio") == ["2", "2", "2", "1"]
+    for one, other, names in ((True, 1, {"A (x=true)", "A (x=1)"}), ("2", 2, {'A (x="2")', "A (x=2)"})):
+        rows = made_up([*runs_of("A", CHEETAH, [0.1], x=one), *runs_of("A", CHEETAH, [0.9], x=other)])
+        assert set(study.aggregate(rows, reps=5)["agent"]) == names
+        assert len(set(argument(rows, "x"))) == 2
 
 
 def test_groups_of_ones_own() -> None:

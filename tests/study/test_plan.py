@@ -385,6 +385,7 @@ def test_agents_that_learn_from_data(plan_of) -> None:
     [
         ("    dataset: data/{task}/expert\n", "", "agent 'BC': bc learns from a dataset only, and needs it"),
         ("algo: sac_sample", "algo: mbma_ppo\n    dataset: x", "line 14: dataset is nothing for mbma_ppo"),
+        ("algo: sac_sample", "algo: dr_q\n    prior_data: x", "line 14: prior_data is nothing for dr_q"),
         ("offline_steps: 500", "offline_steps: 800", "line 10: offline_steps must be fewer than the 800 steps of all"),
         ("    dataset: {Pendulum-v1: ~/pendulum}\n", "", "line 9: offline_steps are gradient steps on a dataset"),
         ("{Pendulum-v1: ~/pendulum}", "{Ant-v5: x}", "line 7: dataset has 'Ant-v5', which is no task of the plan"),
@@ -493,3 +494,43 @@ def test_arguments_of_an_agent_with_another_policy_are_checked(plan_of) -> None:
             "agents: {A: {algo: bro, policy: MultiInputPolicy, model_size: 0.56M}}\ntasks: [dmc/cheetah-run-v0]\n"
             "seeds: 1\nsteps: 30_000\n"
         )
+
+
+GRID = """
+agents:
+  SAC: {algo: sac_sample}
+grid: {GRID}
+tasks: [Pendulum-v1]
+seeds: [0]
+steps: 25_000
+"""
+
+
+@pytest.mark.parametrize("other", ["{gamma: [0.9], replay_ratio: [1]}", "{replay_ratio: [1.0], gamma: [0.9]}"])
+def test_a_grid_that_is_written_otherwise_makes_no_run_anew(plan_of, other: str, tmp_path: Path) -> None:
+    folder = StudyFolder(tmp_path / "study")
+    first = plan_of(GRID.replace("{GRID}", "{replay_ratio: [1], gamma: [0.9]}"))
+    folder.enter(first)
+    again = plan_of(GRID.replace("{GRID}", other))
+    # While there is no run of it.
+    folder.enter(again)
+    folder.enter(first)
+    folder.place(first.runs[0]).mkdir(parents=True)
+    folder.enter(first)
+    with pytest.raises(
+        StudyError, match=r"has SAC, replay_ratio=1, gamma=0.9 .* which the plan now names .*Nothing was"
+    ):
+        folder.enter(again)
+    assert folder.runs() == list(first.runs)
+
+
+def test_settings_of_runs_that_are_not_there_can_be_changed(tmp_path: Path) -> None:
+    def plan(gamma: float) -> Plan:
+        return Plan("s", (Run("A", "bro", {"gamma": gamma}, {}, "dmc/cheetah-run-v0", 0, 3_000),))
+
+    folder = StudyFolder(tmp_path)
+    folder.enter(plan(0.9))
+    folder.enter(plan(0.5))
+    folder.place(folder.runs()[0]).mkdir(parents=True)
+    with pytest.raises(StudyError, match="arguments {'gamma': 0.5}, and the plan now says {'gamma': 0.9}"):
+        folder.enter(plan(0.9))

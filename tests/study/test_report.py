@@ -16,6 +16,7 @@ import pandas as pd
 import pytest
 
 from sb3_sample import cli, study
+from sb3_sample.envs.scores import Score
 from sb3_sample.plots import Curve, all_published_curves, published_curves
 from sb3_sample.saving.training_state import commit, processor
 from sb3_sample.study.plan import Plan, Run
@@ -210,6 +211,30 @@ def test_single_runs_are_no_evidence(tmp_path: Path) -> None:
     text = text_of(written(tmp_path / "r.html", made_up(rows)))
     assert "a is ahead of b, without certainty." in text and "better than" not in text
     assert "There is no interval where a task has a single run: a, b." in text and "no task has a second" not in text
+
+
+def test_who_is_ahead_and_loses_more_often_is_not_ahead(tmp_path: Path) -> None:
+    tasks = [f"dmc/{name}-v0" for name in ("cheetah-run", "walker-run", "hopper-hop", "dog-run", "dog-walk")]
+    rows = [row for task, end in zip(tasks, (900, 10, 10, 500, 500), strict=True) for row in runs("A", task, [end])]
+    for task, end in zip(tasks, (300, 20, 20, 300, 510), strict=True):
+        rows += runs("B", task, [end] * 3)
+    text = text_of(written(tmp_path / "a.html", made_up(rows)))
+    assert "A and B cannot be told apart." in text and "is ahead of" not in text
+
+
+def test_a_score_of_another_metric(tmp_path: Path) -> None:
+    heads = [(agent, {}, CHEETAH, seed, step) for agent in "AB" for seed in (0, 1) for step in (1, 2)]
+    rows = [(*head, "episode_length", 100.0) for head in heads]
+    scores = {CHEETAH: Score("episode_length", 200.0)}
+    assert "0.500" in written(tmp_path / "a.html", made_up(rows), scores=scores)
+    rows = [(*head, "online_return", 100.0) for head in heads]
+    assert "0.500" in written(tmp_path / "b.html", made_up(rows), scores={CHEETAH: Score("online_return", 200.0)})
+
+
+def test_a_run_without_an_evaluation_beside_published_ones(tmp_path: Path) -> None:
+    rows = made_up([("A", {}, CHEETAH, 0, 100, "hours", 0.1)])
+    page = text_of(written(tmp_path / "a.html", rows, published=["BRO"]))
+    assert "No run has been evaluated yet." in page
 
 
 def test_tasks_without_a_score_have_curves_and_are_named(tmp_path: Path) -> None:
@@ -446,7 +471,7 @@ def test_an_agent_with_failed_runs_is_not_better(tmp_path: Path) -> None:
     # The failed run of the worse agent changes nothing.
     place.write_outcome(made[4], Outcome(True, steps=3_000))
     write_evaluations(place.place(made[4]), (1_000, 2_000, 3_000), (100.0,) * 3)
-    place.write_outcome(made[9], Outcome(False, attempts=2))
+    place.write_outcome(made[9], Outcome(False, attempts=2, traceback="failed"))
     (place.place(made[9]) / "evaluations.npz").unlink()
     text = text_of(written(tmp_path / "r.html", place.path, steps=[3_000]))
     assert "A is better than B." in text and "1 failed run of B is not counted" in text
@@ -468,7 +493,9 @@ def study_of_agents(path: Path, agents: dict[str, dict[str, Any]], failed: dict[
         if n:
             steps = (1_000, 2_000, 3_000)[:n]
             write_run(place.place(run), seed=run.seed, steps=steps, values=(1.0,) * n, arguments=run.arguments)
-        place.write_outcome(run, Outcome((run.agent, run.seed) not in failed, steps=1_000 * n, attempts=2))
+        place.write_outcome(
+            run, Outcome((run.agent, run.seed) not in failed, steps=1_000 * n, attempts=2, traceback="failed")
+        )
     return place
 
 
@@ -557,7 +584,7 @@ def test_what_a_run_logs_after_its_last_evaluation_is_in_no_average(tmp_path: Pa
             pass
         log = [{"step": 2_900, "diagnostics/dormant": 0.5}] if failed else []
         write_run(place.place(run), seed=run.seed, steps=(1_000, 2_000, 3_000)[:n], values=values[:n], log=log)
-        place.write_outcome(run, Outcome(not failed, steps=3_000, attempts=2))
+        place.write_outcome(run, Outcome(not failed, steps=3_000, attempts=2, traceback="failed"))
     page = written(tmp_path / "r.html", place.path, steps=[2_500])
     text = text_of(page)
     assert "1 failed run of A is not counted: the comparison favours it." in text and "better than" not in text

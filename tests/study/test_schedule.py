@@ -15,9 +15,11 @@ import pytest
 
 from sb3_sample import cli, study
 from sb3_sample.study import command
-from sb3_sample.study.plan import Plan
-from sb3_sample.study.runs import Outcome, StudyFolder
+from sb3_sample.study.plan import Plan, Run
+from sb3_sample.study.runs import Outcome, Progress, StudyFolder
+from sb3_sample.study.schedule import _batches
 from sb3_sample.study.states import RunStatus, Status
+from sb3_sample.study.worker import attempt
 from tests.study import nothing
 
 ROOT = Path(__file__).parents[2]
@@ -242,3 +244,70 @@ def test_the_work_for_a_run_does_not_grow_with_the_number_of_runs(tmp_path: Path
         for what, number in more.items():
             assert number <= 30 * most.get(what, 0), (who, what, number)
         assert more["opened"] > 0
+
+
+def test_the_time_left_of_runs_that_learn_from_data_first(tmp_path: Path) -> None:
+    """Its two logs have a clock each; the steps of the second begin where the first ends."""
+    data = {"dataset": "d", "offline_steps": 500}
+    runs = tuple(Run("I", "iql", {}, {}, "Pendulum-v1", seed, 1_000, data=data) for seed in (0, 1))
+    folder = StudyFolder(tmp_path)
+    folder.enter(Plan("o", runs))
+    states = zip(runs, ("running", "waiting"), strict=True)
+    found = Status(folder, [RunStatus(each, state, Outcome(False)) for each, state in states])
+    place = folder.place(runs[0])
+    (place / "offline").mkdir(parents=True)
+
+    def log(path: Path, steps: int, seconds: float) -> None:
+        path.write_text(json.dumps({"time/total_timesteps": steps, "time/time_elapsed": seconds}) + "\n")
+
+    log(place / "offline" / "progress.jsonl", 250, 100.0)
+    assert folder.progress(runs[0]) == Progress(250, None, 250, 100.0)
+    log(place / "offline" / "progress.jsonl", 500, 200.0)
+    log(place / "progress.jsonl", 800, 40.0)
+    assert folder.progress(runs[0]) == Progress(800, None, 800, 240.0)
+    assert found.seconds_left(found.progress()) == pytest.approx(1_200 * 0.3)
+
+
+def test_the_time_left_of_runs_that_are_to_have_more_steps(tmp_path: Path) -> None:
+    few, more = nothing.plan(2), [dataclasses.replace(each, steps=4) for each in nothing.plan(2).runs]
+    folder = StudyFolder(tmp_path)
+    folder.enter(few)
+    for each in few.runs:
+        folder.place(each).mkdir(parents=True)
+        folder.claim(each)
+        folder.write_outcome(each, Outcome(True, steps=each.steps, steps_made=each.steps, seconds=10.0))
+    assert [folder.outcome(each) for each in more] == [Outcome(False, steps=few.runs[0].steps)] * 2
+
+
+def test_a_run_whose_next_attempt_was_interrupted_waits(tmp_path: Path) -> None:
+    (only,) = nothing.plan(1).runs
+    folder = StudyFolder(tmp_path)
+    folder.enter(Plan("one", (only,)))
+
+    def ends(error: BaseException):
+        def make(*_) -> None:
+            raise error
+
+        return make
+
+    attempt(folder, only, [], 1, ends(RuntimeError("nothing comes of it")))
+    assert study.status(tmp_path).counts["failed"] == 1
+    with pytest.raises(KeyboardInterrupt):
+        attempt(folder, only, [], 1, ends(KeyboardInterrupt()))
+    found = study.status(tmp_path)
+    assert (found.counts["failed"], found.counts["waiting"]) == (0, 1) and found.runs[0].outcome.attempts == 1
+
+
+def test_seeds_that_learn_from_data_are_made_one_by_one() -> None:
+    seeds = [Run("I", "iql", {}, {}, "Pendulum-v1", seed, 1_000, data={"dataset": "d"}) for seed in (0, 1)]
+    assert _batches(seeds) == [(seeds[0],), (seeds[1],)]
+    assert _batches([dataclasses.replace(each, data={}) for each in seeds])[0][1].seed == 1
+
+
+def test_a_folder_that_cannot_be_one_is_refused_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plan = "agents: {SAC: {algo: sac_sample}}\ntasks: [Pendulum-v1]\nseeds: [0]\nsteps: 25_000\n"
+    (tmp_path / "plan.yml").write_text(plan)
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit):
+        cli.main(["study", "run", str(tmp_path / "plan.yml"), "--folder", str(tmp_path / "file")])
+    assert "sb3-sample study run: " in (said := capsys.readouterr().err) and "Traceback" not in said

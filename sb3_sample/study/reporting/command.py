@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from sb3_sample.envs.scores import Score
 from sb3_sample.plots import PUBLISHED
 from sb3_sample.saving.temporary import becoming
 from sb3_sample.study import table as tables
@@ -79,6 +80,7 @@ def report(
         raise ValueError("pictures are those of markdown, which is not given")
     of_runs = laws if laws is None or isinstance(laws, Laws) else read_laws(laws)
     gathered = gather(folders, published, plan)
+    gathered.scored_by = tuple(each.metric for each in (scores or {}).values() if isinstance(each, Score))
     found = build(
         gathered,
         title=title or ", ".join(gathered.titles),

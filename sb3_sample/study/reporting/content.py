@@ -318,7 +318,9 @@ def _tasks(drawn: Sequence[Curves], looks: Looks) -> Section:
         ends = [each.own[name].data["env_step"].iloc[-1] for name in ours]
         ends += [run.steps[-1] for name in ours for run in each.under_way[name]]
         y_range = (-0.03, 1.03) if each.metric == "success_rate" else None
-        panels.append(Lines(titles[each.task], STEPS, METRICS[each.metric], lines, float(max(ends)), y_range))
+        panels.append(
+            Lines(titles[each.task], STEPS, METRICS.get(each.metric, each.metric), lines, float(max(ends)), y_range)
+        )
     if not panels:
         return Section("tasks", "Single tasks", [])
     caption = "Mean and range over seeds; thin: runs that have not got as far; dashed: measured and published by others"

@@ -145,6 +145,9 @@ def compute(
     runs = scored(rows, scores).groupby(RUN, sort=False, dropna=False)["step"]
     ends = runs.agg(["min", "max", spacing]).reset_index()
     own = ends[~ends["agent"].isin(gathered.published)]
+    if not len(own) and len(gathered.table[~gathered.table["agent"].isin(gathered.published)]):
+        facts.reason = "No run has been evaluated yet."
+        return facts
     facts.steps = sorted(steps) if steps else [_reached(own)]
     reaching = ends[(ends["min"] <= facts.step) & (ends["max"] >= facts.step)]
     if not len(reaching):

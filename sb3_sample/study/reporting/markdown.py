@@ -27,7 +27,9 @@ def write(report: Report, path: Path, pictures: Path | None = None) -> None:
     """
     name = re.sub(r"-{2,}|[<>\n\r]", "-", report.title)
     begin, end = BEGIN.format(name), END.format(name)
-    parts = around(path.read_text(encoding="utf-8") if path.exists() else f"{begin}\n{end}\n", begin, end)
+    # The rest of the page keeps its line ends.
+    page = path.read_bytes().decode() if path.exists() else f"{begin}\n{end}\n"
+    parts = around(page, begin, end)
     if parts is None:
         raise ValueError(
             f"markdown must name a new file, or one with the lines {begin} and {end}, between which the report stands; "

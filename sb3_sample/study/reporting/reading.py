@@ -50,6 +50,7 @@ class Gathered:
     :param notes: what was left out, with the reason
     :param labels: name given to the agents of each of ``states``, None for the names of the plan
     :param shown: the table's name of each of the sources' agents, by its name there and its arguments
+    :param scored_by: metrics of the given scores
     """
 
     names: list[str]
@@ -66,6 +67,7 @@ class Gathered:
     notes: list[str]
     labels: list[str | None] = dataclasses.field(default_factory=list)
     shown: dict[tuple[str, str], str] = dataclasses.field(default_factory=dict)
+    scored_by: tuple[str, ...] = ()
 
     @functools.cached_property
     def missing(self) -> list[Run]:
@@ -81,7 +83,7 @@ class Gathered:
     @property
     def evaluated(self) -> pd.DataFrame:
         """Rows that scores are made from; a run's other logs may continue after its last evaluation."""
-        return self.table[self.table["metric"].isin([*_MEASURED, "episode_length"])]
+        return self.table[self.table["metric"].isin([*_MEASURED, "episode_length", *self.scored_by])]
 
     @property
     def tasks(self) -> list[str]:

@@ -129,6 +129,7 @@ def _verdict(x: str, y: str, chance: Interval, p: float, level: float, is_whole:
         return [f"{x} and {y} cannot be told apart.", why]
     unsure = f"{x} is ahead of {y}, without certainty."
     if math.isnan(chance.low):
+        unsure = unsure if chance.value > 0.5 else f"{x} and {y} cannot be told apart."
         return [unsure, why, "This probability has no interval, since a task has a single run of one of them."]
     if p >= level:
         few = f"Too few runs for a verdict: p of the permutation test must be below {level:.3g}."
