@@ -342,9 +342,7 @@ def settings(file: str) -> Iterator[Case]:
         for text in texts:
             # Of another entry nothing is used.
             must = name != "another" or "python" in text or "&" in text
-            # The zoo's record_video uses those of args.yml only.
-            but = ("record",) if is_config and name == "env_kwargs" else ()
-            yield Case(file, name, f"{text:.80}", partial(set_yaml, name, text), must, but)
+            yield Case(file, name, f"{text:.80}", partial(set_yaml, name, text), must)
     for words, text in YAML_TEXTS.items():
         put = partial(_bytes, text.encode(errors="surrogateescape"))
         yield Case(file, "the text", words, put, words not in _SAID)

@@ -4,7 +4,7 @@ import builtins
 import pickle
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cloudpickle
 import gymnasium as gym
@@ -155,6 +155,66 @@ def test_agents_whose_rates_decay_are_shown(
     assert "1 Episodes" in capsys.readouterr().out
     run("record_video", *shown)
     assert list(Path("logs").glob(f"{algo}/Drawn-v0_1/videos/*.mp4"))
+
+
+class Tinted(Drawn):
+    """Keeps the arguments that it is made with."""
+
+    made: ClassVar[list[dict[str, int]]] = []
+
+    def __init__(self, render_mode: str | None = None, **arguments: int):
+        super().__init__(render_mode)
+        self.made.append(arguments)
+
+
+def test_a_run_is_shown_with_the_arguments_of_its_environment(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("moviepy")
+    spec = gym.envs.registration.EnvSpec("Tinted-v0", entry_point=Tinted, max_episode_steps=20)
+    monkeypatch.setitem(gym.registry, "Tinted-v0", spec)
+    run("train", "--algo", "sac_sample", "--env", "Tinted-v0", "-n", "30", "--eval-freq", "-1", "-params", *SMALL,
+        "env_kwargs:dict(hue=3, shade=1)")  # fmt: skip
+    shown = ["--algo", "sac_sample", "--env", "Tinted-v0", "-f", "logs", "-n", "5"]
+    for command in (["enjoy", *shown, "--no-render"], ["record_video", *shown]):
+        for given, shade in (([], 1), (["--env-kwargs", "shade:2"], 2)):
+            Tinted.made.clear()
+            run(*command, *given)
+            assert Tinted.made == [{"hue": 3, "shade": shade}]
+
+
+class Pictures(Drawn):
+    """Has pictures, with their channels last, as observations."""
+
+    observation_space = gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return self.observation_space.sample(), super().reset(seed=seed)[1]
+
+    def step(self, action: Any) -> Any:
+        return self.observation_space.sample(), *super().step(action)[1:]
+
+
+class NamedPictures(Pictures):
+    """Has pictures by name."""
+
+    observation_space = gym.spaces.Dict({"eye": Pictures.observation_space})  # type: ignore[assignment]
+
+
+@pytest.mark.parametrize(("env", "policy"), [(Pictures, "MlpPolicy"), (NamedPictures, "MultiInputPolicy")])
+def test_models_of_images_whose_channels_are_last_are_shown(
+    run, env: type[Drawn], policy: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = gym.envs.registration.EnvSpec("Pictures-v0", entry_point=env, max_episode_steps=5)
+    monkeypatch.setitem(gym.registry, "Pictures-v0", spec)
+    run("train", "--algo", "sac_sample", "--env", "Pictures-v0", "-n", "25", "--eval-freq", "-1", "-params", *SMALL,
+        "batch_size:4", f"policy:'{policy}'")  # fmt: skip
+    shown = ["enjoy", "--algo", "sac_sample", "--env", "Pictures-v0", "-f", "logs", "--no-render", "-n", "5"]
+    run(*shown)
+    assert "1 Episodes" in capsys.readouterr().out
+    pictures = gym.spaces.Box(0, 255, (36, 40, 3), np.uint8)
+    space = gym.spaces.Dict({"eye": pictures}) if env is NamedPictures else pictures
+    monkeypatch.setattr(env, "observation_space", space)
+    with pytest.raises(SystemExit, match="the model is of .* the run's environment of "):
+        run(*shown)
 
 
 class Goals(Drawn):

@@ -332,12 +332,14 @@ def _with(method: Any, pickles: bool, trusted: tuple[str, ...]) -> Any:
 
 
 @contextlib.contextmanager
-def watched_with(find: Any, make_env: Any, *modules: ModuleType) -> Iterator[None]:
+def watched_with(find: Any, read: Any, make_env: Any, *modules: ModuleType) -> Iterator[None]:
     """
-    Replace the functions with which ``enjoy`` and ``record_video`` look for a run and make its environments: the zoo
-    finds no run by its folder, and trusts its settings. Their options are checked too.
+    Replace the functions with which ``enjoy`` and ``record_video`` look for a run, read its settings and make its
+    environments: the zoo finds no run by its folder, trusts its settings and does not use all of them. Their options
+    are checked too.
 
     :param find: replaces ``get_model_path``
+    :param read: replaces ``get_saved_hyperparams``
     :param make_env: replaces ``create_test_env``
     :param modules: the modules that call them
     """
@@ -345,6 +347,7 @@ def watched_with(find: Any, make_env: Any, *modules: ModuleType) -> Iterator[Non
         for module in modules:
             stack.enter_context(_pairs_checked(module))
             stack.enter_context(_replaced(module, "get_model_path", find))
+            stack.enter_context(_replaced(module, "get_saved_hyperparams", read))
             stack.enter_context(_replaced(module, "create_test_env", make_env))
         yield
 

@@ -8,8 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from rl_zoo3.utils import create_test_env, get_model_path
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_normalize
+from rl_zoo3.utils import create_test_env, get_model_path, get_saved_hyperparams
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.vec_env import (
+    VecEnv,
+    VecFrameStack,
+    VecNormalize,
+    VecTransposeImage,
+    unwrap_vec_normalize,
+)
 
 from sb3_sample.exits import refuse
 from sb3_sample.saving import container
@@ -54,15 +61,15 @@ def watching(options: argparse.Namespace, arguments: Sequence[str], *modules: An
 
     :param options: what ``watch_parser`` has parsed
     :param arguments: the rest of the command line
-    :param modules: the modules that look for a run with ``get_model_path`` and make environments with
-        ``create_test_env``
+    :param modules: the modules that look for a run with ``get_model_path``, read its settings with
+        ``get_saved_hyperparams`` and make environments with ``create_test_env``
     :return: command line for the zoo
     :raises RunError: if ``--run-dir`` is not the folder of a run, or the run is of another algorithm than ours
     """
     given = _given(arguments)
     with contextlib.ExitStack() as stack:
         watch = _Watch(options, given, stack)
-        stack.enter_context(watched_with(watch.find, watch.make_env, *modules))
+        stack.enter_context(watched_with(watch.find, watch.read_settings, watch.make_env, *modules))
         yield [*(_of_record(options, given) if options.run_dir is not None else []), *arguments]
 
 
@@ -95,7 +102,7 @@ def _of_record(options: argparse.Namespace, given: argparse.Namespace) -> list[s
 
 class _Watch:
     """
-    Wraps two functions of the zoo.
+    Wraps three functions of the zoo.
 
     :param options: what ``watch_parser`` has parsed
     :param given: what ``_given`` has found
@@ -107,6 +114,8 @@ class _Watch:
         self._env_kwargs = [argument.partition(":")[0] for argument in given.env_kwargs]
         #: Whether only files are read that run no code.
         self._is_safe = False
+        #: Arguments of the environment in the run's ``config.yml``.
+        self._env_kwargs_of_config: Mapping[str, Any] = {}
         self._env: VecEnv | None = None
         #: The checkpoint that the model is of.
         self._checkpoint: Path | None = None
@@ -146,14 +155,25 @@ class _Watch:
             self._stack.enter_context(models_checked(self._check))
         return found
 
+    def read_settings(self, *args: Any, **kwargs: Any) -> tuple[dict[str, Any], str | None]:
+        """
+        As ``get_saved_hyperparams``, and keep ``env_kwargs``: ``record_video`` ignores them, and ``enjoy`` forgets them
+        for those in ``args.yml``.
+        """
+        settings, path = get_saved_hyperparams(*args, **kwargs)
+        self._env_kwargs_of_config = settings.get("env_kwargs") or {}
+        return settings, path
+
     def make_env(self, env_id: str, *args: Any, **kwargs: Any) -> VecEnv:
         """
-        As ``create_test_env``, but a checkpoint has its own statistics of ``VecNormalize``.
+        As ``create_test_env``, but with all ``env_kwargs`` of the run's settings, and a checkpoint has its own
+        statistics of ``VecNormalize``.
 
         :raises Refused: if the run's settings make no environment that works
         """
         make = make_answering_env if self._is_safe else create_test_env
         settings = kwargs.get("hyperparams") or {}
+        kwargs["env_kwargs"] = {**self._env_kwargs_of_config, **(kwargs.get("env_kwargs") or {})}
         if self._checkpoint is None or not settings.get("normalize"):
             self._env = make(env_id, *args, **kwargs)
             return self._env
@@ -167,7 +187,7 @@ class _Watch:
     def _check(self, model: Any) -> None:
         for name in ("observation_space", "action_space") if self._env is not None else ():
             its, saved = getattr(self._env, name), getattr(model, name)
-            if _shapes(its) != _shapes(saved):
+            if _shapes(_channels_first(its)) != _shapes(saved):
                 raise Refused(f"the model is of {saved!r:.200}, the run's environment of {its!r:.200}")
         is_normalized = self._env is not None and unwrap_vec_normalize(self._env) is not None
         if lacks_vec_normalize(model) and not is_normalized:
@@ -205,6 +225,15 @@ def _normalized(env: VecEnv, path: Path, arguments: Mapping[str, Any]) -> VecNor
     if found != before:
         raise Refused(f"{path}: the statistics of VecNormalize are of the shapes {found}, not {before}")
     return wanted
+
+
+def _channels_first(space: gym.Space) -> gym.Space:
+    """A space as a model learns from it: images have their channels first."""
+    if isinstance(space, gym.spaces.Dict):
+        return gym.spaces.Dict({name: _channels_first(part) for name, part in space.items()})
+    if isinstance(space, gym.spaces.Box) and is_image_space(space) and not is_image_space_channels_first(space):
+        return VecTransposeImage.transpose_space(space)
+    return space
 
 
 def _shapes(space: gym.Space) -> Any:
