@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 from sb3_sample.diagnostics import (
     DiagnosticsCallback,
+    NoiseScaleCallback,
     average_value,
     discounted_return,
     dormant_shares,
@@ -25,6 +26,9 @@ from sb3_sample.diagnostics import (
 )
 from sb3_sample.sac import SAC
 from tests.sac.common import MAKERS, Toy, bro, differing, sac, state, vec
+from tests.sac.test_drawn_steps import DRAWN
+from tests.sac.test_execution import captured
+from tests.sac.test_offline import data
 
 DICT = spaces.Dict({"a": spaces.Box(-10, 10, (3,), np.float32), "b": spaces.Discrete(9)})
 LINEAR: dict[str, Any] = {"policy_kwargs": {"net_arch": []}}
@@ -322,6 +326,19 @@ def test_overfitting(pessimism: float, next_value: float, end: dict[str, bool]) 
     assert results["overfitting"] == pytest.approx(validation / training, rel=1e-5)
 
 
+def test_td_error_of_implicit_q_is_to_the_value_of_the_next_state() -> None:
+    model = MAKERS["IQL"](gamma=0.5)
+    answer(model.critic, 1, 2)
+    answer(model.critic_target, 30, 50)
+    answer(model.objective.value, 6)
+    fill(model, [[0, 0, 0]] * 20, reward=2)
+    results = ready(model, Toy()).measure()
+    target = 2 + 0.5 * 6
+    assert results["td_error_training"] == pytest.approx((target - 1.5) ** 2, rel=1e-5)
+    loss = model.learner.head.loss(torch.tensor([1.0, 2.0]).reshape(2, 1, 1), torch.full((1, 1), target)).item()
+    assert results["td_loss_newest"] == pytest.approx(loss, rel=1e-5)
+
+
 def test_td_error_of_a_drawn_subset() -> None:
     """REDQ's target is that of two critics drawn at random, here (1, 3), (1, 7) or (3, 7)."""
     model = sac(gamma=1 / 2, ent_coef=0.0, target_subset=2, policy_kwargs={"net_arch": [8], "n_critics": 3})
@@ -463,15 +480,25 @@ def test_gradient_norm_is_that_of_the_last_step() -> None:
     assert results["gradient_norm_critic"] > 0 and results["gradient_norm_actor"] > 0
 
 
+def test_gradient_norms_of_captured_steps_if_episodes_set_the_schedule() -> None:
+    model = sac(vec(length=7), train_freq=(1, "episode"), replay_ratio=None, gradient_steps=3).learn(7)
+    captured(model)
+    written = watched(model)
+    model.learn(60, callback=DiagnosticsCallback(Toy(), every=20, n_start_states=1, rollout_length=3))
+    assert [step for step, row in written.diagnostics() if row.get("diagnostics/gradient_norm_critic")] == [20, 40, 60]
+
+
 # ---------------------------------------------------------------- training does not notice
 
 
-@pytest.mark.parametrize("normalized", [False, True])
-@pytest.mark.parametrize("maker", ["SAC", "BRO"])
-def test_training_is_the_same_bit_for_bit(maker: str, normalized: bool) -> None:
+@pytest.mark.parametrize(
+    ("maker", "normalized", "buffer"),
+    [("SAC", False, {}), ("SAC", True, {}), ("BRO", False, {}), ("BRO", True, {}), ("SAC", False, DRAWN)],
+)
+def test_training_is_the_same_bit_for_bit(maker: str, normalized: bool, buffer: dict[str, Any]) -> None:
     def run(callback: DiagnosticsCallback | None) -> tuple[SAC, list[Any]]:
         env: VecEnv = DummyVecEnv([lambda: Monitor(GlobalRandomness()) for _ in range(2)])
-        model = MAKERS[maker](VecNormalize(env) if normalized else env, seed=3)
+        model = MAKERS[maker](VecNormalize(env) if normalized else env, seed=3, **buffer)
         model.learn(60, callback=callback)
         generators = [random.random(), np.random.random(), torch.rand(()).item()]
         return model, generators
@@ -557,6 +584,23 @@ def test_not_while_acting_at_random() -> None:
     assert callback._store.size() > n, "the validation transitions are kept"
     model.learn(8, callback=callback, reset_num_timesteps=False)
     assert [step for step, _ in written.diagnostics()][6:] == [15, 20]
+
+
+def test_a_warning_tells_that_a_data_set_is_not_measured() -> None:
+    model = MAKERS["IQL"](learning_starts=10)
+    dataset = data(40)
+    for callback in (
+        NoiseScaleCallback(every=2),
+        DiagnosticsCallback(Toy(), every=2, n_start_states=1, rollout_length=3),
+    ):
+        with pytest.warns(
+            UserWarning, match=rf"{type(callback).__name__} measures nothing .* learning_starts=10 steps"
+        ):
+            model.learn_offline(dataset, 4, callback=callback)
+        assert not callback.last_results
+    model.learn(12)
+    model.learn_offline(dataset, 4, callback=callback)
+    assert callback.last_results["td_error_training"] > 0
 
 
 NAMES = {

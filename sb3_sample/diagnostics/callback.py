@@ -62,10 +62,14 @@ class DiagnosticsCallback(PeriodicMeasurement):
     observations and rewards of ``eval_env`` are normalised by the training environment's current statistics; the
     statistics of a ``VecNormalize`` around ``eval_env`` are neither used nor changed.
 
-    Training is bit for bit the same with the callback and without: it has its own random numbers, and restores the
-    modules' modes and the global generators, which an environment may use.
+    Training is bit for bit the same with the callback and without where gradient steps are eager (see ``compile``): it
+    has its own random numbers, and restores the modules' modes and the global generators, which an environment may use.
+    Steps that are compiled, captured on a GPU or taken for several seeds together leave no gradients, so the last one
+    before a measurement (before every end of an episode if ``train_freq`` counts episodes) is run eagerly. Its numbers
+    differ by rounding; with ``sampling="device"``, batches and noise are drawn by another generator until then.
 
-    Nothing is measured while the algorithm still acts at random (``learning_starts``).
+    Nothing is measured while the algorithm still acts at random (``learning_starts``), nor in ``learn_offline`` before
+    the model has acted for so long, of which a warning tells: transitions are those of the replay buffer.
 
     :param eval_env: environment for the rollouts, a single one, not the training environment; its normalisation, if
         any, has to be the same as the training environment's. None, the default, is for ``sb3-sample train`` and plans
@@ -179,12 +183,12 @@ class DiagnosticsCallback(PeriodicMeasurement):
             self.model.keep_next_gradients = True
         return super()._on_step()
 
-    def _steps_between_updates(self) -> int:
-        """Upper bound on steps (of all environments) between two gradient steps; 1 if episodes set the schedule."""
+    def _steps_between_updates(self) -> float:
+        """Upper bound on steps (of all environments) between two gradient steps; none if episodes set the schedule."""
         model = self.model
         if model.replay_ratio is None:
             assert isinstance(model.train_freq, TrainFreq)
-            return model.train_freq.frequency if model.train_freq.unit is TrainFrequencyUnit.STEP else 1
+            return model.train_freq.frequency if model.train_freq.unit is TrainFrequencyUnit.STEP else math.inf
         return math.ceil(1 / max(min(model.replay_ratio * model.n_envs, 1), 1e-3))
 
     # ---------------------------------------------------------------- checkpoints

@@ -6,12 +6,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sample.console import say
 from sb3_sample.sac import SAC
+from sb3_sample.warn import warn
 
 
 class PeriodicMeasurement(BaseCallback):
     """
     Base class of callbacks that measure every ``every`` environment steps, and write to the logger under
-    ``diagnostics/``. Nothing is measured while the algorithm still acts at random (``learning_starts``).
+    ``diagnostics/``. Nothing is measured while the algorithm still acts at random (``learning_starts``), nor in
+    ``learn_offline`` before the model has acted for so long, of which a warning tells.
 
     :param every: environment steps between two measurements, taken at the first step at or after each multiple
     :param verbose: 0 nothing, 1 a line for each measurement
@@ -41,13 +43,17 @@ class PeriodicMeasurement(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._next = (self.num_timesteps // self.every + 1) * self.every
+        if self.model._learns_from is not None and self._is_warm_up():
+            warn(
+                f"{type(self).__name__} measures nothing in learn_offline before the model has acted for "
+                f"learning_starts={self.model.learning_starts} steps: it reads the replay buffer, not the data set"
+            )
 
     def _on_step(self) -> bool:
         if self.num_timesteps < self._next:
             return True
         self._next = (self.num_timesteps // self.every + 1) * self.every
-        # The transitions of the current step are stored after this call.
-        if self.model.num_transitions + self.model.n_envs < self.model.learning_starts:
+        if self._is_warm_up():
             return True
         results = self.measure()
         for name, value in results.items():
@@ -59,6 +65,10 @@ class PeriodicMeasurement(BaseCallback):
             shown = ", ".join(f"{name} {results[name]:.3g}" for name in self.SHOWN if name in results)
             say(f"{self.TITLE} at {self.num_timesteps} steps: {shown}")
         return True
+
+    def _is_warm_up(self) -> bool:
+        # The transitions of the current step are stored after this call.
+        return self.model.num_transitions + self.model.n_envs < self.model.learning_starts
 
     def measure(self) -> dict[str, float]:
         """

@@ -92,6 +92,9 @@ def targets(model: SAC, batch: Batch, rng: np.random.Generator) -> tuple[Batch, 
     """
     if model.reward_scaler is not None:
         batch = model.reward_scaler.transform(batch, None)
+    own: torch.Tensor | None = model.objective.target(model.learner, batch)
+    if own is not None:
+        return batch, own
     subset = None
     if model.target_subset is not None:
         subset = torch.from_numpy(rng.permutation(model.critic.n_critics)[: model.target_subset])

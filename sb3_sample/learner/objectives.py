@@ -43,6 +43,16 @@ class Objective(Part):
         """
         return {}, Prepared()
 
+    def target(self, learner: Learning, batch: Batch) -> torch.Tensor | None:
+        """
+        Compute the objective's own target of the critics, without learning.
+
+        :param learner: the learner
+        :param batch: transitions
+        :return: (B, 1), without gradient; None for the TD target of the actor's next action
+        """
+        return None
+
     def actor_loss(
         self,
         learner: Learning,
@@ -197,13 +207,17 @@ class ImplicitQ(Objective):
         learner.minimize(self.optimizer, loss)
         self.value.project()
         with torch.no_grad():
-            assert batch.discounts is not None
             advantage = q - self.value(batch.observations)
             weights = losses.advantage_weights(advantage, self.inverse_temperature, MAX_WEIGHT)
-            following = self.value(batch.next_observations)
-            target = losses.td_target(batch.rewards, batch.dones, batch.discounts, following, 0.0)
+        target = self.target(learner, batch)
         metrics = {"train/value_loss": loss, "train/value": v.mean(), "train/advantage_weight": weights.mean()}
         return metrics, Prepared(target, weights)
+
+    def target(self, learner: Learning, batch: Batch) -> torch.Tensor:
+        with torch.no_grad():
+            assert batch.discounts is not None
+            following = self.value(batch.next_observations)
+            return losses.td_target(batch.rewards, batch.dones, batch.discounts, following, 0.0)
 
     def actor_loss(
         self,

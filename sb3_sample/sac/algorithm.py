@@ -165,7 +165,8 @@ class SAC(  # type: ignore[misc]  # actor
             vars(self).update(spaces_given, n_envs=1)
         #: Whether the gradient step is compiled; None until that is decided. Saved: a loaded model keeps it.
         self.compiled: bool | None = None
-        #: A callback that wants gradients in ``.grad`` sets this: the last of the next gradient steps is run eagerly.
+        #: A callback that wants gradients in ``.grad`` sets this: the last of the next gradient steps is run eagerly,
+        #: on a given batch, unless all steps leave theirs.
         self.keep_next_gradients = False
         self._keeps_gradients = False
         #: Transitions stored over the model's life; unlike ``num_timesteps`` never zeroed by ``learn``.
@@ -696,18 +697,23 @@ class SAC(  # type: ignore[misc]  # actor
     def _draws_in_steps(self) -> bool:
         """Whether the gradient steps that follow draw their batches themselves, from all that is stored now."""
         buffer = self.replay_buffer
-        draws = isinstance(buffer, DeviceReplayBuffer) and buffer.sampling == "device"
-        # Offline training has another source, and gradients are kept only for steps on given batches.
-        draws = draws and self._learns_from is None and not self.keep_next_gradients
-        if not draws:
+        # Offline training has another source.
+        if (
+            not (isinstance(buffer, DeviceReplayBuffer) and buffer.sampling == "device")
+            or self._learns_from is not None
+        ):
             return False
-        assert isinstance(buffer, DeviceReplayBuffer)
         self.learner.draw_from(buffer)
+        # A compiled or captured step that draws its batch leaves no gradients.
+        if self.keep_next_gradients and not self.learner.prepared_drawing().leaves_gradients:
+            return False
         buffer.prepare_draws()
         return True
 
     def _drawn_update(self, batch_size: int) -> dict[str, torch.Tensor]:
         """One gradient step for which the learner draws the batch itself, and what its rule of pessimism needs."""
+        if self._keeps_gradients:
+            self._keeps_gradients = self.keep_next_gradients = False
         buffer = self.replay_buffer
         assert buffer is not None
         held_out = n_held_out(self)

@@ -239,10 +239,13 @@ def test_train_many(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not same(*trained[0])
 
 
-def test_gradients_are_kept_of_a_given_batch() -> None:
+@pytest.mark.parametrize("captured", [False, True])
+def test_gradients_are_kept_of_a_given_batch_if_drawn_steps_leave_none(captured: bool) -> None:
     model = model_of("SAC")
+    if captured:
+        model.learner._drawing = Execution(model.learner, False, False, Recorder(model.learner), "drawn_step")
     model.keep_next_gradients = True
-    assert not model._draws_in_steps()
+    assert model._draws_in_steps() is not captured
     model.train(2)
     assert not model.learner.gradients_are_stale and not model.keep_next_gradients
     assert model._draws_in_steps()
