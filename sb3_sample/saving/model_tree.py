@@ -321,22 +321,26 @@ class Content:
 
     def check_shapes(self, model: BaseAlgorithm) -> None:
         """
-        Check shapes before everything else in which the file must fit: with arguments of the caller's own, a mismatch
-        is not the file's fault.
+        Check names and shapes before everything else in which the file must fit: with arguments of the caller's own, a
+        mismatch is not the file's fault.
 
         :param model: the model that the parameters are for
-        :raises ParametersDoNotFit: if a tensor has another shape there
+        :raises ParametersDoNotFit: if a tensor has another shape there, or is only there or only here
         """
         for name in model._get_torch_save_params()[0]:
             owner, state = recursive_getattr(model, name), self.parameters(model).get(name)
             if not isinstance(owner, torch.nn.Module) or not isinstance(state, dict):
                 continue
-            for key, own in owner.state_dict().items():
+            owned = owner.state_dict()
+            for key, own in owned.items():
                 theirs = state.get(key)
                 if isinstance(own, torch.Tensor) and isinstance(theirs, torch.Tensor) and own.shape != theirs.shape:
                     raise ParametersDoNotFit(
                         f"{name}.{key} has the shape {tuple(theirs.shape)} in the file and {tuple(own.shape)} here"
                     )
+            if others := sorted(map(str, owned.keys() ^ state.keys())):
+                where = "here and not in the file" if others[0] in owned else "in the file and not here"
+                raise ParametersDoNotFit(f"{name}.{others[0]:.200} is {where}")
 
     def check_parameters(self, model: BaseAlgorithm) -> None:
         """

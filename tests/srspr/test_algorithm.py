@@ -344,6 +344,21 @@ def test_arguments_out_of_range(kwargs: dict[str, Any], match: str) -> None:
         tiny(**kwargs)
 
 
+@pytest.mark.parametrize(
+    ("kwargs", "where"),
+    [
+        ({"n_atoms": 21}, r"policy\.q_net\.head\..* has the shape \(51, 8\) in the file and \(21, 8\) here"),
+        ({"network": "bronet"}, r"policy\..* (here and not in the file|in the file and not here)"),
+        ({"noisy": True}, r"policy\.q_net\.head\..* (here and not in the file|in the file and not here)"),
+    ],
+)
+def test_a_file_of_other_networks_is_not_called_damaged(kwargs: dict[str, Any], where: str, tmp_path: Path) -> None:
+    tiny().save(tmp_path / "model")
+    (name,) = kwargs
+    with pytest.raises(ValueError, match=f"^{name}: with these arguments the model has other networks .*{where}"):
+        SRSPR.load(tmp_path / "model", **kwargs)
+
+
 def test_other_arguments_of_the_optimizer_leave_the_published_epsilon() -> None:
     model = tiny(policy_kwargs={**TINY, "optimizer_kwargs": {"weight_decay": 0.1}})
     (group,) = model.policy.optimizer.param_groups
