@@ -257,6 +257,23 @@ def test_what_cannot_have_checkpoints_is_refused(run, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_record_that_was_not_written_whole_is_no_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def full(*paths: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    record = Record("bro", "X", 0, 1, 1, {})
+    with monkeypatch.context() as patched:
+        patched.setattr("sb3_sample.zoo.runs.os.replace", full)
+        with pytest.raises(OSError, match="No space left"):
+            record.write(Path("a"))
+    assert list(Path("a").iterdir()) == []
+    Path("a/.run.json").touch()  # of a process that was killed
+    start = plan(*train_parser().parse_known_args(["--run-dir", "a"]))
+    assert start is not None and start.folder == Path("a") and start.record is None
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

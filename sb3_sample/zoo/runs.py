@@ -53,6 +53,8 @@ from sb3_sample.zoo.files import RunError, add_trust
 from sb3_sample.zoo.patches import managed_by, monitors_go_on
 
 RECORD = "run.json"
+#: The record while it is written.
+_BESIDE = f".{RECORD}"
 #: Largest size of a record, in bytes.
 MAX_RECORD = 2**18
 #: Endings of the files that a run writes.
@@ -99,9 +101,13 @@ class Record(NamedTuple):
         :param folder: the run's folder
         """
         folder.mkdir(parents=True, exist_ok=True)
-        beside = folder / f".{RECORD}"
-        beside.write_text(json.dumps(self._asdict(), indent=1))
-        os.replace(beside, folder / RECORD)
+        beside = folder / _BESIDE
+        try:
+            beside.write_text(json.dumps(self._asdict(), indent=1))
+            os.replace(beside, folder / RECORD)
+        except BaseException:
+            beside.unlink(missing_ok=True)
+            raise
 
     @classmethod
     def read(cls, folder: Path) -> "Record":
@@ -321,8 +327,9 @@ def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
     if not all_checkpoints(folder):
         if options.resume:
             raise RunError(f"--resume: {folder} has no checkpoint to go on from")
-        # A run that was interrupted before its first checkpoint has its record.
-        if folder.exists() and not (folder.is_dir() and (not any(folder.iterdir()) or (folder / RECORD).exists())):
+        # A run that was interrupted before its first checkpoint has its record, or a part of it.
+        is_empty = folder.is_dir() and all(path.name == _BESIDE for path in folder.iterdir())
+        if folder.exists() and not (is_empty or (folder / RECORD).exists()):
             raise RunError(
                 f"--run-dir {folder} holds files, but no run with checkpoints: it must be the folder of such a run, an "
                 "empty one or none"
