@@ -257,6 +257,21 @@ def test_what_cannot_have_checkpoints_is_refused(run, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_search_without_a_completed_trial_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def prune(self: Any, trial: optuna.Trial) -> float:
+        raise optuna.TrialPruned
+
+    monkeypatch.setattr(Manager, "objective", prune)
+    search = [*COMMAND, "-n", "60", "-optimize", "--n-trials", "2", "-params", "learning_starts:20"]
+    with pytest.raises(SystemExit, match="no trial was completed: all were pruned"):
+        cli.main(search)
+    callback = "callback:{'sb3_sample.diagnostics.DiagnosticsCallback': {'every': 10}}"
+    with pytest.raises(SystemExit, match="callback: DiagnosticsCallback does not go with -optimize"):
+        cli.main([*search, callback])
+
+
 def test_a_record_that_was_not_written_whole_is_no_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
 

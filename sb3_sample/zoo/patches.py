@@ -33,7 +33,7 @@ from sb3_sample.saving.replay import SafeReplayBuffers
 from sb3_sample.saving.training_state import argument_names
 from sb3_sample.saving.untrusted import BadFile
 from sb3_sample.zoo.algorithms import ALGORITHMS, BUFFERS, HYPERPARAMS, stored_arguments
-from sb3_sample.zoo.files import PlottedRuns, Refused
+from sb3_sample.zoo.files import PlottedRuns, Refused, RunError
 from sb3_sample.zoo.search import HER_SPACE, sampler
 from sb3_sample.zoo.settings import read_settings
 from sb3_sample.zoo.trials import check_storage, stored_params
@@ -138,17 +138,27 @@ def _adapt_experiment_manager(module: Any) -> None:
         params = stored_params(storage, study_name, trial_id)
         return stored_arguments(self.algo, params, f"trial {trial_id} of {storage}") if convert else params
 
-    # ``hyperparameters_optimization`` opens a storage without checking whether Optuna has written it.
+    # ``hyperparameters_optimization`` opens a storage without checking whether Optuna has written it, and ends a search
+    # without a completed trial in a traceback.
     def optimize(self: Any) -> None:
         if self.algo in ALGORITHMS and self.storage is not None:
             check_storage(self.storage)
-        original_optimize(self)
+        try:
+            original_optimize(self)
+        except ValueError as error:
+            # Optuna's, of a study without a best trial.
+            if self.algo not in ALGORITHMS or "trials are completed" not in str(error):
+                raise
+            raise RunError(
+                "no trial was completed: all were pruned (an error of one is printed above), failed or were "
+                "interrupted, so there is none to report"
+            ) from error
 
-    # ``read_hyperparameters`` makes environments for evaluation with the ``env_kwargs`` of the command line only, not
-    # those of the file, passes the parameters stored by a trial with HerReplayBuffer to any other buffer, and prunes
-    # every trial of a search, or searches in vain, if other arguments put the searched ones out of force. The zoo also
-    # makes a VecFrameStack from ``frame_stack``, which gives stacks of stacks if an algorithm has an argument of
-    # that name.
+    # ``read_hyperparameters`` forgets all ``env_kwargs`` of the file for those of the command line, makes environments
+    # for evaluation with the latter only, passes the parameters stored by a trial with HerReplayBuffer to any other
+    # buffer, and prunes every trial of a search, or searches in vain, if other arguments put the searched ones out of
+    # force. The zoo also makes a VecFrameStack from ``frame_stack``, which gives stacks of stacks if an algorithm has
+    # an argument of that name.
     def read_hyperparameters(self: Any) -> Any:
         hyperparams, saved = original_read(self)
         ours: Any = ALGORITHMS[self.algo].algorithm if self.algo in ALGORITHMS else None

@@ -560,6 +560,11 @@ class Manager(ExperimentManager):
             found = super()._preprocess_hyperparams(hyperparams)
         except (SyntaxError, NameError) as error:
             raise RunError(f"a hyperparameter that is a text of Python is none: {error}") from error
+        if self.optimize_hyperparameters and any(isinstance(each, DiagnosticsCallback) for each in found[2]):
+            raise RunError(
+                "callback: DiagnosticsCallback does not go with -optimize, whose trials make no environment for it: "
+                "leave it out"
+            )
         self._evaluated_in = get_wrapper_class({"env_wrapper": _for_evaluation(wrapper)})
         known = (argument_names(ALGOS[self.algo]) | _OF_NOISE) - _OF_OPTIONS
         for name in found[0].keys() - known:
