@@ -181,6 +181,26 @@ def test_a_run_is_shown_with_the_arguments_of_its_environment(run, monkeypatch: 
             assert Tinted.made == [{"hue": 3, "shade": shade}]
 
 
+def test_arguments_of_the_command_line_are_added_to_those_of_the_entry(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = gym.envs.registration.EnvSpec("Tinted-v0", entry_point=Tinted, max_episode_steps=20)
+    monkeypatch.setitem(gym.registry, "Tinted-v0", spec)
+
+    def made(*command: Any) -> list[dict[str, int]]:
+        Tinted.made.clear()
+        run(*command)
+        return list(Tinted.made)
+
+    command = ["train", "--algo", "sac_sample", "--env", "Tinted-v0", "--eval-freq", "15", "--eval-episodes", "1",
+               "--env-kwargs", "shade:2"]  # fmt: skip
+    entry = ["-params", *SMALL, "env_kwargs:dict(hue=3, shade=1)"]
+    both = [{"hue": 3, "shade": 2}] * 2
+    for n in (30, 40):  # the second time, the run goes on
+        assert made(*command, "--run-dir", "a", "--seed", 1, "-n", n, *entry) == both
+    assert made("enjoy", "--run-dir", "a", "--no-render", "-n", "5") == both[:1]
+    apart = [{"hue": 4, "shade": 1}, {"hue": 3, "shade": 2}]  # that of evaluations is made first
+    assert made(*command, "--eval-env-kwargs", "hue:4", "-n", 30, *entry) == apart
+
+
 class Pictures(Drawn):
     """Has pictures, with their channels last, as observations."""
 

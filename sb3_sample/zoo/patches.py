@@ -56,7 +56,8 @@ def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
     """
     Replace an attribute, for a while.
 
-    :param owner: module or class that has the attribute itself, or a module that uses a built-in function of that name
+    :param owner: module, class or object that has the attribute itself, or a module that uses a built-in function of
+        that name
     :param name: its name
     :param value: its replacement
     """
@@ -160,7 +161,10 @@ def _adapt_experiment_manager(module: Any) -> None:
     # force. The zoo also makes a VecFrameStack from ``frame_stack``, which gives stacks of stacks if an algorithm has
     # an argument of that name.
     def read_hyperparameters(self: Any) -> Any:
-        hyperparams, saved = original_read(self)
+        given = self.env_kwargs
+        # The zoo does not replace the file's by none.
+        with _replaced(self, "env_kwargs", {} if self.algo in ALGORITHMS else given):
+            hyperparams, saved = original_read(self)
         ours: Any = ALGORITHMS[self.algo].algorithm if self.algo in ALGORITHMS else None
         if "frame_stack" in hyperparams and "frame_stack" in getattr(ours, "constructor_arguments", ()):
             raise ValueError(
@@ -176,8 +180,11 @@ def _adapt_experiment_manager(module: Any) -> None:
                 found = [name for name in others if hyperparams.get(name) is not None]
                 if found and searched in ALGORITHMS[self.algo].space:
                     raise ValueError(f"{found[0]}={hyperparams[found[0]]!r} replaces {searched}, which is searched")
-        if self.algo in ALGORITHMS and "env_kwargs" in hyperparams and self._eval_env_kwargs_args is None:
-            self.eval_env_kwargs = hyperparams["env_kwargs"]
+        if self.algo in ALGORITHMS and "env_kwargs" in hyperparams:
+            of_file = hyperparams["env_kwargs"] or {}
+            hyperparams["env_kwargs"] = saved["env_kwargs"] = {**of_file, **given}
+            for_evaluation = self._eval_env_kwargs_args
+            self.eval_env_kwargs = {**of_file, **(given if for_evaluation is None else for_evaluation)}
         return hyperparams, saved
 
     # ``is_robotics_env`` only decides whether Monitor records is_success, which our environments report too.
