@@ -788,7 +788,10 @@ class Learner(Executable):
         """The batch with features in place of observations that several networks read through the online encoder."""
         networks = self.networks
         if networks.encodes_once:
-            batch = batch._replace(observations=Encoded(networks.features(batch.observations)))
+            task = task_of(batch)
+            # Features no longer tell the task, which temperatures by task need.
+            columns = batch.columns if task is None else {**batch.columns, "task": task}
+            batch = batch._replace(observations=Encoded(networks.features(batch.observations)), columns=columns)
         if networks.encodes_next_once:
             with torch.no_grad():
                 batch = batch._replace(next_observations=Encoded(networks.features(batch.next_observations)))

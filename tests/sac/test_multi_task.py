@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_sample import DiagnosticsCallback, MultiTaskEvalCallback, evaluate_tasks, multi_task_env, study
-from sb3_sample.learner.batch import Noise
+from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.learner.scalars import TaskLogScalar
 from sb3_sample.learner.target import next_step
@@ -253,6 +253,25 @@ def test_the_actors_loss_weighs_each_tasks_entropy() -> None:
     assert metrics["train/actor_loss"].item() == pytest.approx(expected, rel=1e-5)
     # As published, there is one temperature for both.
     assert make("SAC").temperature().shape == () and model.temperature().shape == (2,)
+
+
+@pytest.mark.parametrize("name", ["SAC", "BRC"])
+def test_features_from_before_the_step_keep_the_temperatures_of_the_tasks(name: str) -> None:
+    """With critics that stay as they are, features from before and after their step are the same."""
+    generator, found = torch.Generator().manual_seed(0), []
+    task = torch.tensor([[0], [1], [1], [0], [1], [1]])
+    now, following = ({"observation": torch.randn(6, 3, generator=generator), "task": task} for _ in range(2))
+    noise = torch.randn(6, 1, generator=generator)
+    batch = Batch(now, noise.tanh(), following, torch.zeros(6, 1), noise.cos())
+    for features in ("after", "before"):
+        kwargs = {**make(name).policy_kwargs, "actor_features": features, "share_features_extractor": True}
+        model = make(name, task_temperatures=True, target_entropy=[-1.0, 3.0], policy_kwargs=kwargs)
+        with torch.no_grad():
+            model.temperature.log_value.copy_(torch.tensor([math.log(0.2), math.log(3.0)]))
+        model.critic.optimizer.param_groups[0]["lr"] = 0.0
+        metrics = model.learner.step(batch, Noise(noise, noise, noise), eager=True)
+        found.append({**metrics, **state(model)})
+    assert not differing(*found)
 
 
 def test_rewards_are_divided_by_each_tasks_temperature_and_target() -> None:
