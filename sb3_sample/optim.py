@@ -273,13 +273,27 @@ def _cache_sized(rows: list[tuple[torch.Tensor, ...]]) -> Iterator[Iterable[tupl
     yield zip(*group, strict=True)
 
 
+def gradients_of(loss: torch.Tensor, parameters: Sequence[torch.Tensor]) -> list[torch.Tensor | None]:
+    """
+    Gradients of a loss.
+
+    :param loss: scalar
+    :param parameters: what to derive by
+    :return: the gradient for each parameter; None if it is frozen (``requires_grad`` is False), or the loss does not
+        depend on it
+    """
+    trained = [p for p in parameters if p.requires_grad]
+    found = iter(torch.autograd.grad(loss, trained, allow_unused=True) if trained else ())
+    return [next(found) if p.requires_grad else None for p in parameters]
+
+
 def sharpness_aware_gradients(
     loss: torch.Tensor,
     evaluate: Callable[[], torch.Tensor],
     parameters: Sequence[torch.Tensor],
     radius: float,
     n_copies: Sequence[int | None],
-) -> list[torch.Tensor]:
+) -> list[torch.Tensor | None]:
     """
     Gradients of sharpness-aware minimisation (Foret et al. 2021, eq. 2 and 3): those of the loss at ``p + radius * g /
     |g|``, where g is the gradient at p. The parameters are afterwards as they were, bit for bit.
@@ -292,24 +306,26 @@ def sharpness_aware_gradients(
     :param radius: length of the step uphill
     :param n_copies: for each parameter, the number of networks stacked in its leading axis, or None if it is not
         stacked; those of the same number belong together
-    :return: the gradient for each parameter
+    :return: the gradient for each parameter; None for one that is frozen
     """
-    gradients = torch.autograd.grad(loss, parameters)
+    gradients = gradients_of(loss, parameters)
+    moved = [(p, g, copies) for p, g, copies in zip(parameters, gradients, n_copies, strict=True) if g is not None]
+    if not moved:
+        return gradients
     with torch.no_grad():
         squares: dict[int | None, torch.Tensor] = {}
-        for gradient, copies in zip(gradients, n_copies, strict=True):
+        for _, gradient, copies in moved:
             flat = gradient.reshape(1 if copies is None else copies, -1)
             square = flat.square().sum(dim=1)
             squares[copies] = squares[copies] + square if copies in squares else square
         # The floor keeps a gradient of zero from being divided by zero.
         scales = {copies: radius / square.sqrt().clamp_min(1e-12) for copies, square in squares.items()}
-        saved = [p.detach().clone() for p in parameters]
-        for p, gradient, copies in zip(parameters, gradients, n_copies, strict=True):
+        saved = [p.detach().clone() for p, _, _ in moved]
+        for p, gradient, copies in moved:
             scale = scales[copies]
             p.add_(gradient * (scale[0] if copies is None else scale.view(-1, *[1] * (p.dim() - 1))))
     try:
-        uphill = torch.autograd.grad(evaluate(), parameters)
+        return gradients_of(evaluate(), parameters)
     finally:
         with torch.no_grad():
-            torch._foreach_copy_(list(parameters), saved)
-    return list(uphill)
+            torch._foreach_copy_([p for p, _, _ in moved], saved)

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch.optim import Optimizer
 
-from sb3_sample.optim import AdamW
+from sb3_sample.optim import AdamW, gradients_of
 from sb3_sample.tracing import is_tracing
 
 
@@ -17,7 +17,7 @@ def minimize(optimizer: Optimizer, loss: torch.Tensor) -> None:
     :param optimizer: the optimizer
     :param loss: scalar
     """
-    descend(optimizer, torch.autograd.grad(loss, parameters_of(optimizer), allow_unused=True))
+    descend(optimizer, gradients_of(loss, parameters_of(optimizer)))
 
 
 def follow(target: Any, online: Any, tau: float) -> None:
@@ -76,8 +76,7 @@ class _Minimize(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, losses: torch.Tensor, optimizer: AdamW) -> tuple[torch.Tensor, int]:
-        gradients = torch.autograd.grad(losses.sum(), parameters_of(optimizer), allow_unused=True)
-        optimizer.apply(gradients)
+        optimizer.apply(gradients_of(losses.sum(), parameters_of(optimizer)))
         return losses.detach(), 0
 
 

@@ -484,6 +484,8 @@ def _check_alike(learners: Sequence[Learner]) -> None:
                 raise ValueError(f"learners must have parts and networks of the same classes, not {names}")
         if _shapes(learner) != _shapes(first):
             raise ValueError("learners must have networks of the same shapes")
+        if _trained(learner) != _trained(first):
+            raise ValueError("learners must have the same parameters frozen")
         noisy = [m for part in learner.step_modules() for m in part.modules() if isinstance(m, nn.Dropout) and m.p > 0]
         if noisy:
             raise ValueError("learners whose networks have dropout cannot be batched: their noise is not given")
@@ -495,6 +497,10 @@ def _classes(learner: Learner) -> list[type[nn.Module]]:
 
 def _are_equal(ours: Any, theirs: Any) -> bool:
     return all(isinstance(value, torch.Tensor) for value in (ours, theirs)) and torch.equal(ours, theirs)
+
+
+def _trained(learner: Learner) -> list[bool]:
+    return [p.requires_grad for part in learner.step_modules() for p in part.parameters()]
 
 
 def _shapes(learner: Learner) -> list[torch.Size]:

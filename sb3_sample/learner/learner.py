@@ -29,7 +29,7 @@ from sb3_sample.learner.batch import (
     first_copy,
     widened,
 )
-from sb3_sample.learner.descent import descend, follow, minimize
+from sb3_sample.learner.descent import descend, follow, minimize, parameters_of
 from sb3_sample.learner.executable import Executable
 from sb3_sample.learner.execution import Acting, Execution, acting_of
 from sb3_sample.learner.exploration import Exploration
@@ -511,14 +511,16 @@ class Learner(Executable):
         """
         Identify what a compiled or captured gradient step is made for.
 
-        :return: identities of networks, parts, optimizers and loss, and the optimizers' numbers of parameters
+        :return: identities of networks, parts, optimizers and loss, the optimizers' numbers of parameters, and which of
+            these are frozen
         """
         critics = (self.critic, self.critic.trunk, self.critic_target, self.critic_target.trunk)
         optimizers = self.optimizers().values()
         parts = (self.explorer, self.pessimism_rule, self.objective)
         objects = (self.actor, self.actor.trunk, *critics, self.temperature, *parts)
         sizes = (len(group["params"]) for optimizer in optimizers for group in optimizer.param_groups)
-        return (*map(id, (*objects, *optimizers, self.head, self._store)), *sizes)
+        trained = (p.requires_grad for optimizer in optimizers for p in parameters_of(optimizer))
+        return (*map(id, (*objects, *optimizers, self.head, self._store)), *sizes, *trained)
 
     def exchangeable(self) -> dict[str, Any]:
         return {

@@ -10,7 +10,7 @@ from torch import nn
 
 from sb3_sample.networks.initialization import linear
 from sb3_sample.networks.mlp import MLP
-from sb3_sample.optim import AdamW
+from sb3_sample.optim import AdamW, gradients_of
 
 #: Epsilon of Adam for every network of the MBMA paper.
 ADAM_EPS = 1e-5
@@ -306,7 +306,7 @@ def fit(
     sums: dict[str, torch.Tensor] = {}
     n_steps = 0
     for losses in steps:
-        gradients = torch.autograd.grad(torch.stack(list(losses.values())).sum(), parameters)
+        gradients = gradients_of(torch.stack(list(losses.values())).sum(), parameters)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         optimizer.step()

@@ -455,6 +455,18 @@ class DeviceValidationReplayBuffer(ValidationSplit, DeviceReplayBuffer):
         return self._taken(torch.from_numpy(places).to(self.device))
 
 
+#: Buffers in whose place one is taken that holds transitions out, and those that are taken.
+WITHOUT_SPLIT = (
+    ReplayBuffer,
+    DictReplayBuffer,
+    CompactReplayBuffer,
+    CompactDictReplayBuffer,
+    CompactNStepReplayBuffer,
+    DeviceReplayBuffer,
+)
+WITH_SPLIT = (ValidationReplayBuffer, ValidationDictReplayBuffer, DeviceValidationReplayBuffer)
+
+
 def store_float_actions(buffer: ReplayBuffer) -> None:
     """
     Make an empty buffer store actions as floats where Stable-Baselines3's truncates actions in [-1, 1] to integers.

@@ -36,6 +36,8 @@ from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.reward_scale import LinearScale
 from sb3_sample.learner.scalars import FixedScalar
 from sb3_sample.replay.buffers import (
+    WITH_SPLIT,
+    WITHOUT_SPLIT,
     DeviceReplayBuffer,
     DeviceValidationReplayBuffer,
     ValidationDictReplayBuffer,
@@ -43,7 +45,6 @@ from sb3_sample.replay.buffers import (
     ValidationSplit,
     store_float_actions,
 )
-from sb3_sample.replay.columns import has_own_columns
 from sb3_sample.replay.compact import (
     CompactDictReplayBuffer,
     CompactNStepReplayBuffer,
@@ -242,7 +243,7 @@ class SAC(  # type: ignore[misc]  # actor
         super()._complete_arguments()
         is_dict = isinstance(self.observation_space, spaces.Dict)
         if self.validation_proportion > 0:
-            if not has_own_columns(self.replay_buffer_class):
+            if self.replay_buffer_class in (None, *WITHOUT_SPLIT, *WITH_SPLIT):
                 ours = ValidationDictReplayBuffer if is_dict else ValidationReplayBuffer
                 on_device = self.replay_buffer_class in (DeviceReplayBuffer, DeviceValidationReplayBuffer)
                 self.replay_buffer_class = DeviceValidationReplayBuffer if on_device else ours
@@ -250,9 +251,9 @@ class SAC(  # type: ignore[misc]  # actor
                 **self.replay_buffer_kwargs,
                 "validation_proportion": self.validation_proportion,
             }
-        elif self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, ValidationSplit):
+        elif self.replay_buffer_class in WITH_SPLIT:
             # Loaded, with validation_proportion=0 instead of the saved one.
-            on_device = issubclass(self.replay_buffer_class, DeviceReplayBuffer)
+            on_device = self.replay_buffer_class is DeviceValidationReplayBuffer
             self.replay_buffer_class = DeviceReplayBuffer if on_device else None
         can_stack = self.replay_buffer_class is None or issubclass(self.replay_buffer_class, CompactReplay)
         if can_stack and "frame_stack" not in self.replay_buffer_kwargs:

@@ -22,8 +22,14 @@ from sb3_sample.learner.exploration import EXPLORATIONS
 from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.pessimism import PESSIMISMS, LearnedPessimism, Pessimism, check_beta
 from sb3_sample.learner.reward_scale import LinearScale
-from sb3_sample.replay.buffers import DeviceReplayBuffer, DeviceValidationReplayBuffer, ValidationSplit
-from sb3_sample.replay.columns import columns_of, has_own_columns
+from sb3_sample.replay.buffers import (
+    WITH_SPLIT,
+    WITHOUT_SPLIT,
+    DeviceReplayBuffer,
+    DeviceValidationReplayBuffer,
+    ValidationSplit,
+)
+from sb3_sample.replay.columns import HasColumns, columns_of
 from sb3_sample.replay.compact import CompactReplay
 from sb3_sample.replay.weighted import FadedReplay, PrioritizedReplay, WindowReplay
 from sb3_sample.sac.multi_task import is_multi_task
@@ -486,22 +492,24 @@ def _check_buffer_class(agent: Any) -> None:
 
 
 def _check_replay(agent: Any) -> None:
-    if has_own_columns(agent.replay_buffer_class):
-        cls, is_split = agent.replay_buffer_class, issubclass(agent.replay_buffer_class, ValidationSplit)
+    cls, kwargs = agent.replay_buffer_class, agent.replay_buffer_kwargs or {}
+    if kwargs.get("validation_proportion", agent.validation_proportion) != agent.validation_proportion:
+        check_once("replay_buffer_kwargs", kwargs, {"validation_proportion": "validation_proportion"})
+    if agent.validation_proportion > 0 and cls is not None and issubclass(cls, (FadedReplay, PrioritizedReplay)):
+        raise ValueError(
+            f"validation_proportion={agent.validation_proportion} holds transitions out of uniform draws, which "
+            f"replay_buffer_class={cls.__name__} does not make: leave one of them out"
+        )
+    if cls is not None and issubclass(cls, HasColumns) and cls not in (*WITHOUT_SPLIT, *WITH_SPLIT):
+        # A class derived from one of these, in whose place no other is taken.
+        is_split = issubclass(cls, ValidationSplit)
         if is_split != (agent.validation_proportion > 0):
             base, which = ("CompactReplayBuffer", "is") if is_split else ("ValidationReplayBuffer", "is not")
             raise ValueError(
-                f"validation_proportion={agent.validation_proportion}, but replay_buffer_class={cls.__name__}, which "
-                f"has columns of its own, {which} one that holds transitions out: derive it from {base}, or its "
-                "variant for dicts"
+                f"validation_proportion={agent.validation_proportion}, but replay_buffer_class={cls.__name__} {which} "
+                f"one that holds transitions out: derive it from {base}, or its variant for dicts or devices"
             )
     if agent.validation_proportion > 0:
-        cls = agent.replay_buffer_class
-        if cls is not None and issubclass(cls, (FadedReplay, PrioritizedReplay)):
-            raise ValueError(
-                f"validation_proportion={agent.validation_proportion} holds transitions out of uniform draws, which "
-                f"replay_buffer_class={cls.__name__} does not make: leave one of them out"
-            )
         known = (ReplayBuffer, DictReplayBuffer, DeviceReplayBuffer)
         ours = (CompactReplay, DeviceValidationReplayBuffer)
         if cls is not None and cls not in known and not issubclass(cls, ours):

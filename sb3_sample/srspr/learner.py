@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
-from sb3_sample.learner.descent import follow, minimize
+from sb3_sample.learner.descent import follow, minimize, parameters_of
 from sb3_sample.learner.executable import Executable
 from sb3_sample.srspr.augmentation import SHIFT, augmented
 from sb3_sample.srspr.losses import alive_after, n_step_return, project, spr_loss
@@ -110,9 +110,10 @@ class SPRLearner(Executable):
         """
         Identify the objects for which a compiled or captured gradient step is made.
 
-        :return: identities of networks and optimizer
+        :return: identities of networks and optimizer, and which of its parameters are frozen
         """
-        return tuple(map(id, (self.online, self.target, self.policy.optimizer)))
+        trained = (p.requires_grad for p in parameters_of(self.policy.optimizer))
+        return (*map(id, (self.online, self.target, self.policy.optimizer)), *trained)
 
     def exchangeable(self) -> dict[str, Any]:
         # A user's policy class may have another network.

@@ -315,6 +315,19 @@ def test_every_number_may_differ(maker: str) -> None:
             assert torch.allclose(model.learner.action_step(*own)["actions"], theirs["actions"], atol=1e-4)
 
 
+def test_frozen_parameters() -> None:
+    alone, others = models_of("SAC", 2), models_of("SAC", 2)
+    for model in (*alone, *others):
+        model.actor.trunk.requires_grad_(False)
+    for model in alone:
+        take(model, 5)
+    together([model.learner for model in others], lambda i: take(others[i], 5))
+    assert_alike("SAC", alone, others)
+    alone[0].actor.trunk.requires_grad_(True)
+    with pytest.raises(ValueError, match="learners must have the same parameters frozen"):
+        LearnerGroup([model.learner for model in alone])
+
+
 def test_an_error_names_the_numbers_that_differ() -> None:
     """A network of one's own may need a number where several learners have a tensor."""
     models = models_of("BRO", 2)

@@ -25,6 +25,7 @@ from sb3_sample import (
     TOPSAC,
     VPLSAC,
     XQC,
+    CompactReplayBuffer,
     CrossQ,
     Dataset,
     DebiasedRQ,
@@ -51,13 +52,18 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
     '`pessimism="vpl"` without `validation_proportion`': [
         (SAC, {"pessimism": "vpl"}, ("pessimism='vpl'", "validation_proportion=0")),
     ],
-    "`validation_proportion` with `n_steps` above 1, or `HerReplayBuffer` or another buffer of one's own": [
+    "`validation_proportion` with `n_steps` above 1, `HerReplayBuffer`, or one's own buffer that holds none out": [
         (SAC, {"validation_proportion": 0.1, "n_steps": 3}, ("validation_proportion=0.1", "n_steps=3")),
         (VPLSAC, {"n_steps": 3}, ("validation_proportion", "n_steps=3")),
         (
             SAC,
             {"validation_proportion": 0.1, "replay_buffer_class": type("Mine", (ReplayBuffer,), {})},
             ("validation_proportion=0.1", "Mine"),
+        ),
+        (
+            SAC,
+            {"validation_proportion": 0.1, "replay_buffer_class": type("Mine", (CompactReplayBuffer,), {})},
+            ("validation_proportion=0.1", "Mine", "derive it from ValidationReplayBuffer"),
         ),
     ],
     "`validation_proportion` with `FadedReplayBuffer`, `PrioritizedReplayBuffer`": [

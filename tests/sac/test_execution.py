@@ -396,8 +396,9 @@ class AbsoluteHead(ValueHead):
         lambda m: setattr(m.learner, "head", AbsoluteHead()),
         lambda m: setattr(m.learner, "pessimism_rule", Pessimism(0.3)),
         lambda m: m.critic.optimizer.param_groups[0].update(eps=0.1),
+        lambda m: m.actor.trunk.requires_grad_(False),
     ],
-    ids=["integer", "loss", "part", "optimizer"],
+    ids=["integer", "loss", "part", "optimizer", "frozen"],
 )
 def test_changes_on_the_way_are_noticed(how: str, change: Callable[[SAC], None]) -> None:
     model, other = pair("SAC", compile=how == "compiled", learning_rate=1e-3)

@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_sample.learner.batch import Noise
@@ -36,6 +38,17 @@ class NoSynchronisation(TorchDispatchMode):
             masks = [i for i in args[1] if i is not None and i.dtype in (torch.bool, torch.uint8)]
             assert not masks, f"{name} with a mask makes the host wait for the device"
         return func(*args, **(kwargs or {}))
+
+
+class Fixed(BaseFeaturesExtractor):
+    """A layer that does not learn, as if learned before."""
+
+    def __init__(self, observation_space: Any):
+        super().__init__(observation_space, 6)
+        self.layer = nn.Linear(observation_space.shape[0], 6).requires_grad_(False)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        return self.layer(observations)  # type: ignore[no-any-return]
 
 
 def test_the_guard_works() -> None:
@@ -100,6 +113,36 @@ def test_every_network_moves_once() -> None:
         if name.startswith(("policy", "explorer/", "temperature/")):
             assert not torch.equal(before[name], after[name]), name
     assert all(value.shape == () and torch.isfinite(value) and not value.requires_grad for value in metrics.values())
+
+
+@pytest.mark.parametrize("sam_radius", [None, 0.3])
+def test_frozen_parameters_stay_and_others_learn(sam_radius: float | None) -> None:
+    noise = Noise(*torch.randn(3, 8, 2))
+    model, other = sac(sam_radius=sam_radius), sac(sam_radius=sam_radius)
+    for m in (model, other):
+        if m is model:
+            m.critic.trunk.requires_grad_(False)
+        before = {name: p.detach().clone() for name, p in m.policy.named_parameters()}
+        m.learner.step(random_batch(m), noise)
+    trunk = {f"critic.trunk.{name}" for name, _ in model.critic.trunk.named_parameters()}
+    moved = {name for name, p in model.policy.named_parameters() if not torch.equal(p, before[name])}
+    assert moved == before.keys() - trunk - {name for name in before if name.startswith("critic_target.trunk")}
+    if sam_radius is None:
+        assert torch.equal(model.critic.head.weight, other.critic.head.weight)
+    model.critic.trunk.requires_grad_(True)
+    model.learner.step(random_batch(model), noise)
+    assert all(not torch.equal(p, before[name]) for name, p in model.policy.named_parameters())
+
+
+def test_a_frozen_actor_and_a_frozen_encoder() -> None:
+    model = sac(policy_kwargs={"net_arch": [8], "share_features_extractor": True, "features_extractor_class": Fixed})
+    model.actor.requires_grad_(False)
+    before = {name: p.detach().clone() for name, p in model.policy.named_parameters()}
+    model.learn(20)
+    moved = {name for name, p in model.policy.named_parameters() if not torch.equal(p, before[name])}
+    assert moved == {
+        name for name in before if name.startswith(("critic.", "critic_target.")) and "extractor" not in name
+    }
 
 
 def test_polyak() -> None:

@@ -16,12 +16,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_sample.learner.pessimism import LearnedPessimism
 from sb3_sample.replay.buffers import (
+    DeviceReplayBuffer,
+    DeviceValidationReplayBuffer,
     ValidationDictReplayBuffer,
     ValidationReplayBuffer,
     ValidationSplit,
     latest,
     samples_at,
 )
+from sb3_sample.replay.columns import Column
 from sb3_sample.replay.compact import CompactReplayBuffer
 from sb3_sample.sac import BRO, SAC, VPLSAC
 from tests.sac.common import TINY_BRO, TINY_SAC, differing, sac, state, vec
@@ -312,6 +315,44 @@ def test_loaded_with_another_proportion(tmp_path: Path) -> None:
     assert type(without.replay_buffer) is CompactReplayBuffer
     with pytest.raises(ValueError, match=r"validation_proportion=1/32"):
         VPLSAC.load(tmp_path / "m", env=vec(), validation_proportion=0, pessimism="vpl")
+
+
+class Counting(ValidationReplayBuffer):
+    """A buffer of one's own."""
+
+    n_added = 0
+
+    def add(self, *args: Any) -> None:
+        super().add(*args)
+        self.n_added += 1
+
+
+@pytest.mark.parametrize("base", [ValidationReplayBuffer, ValidationDictReplayBuffer, DeviceValidationReplayBuffer])
+def test_a_class_of_ones_own_stays(base: Any) -> None:
+    as_dict = base is ValidationDictReplayBuffer
+    env, policy = tagged(as_dict=as_dict), "MultiInputPolicy" if as_dict else "MlpPolicy"
+    own = Counting if base is ValidationReplayBuffer else type("Own", (base,), {})
+    model = sac(env, policy=policy, validation_proportion=0.5, replay_buffer_class=own).learn(20)
+    assert type(model.replay_buffer) is own and model.replay_buffer.n_validation > 0
+    assert base is not ValidationReplayBuffer or model.replay_buffer.n_added == 20
+    with pytest.raises(ValueError, match="validation_proportion=0.0, but .* is one that .* derive it from Compact"):
+        sac(env, policy=policy, replay_buffer_class=own)
+
+
+@pytest.mark.parametrize("columns", [(), (Column("note", lambda step: [1.0], in_batch=False),)])
+@pytest.mark.parametrize("base", [CompactReplayBuffer, DeviceReplayBuffer])
+def test_a_class_of_ones_own_that_holds_nothing_out_is_refused(base: Any, columns: Any) -> None:
+    own = type("Own", (base,), {"more_columns": columns})
+    with pytest.raises(ValueError, match="class=Own is not one that holds transitions out: derive it from Validation"):
+        sac(validation_proportion=0.5, replay_buffer_class=own)
+
+
+def test_one_proportion() -> None:
+    kwargs = {"validation_proportion": 0.25}
+    assert sac(**kwargs, replay_buffer_kwargs=kwargs).replay_buffer.validation_proportion == 0.25
+    for proportion in (0.5, 0.0):
+        with pytest.raises(ValueError, match="replay_buffer_kwargs has 'validation_proportion', which is the argument"):
+            sac(validation_proportion=proportion, replay_buffer_kwargs=kwargs)
 
 
 def test_bro_and_sac_can_hold_out_too() -> None:
