@@ -60,6 +60,15 @@ class BRC(SAC):
             check_unused(self, ["embedding_size"], "multitask=True")
         elif "features_extractor_class" in self.policy_kwargs:
             check_unused(self, ["embedding_size"], "policy_kwargs['features_extractor_class']")
+        elif self.n_tasks > 1:
+            given = self.policy_kwargs.get("features_extractor_kwargs")
+            checks.check_once("policy_kwargs['features_extractor_kwargs']", given, {"size": "embedding_size"})
+            shares = self.policy_kwargs.get("share_features_extractor", True)
+            if not shares:
+                raise ValueError(
+                    f"share_features_extractor={shares!r} in policy_kwargs gives the actor an encoder of its own, and "
+                    "the embeddings of the tasks are the critics': leave it out, or pass a features_extractor_class"
+                )
 
     def _full_value_head_kwargs(self) -> dict[str, Any]:
         kwargs: dict[str, Any] = super()._full_value_head_kwargs()
@@ -83,6 +92,7 @@ class BRC(SAC):
             kwargs["critic_network_kwargs"] = {"width": self.critic_width, "n_blocks": 2}
         if self.n_tasks > 1 and not self.multitask and "features_extractor_class" not in kwargs:
             kwargs["features_extractor_class"] = TaskEmbedding
-            kwargs["features_extractor_kwargs"] = {"size": self.embedding_size}
+            of_extractor = kwargs.get("features_extractor_kwargs") or {}
+            kwargs["features_extractor_kwargs"] = {**of_extractor, "size": self.embedding_size}
             kwargs["share_features_extractor"] = True
         return with_weight_decay(kwargs, self.weight_decay)

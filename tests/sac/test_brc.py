@@ -49,6 +49,20 @@ def brc(env: Any = None, **kwargs: Any) -> Any:
     return MAKERS["BRC"](env, policy="MultiInputPolicy", embedding_size=4, **kwargs)
 
 
+def test_the_extractor_of_the_embeddings_is_not_described_twice() -> None:
+    for kwargs, words in (
+        ({"features_extractor_kwargs": {"size": 8}}, "has 'size', which is the argument embedding_size here"),
+        ({"share_features_extractor": False}, "share_features_extractor=False in policy_kwargs"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            brc(policy_kwargs=kwargs)
+    with pytest.raises(TypeError, match="no_such"):
+        brc(policy_kwargs={"features_extractor_kwargs": {"no_such": 1}})
+    own = {"features_extractor_class": TaskEmbedding, "features_extractor_kwargs": {"size": 8}}
+    model = MAKERS["BRC"](tasks(0, 2, 2), policy="MultiInputPolicy", policy_kwargs=own)
+    assert model.critic.features_extractor.table.shape == (3, 8) and not model.actor.shares_encoder
+
+
 def test_defaults() -> None:
     """The published sizes and numbers but for the width, which takes a while to be drawn."""
     model = BRC("MlpPolicy", vec(), critic_width=16, buffer_size=10, device="cpu")
