@@ -91,6 +91,8 @@ def check_every(agent: Any, needs_spaces: bool = True) -> None:
         return
     if policy == "MultiInputPolicy" and not isinstance(space, spaces.Dict):
         raise ValueError(f"policy='MultiInputPolicy' needs Dict observations, not {space}: use 'MlpPolicy'")
+    if policy == "MlpPolicy" and isinstance(space, spaces.Dict):
+        raise ValueError(f"policy='MlpPolicy' is not for Dict observations, {space}: use 'MultiInputPolicy'")
     extractor = kwargs.get("features_extractor_kwargs") or {}
     normalized = not kwargs.get("normalize_images", True) or extractor.get("normalized_image", False)
     if policy == "CnnPolicy" and not is_image_space(space, check_channels=False, normalized_image=normalized):

@@ -26,7 +26,7 @@ from stable_baselines3.common.utils import configure_logger
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_sample.arguments import check_every, check_program, default_of
+from sb3_sample.arguments import check_every, check_program, default_of, named_policy
 from sb3_sample.constructor import Given
 from sb3_sample.envs.no_environment import NoEnvironment
 from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, not_finite
@@ -237,6 +237,9 @@ class SAC(  # type: ignore[misc]  # actor
             self.learner.reward_scaler.on_dataset(data.return_range)
 
     def _check_arguments(self) -> None:
+        if named_policy(self) == "MlpPolicy" and is_multi_task(getattr(self, "observation_space", None)):
+            # As in ``_construct``, for spaces that were unknown there.
+            self.policy_class = self.policy_aliases["MultiInputPolicy"]
         checks.check(self)
 
     def _complete_arguments(self) -> None:

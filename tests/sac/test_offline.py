@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_sample import BC, BRO, IQL, SAC, TD3BC, VPLSAC, Dataset, PrioritizedReplayBuffer, SimBa
 from sb3_sample.learner import losses
 from sb3_sample.sac.checks import check_dataset
+from sb3_sample.sac.policies import MultiInputPolicy
 from tests.sac.common import MAKERS, TINY_RESIDUAL, TINY_SAC, differing, sac, state, vec
 
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
@@ -322,6 +323,33 @@ def test_an_environment_whose_numbers_are_of_another_type(tmp_path: Path) -> Non
     for other in (vec(obs_space=spaces.Box(-9, 9, (4,))), vec(action_space=spaces.Box(-2, 2, (2,)))):
         with pytest.raises(ValueError, match=r"spaces do not match: .*\)$"):
             model.set_env(other)
+
+
+@pytest.mark.parametrize("where", ["dataset", "arguments", "environment", "learner"])
+def test_the_policy_of_spaces_that_become_known(where: str) -> None:
+    """MlpPolicy reads observations that tell the task, as in a model made with its environment, and no other dicts."""
+    box, rng = spaces.Box(-9, 9, (3,), np.float32), np.random.default_rng(0)
+    told = spaces.Dict({"observation": box, "task": spaces.Discrete(2)})
+
+    def made(space: Any) -> Any:
+        given = {"observation_space": space, "action_space": ACTIONS}
+        if where == "learner":
+            return SAC.learner(space, ACTIONS, policy="MlpPolicy", policy_kwargs={"net_arch": [8]})
+        model = offline(SAC, **given if where == "arguments" else {})
+        if where == "environment":
+            model.set_env(vec(obs_space=space))
+        if where == "dataset":
+            rows = {name: np.array([part.sample() for _ in range(20)]) for name, part in space.spaces.items()}
+            actions, zeros = rng.uniform(-1, 1, (20, 2)), np.zeros(20)
+            model.learn_offline(Dataset.from_arrays(rows, actions, zeros, zeros, zeros, **given), 1)
+        return model
+
+    model = made(told)
+    assert model.critic.features_extractor.features_dim == 5
+    if where != "learner":
+        assert type(model.policy) is MultiInputPolicy and model.predict(told.sample())[0].shape == (2,)
+    with pytest.raises(ValueError, match="policy='MlpPolicy' is not for Dict observations, .*: use 'MultiInputPolicy'"):
+        made(spaces.Dict({"observation": box, "b": box}))
 
 
 def test_a_model_without_spaces_takes_those_of_its_first_environment() -> None:
