@@ -92,6 +92,8 @@ class Constructed:
     """
     Base of classes whose constructors are declared as attributes. A class that defines ``__init__`` itself, or is
     derived from one that does, keeps it.
+
+    :raises TypeError: if such a class declares arguments, which nothing would take
     """
 
     #: Arguments of the constructor, by name.
@@ -107,12 +109,19 @@ class Constructed:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        attributes = list(vars(cls))
         cls.constructor_arguments = _declared(cls)
+        declared = [name for name in attributes if name not in vars(cls)]
         signature = _signature(cls)
         first = next(base for base in cls.__mro__ if "__init__" in vars(base))
         others = [base for base in cls.__mro__ if hasattr(vars(base).get("__init__"), "of_declarations")]
         if first is not cls and (not others or first is others[0]):
             cls.__init__ = _constructor(cls, signature)  # type: ignore[method-assign, misc]
+        elif declared:
+            raise TypeError(
+                f"{cls.__name__} declares {', '.join(declared)}, which __init__ of {first.__name__} does not take: "
+                "define _construct(self, given) in place of that __init__, or leave the declarations out"
+            )
         cls.__doc__ = _with_meanings(cls, signature)
 
     def _construct(self, given: Given) -> None:

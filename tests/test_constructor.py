@@ -163,6 +163,16 @@ def test_classes_of_ones_own() -> None:
     assert Derived("MlpPolicy", vec(), buffer_size=100).count == 1
 
 
+@pytest.mark.parametrize("base", [SAC, Counting, Derived])
+def test_a_declaration_that_no_constructor_takes_is_refused(base: Any) -> None:
+    body: dict[str, Any] = {"replay_ratio": argument(default=5), "gamma": 0.9}
+    if base is SAC:
+        body["__init__"] = Counting.__init__
+    author = "Own" if base is SAC else "Counting"
+    with pytest.raises(TypeError, match=f"^Own declares replay_ratio, gamma, which __init__ of {author} does not take"):
+        type("Own", (base,), body)
+
+
 def test_a_method_of_an_arguments_name_is_no_default() -> None:
     class Strange(SAC):
         @property
