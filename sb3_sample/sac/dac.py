@@ -60,7 +60,7 @@ class DAC(SAC):
     """spread that optimism adds: "epistemic"; with ``n_quantiles`` also "aleatoric" or "both", the sum"""
     initial_optimism: float | None = argument(default=None, kind=FINITE.or_none())
     """weight of the critics' spread for the optimistic actor at the start, above minus the pessimism; None: 0.5 above
-    it, as published"""
+    it, as published; with ``pessimistic_actor=None`` and a bandit, above minus its smallest arm"""
     initial_kl_weight: float = argument(default=1.0, kind=AT_LEAST_0)
     """weight of the divergence in the optimistic actor's loss, at the start; at 0 it stays 0, while optimism is still
     adjusted"""
@@ -152,5 +152,6 @@ class DAC(SAC):
             return super().make_objective(learner)
         check_uncertainty(self.uncertainty, learner)
         start = self.initial_optimism
-        optimism = 0.5 - float(learner.pessimism_rule.beta()) if start is None else start
+        # Above minus every arm of a bandit, and not by the arm that it happens to have drawn.
+        optimism = 0.5 - learner.pessimism_rule.smallest_beta() if start is None else start
         return OptimisticValue(optimism, self.uncertainty, self.optimistic_entropy)

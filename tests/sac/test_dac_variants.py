@@ -284,6 +284,18 @@ def test_one_optimistic_actor_by_hand(entropy: bool, initial: float | None, opti
     assert loss.item() == pytest.approx(0.3 * 2 * density * entropy - upper, rel=1e-5)
 
 
+@pytest.mark.parametrize(("arms", "optimism"), [((0.0, 1.0), 0.5), ((1.0, 0.75), -0.25)])
+def test_one_optimistic_actor_beside_a_bandit(arms: tuple[float, float], optimism: float, tmp_path: Path) -> None:
+    """Its optimism is the same whichever arm is drawn first, in files too."""
+    bandit = {"pessimism": "top", "pessimism_kwargs": {"arms": arms}}
+    models = [dac(pessimistic_actor=None, seed=seed, **bandit) for seed in range(6)]
+    assert len({model.pessimism_rule.arm for model in models}) == 2
+    models[0].save(tmp_path / "m")
+    models += [DAC.load(tmp_path / "m") for _ in range(4)]
+    models[1].reinitialize()
+    assert {model.objective.optimism for model in models} == {optimism}
+
+
 def test_one_optimistic_actor_does_everything() -> None:
     """It explores with its deviation multiplied, makes the targets without, and is evaluated by its mean."""
     model = dac(pessimistic_actor=None)
