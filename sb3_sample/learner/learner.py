@@ -41,7 +41,7 @@ from sb3_sample.learner.parts import Part, logged
 from sb3_sample.learner.pessimism import LearnedPessimism, Pessimism, pessimistic_value
 from sb3_sample.learner.plasticity import RESETS_TO, ReDo, Resets
 from sb3_sample.learner.q_values import evaluate
-from sb3_sample.learner.randomness import OwnGenerators
+from sb3_sample.learner.randomness import OwnGenerators, with_own_generators
 from sb3_sample.learner.reward_scale import RewardScale, task_of
 from sb3_sample.learner.scalars import FixedScalar, LogScalar, TaskLogScalar
 from sb3_sample.learner.schedules import LearningRateSchedule
@@ -460,6 +460,7 @@ class Learner(Executable):
 
     # ---------------------------------------------------------------- events of the environment
 
+    @with_own_generators
     def on_observations(self, observations: Any) -> None:
         """
         Pass the observations that are acted on to the parts, before the actions of a training step are chosen.
@@ -469,6 +470,7 @@ class Learner(Executable):
         for part in self.parts().values():
             part.on_observations(self, observations)
 
+    @with_own_generators
     def on_step(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """
         Record one step of all environments, and pass it to the parts.
@@ -486,11 +488,13 @@ class Learner(Executable):
                 if "episode" in infos[index]:  # Monitor's entry; absent if the environment is not monitored
                     part.on_episode_end(self, int(index), infos[index]["episode"]["r"])
 
+    @with_own_generators
     def on_environment_reset(self) -> None:
         """Notify the parts that the environments were reset in mid-episode."""
         for part in self.parts().values():
             part.on_environment_reset(self)
 
+    @with_own_generators
     def before_updates(self) -> None:
         """Call ``before_updates`` of the parts, before the gradient steps that follow an environment step."""
         self._heard = False
@@ -1056,6 +1060,7 @@ class Learner(Executable):
 
     # ---------------------------------------------------------------- starting anew
 
+    @with_own_generators
     def reinitialize(self, shrink: float = 0.0, keep: Sequence[str] = (), to: str = "fresh") -> None:
         """
         Start every network, optimizer and learned number anew, in place.

@@ -1,11 +1,15 @@
 """Random generators of one learner."""
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 import torch
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def checked_state(state: Any, name: str) -> torch.Tensor:
@@ -27,6 +31,22 @@ def checked_state(state: Any, name: str) -> torch.Tensor:
     return state  # type: ignore[no-any-return]
 
 
+def with_own_generators(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[Any, P], R]:
+    """
+    Let a method of a learner draw from the learner's own generators, if it has some.
+
+    :param method: the method
+    :return: the same with the generators in force
+    """
+
+    @functools.wraps(method)
+    def wrapped(self: Any, *args: P.args, **kwargs: P.kwargs) -> R:
+        with self._random():
+            return method(self, *args, **kwargs)
+
+    return wrapped
+
+
 class OwnGenerators:
     """
     Generators of torch for one learner: inside :meth:`in_force` they replace the global ones, so that initial weights,
@@ -38,19 +58,24 @@ class OwnGenerators:
 
     def __init__(self, seed: int, device: torch.device | str = "cpu"):
         self._device = torch.device(device)
+        self._are_in_force = False
         with self._kept():
             torch.manual_seed(seed)
             self._state = self._now()
 
     @contextmanager
     def in_force(self) -> Iterator[None]:
-        """Replace the global generators inside the context."""
+        """Replace the global generators inside the context; nothing changes where they are replaced already."""
+        if self._are_in_force:
+            yield
+            return
         with self._kept():
             self._put(self._state)
+            self._are_in_force = True
             try:
                 yield
             finally:
-                self._state = self._now()
+                self._state, self._are_in_force = self._now(), False
 
     @contextmanager
     def _kept(self) -> Iterator[None]:

@@ -15,6 +15,7 @@ from gymnasium import spaces
 from sb3_sample import BRO, DAC, SAC, TOPSAC, VPLSAC, Dataset
 from sb3_sample.learner import Learner
 from sb3_sample.learner.batch import Extra, Noise
+from sb3_sample.learner.pessimism import Pessimism
 from tests.sac.common import MAKERS, PIXEL_MAKERS, random_batch
 
 OBSERVATIONS, ACTIONS = spaces.Box(-np.inf, np.inf, (3,), np.float32), spaces.Box(-2, 2, (2,), np.float32)
@@ -222,6 +223,41 @@ def test_a_rule_that_needs_transitions_held_out_is_given_them() -> None:
     assert learner.pessimism_rule.beta().item() == beta  # type: ignore[union-attr]
     learner.update(data().sample(16), extra=Extra(data(seed=1).sample(4)._replace(discounts=0.99)))
     assert learner.pessimism_rule.beta().item() != beta  # type: ignore[union-attr]
+
+
+class Drawing(Pessimism):
+    """Draws a number at every event."""
+
+    def __init__(self, learner: Any):
+        super().__init__(1.0)
+        self.drawn: list[float] = []
+
+    def _draw(self, *_: Any) -> None:
+        self.drawn.append(torch.rand(()).item())
+
+    on_observations = on_step = on_environment_reset = before_updates = _draw
+
+
+@pytest.mark.parametrize("pessimism", ["top", Drawing])
+def test_events_and_restarts_draw_from_its_own_generators(pessimism: Any) -> None:
+    found = []
+    for global_seed in (1, 2):
+        torch.manual_seed(global_seed)
+        before = torch.get_rng_state()
+        learner = make(SAC, seed=5, pessimism=pessimism, reset_gradient_steps=2)
+        rule: Any = learner.pessimism_rule
+        arms = []
+        for _ in range(8):
+            learner.on_observations(np.zeros((1, 3)))
+            heard(learner, episode={"r": 0.0})
+            arms.append(getattr(rule, "arm", None))
+        learner.on_environment_reset()
+        learner.before_updates()
+        train(learner, 5)
+        learner.reinitialize()
+        assert torch.equal(before, torch.get_rng_state()) and learner.plasticity.n_done == 2
+        found.append((learner, arms, getattr(rule, "drawn", None)))
+    assert same(found[0][0], found[1][0]) and found[0][1:] == found[1][1:]
 
 
 # ---------------------------------------------------------------- arguments
