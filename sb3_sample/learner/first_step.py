@@ -36,6 +36,7 @@ def check_batch(who: str, batch: Any, like: Batch | None = None) -> None:
     """
     if not isinstance(batch, Batch):
         raise ValueError(f"{who} must be a Batch, not {_shown(batch)}: batch._replace(...) makes one")
+    alone = like is None
     if like is None:
         if not isinstance(batch.actions, torch.Tensor) or batch.actions.dim() != 2 or len(batch.actions) == 0:
             raise ValueError(f"{who} must have actions of shape (B, A), not {_shown(batch.actions)}")
@@ -43,7 +44,7 @@ def check_batch(who: str, batch: Any, like: Batch | None = None) -> None:
     for name in ("observations", "next_observations"):
         stored, found = getattr(like, name), getattr(batch, name)
         # The TD target may have another number of copies of each transition than the rest.
-        n = len(like.actions) if like is batch or name == "observations" else len(like.rewards)
+        n = len(like.actions) if alone or name == "observations" else len(like.rewards)
         if isinstance(stored, dict):
             if not isinstance(found, dict) or found.keys() != stored.keys():
                 words = sorted(found) if isinstance(found, dict) else _shown(found)

@@ -29,6 +29,7 @@ from sb3_sample import (
 )
 from sb3_sample.learner.augmentation import RandomShift, shifted
 from sb3_sample.learner.batch import Batch, Noise
+from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.sac.encoders import ConvEncoder
 from tests.sac.common import COMPILES, MAKERS, differing, sac, sampled, state
 from tests.sac.pixels import TINY, TINY_DRQ, Frames, drq, drqv2, frames
@@ -158,6 +159,20 @@ def test_several_copies_of_a_transition() -> None:
     # The actor of before its own step, on the first shift, by the encoder after its step.
     assert abs(metrics["train/entropy"] + log_prob.mean()) < 0.5
     assert metrics["train/entropy"] != -log_prob.mean()
+
+
+class Nothing(BatchTransform):
+    def transform(self, batch: Batch, noise: Any) -> Batch:
+        return batch
+
+
+@pytest.mark.parametrize(("k", "m"), [(2, 1), (1, 2)])
+def test_a_transform_may_return_the_batch_of_copies_itself(k: int, m: int) -> None:
+    models = [drq(target_copies=k, online_copies=m, batch_transforms=each) for each in ([], [Nothing])]
+    for model in models:
+        torch.manual_seed(0)
+        model.learner.update(batch_of(4))
+    assert not differing(*map(state, models))
 
 
 def test_copies_have_offsets_and_actions_of_their_own() -> None:
