@@ -65,7 +65,7 @@ class CrossQ(SAC):
     }
 
     def _construct(self, given: Given) -> None:
-        if given["weight_norm"] is True:
+        if TRUE_OR_FALSE.fits(given["weight_norm"]) and given["weight_norm"]:
             for name, value in self.WITH_WEIGHT_NORM.items():
                 default = type(self).constructor_arguments[name].default
                 if name in given.passed or default != CrossQ.constructor_arguments[name].default:

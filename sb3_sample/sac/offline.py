@@ -30,7 +30,7 @@ class BC(SAC):
     """whether the actor is deterministic"""
 
     def _construct(self, given: Given) -> None:
-        if given["deterministic"] is True:
+        if TRUE_OR_FALSE.fits(given["deterministic"]) and given["deterministic"]:
             given["backbone"] = "td3"
         super()._construct(given)
 

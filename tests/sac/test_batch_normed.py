@@ -501,6 +501,10 @@ def test_defaults_with_weight_norm() -> None:
         learning_rate: float = 7e-4
 
     assert Mine("MlpPolicy", vec(), weight_norm=True, device="cpu").learning_rate == 7e-4
+    numpys: Any = np.True_
+    same = CrossQ("MlpPolicy", vec(), weight_norm=numpys, device="cpu")
+    names = (*CrossQ.WITH_WEIGHT_NORM, "weight_norm")
+    assert [getattr(same, name) for name in names] == [getattr(normed, name) for name in names]
 
 
 @pytest.mark.parametrize(
