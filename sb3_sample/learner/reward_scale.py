@@ -353,6 +353,18 @@ class LinearScale(RewardScale):
         assert self.return_range is not None
         self.factor.fill_(self.return_range / return_range)
 
+    def take_the_place_of(self, former: float | None) -> None:
+        """
+        Change the factor, taken from a file, to what this ``return_range`` would have given.
+
+        :param former: the file's ``return_range``; None if its factor is not of one
+        """
+        assert self.return_range is not None
+        if former is None:
+            self.factor.zero_()
+        elif former != self.return_range:
+            self.factor.mul_(self.return_range / former)
+
     def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
         return 1 / self.factor
 

@@ -30,7 +30,7 @@ from sb3_sample.arguments import check_every, check_program, default_of, named_p
 from sb3_sample.constructor import Given
 from sb3_sample.envs.no_environment import NoEnvironment
 from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, not_finite
-from sb3_sample.kinds import check_value, instance, integer
+from sb3_sample.kinds import ABOVE_0, check_value, instance, integer
 from sb3_sample.learner.batch import SLOTS, Batch, Noise
 from sb3_sample.learner.learner import Learner
 from sb3_sample.learner.reward_scale import LinearScale
@@ -67,6 +67,7 @@ from sb3_sample.sac.sb3_names import SB3Names
 from sb3_sample.sac.update_schedule import UpdateSchedule
 from sb3_sample.saving.checkpoint import CHECKPOINT_FREQ
 from sb3_sample.saving.checks import check_environment
+from sb3_sample.saving.container import BadFile
 from sb3_sample.saving.encoding import Lenient
 from sb3_sample.saving.kept import Kept
 from sb3_sample.saving.model import SafeFiles
@@ -326,7 +327,11 @@ class SAC(  # type: ignore[misc]  # actor
                 f"prior_data: the model of {content.name} learned with {checks.prior_words(prior_of)}, which the file "
                 "does not hold: pass prior_data=, or prior_data=None to go on without"
             )
-        return super()._made(content, attributes, kwargs, *args)
+        model = super()._made(content, attributes, kwargs, *args)
+        scale = model.learner.reward_scaler
+        if "reward_scale_kwargs" in kwargs and isinstance(scale, LinearScale) and scale.return_range is not None:
+            scale.take_the_place_of(_return_range_of(content))
+        return model
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -746,3 +751,13 @@ class SAC(  # type: ignore[misc]  # actor
         if errors is not None and isinstance(self.replay_buffer, PrioritizedReplay):
             self.replay_buffer.renew(batch.columns[SLOTS], errors)
         return metrics
+
+
+def _return_range_of(content: Any) -> float | None:
+    """The ``return_range`` of a model's file, from which its scale of rewards follows; None if there is none."""
+    others = content.tree["attributes"].keys() - {"reward_scale_kwargs"}
+    with contextlib.suppress(BadFile):
+        kwargs = content.attributes(others, {}).get("reward_scale_kwargs")
+        found = kwargs.get("return_range") if isinstance(kwargs, dict) else None
+        return found if ABOVE_0.fits(found) else None
+    return None

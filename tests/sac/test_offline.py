@@ -188,6 +188,12 @@ def test_bc_recovers_a_linear_policy(deterministic: bool) -> None:
         np.testing.assert_allclose(log_std.detach().exp().numpy().mean(0), 0.02, rtol=0.05)
 
 
+def test_bc_takes_numpys_truth() -> None:
+    for value in (True, False):
+        model = offline(BC, vec(), deterministic=np.bool_(value))
+        assert model.deterministic is value and model.backbone == ("td3" if value else "sac")
+
+
 def test_td3_bc_moves_its_actor_every_second_step_towards_value_and_data() -> None:
     model, transitions = offline(TD3BC, vec()), data()
     model._take_settings()
@@ -509,6 +515,24 @@ def test_rewards_scaled_as_iql_does(kwargs: dict[str, Any], tmp_path: Path) -> N
     again = IQL.load(tmp_path / "m", env=vec()).learn_offline(data(seed=7), 1)
     np.testing.assert_array_equal(again.learner.reward_scaler.transform(batch, None).rewards, scaled)
     assert again.learn(12)._n_updates > 3
+
+
+def test_another_range_of_returns_at_loading(tmp_path: Path) -> None:
+    transitions, given = data(), {"reward_scale": "linear", "reward_scale_kwargs": {"return_range": 1_000.0}}
+    model = offline(IQL, vec(), **given).learn_offline(transitions, 1)
+    factor = model.reward_scaler.factor.item()
+    model.save(tmp_path / "m")
+    for kwargs, expected in (({"return_range": 1_000.0}, factor), ({"return_range": 10.0, "shift": 1.0}, factor / 100)):
+        loaded = IQL.load(tmp_path / "m", reward_scale_kwargs=kwargs)
+        for seed in (None, 7):
+            if seed is not None:
+                loaded.learn_offline(data(seed=seed), 1)
+            assert loaded.reward_scaler.factor.item() == pytest.approx(expected, rel=1e-6)
+    # Of a file without a range, that of the first data set counts.
+    IQL.load(tmp_path / "m", reward_scale_kwargs={"factor": 3.0}).save(tmp_path / "n")
+    loaded = IQL.load(tmp_path / "n", reward_scale_kwargs={"return_range": 1_000.0})
+    assert loaded.reward_scaler.waits_for_data
+    assert loaded.learn_offline(transitions, 1).reward_scaler.factor.item() == factor
 
 
 def test_a_range_of_returns_needs_data() -> None:
