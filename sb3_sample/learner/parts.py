@@ -212,7 +212,7 @@ def logged(part: nn.Module, method: str, metrics: Any) -> dict[str, torch.Tensor
     if not isinstance(metrics, dict):
         raise ValueError(f"{type(part).__name__}.{method} must return a dict of what to log, not {metrics!r}")
     for name, value in metrics.items():
-        if not isinstance(value, torch.Tensor) or value.numel() != 1:
+        if not isinstance(value, torch.Tensor) or value.dim() != 0:
             shown = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, torch.Tensor) else repr(value)
             raise ValueError(f"{type(part).__name__}.{method} must log scalar tensors; {name!r} is {shown}")
     return metrics

@@ -117,6 +117,10 @@ SHAPES: list[tuple[dict[str, Any], str]] = [
         "MyRule.after_update must log scalar tensors; 'a' is a tensor of shape (2,)",
     ),
     (
+        {"pessimism": rule(update=lambda *_, **__: {"a": torch.ones(1)})},
+        "MyRule.update must log scalar tensors; 'a' is a tensor of shape (1,)",
+    ),
+    (
         {"value_head": head(values=lambda self, q: q.squeeze(-1))},
         "MyHead.values must return values of shape (E, B, K) = (2, ",
     ),
