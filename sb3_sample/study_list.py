@@ -110,6 +110,21 @@ def part_of_path(name: str) -> str:
     return f"{plain[:MAX_NAME]}-{hashlib.sha256(name.encode()).hexdigest()[:12]}"
 
 
+def word(value: Any) -> str:
+    """
+    :param value: of an argument; None if it was not given
+    :return: its text in names of agents; a text that reads as another value, such as "2", is in quotation marks
+    """
+    if value is None:
+        return "default"
+    if not isinstance(value, str):
+        return json.dumps(_plain(value))
+    try:
+        return json.dumps(value) if json.loads(value) is not None else value
+    except ValueError:
+        return value
+
+
 def short(value: Any) -> str:
     """
     :param value: value of an argument in a grid

@@ -113,7 +113,7 @@ def everything() -> Iterator[None]:
             patches.managed_by(print, rl_zoo3.train),
             patches.monitors_go_on(rl_zoo3.exp_manager),
             patches.reading(allow_pickle=True),
-            patches.watched_with(print, print, rl_zoo3.enjoy, rl_zoo3.utils),
+            patches.watched_with(print, print, print, rl_zoo3.enjoy, rl_zoo3.utils),
             patches.models_checked(print),
             patches.reading_settings(),
             patches.reading_monitors(plots),

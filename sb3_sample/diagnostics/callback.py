@@ -68,8 +68,8 @@ class DiagnosticsCallback(PeriodicMeasurement):
     before a measurement (before every end of an episode if ``train_freq`` counts episodes) is run eagerly. Its numbers
     differ by rounding; with ``sampling="device"``, batches and noise are drawn by another generator until then.
 
-    Nothing is measured while the algorithm still acts at random (``learning_starts``), nor in ``learn_offline`` before
-    the model has acted for so long, of which a warning tells: transitions are those of the replay buffer.
+    Nothing is measured while the algorithm still acts at random (``learning_starts``). In ``learn_offline`` a model
+    that has not acted for so long is not measured, with a warning: the replay buffer is read, not the data set.
 
     :param eval_env: environment for the rollouts, a single one, not the training environment; its normalisation, if
         any, has to be the same as the training environment's. None, the default, is for ``sb3-sample train`` and plans

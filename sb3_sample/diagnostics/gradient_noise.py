@@ -36,8 +36,8 @@ class NoiseScaleCallback(PeriodicMeasurement):
     evaluation mode, so that with batch normalisation the rows of a batch do not depend on each other. Training is bit
     for bit the same with the callback and without.
 
-    Nothing is measured while the algorithm still acts at random (``learning_starts``), nor in ``learn_offline`` before
-    the model has acted for so long, of which a warning tells: transitions are those of the replay buffer.
+    Nothing is measured while the algorithm still acts at random (``learning_starts``). In ``learn_offline`` a model
+    that has not acted for so long is not measured, with a warning: the replay buffer is read, not the data set.
 
     :param every: environment steps between two measurements, taken at the first step at or after each multiple
     :param window: measurements whose squared norms are averaged

@@ -92,7 +92,7 @@ def targets(model: SAC, batch: Batch, rng: np.random.Generator) -> tuple[Batch, 
     """
     if model.reward_scaler is not None:
         batch = model.reward_scaler.transform(batch, None)
-    own: torch.Tensor | None = model.objective.target(model.learner, batch)
+    own: torch.Tensor | None = model.objective.own_target(model.learner, batch)
     if own is not None:
         return batch, own
     subset = None

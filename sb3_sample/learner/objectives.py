@@ -43,7 +43,7 @@ class Objective(Part):
         """
         return {}, Prepared()
 
-    def target(self, learner: Learning, batch: Batch) -> torch.Tensor | None:
+    def own_target(self, learner: Learning, batch: Batch) -> torch.Tensor | None:
         """
         Compute the objective's own target of the critics, without learning.
 
@@ -209,11 +209,11 @@ class ImplicitQ(Objective):
         with torch.no_grad():
             advantage = q - self.value(batch.observations)
             weights = losses.advantage_weights(advantage, self.inverse_temperature, MAX_WEIGHT)
-        target = self.target(learner, batch)
+        target = self.own_target(learner, batch)
         metrics = {"train/value_loss": loss, "train/value": v.mean(), "train/advantage_weight": weights.mean()}
         return metrics, Prepared(target, weights)
 
-    def target(self, learner: Learning, batch: Batch) -> torch.Tensor:
+    def own_target(self, learner: Learning, batch: Batch) -> torch.Tensor:
         with torch.no_grad():
             assert batch.discounts is not None
             following = self.value(batch.next_observations)

@@ -427,11 +427,21 @@ class CompactReplay(HasColumns):
 
         :return: attributes that are numbers or true or false, by name
         """
-        return {name: value for name, value in vars(self).items() if is_number(value) and name not in _GIVEN}
+        return {name: value for name, value in numbers_of(self).items() if name not in _GIVEN}
 
     def load_own_numbers(self, numbers: dict[str, Any]) -> None:
         """
         Restore the numbers that a subclass keeps.
+
+        :param numbers: from :meth:`own_numbers`
+        :raises ValueError: see :meth:`check_own_numbers`
+        """
+        self.check_own_numbers(numbers)
+        vars(self).update(numbers)
+
+    def check_own_numbers(self, numbers: dict[str, Any]) -> None:
+        """
+        Check numbers before anything is restored.
 
         :param numbers: from :meth:`own_numbers`
         :raises ValueError: if this buffer has none of a name, or something else is given for it
@@ -440,7 +450,6 @@ class CompactReplay(HasColumns):
         for name, value in numbers.items():
             if name not in own or not is_number(value) or isinstance(value, bool) != isinstance(own[name], bool):
                 raise ValueError(f"the buffer's {name:.50} cannot be {value!r:.50}")
-        vars(self).update(numbers)
 
     def changing_state(self) -> dict[str, Any]:
         """
@@ -482,6 +491,7 @@ class CompactReplay(HasColumns):
         size = self.buffer_size if full else pos
         newest = (pos - 1) % self.buffer_size
         self._check_rows(piece, size, newest)
+        self.check_own_numbers(numbers)
         self.reset()
         if size > 0:
             self._put(np.arange(size), piece, newest)
@@ -491,12 +501,21 @@ class CompactReplay(HasColumns):
         self.load_own_numbers(numbers)
 
 
+def numbers_of(owner: Any) -> dict[str, float]:
+    """
+    :param owner: an object
+    :return: its attributes that are numbers, or true or false, by name, those of NumPy as Python's
+    """
+    found = {name: value for name, value in vars(owner).items() if is_number(value)}
+    return {name: value.item() if isinstance(value, np.generic) else value for name, value in found.items()}
+
+
 def is_number(value: Any) -> bool:
     """
     :param value: any value
     :return: whether it is a number, or true or false
     """
-    return isinstance(value, (bool, int, float))
+    return isinstance(value, (bool, int, float, np.bool_, np.integer, np.floating))
 
 
 def _n_frames(frame_stack: Any, space: spaces.Space) -> int | None:

@@ -331,6 +331,9 @@ class Checkpointer:
         for env in self._environments()[1:]:
             watch_workers(env)
         self._interrupts = Interrupts(self._environments(), self._folder.path, self._seat)
+        if self._progress is not None and self._progress not in model.logger.output_formats:
+            # A callback has set another logger.
+            model.logger.output_formats.append(self._progress)
         self._console = LossyLog(model.logger)
         self._period = model.num_timesteps // self._every
         self._warn_of_losses()

@@ -47,7 +47,9 @@ class Interrupts:
                 if signal.getsignal(number) not in (signal.SIG_IGN, None):
                     self._before[number] = signal.signal(number, self._receive)
             for env in envs:
-                vec_envs.set_sigint_ignored(env, True)
+                # A dead worker cannot be told; who asks it for a step finds out, and one in its place ignores SIGINT.
+                with contextlib.suppress(EnvironmentDied, EOFError, OSError):
+                    vec_envs.set_sigint_ignored(env, True)
                 self._envs.append(env)
         except BaseException:
             self.restore(orderly=False)

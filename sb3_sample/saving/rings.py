@@ -16,7 +16,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_sample.replay.columns import HasColumns, columns_of
-from sb3_sample.replay.compact import CompactReplay
+from sb3_sample.replay.compact import CompactReplay, is_number, numbers_of
 from sb3_sample.replay.endings import end_episodes
 from sb3_sample.saving.attributes import is_inert
 from sb3_sample.saving.untrusted import BadFile
@@ -38,17 +38,18 @@ _COUNTS = (
 )  # fmt: skip
 
 
-#: Values that numbers and settings have.
+#: Values of settings, which nothing changes in place.
 _SETTINGS = (
-    bool, int, float, str, bytes, type(None), type, enum.Enum, torch.device, torch.dtype, np.dtype, spaces.Space,
+    str, bytes, type(None), type, enum.Enum, torch.device, torch.dtype, np.dtype, spaces.Space,
 )  # fmt: skip
 
 
 def _is_kept(value: Any) -> bool:
-    """Whether a buffer's attribute is in checkpoints, or has no state: this package's objects save their own."""
+    """Whether a buffer's attribute is in checkpoints, or has no state. This package's objects belong to its buffers."""
     if isinstance(value, tuple):
         return all(map(_is_kept, value))
-    return isinstance(value, _SETTINGS) or is_inert(value) or type(value).__module__.partition(".")[0] == "sb3_sample"
+    is_ours = type(value).__module__.partition(".")[0] == "sb3_sample"
+    return is_number(value) or isinstance(value, _SETTINGS) or is_inert(value) or is_ours
 
 
 def check_values(columns: Mapping[str, Any], name: str, buffer: Any) -> None:
@@ -182,7 +183,7 @@ class Ring:
             parts = {"changing": self.buffer.changing_state(), "own": self.buffer.own_numbers()}
             return small | {name: part for name, part in parts.items() if part}
         own = vars(self.buffer)
-        small["numbers"] = {name: value for name, value in own.items() if isinstance(value, (bool, int, float))}
+        small["numbers"] = numbers_of(self.buffer)
         small["arrays"] = {name: own[name] for name in _SMALL if name in own}
         # The last next observation, which lies at the place of the next row.
         small["head"] = self.buffer.observations[self.buffer.pos] if self.buffer.optimize_memory_usage else None
@@ -204,6 +205,7 @@ class Ring:
             changing, own = small.get("changing", {}), small.get("own", {})
             if not (isinstance(changing, dict) and isinstance(own, dict)):
                 raise ValueError(f"what changes in the buffer cannot be {changing!r:.50} and {own!r:.50}")
+            self.buffer.check_own_numbers(own)
             self.buffer.restore_rows(followed)
             self.buffer.load_changing_state(changing)
             self.buffer.load_own_numbers(own)
@@ -217,7 +219,7 @@ class Ring:
 
     def _restore(self, small: dict[str, Any], pieces: Iterable[tuple[int, dict[str, np.ndarray]]]) -> None:
         columns = self._columns()
-        own = {name: value for name, value in vars(self.buffer).items() if isinstance(value, (bool, int, float))}
+        own = numbers_of(self.buffer)
         numbers = small["numbers"]
         for name, value in numbers.items():
             fixed = name in ("buffer_size", "n_envs", "optimize_memory_usage")

@@ -207,6 +207,8 @@ def save(venv: VecEnv) -> tuple[dict[str, Any], list[str]]:
     try:
         packed, opaque = _pack(innermost)
     except (EnvironmentDied, EOFError, OSError) as error:
+        if not isinstance(innermost, SubprocVecEnv):
+            raise
         # The next step or reset raises the error, or replaces the worker.
         missing.append(f"a worker does not answer ({type(error).__name__}: {error})")
         return state, missing

@@ -18,6 +18,7 @@ from sb3_sample.envs.scores import SCORED, Score, score_of
 from sb3_sample.envs.suites import DAC_NAMED
 from sb3_sample.extras import install
 from sb3_sample.study.table import RUN, plain_texts
+from sb3_sample.study_list import word
 from sb3_sample.warn import warn
 
 #: Scores of tasks without a common score, or in place of it; the other tasks have ``score_of``.
@@ -174,21 +175,6 @@ def differing_arguments(runs: pd.DataFrame) -> list[str]:
         # As texts: true is not 1.
         differing |= {name for name in names if len({json.dumps(each.get(name), sort_keys=True) for each in found}) > 1}
     return sorted(differing)
-
-
-def word(value: Any) -> str:
-    """
-    :param value: of an argument; None if it was not given
-    :return: its text in names; a text that reads as another value, such as "2", is in quotation marks
-    """
-    if value is None:
-        return "default"
-    if not isinstance(value, str):
-        return json.dumps(value)
-    try:
-        return json.dumps(value) if json.loads(value) is not None else value
-    except ValueError:
-        return value
 
 
 def group_tasks(groups: Groups | None, tasks: Sequence[str], in_table: Iterable[str] = ()) -> dict[str, list[str]]:

@@ -30,9 +30,9 @@ from sb3_sample.study.aggregate import (
     iqm,
     named_apart,
     scored,
-    word,
 )
 from sb3_sample.study.table import RUN, plain_texts
+from sb3_sample.study_list import word
 from sb3_sample.warn import warn
 
 #: Evaluations at the end of a run that are averaged (the regularization study, appendix A).

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sb3_sample.study_list import part_of_path, short, variant_of
+from sb3_sample.study_list import part_of_path, variant_of, word
 
 #: Data that an agent learns from besides the environment, and the number of steps on them.
 DATA = ("dataset", "offline_steps", "prior_data")
@@ -76,7 +76,7 @@ class Run:
     @property
     def label(self) -> str:
         """The agent's name in the plan with its place in the grid, as in tables of results."""
-        grid = [f"{n}={short(v)}" for n, v in sorted(self.grid.items())]
+        grid = [f"{n}={word(v)}" for n, v in sorted(self.grid.items())]
         return f"{self.agent} ({', '.join(grid)})" if grid else self.agent
 
     @property

@@ -223,8 +223,8 @@ class StudyFolder:
     def outcome(self, run: Run) -> Outcome:
         """
         :param run: a run
-        :return: its outcome so far. A run whose folder was removed counts as never made, and so does one that is to
-            have more steps
+        :return: its outcome so far. A run whose folder was removed counts as never made; one that is to have more steps
+            goes on from those it has
         :raises StudyError: its file is damaged
         """
         path = self._beside(run, ".json")

@@ -474,12 +474,12 @@ def load(path: str | Path) -> pd.DataFrame:
             table = pd.read_csv(
                 path, dtype=text, keep_default_na=False, na_values=missing, float_precision="round_trip"
             )
-        table = table[COLUMNS].astype({**text, "seed": "Int64", "step": np.int64, "value": float})
+        table = plain_texts(table[COLUMNS].astype({**text, "seed": "Int64", "step": np.int64, "value": float}))
     except KeyError as error:
         raise BadFile(f"{path} is no table of runs: {error}. It must have {', '.join(COLUMNS)}") from error
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise BadFile(f"{path} is no table of runs: {error}") from error
-    return plain_texts(table)
+    return table
 
 
 def _check_parquet() -> None:

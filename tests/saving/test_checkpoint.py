@@ -407,11 +407,12 @@ def test_buffers_that_no_checkpoint_can_hold(tmp_path: Path) -> None:
 class Annealed(CompactReplayBuffer):
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
-        self.exponent, self.n_added, self.mean = 0.5, 0, 0
+        self.exponent, self.n_added, self.mean, self.largest = 0.5, np.int64(0), 0, np.float32(0)
 
     def add(self, *args: Any) -> None:
         super().add(*args)
         self.exponent, self.n_added, self.mean = self.exponent + 0.125, self.n_added + 1, 0.25
+        self.largest = np.float32(self.n_added)
 
 
 class Drawing(CompactReplayBuffer):
@@ -423,7 +424,7 @@ class Drawing(CompactReplayBuffer):
 def test_numbers_of_a_buffer_of_ones_own(tmp_path: Path) -> None:
     sac(replay_buffer_class=Annealed).learn(20, checkpoint=tmp_path / "run")
     buffer = sac(replay_buffer_class=Annealed).learn(30, checkpoint=tmp_path / "run").replay_buffer
-    assert (buffer.exponent, buffer.n_added, buffer.mean) == (4.25, 30, 0.25)
+    assert (buffer.exponent, buffer.n_added, buffer.mean, buffer.largest) == (4.25, 30, 0.25, 30)
     model = sac(replay_buffer_class=Annealed)
     model.replay_buffer = buffer
     model.save_replay_buffer(tmp_path / "buffer")
@@ -434,6 +435,9 @@ def test_numbers_of_a_buffer_of_ones_own(tmp_path: Path) -> None:
         again.replay_buffer.load_own_numbers({"missing": 1})
     with pytest.raises(ValueError, match="the buffer's exponent cannot be True"):
         again.replay_buffer.load_own_numbers({"exponent": True})
+    with pytest.raises(ValueError, match="the buffer's other cannot be 1"):
+        again.replay_buffer.load_state_dict({**buffer.state_dict(), "own/other": 1})
+    assert again.replay_buffer.size() == 30
     with pytest.raises(ValueError, match=r"replay_buffer_class=Drawing keeps 'rng' \(Generator\)"):
         sac(replay_buffer_class=Drawing).learn(10, checkpoint=tmp_path / "other")
 

@@ -215,6 +215,18 @@ def test_a_dead_worker_of_an_evaluation_costs_no_checkpoint(cls: Any, tmp_path: 
     evaluated.close()
 
 
+def test_a_worker_of_an_evaluation_that_dies_between_two_trainings_is_replaced(tmp_path: Path) -> None:
+    evaluated = SupervisedSubprocVecEnv([lambda: Monitor(Toy())], start_method="fork", restart_envs=True)
+    model = sac(compile=False)
+    for n, folder in enumerate(("first", "second")):
+        evaluation = EvalCallback(evaluated, eval_freq=15, n_eval_episodes=1, verbose=0)
+        model.learn(20, evaluation, checkpoint=tmp_path / folder)
+        assert evaluated.n_restarts == n and np.isfinite(evaluation.last_mean_reward)
+        os.kill(evaluated.processes[0].pid, signal.SIGKILL)
+        evaluated.processes[0].join()
+    evaluated.close()
+
+
 def test_a_worker_that_dies_between_two_turns_costs_no_checkpoint(tmp_path: Path) -> None:
     def envs() -> Any:
         return SupervisedSubprocVecEnv([lambda: Monitor(Toy())] * 2, start_method="fork", restart_envs=True)

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
 
 from sb3_sample.saving import progress
 from sb3_sample.saving.folders import Folder
@@ -124,6 +125,20 @@ def test_what_is_logged_before_the_first_turn(tmp_path: Path) -> None:
     # That of the run's beginning, and not that of the program that went on with it.
     assert [line["step"] for line in lines] == [0, 7, 14, 21, 28]
     assert [line.get("eval/first") for line in lines] == [0, None, None, None, None]
+
+
+def test_a_logger_that_a_callback_sets_has_the_log_too(tmp_path: Path) -> None:
+    class Sets(BaseCallback):
+        def _on_training_start(self) -> None:
+            self.model.set_logger(configure(str(tmp_path / "other"), ["csv"]))
+
+        def _on_step(self) -> bool:
+            return True
+
+    for steps in (20, 30):
+        sac().learn(steps, Sets(), checkpoint=tmp_path / "run", log_interval=1)
+    lines = [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [7, 14, 21, 28]
 
 
 def test_a_log_that_is_read_only_for_real(tmp_path: Path) -> None:

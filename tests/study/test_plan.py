@@ -534,3 +534,8 @@ def test_settings_of_runs_that_are_not_there_can_be_changed(tmp_path: Path) -> N
     folder.place(folder.runs()[0]).mkdir(parents=True)
     with pytest.raises(StudyError, match="arguments {'gamma': 0.5}, and the plan now says {'gamma': 0.9}"):
         folder.enter(plan(0.9))
+
+
+def test_a_run_has_the_name_of_its_agent_in_tables() -> None:
+    for value, text in (("2", 'A (x="2")'), (2.0, "A (x=2)"), ("adam", "A (x=adam)"), (True, "A (x=true)")):
+        assert Run("A", "bro", {"x": value}, {"x": value}, "dmc/cheetah-run-v0", 0, 1).label == text

@@ -90,6 +90,7 @@ def test_a_process_that_dies_while_it_answers_has_ended(tmp_path: Path) -> None:
     assert found.failures == {plan.runs[0].title: "the process that made the run was ended by SIGKILL"}
 
 
+@pytest.mark.slow
 def test_two_schedulers_on_one_folder_share_the_runs(tmp_path: Path) -> None:
     program = (
         "import sys; from sb3_sample import study; from tests.study import nothing\n"
@@ -276,7 +277,12 @@ def test_the_time_left_of_runs_that_are_to_have_more_steps(tmp_path: Path) -> No
         folder.place(each).mkdir(parents=True)
         folder.claim(each)
         folder.write_outcome(each, Outcome(True, steps=each.steps, steps_made=each.steps, seconds=10.0))
-    assert [folder.outcome(each) for each in more] == [Outcome(False, steps=few.runs[0].steps)] * 2
+    log = json.dumps({"time/total_timesteps": 1, "time/time_elapsed": 10.0}) + "\n"
+    (folder.place(few.runs[0]) / "progress.jsonl").write_text(log)
+    states = zip(more, ("running", "waiting"), strict=True)
+    found = Status(folder, [RunStatus(each, state, folder.outcome(each)) for each, state in states])
+    # Three steps of each, at ten seconds a step.
+    assert found.seconds_left(found.progress()) == pytest.approx(60)
 
 
 def test_a_run_whose_next_attempt_was_interrupted_waits(tmp_path: Path) -> None:

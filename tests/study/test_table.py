@@ -347,9 +347,10 @@ def test_tables_that_are_none_are_refused(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text("agent,task\na,b\n")
     with pytest.raises(ValueError, match="no table of runs.*It must have agent, arguments"):
         study.load(tmp_path / "t.csv")
-    (tmp_path / "t.csv").write_text("agent,arguments,task,seed,step,metric,value\na,{},b,0,x,return,1\n")
-    with pytest.raises(ValueError, match="no table of runs"):
-        study.load(tmp_path / "t.csv")
+    for row in ("a,{},b,0,x,return,1", "a,,b,0,1,return,1"):
+        (tmp_path / "t.csv").write_text(f"agent,arguments,task,seed,step,metric,value\n{row}\n")
+        with pytest.raises(ValueError, match="no table of runs"):
+            study.load(tmp_path / "t.csv")
     with pytest.raises(ValueError, match="output must end in .csv or .parquet"):
         study.write(made_up([]), tmp_path / "t.txt")
 
