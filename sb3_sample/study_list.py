@@ -83,12 +83,12 @@ def variant_of(agent: str, grid: Mapping[str, Any]) -> str:
     return part_of_path(",".join([agent, *(f"{name}={short(value)}" for name, value in grid.items())]))
 
 
-def to_json(arguments: Mapping[str, Any]) -> str:
+def to_json(value: Any) -> str:
     """
-    :param arguments: plain values by name
-    :return: their text in tables of runs, equal for equal arguments: 2.0 is 2
+    :param value: a plain value, such as arguments by name
+    :return: its text in tables of runs, equal for equal values: 2.0 is 2, and true is not 1
     """
-    return json.dumps(_plain(arguments), sort_keys=True)
+    return json.dumps(_plain(value), sort_keys=True)
 
 
 def _plain(value: Any) -> Any:

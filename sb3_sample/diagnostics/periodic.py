@@ -12,8 +12,8 @@ from sb3_sample.warn import warn
 class PeriodicMeasurement(BaseCallback):
     """
     Base class of callbacks that measure every ``every`` environment steps, and write to the logger under
-    ``diagnostics/``. Nothing is measured while the algorithm still acts at random (``learning_starts``), nor in
-    ``learn_offline`` before the model has acted for so long, of which a warning tells.
+    ``diagnostics/``. Nothing is measured while the algorithm still acts at random (``learning_starts``). In
+    ``learn_offline`` a model that has not acted for so long is not measured, with a warning.
 
     :param every: environment steps between two measurements, taken at the first step at or after each multiple
     :param verbose: 0 nothing, 1 a line for each measurement

@@ -372,7 +372,7 @@ class SupervisedSubprocVecEnv(SubprocVecEnv):
         self._context = multiprocessing.get_context(start_method)
         self.processes: list[Any] = []
         self.remotes: Any = []
-        #: What the environments are wrapped in, by class, as their workers last answered.
+        #: Last answers of the workers whether their environments are wrapped in a class, by the class.
         self._wrapped_in: dict[type, list[bool | None]] = {}
         #: The last observation of each environment.
         self.last_observations: list[Any] = [None] * len(self._env_fns)

@@ -448,7 +448,8 @@ class CompactReplay(HasColumns):
         """
         own = self.own_numbers()
         for name, value in numbers.items():
-            if name not in own or not is_number(value) or isinstance(value, bool) != isinstance(own[name], bool):
+            is_alike = is_number_or_flag(value) and isinstance(value, bool) == isinstance(own.get(name), bool)
+            if name not in own or not is_alike:
                 raise ValueError(f"the buffer's {name:.50} cannot be {value!r:.50}")
 
     def changing_state(self) -> dict[str, Any]:
@@ -506,14 +507,14 @@ def numbers_of(owner: Any) -> dict[str, float]:
     :param owner: an object
     :return: its attributes that are numbers, or true or false, by name, those of NumPy as Python's
     """
-    found = {name: value for name, value in vars(owner).items() if is_number(value)}
+    found = {name: value for name, value in vars(owner).items() if is_number_or_flag(value)}
     return {name: value.item() if isinstance(value, np.generic) else value for name, value in found.items()}
 
 
-def is_number(value: Any) -> bool:
+def is_number_or_flag(value: Any) -> bool:
     """
     :param value: any value
-    :return: whether it is a number, or true or false
+    :return: whether it is a real number, or true or false, Python's or NumPy's
     """
     return isinstance(value, (bool, int, float, np.bool_, np.integer, np.floating))
 

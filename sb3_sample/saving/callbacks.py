@@ -135,10 +135,9 @@ class CallbackStates:
             self._note(path, callback)
 
     def _note(self, path: str, callback: BaseCallback) -> None:
-        before = self._before[path]
-        self._changed[path] |= {
-            name for name, node in _each_apart(callback).items() if name not in before or not same(node, before[name])
-        }
+        before, changed = self._before[path], self._changed[path]
+        now = _each_apart(callback, changed)
+        changed |= {name for name, node in now.items() if name not in before or not same(node, before[name])}
 
     def _save(self, path: str, callback: BaseCallback) -> dict[str, Any]:
         now = self._attributes(callback)[0]
@@ -208,13 +207,13 @@ def _skipped(callback: BaseCallback) -> Set[str]:
     return {*_NOT_OWN, *children, *(name for name, _ in environments(callback))}
 
 
-def _each_apart(callback: BaseCallback) -> dict[str, Node]:
+def _each_apart(callback: BaseCallback, skip: Set[str] = frozenset()) -> dict[str, Node]:
     """
-    Describe each attribute by itself, to be compared at another time: in a common description an attribute that grows
-    changes the numbers of those after it.
+    Describe each attribute but some by itself, to be compared at another time: in a common description an attribute
+    that grows changes the numbers of those after it.
     """
     names, described = attributes_of(callback).keys(), dict[str, Node]()
-    for name in names - _skipped(callback):
+    for name in names - _skipped(callback) - skip:
         described |= Describer().attributes(callback, names - {name})[0]
     return described
 

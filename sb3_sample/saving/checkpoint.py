@@ -246,7 +246,7 @@ class Checkpointer:
         """
         if self._resumed is None:
             if self._folder is not None:
-                # What callbacks log before the first turn belongs to the run's log too.
+                # Lines that callbacks log before the first turn belong to the run's log too.
                 self._open_log({"size": 0, "pending": []})
             return
         if self._manifest["steps"] >= total_timesteps:

@@ -1,6 +1,5 @@
 """Signals during a training."""
 
-import contextlib
 import os
 import signal
 import threading
@@ -11,7 +10,6 @@ from typing import Any
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sample.console import tell
-from sb3_sample.envs.workers import EnvironmentDied
 from sb3_sample.lockstep import LeftWithTheOthers, Seat
 from sb3_sample.saving import vec_envs
 
@@ -47,9 +45,7 @@ class Interrupts:
                 if signal.getsignal(number) not in (signal.SIG_IGN, None):
                     self._before[number] = signal.signal(number, self._receive)
             for env in envs:
-                # A dead worker cannot be told; who asks it for a step finds out, and one in its place ignores SIGINT.
-                with contextlib.suppress(EnvironmentDied, EOFError, OSError):
-                    vec_envs.set_sigint_ignored(env, True)
+                vec_envs.set_sigint_ignored(env, True)
                 self._envs.append(env)
         except BaseException:
             self.restore(orderly=False)
@@ -108,7 +104,5 @@ class Interrupts:
         self._before = {}
         for env in self._envs if orderly else ():
             if not getattr(env.unwrapped, "closed", False):
-                # A dead worker cannot be told.
-                with contextlib.suppress(EnvironmentDied, EOFError, OSError):
-                    vec_envs.set_sigint_ignored(env, False)
+                vec_envs.set_sigint_ignored(env, False)
         self._envs = []

@@ -16,7 +16,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_sample.replay.columns import HasColumns, columns_of
-from sb3_sample.replay.compact import CompactReplay, is_number, numbers_of
+from sb3_sample.replay.compact import CompactReplay, is_number_or_flag, numbers_of
 from sb3_sample.replay.endings import end_episodes
 from sb3_sample.saving.attributes import is_inert
 from sb3_sample.saving.untrusted import BadFile
@@ -49,7 +49,7 @@ def _is_kept(value: Any) -> bool:
     if isinstance(value, tuple):
         return all(map(_is_kept, value))
     is_ours = type(value).__module__.partition(".")[0] == "sb3_sample"
-    return is_number(value) or isinstance(value, _SETTINGS) or is_inert(value) or is_ours
+    return is_number_or_flag(value) or isinstance(value, _SETTINGS) or is_inert(value) or is_ours
 
 
 def check_values(columns: Mapping[str, Any], name: str, buffer: Any) -> None:

@@ -7,6 +7,7 @@ the environment in this way and puts a helper into it, whose methods ``env_metho
 values are pickled, as always in Stable-Baselines3; in files they are not.
 """
 
+import contextlib
 import random
 import signal
 from collections.abc import Iterator
@@ -30,6 +31,9 @@ _SKIPPED = (
     "venv", "class_attributes", "observation_space", "action_space", "num_envs", "render_mode", "metadata",
     "reset_infos", "_seeds", "_options", "t_start",
 )  # fmt: skip
+
+#: Errors by which a worker shows that it is gone.
+_GONE = (EnvironmentDied, EOFError, OSError)
 
 
 class _Helper:
@@ -206,7 +210,7 @@ def save(venv: VecEnv) -> tuple[dict[str, Any], list[str]]:
     }
     try:
         packed, opaque = _pack(innermost)
-    except (EnvironmentDied, EOFError, OSError) as error:
+    except _GONE as error:
         if not isinstance(innermost, SubprocVecEnv):
             raise
         # The next step or reset raises the error, or replaces the worker.
@@ -304,10 +308,11 @@ def _for_the_next_reset(state: dict[str, Any], n_envs: int) -> tuple[list[Any], 
 def set_sigint_ignored(venv: VecEnv, ignored: bool) -> None:
     """
     Set whether the workers of a vectorised environment ignore SIGINT. An environment without workers, or that cannot be
-    reached, stays as it is.
+    reached, stays as it is: a dead worker is reported by the next step, and one in its place ignores SIGINT.
 
     :param venv: a vectorised environment
     :param ignored: whether they ignore it
     """
     if isinstance(venv.unwrapped, SubprocVecEnv):
-        call(venv, "ignore_sigint", [ignored] * venv.num_envs)
+        with contextlib.suppress(*_GONE):
+            call(venv, "ignore_sigint", [ignored] * venv.num_envs)

@@ -9,7 +9,6 @@ import difflib
 import importlib
 import inspect
 import itertools
-import json
 import math
 import re
 from collections import deque
@@ -45,7 +44,7 @@ from sb3_sample.study.trial_agents import (
     settings_of,
     why_not_acting,
 )
-from sb3_sample.study_list import part_of_path, short
+from sb3_sample.study_list import part_of_path, short, to_json
 
 #: Entries of a plan; those after the first four have defaults.
 ENTRIES = (
@@ -355,7 +354,7 @@ class _Reader:
                 for agent in agents:
                     self._argument(agent.algo, name, key, each, f"grid, for agent {agent.name!r},")
                 value = self._plain(each)
-                if _key(value) in map(_key, values):
+                if to_json(value) in map(to_json, values):
                     raise self._fail(each, f"{name!r} of grid has {value!r} twice: each agent can be there once")
                 for other in values:
                     if part_of_path(short(other)).lower() == part_of_path(short(value)).lower():
@@ -378,7 +377,7 @@ class _Reader:
             for values in itertools.product(*grid.values()):
                 point = dict(zip(grid, values, strict=True))
                 arguments = {**agent.arguments, **point}
-                key = _key([agent.algo, _without_defaults(agent.algo, arguments), agent.data, agent.steps])
+                key = to_json([agent.algo, _without_defaults(agent.algo, arguments), agent.data, agent.steps])
                 first = seen.setdefault(key, agent)
                 if first is not agent:
                     line = first.node.start_mark.line + 1
@@ -568,19 +567,6 @@ def _nodes(node: yaml.Node) -> Iterator[yaml.Node]:
                 waiting.extend(child if isinstance(child, tuple) else (child,))
 
 
-def _key(value: Any) -> str:
-    """Key that is equal for equal values: 1 equals 1.0, and True does not equal 1."""
-    return json.dumps(_with_floats(value), sort_keys=True)
-
-
-def _with_floats(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {name: _with_floats(each) for name, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_with_floats(each) for each in value]
-    return float(value) if type(value) is int and abs(value) < 2**53 else value
-
-
 def _without_defaults(algo: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments without those at their defaults, unless the settings of a task name them."""
     known, settings = constructor_arguments(algo), settings_of(algo).values()
@@ -590,7 +576,7 @@ def _without_defaults(algo: str, arguments: Mapping[str, Any]) -> dict[str, Any]
         for name, value in arguments.items()
         if name in named
         or not isinstance(known[name].default, (bool, int, float, str, type(None)))
-        or _key(value) != _key(known[name].default)
+        or to_json(value) != to_json(known[name].default)
     }
 
 

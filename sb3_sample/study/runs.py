@@ -117,7 +117,7 @@ class StudyFolder:
             former: list[Run] = []
             if (self.path / LIST).exists():
                 known, former = self.runs(), self._former()
-                # What was never begun, or was removed, has no settings to keep.
+                # Runs that were never begun, or were removed, have no settings to keep.
                 there = [*former, *(run for run in known if self.place(run).is_dir())]
                 _check_same(self.path, there, plan.runs)
                 _check_names(self.path, there, plan.runs)
