@@ -262,7 +262,7 @@ def run(n_steps: int, seed: int = 0, **changes: Any) -> tuple[Any, list[float]]:
     return one_file.train("Pendulum-v1", dataclasses.replace(TINY, **changes), n_steps, seed, eval_every=100)
 
 
-@pytest.mark.parametrize("n_steps", [29, 30, 31, 75])
+@pytest.mark.parametrize("n_steps", [29, 30, 31, pytest.param(75, marks=pytest.mark.slow)])
 def test_resets_and_replay_ratio(n_steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many gradient steps since the last reset, and as many resets, as the library's BRO has taken."""
     made: list[Any] = []

@@ -239,6 +239,7 @@ def test_statistics_can_be_given(tmp_path: Path) -> None:
     check(model, tmp_path / "off", given=off)
 
 
+@pytest.mark.slow
 def test_no_state_is_touched(tmp_path: Path) -> None:
     model = shake(sac()).learn(15)
     before = {name: value.clone() for name, value in model.policy.state_dict().items()}
@@ -378,6 +379,7 @@ def test_statistics_that_a_plain_environment_lacks_are_warned_of(tmp_path: Path)
         sac().export(tmp_path / "policy")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["sac", pytest.param("ppo", marks=pytest.mark.slow)])
 def test_without_normalisation_no_statistics_are_asked_for(family: str, tmp_path: Path) -> None:
     model = sac().learn(12) if family == "sac" else tiny(MBMAPPO).learn(16)

@@ -40,6 +40,7 @@ def test_the_runs_are_those_of_as_many_commands(call: Call, tmp_path: Path, caps
         call("--seeds", "3", "--run-dir", "together", "-tb", "tb")
 
 
+@pytest.mark.slow
 def test_without_a_folder_each_run_has_one_where_the_zoo_says(call: Call) -> None:
     call("--seeds", "4", "7", "--log-folder", "logs")
     folders = [Path(f"logs/sac_sample/Pendulum-v1_{i}") for i in (1, 2)]

@@ -78,7 +78,7 @@ def test_outlives_the_end_of_an_episode() -> None:
         assert torch.equal(explorer.hold(torch.zeros(1, 2), 0.0), first)
 
 
-@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("n_envs", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_resumed_bit_by_bit(n_envs: int, tmp_path: Path) -> None:
     """A run that stops while a noise is held goes on with it."""
 

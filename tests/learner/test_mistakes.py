@@ -28,7 +28,7 @@ from sb3_sample.parts import (
     ValueHead,
     linear,
 )
-from tests.sac.common import COMPILES, MAKERS, differing, random_batch, sac, state, vec
+from tests.sac.common import COMPILES, MAKERS, differing, random_batch, sac, sampled, state, vec
 
 
 def rule(**methods: Any) -> type[Pessimism]:
@@ -806,7 +806,7 @@ def test_what_is_saved_is_not(cls: type, tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", sampled(MAKERS))
 def test_nor_is_anything_of_this_package(maker: str, tmp_path: Path) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

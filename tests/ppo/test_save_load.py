@@ -50,7 +50,7 @@ def test_loaded_model_trains_on_identically(cls: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("cls", EVERY)
-@pytest.mark.parametrize("discrete", [False, True])
+@pytest.mark.parametrize("discrete", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_seed_fixes_everything(cls: Any, discrete: bool) -> None:
     def trained(seed: int) -> Any:
         space = spaces.Discrete(3) if discrete else None

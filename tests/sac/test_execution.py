@@ -505,8 +505,9 @@ def set_threshold(monkeypatch: pytest.MonkeyPatch, n_updates: int) -> None:
         monkeypatch.setattr(compiling, name, n_updates)
 
 
+@pytest.mark.slow
 @COMPILES
-@pytest.mark.parametrize("maker", ["SAC", pytest.param("SRSPR", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("maker", ["SAC", "SRSPR"])
 def test_auto_compiles_where_it_pays_and_the_file_remembers(
     maker: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

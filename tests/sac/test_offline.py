@@ -160,7 +160,7 @@ def test_iql_against_a_replay_of_its_published_update(network: str) -> None:
             torch.testing.assert_close(a, b, rtol=1e-4, atol=2e-5, msg=name)
 
 
-@pytest.mark.parametrize("deterministic", [True, False])
+@pytest.mark.parametrize("deterministic", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_bc_recovers_a_linear_policy(deterministic: bool) -> None:
     rng = np.random.default_rng(0)
     observations = rng.normal(size=(2_000, 3)).astype(np.float32)

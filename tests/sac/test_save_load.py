@@ -87,7 +87,7 @@ def test_through_memory_and_a_second_time(maker: str) -> None:
         model = loaded
 
 
-@pytest.mark.parametrize("maker", OFF_POLICY)
+@pytest.mark.parametrize("maker", sampled(OFF_POLICY))
 def test_load_without_environment(maker: str, tmp_path: Path) -> None:
     model = OFF_POLICY[maker]().learn(20)
     model.save(tmp_path / "m")
@@ -197,7 +197,7 @@ def test_bad_override_at_loading(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- parameters
 
 
-@pytest.mark.parametrize("maker", OFF_POLICY)
+@pytest.mark.parametrize("maker", sampled(OFF_POLICY))
 def test_get_and_set_parameters(maker: str) -> None:
     model, other = OFF_POLICY[maker](seed=0).learn(20), OFF_POLICY[maker](seed=1)
     assert differing(state(model), state(other))
@@ -245,7 +245,7 @@ def test_every_learned_tensor_is_in_the_parameters() -> None:
     assert not differing(state(model), state(other))
 
 
-@pytest.mark.parametrize("maker", OFF_POLICY)
+@pytest.mark.parametrize("maker", sampled(OFF_POLICY))
 def test_policy_save_load(maker: str, tmp_path: Path) -> None:
     model = OFF_POLICY[maker]().learn(20)
     policy = model.policy
@@ -310,7 +310,7 @@ def test_replay_buffer(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- seeds
 
 
-@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("n_envs", [pytest.param(1, marks=pytest.mark.slow), 3])
 @pytest.mark.parametrize("maker", sampled(REPRESENTATIVE, ("SAC", "BRO", "VPLSAC", "RegularizedSAC")))
 def test_seeds(maker: str, n_envs: int) -> None:
     first, same, different = (MAKERS[maker](vec(n_envs), seed=s, resets=(20,)).learn(36) for s in (4, 4, 5))

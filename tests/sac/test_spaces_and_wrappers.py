@@ -153,7 +153,7 @@ ACTION_SPACES = [
 ]
 
 
-@pytest.mark.parametrize("bias", [40, -40, 0])
+@pytest.mark.parametrize("bias", [40, *(pytest.param(bias, marks=pytest.mark.slow) for bias in (-40, 0))])
 @pytest.mark.parametrize("space", ACTION_SPACES)
 @pytest.mark.parametrize("maker", ["SAC", "BRO"])
 def test_actions_within_bounds(maker: str, space: spaces.Box, bias: float) -> None:

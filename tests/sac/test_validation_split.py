@@ -216,7 +216,7 @@ def test_latest_needs_as_many() -> None:
 # ------------------------------------------------------------------ a model that trains
 
 
-@pytest.mark.parametrize("lengths", [(7,), (3, 7, 10)])
+@pytest.mark.parametrize("lengths", [pytest.param((7,), marks=pytest.mark.slow), (3, 7, 10)])
 @pytest.mark.parametrize("as_dict", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_training_never_sees_what_is_held_out(
     lengths: tuple[int, ...], as_dict: bool, monkeypatch: pytest.MonkeyPatch

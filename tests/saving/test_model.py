@@ -28,11 +28,12 @@ from sb3_sample.saving import BadFile, container, load_vec_normalize, model_tree
 from sb3_sample.saving.container import PickledFile
 from tests.agents import OFF_POLICY, env_of
 from tests.ppo.common import ALGORITHMS, tiny
-from tests.sac.common import bro, differing, sac, state, vec
+from tests.sac.common import REPRESENTATIVE, bro, differing, sac, sampled, state, vec
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(16, 3)).astype(np.float32)
 ON_POLICY = {cls.__name__: lambda cls=cls, **kwargs: tiny(cls, **kwargs) for cls in ALGORITHMS}
 MAKE: dict[str, Any] = {**OFF_POLICY, **ON_POLICY}
+SAMPLE = (*REPRESENTATIVE, "MBMAPPO", "SRSPR")
 
 
 @pytest.fixture
@@ -56,7 +57,7 @@ def no_pickle(monkeypatch: pytest.MonkeyPatch) -> None:
             monkeypatch.setattr(module, name, raising(f"{module.__name__}.{name}", getattr(module, name)))
 
 
-@pytest.mark.parametrize("maker", MAKE)
+@pytest.mark.parametrize("maker", sampled(MAKE, SAMPLE))
 def test_no_pickle_is_touched(maker: str, tmp_path: Path, no_pickle: None) -> None:
     model = MAKE[maker]().learn(32)
     model.save(tmp_path / "m")
@@ -557,7 +558,7 @@ def test_a_base_class_says_which_arguments_it_drops(
         assert DecayAgent.load(tmp_path / "m", pessimism=Decaying).pessimism_rule.rate == 0.9
 
 
-@pytest.mark.parametrize("maker", MAKE)
+@pytest.mark.parametrize("maker", sampled(MAKE, SAMPLE))
 def test_models_of_one_class_lose_no_arguments(maker: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nor does the guess where a file's class is not known take something for lost that is not."""
     model = MAKE[maker]().learn(20)

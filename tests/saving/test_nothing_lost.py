@@ -373,7 +373,14 @@ SCHEDULES: dict[str, Callable[[], Any]] = {
 
 @pytest.mark.parametrize(
     ("kind", "name"),
-    [*((kind, "learning_rate") for kind in SCHEDULES), ("closure", "clip_range"), ("steps", "clip_range_vf")],
+    [
+        *(
+            pytest.param(kind, "learning_rate", marks=[] if kind in ("closure", "method", "kink") else pytest.mark.slow)
+            for kind in SCHEDULES
+        ),
+        ("closure", "clip_range"),
+        ("steps", "clip_range_vf"),
+    ],
 )
 def test_a_schedule_without_a_name_is_a_table(kind: str, name: str, tmp_path: Path) -> None:
     schedule = SCHEDULES[kind]()

@@ -159,6 +159,7 @@ def test_the_policy_alone_is_silent_and_training_is_not() -> None:
     assert len(explored) > 3
 
 
+@pytest.mark.slow
 def test_noisy_layers_are_silent_in_exported_files(tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     model = noisy()

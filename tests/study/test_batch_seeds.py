@@ -42,6 +42,7 @@ def test_which_runs_are_made_together() -> None:
     assert _batches(mixed) == [tuple(sac), (ppo[0],), tuple(other), (ppo[1],)]
 
 
+@pytest.mark.slow
 def test_what_cannot_be_made_together_is_made_one_by_one(tmp_path: Path) -> None:
     found = study.run(nothing.plan(3), tmp_path, worker=nothing.COMMAND, workers=1, batch_seeds=True)
     assert found.counts["done"] == 3

@@ -65,6 +65,7 @@ def test_every_plan_of_the_queue_has_its_place(module: Any) -> None:
         assert text.count(mark("begin", page.title)) == text.count(mark("end", page.title)) == 1
 
 
+@pytest.mark.slow
 def test_results_are_put_into_their_page(module: Any, tmp_path: Path) -> None:
     plan, page_of = "bro_fast_seeds", module.PAGES["bro_fast_seeds"]
     title = page_of.title

@@ -115,6 +115,7 @@ def test_a_reader_sees_first_what_was_compared_who_wins_and_what_is_missing(tmp_
     assert page.count('<svg viewBox="0 0 ') - page.count('aria-hidden="true"') == 4 + 1 + 2 + 1 + 1
 
 
+@pytest.mark.slow
 def test_the_table_9_of_bro_is_on_the_page_of_the_published_seeds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -624,6 +625,7 @@ def test_an_empty_study_and_one_without_evaluations(tmp_path: Path) -> None:
     assert "A 0.005." in text_of(written(tmp_path / "r.html", place.path))
 
 
+@pytest.mark.slow
 def test_a_real_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("rl_zoo3")
     plan = tmp_path / "plan.yml"
