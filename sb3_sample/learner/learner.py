@@ -857,7 +857,9 @@ class Learner(Executable):
         # Critics, towards the targets' value of the actor's next action, unless the objective has another target.
         step: CriticStep | None = None
         if prepared.target is None:
-            next_actions, entropy_bonus = next_step(self, copies, alpha, noise.critic)
+            # Where tasks have their own, a temperature for each copy.
+            of_copies = alpha if alpha.dim() == 0 else alpha.repeat(self.target_copies, 1)
+            next_actions, entropy_bonus = next_step(self, copies, of_copies, noise.critic)
             q, next_q = step_outputs(self, copies, next_actions, noise.subset)
             with torch.no_grad():
                 target = self.head.target(copies, next_q, self.pessimism_rule.value, entropy_bonus)
@@ -1097,7 +1099,9 @@ class Learner(Executable):
     @staticmethod
     def restart(module: Any, fresh: Any, shrink: float = 0.0) -> None:
         """
-        Give a module the values of a fresh one, in place, and start the optimizers of a part anew.
+        Give a module the values of a fresh one, in place, and start the optimizers of a part anew. What was frozen
+        after it had been made (``requires_grad_(False)``), a pretrained encoder, stays as it is, as do the targets of
+        it.
 
         :param module: the module
         :param fresh: a module of the same kind
@@ -1109,6 +1113,8 @@ class Learner(Executable):
                 state[name] = torch.lerp(state[name].to(parameter.device), parameter.detach(), shrink)
             # Fresh moments would fit neither the old network nor the mixed one.
             state.update({name: moment for name, moment in running_moments(module) if name in state})
+        if frozen := _frozen_since(module, fresh):
+            state.update({name: value for name, value in module.state_dict().items() if name in frozen})
         module.load_state_dict(state)
         if shrink > 0:
             project_weights(module)
@@ -1119,3 +1125,19 @@ class Learner(Executable):
         if isinstance(module, Part):
             for optimizer in module.optimizers().values():
                 optimizer.state.clear()
+
+
+def _frozen_since(module: nn.Module, fresh: nn.Module) -> set[str]:
+    """
+    Names in a module's state of parameters that a fresh one of its kind trains and it does not, of the buffers of
+    modules with no others, such as the moments of batch norms, and of the same in target networks.
+    """
+    trained = {name for name, parameter in fresh.named_parameters() if parameter.requires_grad}
+    frozen = {name for name, parameter in module.named_parameters() if name in trained and not parameter.requires_grad}
+    for path, part in module.named_modules() if frozen else ():
+        before = f"{path}." if path else ""
+        names = {before + name for name, _ in part.named_parameters()}
+        if names and names <= frozen:
+            frozen |= {before + name for name, _ in part.named_buffers()}
+    of_targets = (f"{network}_target.{rest}" for network, _, rest in (name.partition(".") for name in frozen))
+    return frozen.union(of_targets)

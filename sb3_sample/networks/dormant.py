@@ -9,7 +9,7 @@ from torch import nn
 
 from sb3_sample.networks.activations import width_factor
 from sb3_sample.networks.ensemble import Dense, EnsembleLinear
-from sb3_sample.networks.network import Network
+from sb3_sample.networks.network import HiddenUnits, Network
 from sb3_sample.networks.spectral_norm import SpectralNorm
 
 
@@ -72,7 +72,7 @@ def recycle(
     as in the published code. The output does change where a layer norm follows, which reads the new neuron with the
     others, and where the kernel of a spectral norm has changed.
 
-    Nothing is copied to the host.
+    Nothing is copied to the host. Neurons of which something is frozen (``requires_grad_(False)``) are left alone.
 
     :param trunk: the network
     :param head: the layer that reads the network's output, None if several do (the last neurons are then left alone)
@@ -85,7 +85,7 @@ def recycle(
     if not threshold >= 0:
         raise ValueError(f"threshold must be at least 0, not {threshold}")
     scores = neuron_scores(trunk, head, x)
-    recyclable = [units for units in trunk.hidden_units(head) if units.outgoing is not None]
+    recyclable = [units for units in trunk.hidden_units(head) if units.outgoing is not None and not _frozen(units)]
     layers = [(units, scores[units.name] <= threshold) for units in recyclable]
     n_recycled = torch.zeros((), dtype=torch.long, device=x.device)
     for units, dormant in layers:
@@ -106,6 +106,12 @@ def recycle(
         if isinstance(layer, SpectralNorm):
             layer.find_direction()
     return n_recycled
+
+
+def _frozen(units: HiddenUnits) -> bool:
+    """Whether something is frozen that recycling would change."""
+    layers = (units.dense, units.norm, units.outgoing)
+    return not all(p.requires_grad for layer in layers if layer is not None for p in layer.parameters())
 
 
 def _columns(mask: torch.Tensor, layer: Dense) -> torch.Tensor:

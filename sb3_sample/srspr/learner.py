@@ -201,13 +201,17 @@ class SPRLearner(Executable):
     def reset(self, shrink: float) -> None:
         """
         Shrink and perturb: projection, predictor and head are reinitialised; encoder and transition model keep a share
-        of their parameters. The target network is reset likewise with a separate draw; Adam's state is cleared.
+        of their parameters. The target network is reset likewise with a separate draw; Adam's state is cleared. Frozen
+        parameters of the online network, and the target's of the same names, stay as they are.
 
         :param shrink: share of the old parameters that stays
         """
+        frozen = {name for name, parameter in self.online.named_parameters() if not parameter.requires_grad}
         for network in (self.online, self.target):
             fresh = dict(self.policy.make_network().to(self.device).named_parameters())
             for name, parameter in network.named_parameters():
+                if name in frozen:
+                    continue
                 if name.partition(".")[0] in FRESH:
                     parameter.copy_(fresh[name])
                 else:

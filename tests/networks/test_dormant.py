@@ -359,6 +359,19 @@ def test_without_a_head_the_last_layer_is_left_alone() -> None:
     assert net.layers[2].bias.all()
 
 
+@pytest.mark.parametrize(("layer", "n"), [(0, 5), (2, 0), (None, 11)])
+def test_frozen_neurons_are_left_alone(layer: int | None, n: int) -> None:
+    """Those of a frozen layer, and those that it reads."""
+    net, head = MLP(3, (6, 5)), linear(5, 2, None)
+    randomize(net)
+    if layer is not None:
+        net.layers[layer].requires_grad_(False)
+    before = [parameter.clone() for parameter in net.parameters()]
+    assert recycle(net, head, torch.randn(B, 3), 1e6) == n
+    for old, new in zip(before, net.parameters(), strict=True):
+        assert torch.equal(old, new) != new.requires_grad or n == 0
+
+
 def test_spectral_norm_follows_at_once() -> None:
     torch.manual_seed(0)
     net, head = MLP(3, (6, 6), spectral_norm=True), linear(6, 2, None)

@@ -26,6 +26,7 @@ from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.learner.scalars import TaskLogScalar
 from sb3_sample.learner.target import next_step
+from sb3_sample.learner.transforms import BatchTransform
 from sb3_sample.networks import MLP, BroNet, Network, widened
 from sb3_sample.sac import BRC, BRO, SAC, BROFast
 from sb3_sample.sac.multi_task import TaskEmbedding, TaskOneHot
@@ -231,6 +232,34 @@ def test_temperatures_by_task_by_hand(target_entropy: Any) -> None:
     assert metrics["train/ent_coef"].item() == pytest.approx(alphas.mean().item(), rel=1e-5)
     of_task = [(alphas * excess)[batch.observations["task"] == k].sum() / 6 for k in range(2)]
     torch.testing.assert_close(temperature.log_value.grad, torch.stack(of_task), rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize(("k", "m"), [(3, 1), (1, 2), (2, 3)])
+def test_copies_of_transitions_have_the_temperatures_of_their_tasks(k: int, m: int) -> None:
+    """Equal copies with equal noise have the target of one, and ``m`` times its loss."""
+
+    class Copies(BatchTransform):
+        target_copies, online_copies = k, m
+
+        def transform(self, batch: Batch, noise: Any) -> Batch:
+            return batch
+
+    noise = torch.randn(6, 1, generator=torch.Generator().manual_seed(1))
+    steps = []
+    for transforms, n in ([], 1), ([Copies], k):
+        model = make("SAC", task_temperatures=True, batch_transforms=transforms)
+        batch = batch_of(model)
+        # The first batch's networks, too, whatever was drawn before.
+        torch.manual_seed(0)
+        with torch.no_grad():
+            for parameter in model.policy.parameters():
+                parameter.normal_(0, 0.3)
+            model.temperature.log_value.copy_(torch.tensor([math.log(0.2), math.log(3.0)]))
+        batch = batch._replace(actions=batch.actions * 0, rewards=batch.rewards * 0, dones=batch.dones * 0)
+        steps.append(model.learner.step(batch, Noise(noise.repeat(n, 1), noise, noise), eager=True))
+    one, copies = steps
+    assert copies["train/critic_loss"].item() == pytest.approx(m * one["train/critic_loss"].item(), rel=1e-4)
+    assert copies["train/ent_coef_loss"].item() == pytest.approx(one["train/ent_coef_loss"].item(), rel=1e-4)
 
 
 def test_the_actors_loss_weighs_each_tasks_entropy() -> None:

@@ -229,6 +229,34 @@ def test_optimizers_work_after_a_reset() -> None:
     assert all(not torch.equal(before[name], after[name]) for name in before)
 
 
+@pytest.mark.parametrize("shrink", [0.0, 0.5])
+@pytest.mark.parametrize(
+    ("maker", "frozen"),
+    [("BRO", "critic.trunk"), ("BROTD3", "actor.trunk"), ("CrossQ", "critic.trunk"), ("DebiasedRQ", "encoder")],
+)
+def test_what_is_frozen_stays_as_it_is(maker: str, frozen: str, shrink: float) -> None:
+    """With the moments of its batch norms, and its targets."""
+    model = MAKERS[maker]().learn(20)
+    model.policy.get_submodule(frozen).requires_grad_(False)
+    model.learn(20)
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    model.reinitialize(shrink)
+    network, _, rest = frozen.partition(".")
+    kept = tuple(".".join(filter(None, (each, rest))) + "." for each in (network, f"{network}_target"))
+    if maker == "CrossQ":
+        assert any("running" in name or "mean" in name for name in before if name.startswith(kept))
+    for name, value in model.policy.state_dict().items():
+        if name.startswith(kept):
+            assert torch.equal(value, before[name]), name
+    learned = [name for name, p in model.policy.named_parameters() if p.requires_grad]
+    assert learned and not any(torch.equal(model.policy.get_parameter(name), before[name]) for name in learned)
+    # Trained again, it is reset again.
+    model.policy.get_submodule(frozen).requires_grad_(True)
+    model.reinitialize(shrink)
+    changed = (not torch.equal(p, before[name]) for name, p in model.policy.named_parameters() if name.startswith(kept))
+    assert any(changed)
+
+
 def test_temperature_starts_from_its_own_start() -> None:
     model = sac(ent_coef="auto_0.3", learning_rate=1e-2)
     model.learn(30)

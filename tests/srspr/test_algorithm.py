@@ -126,6 +126,16 @@ def test_a_reset_makes_heads_anew_and_shrinks_the_rest() -> None:
     model.train(2)
 
 
+def test_a_reset_leaves_a_frozen_encoder_and_its_target() -> None:
+    model = tiny().learn(40)
+    model.policy.q_net.encoder.requires_grad_(False)
+    before = parameters(model)
+    model.learner.reset(0.8)
+    for name, now in parameters(model).items():
+        kept = name.partition(".")[2].startswith("encoder.")
+        assert torch.equal(now, before[name]) == kept, name
+
+
 @pytest.mark.slow
 def test_it_learns_the_small_world() -> None:
     torch.manual_seed(0)
