@@ -279,14 +279,17 @@ def test_a_record_that_was_not_written_whole_is_no_run(monkeypatch: pytest.Monke
         raise OSError(28, "No space left on device")
 
     record = Record("bro", "X", 0, 1, 1, {})
-    with monkeypatch.context() as patched:
-        patched.setattr("sb3_sample.zoo.runs.os.replace", full)
-        with pytest.raises(OSError, match="No space left"):
-            record.write(Path("a"))
-    assert list(Path("a").iterdir()) == []
-    Path("a/.run.json").touch()  # of a process that was killed
+    for name in ("fsync", "replace"):
+        with monkeypatch.context() as patched:
+            patched.setattr(f"sb3_sample.saving.temporary.os.{name}", full)
+            with pytest.raises(OSError, match="No space left"):
+                record.write(Path("a"))
+        assert list(Path("a").iterdir()) == []
+    Path("a/.run.json.0123456789ab.tmp").touch()  # of a process that was killed
     start = plan(*train_parser().parse_known_args(["--run-dir", "a"]))
     assert start is not None and start.folder == Path("a") and start.record is None
+    record.write(Path("a"))
+    assert [path.name for path in Path("a").iterdir()] == ["run.json"] and Record.read(Path("a")) == record
 
 
 @pytest.mark.parametrize(

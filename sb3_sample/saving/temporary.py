@@ -72,6 +72,14 @@ def lock(descriptor: int, shared: bool = False) -> bool | None:
     return True
 
 
+def is_temporary(name: str) -> bool:
+    """
+    :param name: of a file
+    :return: whether it is the name of a temporary file
+    """
+    return _NAME.fullmatch(name) is not None
+
+
 def remove_abandoned(folder: Path) -> None:
     """
     Remove the temporary files of this user in a folder whose writers are gone. Those that cannot be removed stay.
@@ -82,7 +90,7 @@ def remove_abandoned(folder: Path) -> None:
     with contextlib.suppress(OSError):
         names = os.listdir(folder)
     for name in names:
-        if _NAME.fullmatch(name):
+        if is_temporary(name):
             with contextlib.suppress(OSError):
                 _remove_if_abandoned(folder / name)
 

@@ -42,8 +42,10 @@ from sb3_sample.replay.reading import read_dataset
 from sb3_sample.run_logs import OFFLINE, monitor_files, monitor_head
 from sb3_sample.sac.algorithm import SAC
 from sb3_sample.sac.many import train_together
+from sb3_sample.saving.container import replacing
 from sb3_sample.saving.folders import Folder, is_plain
 from sb3_sample.saving.normalization import lacks_vec_normalize
+from sb3_sample.saving.temporary import is_temporary
 from sb3_sample.saving.training_state import argument_names
 from sb3_sample.saving.untrusted import BadFile, parse_json, read_regular
 from sb3_sample.training.seats import all_made
@@ -53,8 +55,6 @@ from sb3_sample.zoo.files import RunError, add_trust
 from sb3_sample.zoo.patches import managed_by, monitors_go_on
 
 RECORD = "run.json"
-#: The record while it is written.
-_BESIDE = f".{RECORD}"
 #: Largest size of a record, in bytes.
 MAX_RECORD = 2**18
 #: Endings of the files that a run writes.
@@ -99,15 +99,11 @@ class Record(NamedTuple):
     def write(self, folder: Path) -> None:
         """
         :param folder: the run's folder
+        :raises OSError: it cannot be written; one that was there is unchanged then
         """
         folder.mkdir(parents=True, exist_ok=True)
-        beside = folder / _BESIDE
-        try:
-            beside.write_text(json.dumps(self._asdict(), indent=1))
-            os.replace(beside, folder / RECORD)
-        except BaseException:
-            beside.unlink(missing_ok=True)
-            raise
+        with replacing(folder / RECORD) as file:
+            file.write(json.dumps(self._asdict(), indent=1).encode())
 
     @classmethod
     def read(cls, folder: Path) -> "Record":
@@ -328,7 +324,7 @@ def plan(options: argparse.Namespace, arguments: Sequence[str]) -> Start | None:
         if options.resume:
             raise RunError(f"--resume: {folder} has no checkpoint to go on from")
         # A run that was interrupted before its first checkpoint has its record, or a part of it.
-        is_empty = folder.is_dir() and all(path.name == _BESIDE for path in folder.iterdir())
+        is_empty = folder.is_dir() and all(is_temporary(path.name) for path in folder.iterdir())
         if folder.exists() and not (is_empty or (folder / RECORD).exists()):
             raise RunError(
                 f"--run-dir {folder} holds files, but no run with checkpoints: it must be the folder of such a run, an "
