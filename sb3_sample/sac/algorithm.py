@@ -303,6 +303,9 @@ class SAC(  # type: ignore[misc]  # actor
             implied["replay_ratio"] = None
         if "prior_data" in kwargs and kwargs["prior_data"] is None:
             implied |= {"_prior_of": None, "prior_share": default_of(cls, "prior_share")}
+        if kwargs.get("backbone") == "td3":
+            # That a file's networks are others is said of the backbone, not of entropies.
+            implied |= {name: default_of(cls, name) for name in ("ent_coef", "target_entropy")}
         # One way to count resets replaces the file's other one.
         if kwargs.get("reset_gradient_steps") is not None:
             implied["resets"] = ()

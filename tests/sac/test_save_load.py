@@ -87,6 +87,14 @@ def test_through_memory_and_a_second_time(maker: str) -> None:
         model = loaded
 
 
+@pytest.mark.parametrize("kwargs", [{}, {"ent_coef": 0.2}, {"target_entropy": -3.0}])
+def test_another_actor_than_the_files_is_what_is_refused(kwargs: dict[str, Any], tmp_path: Path) -> None:
+    """And not the entropy in the file, which no argument of ``load`` could leave out."""
+    sac(**kwargs).save(tmp_path / "model")
+    with pytest.raises(ValueError, match="^backbone: with these arguments the model has other networks"):
+        SAC.load(tmp_path / "model", backbone="td3")
+
+
 @pytest.mark.parametrize("maker", sampled(OFF_POLICY))
 def test_load_without_environment(maker: str, tmp_path: Path) -> None:
     model = OFF_POLICY[maker]().learn(20)
