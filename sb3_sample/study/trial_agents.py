@@ -6,9 +6,11 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 import yaml
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
+from torch.overrides import TorchFunctionMode
 
 from sb3_sample.warn import warn
 
@@ -75,12 +77,26 @@ def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | Non
     for space in usual if actions is None else [actions]:
         env = DummyVecEnv([functools.partial(_TrialEnv, observations, space)])
         try:
-            algorithm(**{"device": "cpu", **settings, "env": env})
+            with _NotOrthogonal():
+                algorithm(**{"device": "cpu", **settings, "env": env})
             return space
         except (ValueError, TypeError, AssertionError) as error:
             errors.append(error)
     # For example, "all actions of a discrete space" exists only with discrete actions.
     raise errors[0]
+
+
+class _NotOrthogonal(TorchFunctionMode):
+    """
+    Leaves kernels as they were drawn, before they are made orthogonal: no argument depends on it, and it is most of the
+    time that large networks take to make.
+    """
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func is torch.linalg.qr:
+            (kernel,) = args
+            return kernel, kernel[: kernel.shape[1]]
+        return func(*args, **(kwargs or {}))
 
 
 class _TrialEnv(gym.Env[Any, Any]):

@@ -1,5 +1,6 @@
 """Plans: what they say, and what is refused before anything runs."""
 
+import contextlib
 import dataclasses
 import shutil
 import textwrap
@@ -9,6 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
+import torch
 
 pytest.importorskip("rl_zoo3")
 
@@ -316,6 +318,18 @@ def test_the_plans_that_come_with_it_are_good(path: Path) -> None:
             assert {run.steps for run in plan.runs} == {500_000 if "half a million" in text else 1_000_000}
     elif path.stem.endswith("_small"):
         assert f"{len(plan.runs)} runs of" in text and f"papers/{path.stem.removesuffix('_small')}.yml" in text
+
+
+@pytest.mark.parametrize("shape", [(5, 3), (3, 5), (4, 4)])
+def test_kernels_of_trial_agents_are_left_as_they_were_drawn(shape: tuple[int, int]) -> None:
+    kernels = []
+    for mode in (trial_agents._NotOrthogonal(), contextlib.nullcontext()):
+        torch.manual_seed(0)
+        with mode:
+            kernels.append(torch.nn.init.orthogonal_(torch.empty(shape)))
+    trial, usual = (kernel @ kernel.T if shape[0] <= shape[1] else kernel.T @ kernel for kernel in kernels)
+    torch.testing.assert_close(usual, torch.eye(min(shape)))
+    assert torch.isfinite(trial).all() and (trial - usual).abs().max() > 0.1
 
 
 def test_each_study_of_the_papers_has_a_small_one() -> None:
