@@ -162,6 +162,8 @@ class _Reader:
             freq = self._count(entries["checkpoint_freq"].value, "checkpoint_freq")
         measured = {n: self._count(entries[n].value, n) for n in ("measure", "diagnostics") if n in entries}
         env_kwargs = self._env_kwargs(entries, tasks)
+        for agent in agents:
+            self._check_data(agent, agent.steps or steps, tasks)
         variants = list(self._variants(agents, grid))
         self._check_actions(variants, tasks, env_kwargs)
         for name in measured:
@@ -188,8 +190,6 @@ class _Reader:
             for agent, arguments, point, _ in variants
             if _has_data_on(agent.data, task)
         )
-        for agent in agents:
-            self._check_data(agent, agent.steps or steps, tasks)
         comparison = Comparison(self._groups(entries, tasks), self._factors(entries, agents, grid))
         return Plan(self._path.stem, runs, text, comparison)
 
@@ -390,7 +390,7 @@ class _Reader:
 
     def _made_on(self, agent: _Agent, arguments: dict[str, Any], point: dict[str, Any]) -> "spaces.Space[Any]":
         try:
-            return make(agent.algo, _without_data(agent, arguments))
+            return make(agent.algo, arguments, has_prior_data="prior_data" in agent.data)
         except (ValueError, TypeError, AssertionError) as error:
             where = f" with {', '.join(f'{k}={v!r}' for k, v in point.items())} of grid" if point else ""
             raise self._fail(agent.node, f"agent {agent.name!r}{where} cannot be made: {error}") from error
@@ -409,7 +409,8 @@ class _Reader:
                 if actions is None or repr(actions) in tried or not _has_data_on(agent.data, task):
                     continue
                 tried.add(repr(actions))
-                if why := why_not_acting(agent.algo, _without_data(agent, arguments), actions, made_on):
+                has_prior_data = "prior_data" in agent.data
+                if why := why_not_acting(agent.algo, arguments, actions, made_on, has_prior_data):
                     raise self._fail(agent.node, f"agent {agent.name!r} cannot act in task {task!r}: {why}")
 
     def _check_measured(self, name: str, node: yaml.Node, agents: list[_Agent]) -> None:
@@ -536,11 +537,6 @@ class _Reader:
                 ) from error
             names.append(name)
         return tuple(names)
-
-
-def _without_data(agent: _Agent, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Arguments without the share of prior data, which needs the data, and these are read only when a run begins."""
-    return {name: value for name, value in arguments.items() if name != "prior_share" or "prior_data" not in agent.data}
 
 
 def _has_data_on(data: Mapping[str, Any], task: str) -> bool:

@@ -12,6 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch.overrides import TorchFunctionMode
 
+from sb3_sample.replay.dataset import Dataset
 from sb3_sample.warn import warn
 
 #: Arguments of the constructors that belong to the run, not the agent; ``frame_stack`` is the zoo's VecFrameStack.
@@ -48,7 +49,12 @@ def constructor_value(name: str, value: Any) -> Any:
     return BUFFERS.get(value, value) if name == "replay_buffer_class" and isinstance(value, str) else value
 
 
-def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | None" = None) -> "spaces.Space[Any]":
+def make(
+    algo: str,
+    arguments: dict[str, Any],
+    actions: "spaces.Space[Any] | None" = None,
+    has_prior_data: bool = False,
+) -> "spaces.Space[Any]":
     """
     Make an agent, on a small task and with the settings of ``hyperparams/<algo>.yml``, so that its arguments are
     checked together.
@@ -56,6 +62,8 @@ def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | Non
     :param algo: its algorithm
     :param arguments: its arguments; the observations of the task are chosen for ``policy``
     :param actions: action space of the task; None: one that the agent supports
+    :param has_prior_data: whether a share of its batches is of a data set, which is read only when a run begins; here
+        it is a single transition
     :return: action space of the agent that was made
     :raises ValueError: they contradict each other, or one is out of range; a ``TypeError`` if they are of another kind
     """
@@ -76,6 +84,8 @@ def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | Non
     usual = _USUAL_ACTIONS[::-1] if _is_for_games(algo) else _USUAL_ACTIONS
     for space in usual if actions is None else [actions]:
         env = DummyVecEnv([functools.partial(_TrialEnv, observations, space)])
+        if has_prior_data and isinstance(space, spaces.Box):
+            settings["prior_data"] = _transition(observations, space)
         try:
             with _NotOrthogonal():
                 algorithm(**{"device": "cpu", **settings, "env": env})
@@ -84,6 +94,16 @@ def make(algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any] | Non
             errors.append(error)
     # For example, "all actions of a discrete space" exists only with discrete actions.
     raise errors[0]
+
+
+def _transition(observations: "spaces.Space[Any]", actions: spaces.Box) -> Dataset:
+    """A data set of one transition."""
+    env = DummyVecEnv([functools.partial(_TrialEnv, observations, actions)])
+    one = env.reset()
+    return Dataset.from_arrays(
+        one, actions.low[None], [0.0], [False], [True],
+        next_observations=one, observation_space=observations, action_space=actions,
+    )  # fmt: skip
 
 
 class _NotOrthogonal(TorchFunctionMode):
@@ -159,7 +179,11 @@ def action_space(task: str, env_kwargs: dict[str, Any]) -> "spaces.Space[Any] | 
 
 
 def why_not_acting(
-    algo: str, arguments: dict[str, Any], actions: "spaces.Space[Any]", made_on: "spaces.Space[Any]"
+    algo: str,
+    arguments: dict[str, Any],
+    actions: "spaces.Space[Any]",
+    made_on: "spaces.Space[Any]",
+    has_prior_data: bool = False,
 ) -> str | None:
     """
     Find why an agent does not support an action space.
@@ -168,12 +192,13 @@ def why_not_acting(
     :param arguments: its arguments
     :param actions: action space of the task
     :param made_on: action space on which it could be made
+    :param has_prior_data: as in :func:`make`
     :return: the reason; None if it supports them
     """
     if isinstance(actions, type(made_on)) and _is_plain(actions):
         return None
     try:
-        make(algo, arguments, actions)
+        make(algo, arguments, actions, has_prior_data)
     except (ValueError, TypeError, AssertionError) as error:
         return str(error)
     return None
