@@ -84,7 +84,7 @@ def make(
     usual = _USUAL_ACTIONS[::-1] if _is_for_games(algo) else _USUAL_ACTIONS
     for space in usual if actions is None else [actions]:
         env = DummyVecEnv([functools.partial(_TrialEnv, observations, space)])
-        if has_prior_data and isinstance(space, spaces.Box):
+        if has_prior_data and isinstance(space, spaces.Box) and space.is_bounded():
             settings["prior_data"] = _transition(observations, space)
         try:
             with _NotOrthogonal():

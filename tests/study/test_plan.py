@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 
@@ -416,6 +417,13 @@ def test_data_of_a_plan_that_are_refused(plan_of, before: str, now: str, message
     assert before in DATA
     with pytest.raises(PlanError, match=message):
         plan_of(DATA.replace(before, now))
+
+
+def test_prior_data_change_nothing_about_actions_that_are_refused() -> None:
+    usual = gym.spaces.Box(-1, 1, (1,), np.float32)
+    for actions in gym.spaces.Box(-np.inf, np.inf, (1,), np.float32), gym.spaces.Discrete(3):
+        why = [trial_agents.why_not_acting("bro", {}, actions, usual, has) for has in (False, True)]
+        assert why[0] is not None and why[0] == why[1]
 
 
 def test_a_run_that_was_taken_out_of_the_plan_is_not_forgotten(tmp_path: Path) -> None:
