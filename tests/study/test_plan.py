@@ -481,7 +481,7 @@ def test_the_actions_are_those_of_the_task_with_its_arguments(plan_of) -> None:
 def test_an_agent_that_can_act_in_a_task_is_not_made_again(plan_of, monkeypatch: pytest.MonkeyPatch) -> None:
     made = []
 
-    def make(*given: Any) -> gym.Space[Any]:
+    def make(*given: Any, **named: Any) -> gym.Space[Any]:
         made.append(given)
         return gym.spaces.Box(-1, 1, (1,))
 
