@@ -39,7 +39,7 @@ from sb3_sample.learner.observation_statistics import ObservationStatistics
 from sb3_sample.learner.observations import Observations
 from sb3_sample.learner.parts import Part, logged
 from sb3_sample.learner.pessimism import LearnedPessimism, Pessimism, pessimistic_value
-from sb3_sample.learner.plasticity import RESETS_TO, ReDo, Resets
+from sb3_sample.learner.plasticity import RESETS_TO, ReDo, Resets, frozen_since
 from sb3_sample.learner.q_values import evaluate
 from sb3_sample.learner.randomness import OwnGenerators, with_own_generators
 from sb3_sample.learner.reward_scale import RewardScale, task_of
@@ -1113,7 +1113,7 @@ class Learner(Executable):
                 state[name] = torch.lerp(state[name].to(parameter.device), parameter.detach(), shrink)
             # Fresh moments would fit neither the old network nor the mixed one.
             state.update({name: moment for name, moment in running_moments(module) if name in state})
-        if frozen := _frozen_since(module, fresh):
+        if frozen := frozen_since(module, fresh):
             state.update({name: value for name, value in module.state_dict().items() if name in frozen})
         module.load_state_dict(state)
         if shrink > 0:
@@ -1125,19 +1125,3 @@ class Learner(Executable):
         if isinstance(module, Part):
             for optimizer in module.optimizers().values():
                 optimizer.state.clear()
-
-
-def _frozen_since(module: nn.Module, fresh: nn.Module) -> set[str]:
-    """
-    Names in a module's state of parameters that a fresh one of its kind trains and it does not, of the buffers of
-    modules with no others, such as the moments of batch norms, and of the same in target networks.
-    """
-    trained = {name for name, parameter in fresh.named_parameters() if parameter.requires_grad}
-    frozen = {name for name, parameter in module.named_parameters() if name in trained and not parameter.requires_grad}
-    for path, part in module.named_modules() if frozen else ():
-        before = f"{path}." if path else ""
-        names = {before + name for name, _ in part.named_parameters()}
-        if names and names <= frozen:
-            frozen |= {before + name for name, _ in part.named_buffers()}
-    of_targets = (f"{network}_target.{rest}" for network, _, rest in (name.partition(".") for name in frozen))
-    return frozen.union(of_targets)

@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from torch import nn
 
 from sb3_sample.console import say
 from sb3_sample.kinds import check_value, is_integer, one_of
@@ -177,6 +178,26 @@ class Resets(Part):
             name: None if start is None else checked_state(start, f"what {name} came from")
             for name, start in state["starts"].items()
         }
+
+
+def frozen_since(module: nn.Module, fresh: nn.Module) -> set[str]:
+    """
+    Find what a reset leaves as it is.
+
+    :param module: a module
+    :param fresh: one of its kind
+    :return: names in the module's state of parameters that the fresh one trains and it does not, of the buffers of
+        modules with no others, such as the moments of batch norms, and of the same in target networks
+    """
+    trained = {name for name, parameter in fresh.named_parameters() if parameter.requires_grad}
+    frozen = {name for name, parameter in module.named_parameters() if name in trained and not parameter.requires_grad}
+    for path, part in module.named_modules() if frozen else ():
+        before = f"{path}." if path else ""
+        names = {before + name for name, _ in part.named_parameters()}
+        if names and names <= frozen:
+            frozen |= {before + name for name, _ in part.named_buffers()}
+    of_targets = (f"{network}_target.{rest}" for network, _, rest in (name.partition(".") for name in frozen))
+    return frozen.union(of_targets)
 
 
 class ReDo(Part):

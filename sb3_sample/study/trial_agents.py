@@ -85,7 +85,7 @@ def make(
     for space in usual if actions is None else [actions]:
         env = DummyVecEnv([functools.partial(_TrialEnv, observations, space)])
         if has_prior_data and isinstance(space, spaces.Box) and space.is_bounded():
-            settings["prior_data"] = _transition(observations, space)
+            settings["prior_data"] = _transition(env)
         try:
             with _NotOrthogonal():
                 algorithm(**{"device": "cpu", **settings, "env": env})
@@ -96,13 +96,13 @@ def make(
     raise errors[0]
 
 
-def _transition(observations: "spaces.Space[Any]", actions: spaces.Box) -> Dataset:
-    """A data set of one transition."""
-    env = DummyVecEnv([functools.partial(_TrialEnv, observations, actions)])
-    one = env.reset()
+def _transition(env: DummyVecEnv) -> Dataset:
+    """A data set of one transition in an environment's spaces, whose actions are bounded numbers."""
+    observation, actions = env.reset(), env.action_space
+    assert isinstance(actions, spaces.Box)
     return Dataset.from_arrays(
-        one, actions.low[None], [0.0], [False], [True],
-        next_observations=one, observation_space=observations, action_space=actions,
+        observation, actions.low[None], [0.0], [False], [True],
+        next_observations=observation, observation_space=env.observation_space, action_space=actions,
     )  # fmt: skip
 
 

@@ -249,7 +249,7 @@ def test_copies_of_transitions_have_the_temperatures_of_their_tasks(k: int, m: i
     for transforms, n in ([], 1), ([Copies], k):
         model = make("SAC", task_temperatures=True, batch_transforms=transforms)
         batch = batch_of(model)
-        # The first batch's networks, too, whatever was drawn before.
+        # Both models and both batches alike, whatever they have learned.
         torch.manual_seed(0)
         with torch.no_grad():
             for parameter in model.policy.parameters():
