@@ -66,8 +66,13 @@ class DebiasedRQLearner(Learner):
     def _what_moves(self) -> tuple[bool, bool]:
         return False, super()._what_moves()[1]
 
-    def _follow(self, target: Any, online: Any) -> None:
-        """Targets are copies, made by :meth:`learn_embeddings`."""
+    def move_target(self, target: Any, online: Any) -> None:
+        """
+        Leave a target as it is: targets are copies, made by :meth:`learn_embeddings`.
+
+        :param target: target network
+        :param online: its online network
+        """
 
     # ---------------------------------------------------------------- how steps are run
 

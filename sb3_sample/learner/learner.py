@@ -1,7 +1,7 @@
 """
 Learner of the off-policy family: networks, targets, learned numbers, optimizers and parts, and their one update.
 
-``Learner.gradient_step`` is the whole gradient step, in the order of BRO's pseudo-code (BRO, algorithm 2).
+``Learner.gradient_step`` is the whole gradient step (``learner/gradient_step.py``).
 """
 
 import functools
@@ -16,12 +16,9 @@ from torch import nn
 from torch.optim import Optimizer
 
 from sb3_sample.kinds import check_value, one_of
-from sb3_sample.learner import first_step, losses
+from sb3_sample.learner import first_step
 from sb3_sample.learner.batch import (
-    SLOTS,
     Batch,
-    CriticStep,
-    Encoded,
     Extra,
     Noise,
     Store,
@@ -29,33 +26,27 @@ from sb3_sample.learner.batch import (
     first_copy,
     widened,
 )
-from sb3_sample.learner.descent import descend, follow, minimize, parameters_of
+from sb3_sample.learner.descent import follow, minimize, parameters_of
 from sb3_sample.learner.executable import Executable
 from sb3_sample.learner.execution import Acting, Execution, acting_of
 from sb3_sample.learner.exploration import Exploration
+from sb3_sample.learner.gradient_step import TD_ERRORS, gradient_step
 from sb3_sample.learner.heads import ValueHead
-from sb3_sample.learner.objectives import Objective, Prepared
+from sb3_sample.learner.objectives import Objective
 from sb3_sample.learner.observation_statistics import ObservationStatistics
 from sb3_sample.learner.observations import Observations
 from sb3_sample.learner.parts import Part, logged
 from sb3_sample.learner.pessimism import LearnedPessimism, Pessimism, pessimistic_value
-from sb3_sample.learner.plasticity import RESETS_TO, ReDo, Resets, frozen_since
-from sb3_sample.learner.q_values import evaluate
+from sb3_sample.learner.plasticity import RESETS_TO, ReDo, Resets, restart
 from sb3_sample.learner.randomness import OwnGenerators, with_own_generators
 from sb3_sample.learner.reward_scale import RewardScale, task_of
 from sb3_sample.learner.scalars import FixedScalar, LogScalar, TaskLogScalar
 from sb3_sample.learner.schedules import LearningRateSchedule
-from sb3_sample.learner.target import next_step, online_outputs, step_outputs, td_target
 from sb3_sample.learner.transforms import BatchTransform
-from sb3_sample.networks.batch_norm import running_moments
 from sb3_sample.networks.modes import ModeSwitch
 from sb3_sample.networks.network import Network
 from sb3_sample.networks.projected import Projected
-from sb3_sample.networks.unit_norm import project_weights
-from sb3_sample.optim import AdamW, sharpness_aware_gradients
-
-#: Name of the TD errors among a gradient step's results, which are not a metric.
-_TD_ERRORS = "td_errors"
+from sb3_sample.optim import AdamW
 
 
 def check_is_batch(batch: Any) -> None:
@@ -661,9 +652,9 @@ class Learner(Executable):
         batch, noise, extra = self._inputs(batch, noise, extra)
         self._count()
         metrics = execution(self, batch, noise, extra, *self._what_moves(), eager=eager)
-        self._td_errors = metrics.pop(_TD_ERRORS, None)
+        self._td_errors = metrics.pop(TD_ERRORS, None)
         self.gradients_are_stale = not (eager or execution.leaves_gradients)
-        batch = self._first_copy(batch)
+        batch = self.first_copies(batch)
         for part in self.parts().values():
             metrics.update(logged(part, "after_update", part.after_update(self, batch)))
         return metrics
@@ -755,7 +746,7 @@ class Learner(Executable):
             batch, noise, extra = self._transformed(batch, noise, extra)
         noise = (noise or Noise()).completed(batch, extra, self._subset(), (self.target_copies, self.online_copies))
         if not self._checked_step:
-            first_step.check(self, self._first_copy(batch), extra)
+            first_step.check(self, self.first_copies(batch), extra)
             self._checked_step = True
         return batch, noise, extra
 
@@ -770,7 +761,7 @@ class Learner(Executable):
             batch = self.reward_scaler.transform(batch, None)
             if extra is not None:
                 extra = extra._replace(batch=self.reward_scaler.transform(extra.batch, None))
-        if self._has_copies:
+        if self.has_copies:
             batch = widened(batch, self.target_copies, self.online_copies)
         drawn = noise.transforms or tuple(transform.draw(batch) for transform in self.transforms)
         for transform, numbers in zip(self.transforms, drawn, strict=True):
@@ -782,26 +773,18 @@ class Learner(Executable):
         return batch, noise._replace(transforms=None), extra
 
     @property
-    def _has_copies(self) -> bool:
+    def has_copies(self) -> bool:
         """Whether there are several copies of each transition in the critics' step."""
         return self.target_copies > 1 or self.online_copies > 1
 
-    def _first_copy(self, batch: Batch) -> Batch:
-        """The first copy of each transition."""
-        return first_copy(batch, len(batch.actions) // self.online_copies) if self._has_copies else batch
+    def first_copies(self, batch: Batch) -> Batch:
+        """
+        Take the first copy of each transition.
 
-    def _encoded_once(self, batch: Batch) -> Batch:
-        """The batch with features in place of observations that several networks read through the online encoder."""
-        networks = self.networks
-        if networks.encodes_once:
-            task = task_of(batch)
-            # Features no longer tell the task, which temperatures by task need.
-            columns = batch.columns if task is None else {**batch.columns, "task": task}
-            batch = batch._replace(observations=Encoded(networks.features(batch.observations)), columns=columns)
-        if networks.encodes_next_once:
-            with torch.no_grad():
-                batch = batch._replace(next_observations=Encoded(networks.features(batch.next_observations)))
-        return batch
+        :param batch: transitions, or several copies of each
+        :return: B transitions
+        """
+        return first_copy(batch, len(batch.actions) // self.online_copies) if self.has_copies else batch
 
     def gradient_step(
         self, batch: Batch, noise: Noise, extra: Extra | None, moves_targets: bool, moves_actor: bool
@@ -816,128 +799,7 @@ class Learner(Executable):
         :param moves_actor: whether actors and temperature learn in this step
         :return: what to log, by name, scalars
         """
-        images, copies = batch.observations, self._encoded_once(batch)
-        batch = self._first_copy(copies)
-        alpha = self.temperature_of(batch)
-        metrics, prepared = self.objective.prepare(self, batch)
-        if self.actor_first and moves_actor:
-            metrics.update(self._learn_actors(batch, noise, alpha, prepared))
-            alpha = self.temperature_of(batch)
-        step: CriticStep | None = None
-        if self.objective.learns_critics:
-            step, of_critics = self._learn_critics(batch, copies, images, noise, alpha, moves_targets, prepared)
-            metrics.update(of_critics)
-        if moves_actor and not self.actor_first:
-            metrics.update(self._learn_actors(batch, noise, alpha, prepared))
-        elif self.actor.trunk.statistics_every_step and not moves_actor:
-            with torch.no_grad():
-                self.actor.gaussian(self.actor.features(self.encoded(batch.observations)))
-
-        # Pessimism.
-        if step is not None:
-            rule = self.pessimism_rule
-            metrics.update(logged(rule, "update", rule.update(self, batch, step, noise.pessimism, extra)))
-        return {name: value.detach() for name, value in metrics.items()}
-
-    def _learn_critics(
-        self,
-        batch: Batch,
-        copies: Batch,
-        observations: Any,
-        noise: Noise,
-        alpha: torch.Tensor,
-        moves_targets: bool,
-        prepared: Prepared,
-    ) -> tuple[CriticStep | None, dict[str, torch.Tensor]]:
-        """
-        Take the critics' step on all copies of the transitions, and the step of their targets. Returns the results for
-        the rule of pessimism, None if there are none, and the metrics. ``observations`` are those of the copies before
-        they were encoded.
-        """
-        # Critics, towards the targets' value of the actor's next action, unless the objective has another target.
-        step: CriticStep | None = None
-        if prepared.target is None:
-            # Where tasks have their own, a temperature for each copy.
-            of_copies = alpha if alpha.dim() == 0 else alpha.repeat(self.target_copies, 1)
-            next_actions, entropy_bonus = next_step(self, copies, of_copies, noise.critic)
-            q, next_q = step_outputs(self, copies, next_actions, noise.subset)
-            with torch.no_grad():
-                target = self.head.target(copies, next_q, self.pessimism_rule.value, entropy_bonus)
-        else:
-            q, target = evaluate(self.critic, copies.observations, copies.actions), prepared.target
-        if self._has_copies:
-            n = len(batch.actions)
-            # Each copy gets the mean over the copies.
-            target = target.reshape(-1, n, target.shape[-1]).mean(dim=0).repeat(self.online_copies, 1)
-        critic_loss = self._critic_loss(q, target)
-        if self.sam_radius is None:
-            self.minimize(self.critic.optimizer, critic_loss)
-        else:
-            # Uphill, the features differ too.
-            self._sharpness_aware_step(critic_loss, copies._replace(observations=observations), next_actions, target)
-        self.critic.project()
-        q = self.head.values(q)
-        if self._has_copies:
-            q, target = q[:, :n], target[:n]
-            if prepared.target is None:
-                next_q, entropy_bonus = next_q[:, :n], entropy_bonus[:n]
-        metrics = {"train/critic_loss": critic_loss, "train/q_mean": q.mean()}
-        if prepared.target is None:
-            step = CriticStep(q.detach(), self.head.values(next_q), entropy_bonus, noise.subset)
-        if SLOTS in batch.columns:
-            metrics[_TD_ERRORS] = self._errors(batch, q, step, prepared)
-
-        # Targets, by Polyak averaging.
-        if moves_targets:
-            self._follow(self.critic_target, self.critic)
-        return step, metrics
-
-    def _critic_loss(self, q: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """The critics' loss, summed over the copies of transitions, if there are several."""
-        loss: torch.Tensor = self.head.loss(q, target)
-        return loss if self.online_copies == 1 else loss * self.online_copies
-
-    def _learn_actors(
-        self, batch: Batch, noise: Noise, alpha: torch.Tensor, prepared: Prepared
-    ) -> dict[str, torch.Tensor]:
-        """Take the steps of actor, explorer and temperature."""
-        # Actor, on the critics, and on their encoder if it is shared.
-        observations = self.encoded(batch.observations)
-        actor_loss, log_prob = self.objective.actor_loss(self, batch, observations, alpha, noise.actor, prepared)
-        self.minimize(self.actor.optimizer, actor_loss)
-        self.actor.project()
-        metrics = {"train/actor_loss": actor_loss}
-        if self.networks.actor_target is not None:
-            self._follow(self.networks.actor_target, self.actor)
-            self.networks.actor_target.trunk.follow_directions()
-
-        # Explorer, on the critics and the new actor.
-        metrics.update(logged(self.explorer, "update", self.explorer.update(self, batch, noise.exploration)))
-
-        # Temperature.
-        if self.actor.has_entropy and log_prob is not None:
-            entropy = -log_prob.detach().mean()
-            by_task = isinstance(self.temperature, TaskLogScalar)
-            metrics.update({"train/entropy": entropy, "train/ent_coef": alpha.mean() if by_task else alpha})
-            if self.temperature_optimizer is not None:
-                if by_task:
-                    targets = self.target_entropy
-                    targets = targets[task_of(batch)] if isinstance(targets, torch.Tensor) else targets
-                    temperature_loss = losses.temperature_loss(alpha, -log_prob, targets).mean()
-                else:
-                    temperature_loss = losses.temperature_loss(alpha, entropy, self.target_entropy)
-                self.minimize(self.temperature_optimizer, temperature_loss)
-                metrics["train/ent_coef_loss"] = temperature_loss
-        return metrics
-
-    @torch.no_grad()
-    def _errors(self, batch: Batch, q: torch.Tensor, step: CriticStep | None, prepared: Prepared) -> torch.Tensor:
-        """The largest absolute TD error of any critic, between means over quantiles, (B,)."""
-        target = prepared.target
-        if target is None:
-            assert step is not None
-            target = td_target(batch, self.pessimism_rule.value(step.next_q), step.entropy_bonus)
-        return (q.mean(dim=2) - target.mean(dim=1)).abs().amax(dim=0)
+        return gradient_step(self, batch, noise, extra, moves_targets, moves_actor)
 
     def actor_value(self, q: torch.Tensor) -> torch.Tensor:
         """
@@ -952,36 +814,19 @@ class Learner(Executable):
         weight: Any = self.actor_pessimism
         return pessimistic_value(q, weight if isinstance(weight, torch.Tensor) else float(weight))
 
-    def _follow(self, target: Any, online: Any) -> None:
-        """Take one step of Polyak averaging; with ``tau=1`` the target is the online network."""
+    def move_target(self, target: Any, online: Any) -> None:
+        """
+        Take one step of Polyak averaging within the gradient step; with ``tau=1`` the target is the online network.
+
+        :param target: target network
+        :param online: its online network
+        """
         self.follow(target, online, self.tau)
         with torch.no_grad():
             # Running statistics, as in Stable-Baselines3; a target without its own encoder lacks the encoder's.
             ours, theirs = target.statistics(), online.statistics()
             for own, other in zip(ours, theirs[len(theirs) - len(ours) :], strict=True):
                 own.copy_(other)
-
-    def _sharpness_aware_step(
-        self, loss: torch.Tensor, batch: Batch, next_actions: torch.Tensor, target: torch.Tensor
-    ) -> None:
-        """Take one step of the critics' optimizer with the gradient at the point ``sam_radius`` uphill."""
-        assert self.sam_radius is not None
-        parameters = list(self.critic.parameters())
-        copied = {id(p) for p in self.critic.copied_parameters()}
-        statistics = self.critic.statistics()
-        before = [each.clone() for each in statistics]
-        gradients = sharpness_aware_gradients(
-            loss,
-            lambda: self._critic_loss(online_outputs(self, batch, next_actions)[0], target),
-            parameters,
-            self.sam_radius,
-            [len(p) if id(p) in copied else None for p in parameters],
-        )
-        with torch.no_grad():
-            # The statistics are those after the critics' own pass; the pass uphill must not move them.
-            for each, value in zip(statistics, before, strict=True):
-                each.copy_(value)
-        descend(self.critic.optimizer, gradients)
 
     @staticmethod
     def follow(target: Any, online: Any, tau: float) -> None:
@@ -1107,21 +952,4 @@ class Learner(Executable):
         :param fresh: a module of the same kind
         :param shrink: share of the old parameters that stays; above 0 the running moments of batch norms stay whole
         """
-        state = fresh.state_dict()
-        if shrink > 0:
-            for name, parameter in module.named_parameters():
-                state[name] = torch.lerp(state[name].to(parameter.device), parameter.detach(), shrink)
-            # Fresh moments would fit neither the old network nor the mixed one.
-            state.update({name: moment for name, moment in running_moments(module) if name in state})
-        if frozen := frozen_since(module, fresh):
-            state.update({name: value for name, value in module.state_dict().items() if name in frozen})
-        module.load_state_dict(state)
-        if shrink > 0:
-            project_weights(module)
-            # Quantities computed from the weights, such as the directions of spectral norms, are refreshed.
-            for network in module.modules():
-                if isinstance(network, Network):
-                    network.refresh()
-        if isinstance(module, Part):
-            for optimizer in module.optimizers().values():
-                optimizer.state.clear()
+        restart(module, fresh, shrink)

@@ -14,7 +14,10 @@ from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.execution import CAPTURING
 from sb3_sample.learner.parts import Learning, Part
 from sb3_sample.learner.randomness import checked_state
+from sb3_sample.networks.batch_norm import running_moments
 from sb3_sample.networks.dormant import recycle
+from sb3_sample.networks.network import Network
+from sb3_sample.networks.unit_norm import project_weights
 
 T = TypeVar("T")
 
@@ -198,6 +201,35 @@ def frozen_since(module: nn.Module, fresh: nn.Module) -> set[str]:
             frozen |= {before + name for name, _ in part.named_buffers()}
     of_targets = (f"{network}_target.{rest}" for network, _, rest in (name.partition(".") for name in frozen))
     return frozen.union(of_targets)
+
+
+def restart(module: nn.Module, fresh: nn.Module, shrink: float = 0.0) -> None:
+    """
+    Give a module the values of a fresh one, in place, and start the optimizers of a part anew; see
+    :meth:`~sb3_sample.learner.learner.Learner.restart`.
+
+    :param module: the module
+    :param fresh: a module of the same kind
+    :param shrink: share of the old parameters that stays
+    """
+    state = fresh.state_dict()
+    if shrink > 0:
+        for name, parameter in module.named_parameters():
+            state[name] = torch.lerp(state[name].to(parameter.device), parameter.detach(), shrink)
+        # Fresh moments would fit neither the old network nor the mixed one.
+        state.update({name: moment for name, moment in running_moments(module) if name in state})
+    if frozen := frozen_since(module, fresh):
+        state.update({name: value for name, value in module.state_dict().items() if name in frozen})
+    module.load_state_dict(state)
+    if shrink > 0:
+        project_weights(module)
+        # Quantities computed from the weights, such as the directions of spectral norms, are refreshed.
+        for network in module.modules():
+            if isinstance(network, Network):
+                network.refresh()
+    if isinstance(module, Part):
+        for optimizer in module.optimizers().values():
+            optimizer.state.clear()
 
 
 class ReDo(Part):

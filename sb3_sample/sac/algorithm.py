@@ -1,7 +1,7 @@
 """
 The off-policy family as a Stable-Baselines3 algorithm: acting, storing, when and how often to learn, logging, files.
 
-The learner does the update (``sb3_sample/learner/learner.py``).
+The learner does the update (``sb3_sample/learner/gradient_step.py``).
 """
 
 import collections
