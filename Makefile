@@ -75,8 +75,11 @@ lint: $(VENV)/.all
 	$(BIN)/mypy --num-workers 2 sb3_sample
 	$(BIN)/lint-imports
 
+# Tests start many programs, each of which would compile the whole package where bytecode is not kept.
+TESTING := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=
+
 test: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -m "not slow" -n 2 --dist worksteal
+	$(TESTING) $(BIN)/python -m pytest -rs -m "not slow" -n 2 --dist worksteal
 
 # On a GPU: torch, NumPy, SciPy, pytest and their like are there; what is carried along is put beside them.
 GPU_FOLDER := .gpu
@@ -107,7 +110,7 @@ demo-imports: setup.cfg $(LOCK)
 # With Ray too, which [all] leaves out.
 test-all: lint demo-imports
 	$(PIP) -e ".[cluster]"
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -rs -n 2 --dist worksteal --durations=60
+	$(TESTING) $(BIN)/python -m pytest -rs -n 2 --dist worksteal --durations=60
 
 WORKERS ?= 1
 THREADS ?= 1

@@ -55,6 +55,15 @@ def circles(graph: dict[str, set[str]]) -> list[list[str]]:
     return components
 
 
+def test_studies_import_slow_modules_where_they_are_used() -> None:
+    """Every process of a study imports all of its modules, and scipy's statistics and optimisers take over a second."""
+    for path in (ROOT / "sb3_sample/study").rglob("*.py"):
+        for node in ast.parse(path.read_text()).body:
+            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            assert not [n for n in names if n == "scipy" or n.startswith(("scipy.stats", "scipy.optimize"))], path
+
+
 def test_no_circle_of_files() -> None:
     assert circles(imports(ROOT / "sb3_sample")) == []
 

@@ -156,7 +156,7 @@ def replay(path: Path) -> int:
 
 
 def is_quantile_bro(path: Path) -> bool:
-    return bool(recorded(path)[1]["hyperparameters"].get("distributional"))
+    return bool(json.loads(str(np.load(path)["meta"]))["hyperparameters"].get("distributional"))
 
 
 FILES = [path for path in golden.FILES if is_quantile_bro(path)]

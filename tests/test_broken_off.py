@@ -47,8 +47,8 @@ def assert_transitions_lead_on(model: Any) -> None:
     [
         ("SAC", 1, None, 18),
         ("SAC", 2, KeyboardInterrupt, 28),
-        ("BRO", 1, None, 28),
-        ("DebiasedRQ", 1, KeyboardInterrupt, 18),
+        pytest.param("BRO", 1, None, 28, marks=pytest.mark.slow),
+        pytest.param("DebiasedRQ", 1, KeyboardInterrupt, 18, marks=pytest.mark.slow),
         ("DebiasedRQ", 2, None, 28),
     ],
 )

@@ -493,7 +493,13 @@ def test_gradient_norms_of_captured_steps_if_episodes_set_the_schedule() -> None
 
 @pytest.mark.parametrize(
     ("maker", "normalized", "buffer"),
-    [("SAC", False, {}), ("SAC", True, {}), ("BRO", False, {}), ("BRO", True, {}), ("SAC", False, DRAWN)],
+    [
+        ("SAC", True, {}),
+        ("BRO", False, {}),
+        ("SAC", False, DRAWN),
+        pytest.param("SAC", False, {}, marks=pytest.mark.slow),
+        pytest.param("BRO", True, {}, marks=pytest.mark.slow),
+    ],
 )
 def test_training_is_the_same_bit_for_bit(maker: str, normalized: bool, buffer: dict[str, Any]) -> None:
     def run(callback: DiagnosticsCallback | None) -> tuple[SAC, list[Any]]:

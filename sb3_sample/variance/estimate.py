@@ -14,7 +14,7 @@ from typing import NamedTuple
 import gymnasium as gym
 import numpy as np
 import torch
-from scipy import stats
+from scipy.special import stdtrit
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_sample.envs.states import check_restorable, save_state
@@ -115,7 +115,7 @@ def jackknife(value: float, left_out: np.ndarray, confidence: float = 0.95) -> I
         raise ValueError(f"confidence must be between 0 and 1, not {confidence!r}")
     m = len(left_out)
     deviation = math.sqrt((m - 1) / m * np.sum((left_out - left_out.mean()) ** 2))
-    half = float(stats.t.ppf(0.5 + confidence / 2, m - 1)) * deviation
+    half = float(stdtrit(m - 1, 0.5 + confidence / 2)) * deviation
     return Interval(float(value), float(value) - half, float(value) + half)
 
 

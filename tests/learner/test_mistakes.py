@@ -226,7 +226,7 @@ def test_an_error_that_a_part_raises_has_a_note_of_where(kwargs: dict[str, Any],
 
 
 @COMPILES
-@pytest.mark.parametrize("compile", [True, "auto"])
+@pytest.mark.parametrize("compile", [True, pytest.param("auto", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("update", "error", "words"),
     [

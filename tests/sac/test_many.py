@@ -460,7 +460,11 @@ def saved(folder: Path) -> list[list[int]]:
 
 @pytest.mark.parametrize(
     ("number", "index", "joint"),
-    [(signal.SIGINT, 0, "each its own"), (signal.SIGINT, 1, "together"), (signal.SIGTERM, 2, "together")],
+    [
+        pytest.param(signal.SIGINT, 0, "each its own", marks=pytest.mark.slow),
+        (signal.SIGINT, 1, "together"),
+        pytest.param(signal.SIGTERM, 2, "together", marks=pytest.mark.slow),
+    ],
     indirect=["joint"],
 )
 def test_a_signal_saves_all_at_the_same_step(number: int, index: int, tmp_path: Path, joint: Any, whole: Any) -> None:

@@ -57,7 +57,7 @@ def told(task: Any, n: int | None = None) -> dict[str, Any]:
 # ---------------------------------------------------------------- one task
 
 
-@pytest.mark.parametrize("policy", ["MlpPolicy", "MultiInputPolicy"])
+@pytest.mark.parametrize("policy", [pytest.param("MlpPolicy", marks=pytest.mark.slow), "MultiInputPolicy"])
 @pytest.mark.parametrize("name", sampled(("BRC", "BRO", "SAC", "SimBa", "DebiasedRQ"), ("BRC", "DebiasedRQ")))
 def test_one_task_is_single_task_bit_by_bit(name: str, policy: str) -> None:
     """Nothing is appended and nothing widened, whatever is asked of several tasks."""

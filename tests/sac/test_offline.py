@@ -643,7 +643,9 @@ class Break(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize("cls", [BC, IQL, TD3BC, BRO, VPLSAC, SimBa])
+@pytest.mark.parametrize(
+    "cls", [IQL, BRO, *(pytest.param(cls, marks=pytest.mark.slow) for cls in (BC, TD3BC, VPLSAC, SimBa))]
+)
 def test_a_run_that_goes_on_is_the_same_bit_by_bit(cls: type[SAC], tmp_path: Path) -> None:
     kwargs: dict[str, Any] = {"learning_rate": lambda left: 1e-3 * left}
     if cls is BRO:

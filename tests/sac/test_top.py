@@ -140,7 +140,7 @@ def test_the_better_arm_wins() -> None:
     assert rule.probabilities()[1] > 0.95
 
 
-@pytest.mark.parametrize("lengths", [(5,), (3, 7, 5)])
+@pytest.mark.parametrize("lengths", [pytest.param((5,), marks=pytest.mark.slow), (3, 7, 5)])
 @pytest.mark.parametrize("normalize", [False, True])
 def test_a_run_against_brute_force(lengths: tuple[int, ...], normalize: bool) -> None:
     """The bandit of a model, recomputed from every episode's raw return and arm."""

@@ -148,7 +148,7 @@ def test_both_samples_are_uniform() -> None:
         assert abs(counts - 2000).max() < 5 * 45, counts
 
 
-@pytest.mark.parametrize("p", [1 / 128, 1 / 32, 1 / 8, 1 / 2])
+@pytest.mark.parametrize("p", [1 / 128, *(pytest.param(p, marks=pytest.mark.slow) for p in (1 / 32, 1 / 8)), 1 / 2])
 def test_share_held_out(p: float) -> None:
     np.random.seed(2)
     buffer = make_buffer(20000, 2, p)

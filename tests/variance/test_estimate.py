@@ -56,7 +56,7 @@ def exact(limit: int | None = None, bandit: bool = False, baseline: bool = True)
         pytest.param({"baseline": False}, {"baseline": False}, marks=pytest.mark.slow),
         pytest.param({"n_actions": 3, "n_returns": 3}, {}, marks=pytest.mark.slow),
         ({"limit": 4}, {"limit": 4}),
-        ({"bandit": True}, {"bandit": True}),
+        pytest.param({"bandit": True}, {"bandit": True}, marks=pytest.mark.slow),
     ],
     ids=["plain", "no baseline", "three actions and returns", "time limit", "bandit"],
 )

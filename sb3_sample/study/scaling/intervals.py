@@ -1,7 +1,7 @@
 """Intervals by the bootstrap over seeds."""
 
 import numpy as np
-from scipy.stats import norm, t
+from scipy.special import ndtr, ndtri, stdtrit
 
 from sb3_sample.study.aggregate import check_samples
 
@@ -42,11 +42,11 @@ def interval(
     level = (1 - confidence) / 2
     factor = 1.0
     if n is not None:
-        wide = float(t.ppf(level, n - 1) * np.sqrt(n / (n - 1)))
+        wide = float(stdtrit(n - 1, level) * np.sqrt(n / (n - 1)))
         if n < FEW:
-            factor = wide / float(norm.ppf(level))
+            factor = wide / float(ndtri(level))
         else:
-            level = float(norm.cdf(wide))
+            level = float(ndtr(wide))
     there = np.isfinite(reps)
     enough = (2 * there.sum(axis=0) >= len(reps)) & np.isfinite(point)
     # Zeros where there are not enough, to avoid warnings about values that are not used.

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy.optimize import least_squares
 
 #: Range of searched exponents.
 ALPHA = (0.02, 20.0)
@@ -423,6 +422,8 @@ def fit_model_size(
     :return: the law
     :raises ValueError: fewer than three replay ratios or sizes, fewer than six points, or numbers that are not positive
     """
+    from scipy.optimize import least_squares  # takes as long to import as all of this package's studies
+
     ratios, sizes = _positive(replay_ratio, "replay_ratio").reshape(-1), _positive(critic_params, "critic_params")
     sizes, values = sizes.reshape(-1), _positive(steps, "steps").reshape(-1)
     if not len(ratios) == len(sizes) == len(values):
