@@ -2,6 +2,7 @@
 
 import argparse
 import ast
+import contextlib
 import importlib
 import json
 import warnings
@@ -129,9 +130,10 @@ def _recorded(args: argparse.Namespace) -> Dataset:
         if not kwargs:
             raise
         raise ValueError(f"{args.env} cannot be made with --env-kwargs {kwargs}: {error}") from error
-    if args.vecnormalize is not None:
-        env = load_vec_normalize(args.vecnormalize, env)
-    return record(model, env, args.episodes, deterministic=not args.stochastic, seed=args.seed)
+    with contextlib.closing(env):
+        if args.vecnormalize is not None:
+            env = load_vec_normalize(args.vecnormalize, env)
+        return record(model, env, args.episodes, deterministic=not args.stochastic, seed=args.seed)
 
 
 def _read(args: argparse.Namespace) -> Dataset:

@@ -1,9 +1,12 @@
-"""A check at the vectorised environment that observations and rewards are finite."""
+"""A check at the vectorised environment of observations and rewards."""
 
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn
+
+from sb3_sample.envs.numbers import counts, outside
 
 #: The largest number of single precision, in which buffers and networks compute: larger ones are infinite there.
 LARGEST = float(np.finfo(np.float32).max)
@@ -11,7 +14,8 @@ LARGEST = float(np.finfo(np.float32).max)
 
 class FiniteCheck:
     """
-    Stop with an error when an environment gives a NaN or an infinity, before anything learns from it.
+    Stop with an error when an environment gives a NaN, an infinity, or a number outside of a Discrete or MultiDiscrete
+    space, before anything learns from it.
 
     The check sits at the innermost vectorised environment: ``VecNormalize`` would otherwise carry the value into its
     running statistics first. It takes the place of that environment's ``reset`` and ``step_wait`` instead of being one
@@ -23,6 +27,9 @@ class FiniteCheck:
 
     def __init__(self, venv: VecEnv):
         self._reset, self._step_wait = venv.reset, venv.step_wait
+        space = venv.observation_space
+        parts = space.spaces.items() if isinstance(space, spaces.Dict) else (("", space),)
+        self._counting = {key: part for key, part in parts if counts(part)}
         self.n_steps = 0
 
     @classmethod
@@ -40,22 +47,22 @@ class FiniteCheck:
     def reset(self) -> Any:
         """
         :return: first observations, as the environment gave them
-        :raises ValueError: if one is not finite
+        :raises ValueError: if one is not finite, or outside of its space
         """
         observations = self._reset()
-        self._check("observation", observations, "at reset")
+        self._check_observations("observation", observations, "at reset")
         return observations
 
     def step_wait(self) -> VecEnvStepReturn:
         """
         :return: the step's results, as the environment gave them
-        :raises ValueError: if an observation or reward is not finite
+        :raises ValueError: if an observation or reward is not finite, or an observation lies outside of its space
         """
         observations, rewards, dones, infos = self._step_wait()
         self.n_steps += 1
         when = f"at its step {self.n_steps}"
         self._check("reward", rewards, when)
-        self._check("observation", observations, when)
+        self._check_observations("observation", observations, when)
         for index in np.flatnonzero(dones):
             terminal = infos[index].get("terminal_observation")
             if isinstance(terminal, dict):
@@ -63,8 +70,21 @@ class FiniteCheck:
             elif terminal is not None:
                 terminal = np.asarray(terminal)[None]
             if terminal is not None:
-                self._check("last observation of the episode", terminal, when, offset=int(index))
+                self._check_observations("last observation of the episode", terminal, when, offset=int(index))
         return observations, rewards, dones, infos
+
+    def _check_observations(self, what: str, values: Any, when: str, offset: int = 0) -> None:
+        self._check(what, values, when, offset)
+        for key, space in self._counting.items():
+            wrong = outside(space, values[key] if key else values)
+            if wrong.any():
+                index = int(wrong.argmax())
+                name = f"{what} {key!r}" if key else what
+                raise ValueError(
+                    f"environment {index + offset} gave {_article(what)} {name} that is not of {space} {when}: "
+                    f"{(values[key] if key else values)[index]!s:.300}. Training stopped before the value reached the "
+                    "replay buffer."
+                )
 
     @staticmethod
     def _check(what: str, values: Any, when: str, offset: int = 0) -> None:
@@ -73,12 +93,15 @@ class FiniteCheck:
                 continue
             index = next(i for i in range(len(array)) if not _is_fine(np.asarray(array[i])))
             name = f"{what} {key!r}" if key else what
-            article = "an" if what == "observation" else "a"
             raise ValueError(
-                f"environment {index + offset} gave {article} {name} that is not finite {when}: {array[index]!s:.300}. "
+                f"environment {index + offset} gave {_article(what)} {name} that is not finite {when}: {array[index]!s:.300}. "
                 f"Allowed are finite numbers, up to {LARGEST:.3g}, the largest that networks take. Training stopped "
                 "before the value reached the replay buffer."
             )
+
+
+def _article(what: str) -> str:
+    return "an" if what == "observation" else "a"
 
 
 def _is_fine(array: np.ndarray) -> bool:

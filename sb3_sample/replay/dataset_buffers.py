@@ -15,7 +15,7 @@ from sb3_sample.replay.columns import (
     own_columns_of,
     rows_at,
 )
-from sb3_sample.replay.steps import as_numpy
+from sb3_sample.replay.steps import as_numpy, check_action_space
 
 
 def arrays_of(buffer: Any) -> dict[str, Any]:
@@ -24,8 +24,12 @@ def arrays_of(buffer: Any) -> dict[str, Any]:
 
     :param buffer: Stable-Baselines3's replay buffer, or one of this package
     :return: arguments of ``Dataset.from_arrays``; observations are gathered from the buffer as they are read
-    :raises ValueError: if the buffer is empty
+    :raises ValueError: if the buffer is empty, or its actions are not of a bounded Box
     """
+    space = buffer.action_space
+    if not isinstance(space, spaces.Box):
+        raise ValueError(f"buffer must have actions of a Box, as those of a data set are, not of {space}")
+    check_action_space(space.shape, space)
     size, first = buffer.size(), int(buffer.pos) if buffer.full else 0
     if buffer.full and getattr(buffer, "optimize_memory_usage", False):
         # The observation of the oldest row was overwritten by the newest next observation.
@@ -42,7 +46,6 @@ def arrays_of(buffer: Any) -> dict[str, Any]:
     # A time limit does not end the bootstrap.
     terminations = taken(buffer.dones)[:, 0].astype(bool) & ~truncations
     truncations[size - 1 :: size] |= ~terminations[size - 1 :: size]  # of each environment
-    space = buffer.action_space
     low, high = space.low.astype(np.float64).ravel(), space.high.astype(np.float64).ravel()
     actions = low + 0.5 * (taken(buffer.actions).astype(np.float64) + 1) * (high - low)
     return {

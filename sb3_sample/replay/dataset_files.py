@@ -242,11 +242,14 @@ def write_minari(data: Any, id_or_path: Any, metadata: dict[str, Any]) -> Path:
 def _episodes(data: Any, buffer_class: Any) -> Iterator[Any]:
     for rows in data.episodes():
         found = data.rows(rows)
-        now, following = found["observations"], found["next_observations"]
+        now, following, space = found["observations"], found["next_observations"], data.observation_space
+        # The numbers of a Discrete space have no axis in Minari's files.
         if isinstance(now, dict):
-            observations: Any = {key: np.concatenate((now[key], following[key][-1:])) for key in now}
+            observations: Any = {
+                key: np.concatenate((now[key], following[key][-1:])).reshape(-1, *space[key].shape) for key in now
+            }
         else:
-            observations = np.concatenate((now, following[-1:]))
+            observations = np.concatenate((now, following[-1:])).reshape(-1, *space.shape)
         yield buffer_class(
             observations=observations,
             actions=found["actions"],

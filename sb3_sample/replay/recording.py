@@ -1,5 +1,6 @@
 """Recording of data sets: a policy's episodes."""
 
+import contextlib
 from typing import Any
 
 import gymnasium as gym
@@ -35,8 +36,10 @@ def record(
         and ``env`` is in none
     """
     check_value("episodes", episodes, integer(1))
-    made: Any = make_vec_env(env) if isinstance(env, str) else env
-    venv: VecEnv = BaseAlgorithm._wrap_env(made)
+    if isinstance(env, str):
+        with contextlib.closing(make_vec_env(env)) as made:
+            return record(model, made, episodes, deterministic=deterministic, seed=seed)
+    venv: VecEnv = BaseAlgorithm._wrap_env(env)
     for name in "observation_space", "action_space":
         theirs, of_model = getattr(venv, name), getattr(model, name, None)
         if of_model is not None and of_model != theirs:

@@ -567,6 +567,7 @@ class SAC(  # type: ignore[misc]  # actor
     def _learning_from(self, dataset: Dataset) -> Iterator[None]:
         """Put a data set in the place of the replay buffer, and a placeholder in the place of a missing environment."""
         if not hasattr(self, "observation_space"):
+            checks.check_dataset("dataset", dataset, dataset.observation_space, dataset.action_space)
             self.observation_space, self.action_space, self.n_envs = dataset.observation_space, dataset.action_space, 1
             self._setup_model()
         checks.check_dataset("dataset", dataset, self.observation_space, self.action_space)

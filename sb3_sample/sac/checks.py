@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import ConstantSchedule
 from stable_baselines3.her import HerReplayBuffer
@@ -127,6 +128,13 @@ def check_dataset(name: str, dataset: Any, observation_space: Any, action_space:
     :param action_space: the model's
     :raises ValueError: if its observations or actions are others
     """
+    for key, part in _parts(dataset.observation_space).items():
+        if is_image_space(part, check_channels=False) and not is_image_space_channels_first(part):
+            which = f"observations[{key!r}]" if key else "observations"
+            raise ValueError(
+                f"{name} must have images in {which} with their channels first, as models get those of an environment, "
+                f"not of shape {part.shape}: pass numpy.moveaxis(images, -1, 1) where the data set is made"
+            )
     ours, theirs = _shapes(observation_space), _shapes(dataset.observation_space)
     if ours != theirs:
         raise ValueError(f"{name} must have observations of the model's shape, {ours}, not {theirs}")
@@ -241,6 +249,11 @@ def _check_prior_data(agent: Any) -> None:
     if cls is not None and issubclass(cls, PrioritizedReplay):
         raise ValueError(
             f"prior_data have no priorities, by which replay_buffer_class={cls.__name__} draws: leave one of them out"
+        )
+    if cls is not None and issubclass(cls, NStepReplayBuffer):
+        raise ValueError(
+            f"prior_data has transitions of one step, which replay_buffer_class={cls.__name__} would mix with returns "
+            "of several: leave one of them out"
         )
     columns = sorted(name for name, column in columns_of(cls).items() if column.in_batch)
     ours, theirs = sorted(set(columns) - set(columns_of(None))), agent.prior_data.column_names

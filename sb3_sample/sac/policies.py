@@ -19,6 +19,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_sample.arguments import check_net_arch
+from sb3_sample.envs.numbers import check_numbers
 from sb3_sample.kinds import ABOVE_0, DICT, TRUE_OR_FALSE, check_value, integer, one_of
 from sb3_sample.learner.batch import Encoded
 from sb3_sample.networks import Network, Projected, RunningNorm
@@ -369,6 +370,18 @@ class SACPolicy(BasePolicy):
         :return: the actor's actions in [-1, 1], (B, A)
         """
         return self.actor(obs, deterministic)
+
+    def obs_to_tensor(self, observation: Any) -> Any:
+        """
+        Convert observations of ``predict``, as in Stable-Baselines3.
+
+        :param observation: one observation or several
+        :return: tensors, (B, O), and whether there are several
+        :raises ValueError: if a number of a Discrete or MultiDiscrete space lies outside of it
+        """
+        if isinstance(self.observation_space, spaces.Dict) == isinstance(observation, Mapping):
+            check_numbers("observation", self.observation_space, observation)
+        return super().obs_to_tensor(observation)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
         return self(observation, deterministic)

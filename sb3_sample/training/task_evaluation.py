@@ -208,7 +208,9 @@ class MultiTaskEvalCallback(EvalCallback):
         found = evaluate_tasks(
             self.model, self.eval_env, self.n_eval_episodes, self.deterministic, self.render, self.warn
         )
-        steps = self.num_timesteps // len(found)
+        # Gradient steps, not those of all tasks together, where the model learns from a data set.
+        offline = getattr(self.model, "_learns_from", None) is not None
+        steps = self.num_timesteps if offline else self.num_timesteps // len(found)
         self.last_mean_reward = float(np.mean([task.mean_return for task in found.values()]))
         self._log(found, steps)
         self.evaluations_timesteps.append(steps)

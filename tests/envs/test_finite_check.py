@@ -17,6 +17,12 @@ def checked(venv: VecEnv) -> VecEnv:
     return venv
 
 
+def steps(venv: VecEnv, n: int) -> None:
+    venv.reset()
+    for _ in range(n):
+        venv.step(np.zeros((venv.num_envs, 2), np.float32))
+
+
 def test_sits_at_the_innermost_and_adds_no_wrapper() -> None:
     inner = vec()
     normalized = VecNormalize(VecFrameStack(inner, 2))
@@ -117,3 +123,33 @@ def test_dict_with_an_integer() -> None:
     env.reset()
     for _ in range(20):
         env.step(np.zeros((2, 2), np.float32))
+
+
+@pytest.mark.parametrize("as_dict", [False, True])
+@pytest.mark.parametrize(
+    ("space", "right", "wrong"),
+    [
+        (spaces.Discrete(3), 2, 3),
+        (spaces.Discrete(3, start=-1), -1, 2),
+        (spaces.MultiDiscrete([3, 4]), np.array([2, 3]), np.array([2, 4])),
+        (spaces.MultiDiscrete([3, 4]), np.array([0, 0]), np.array([-1, 0])),
+    ],
+)
+def test_numbers_outside_of_their_space(space: spaces.Space, right: Any, wrong: Any, as_dict: bool) -> None:
+    """At a reset, in a step, and at the end of an episode."""
+
+    class Counts(Toy):
+        at = 0
+
+        def _observation(self, space: spaces.Space) -> Any:
+            Counts.at -= 1
+            number = wrong if Counts.at == 0 else right
+            return {"k": number} if as_dict else number
+
+    name = " 'k'" if as_dict else ""
+    for at, what in ((1, f"an observation{name} .* at reset"), (3, f"an observation{name} .* at its step 2"),
+                     (8, f"a last observation of the episode{name} .* at its step 7")):  # fmt: skip
+        env = checked(DummyVecEnv([lambda: Counts(spaces.Dict({"k": space}) if as_dict else space)]))
+        Counts.at = at
+        with pytest.raises(ValueError, match=rf"environment 0 gave {what}: .*before the value reached"):
+            steps(env, 10)

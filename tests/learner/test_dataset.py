@@ -13,6 +13,7 @@ from sb3_sample.replay import steps
 #: Two episodes: one of three steps that terminates, one of three that is cut off; then two steps of a third.
 OBSERVATIONS = np.arange(8, dtype=np.float64)[:, None] * 10
 ACTIONS = np.linspace(-1, 1, 8)[:, None]
+STEPS = np.arange(8)
 REWARDS = np.arange(8.0)
 TERMINATIONS = np.array([0, 0, 1, 0, 0, 0, 0, 0])
 TRUNCATIONS = np.array([0, 0, 0, 0, 0, 1, 0, 0])
@@ -136,6 +137,21 @@ def test_dict_and_image_observations() -> None:
         ),
         ({"observation_space": spaces.Box(0, 9, (1,), np.uint8), "observations": ACTIONS}, "not -1.0"),
         ({"observation_space": spaces.Discrete(9), "observations": np.full((8, 1), np.nan)}, "whole numbers"),
+        (
+            {"observation_space": spaces.Discrete(7), "observations": STEPS},
+            r"observations must be numbers of Discrete\(7\), not 7",
+        ),
+        (
+            {"observation_space": spaces.Discrete(8), "observations": STEPS, "next_observations": STEPS + 1},
+            r"next_observations must be numbers of Discrete\(8\), not 8",
+        ),
+        (
+            {
+                "observation_space": spaces.Dict({"k": spaces.MultiDiscrete([9, 4])}),
+                "observations": {"k": np.stack((STEPS, STEPS // 2 + 1), axis=1)},
+            },
+            r"observations\['k'\] must be numbers of MultiDiscrete\(\[9 4\]\), not \[6 4\]",
+        ),
         ({"columns": {"task": REWARDS, "rewards": REWARDS}}, "columns must have names of their own, not rewards,"),
         ({"columns": {"next_observations": REWARDS}}, "names of their own, not next_observations,"),
         ({"next_observations": np.zeros((7, 1))}, "next_observations must have as many steps"),

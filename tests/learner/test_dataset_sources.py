@@ -90,6 +90,28 @@ def test_arrays_of_other_types_than_their_spaces_survive_minari(tmp_path: Path) 
         assert [rows["observations"][key].dtype for key in "bc"] == [np.int8, np.int64]
 
 
+@pytest.mark.parametrize("as_dict", [False, True])
+def test_numbers_in_minaris_files_are_of_their_space(as_dict: bool, tmp_path: Path) -> None:
+    minari = pytest.importorskip("minari", reason="needs the extra [offline]")
+    space: Any = spaces.Dict({"k": spaces.Discrete(5)}) if as_dict else spaces.Discrete(5)
+    numbers = np.arange(4)
+    data = Dataset.from_arrays(
+        {"k": numbers} if as_dict else numbers, np.zeros((4, 1)), np.zeros(4), np.arange(4) == 3, np.zeros(4),
+        next_observations={"k": numbers + 1} if as_dict else numbers + 1, observation_space=space,
+    )  # fmt: skip
+    data.to_minari(tmp_path / "set")
+    (episode,) = minari.MinariDataset(tmp_path / "set" / "data").iterate_episodes()
+    found = episode.observations["k"] if as_dict else episode.observations
+    assert found.tolist() == [0, 1, 2, 3, 4] and (space["k"] if as_dict else space).contains(found[-1])
+    assert_same(data, Dataset.from_minari(tmp_path / "set"))
+
+
+def test_a_buffer_of_discrete_actions_is_refused() -> None:
+    buffer = ReplayBuffer(10, spaces.Box(-1, 1, (2,)), spaces.Discrete(3))
+    with pytest.raises(ValueError, match=r"buffer must have actions of a Box, .* not of Discrete\(3\)"):
+        Dataset.from_replay_buffer(buffer)
+
+
 def test_columns_that_minari_has_no_place_for_are_warned_of(tmp_path: Path) -> None:
     pytest.importorskip("minari", reason="needs the extra [offline]")
     with pytest.warns(UserWarning, match=r"Minari's format has no place for columns=\['task'\]"):
@@ -330,6 +352,14 @@ def test_record_whole_episodes_of_several_environments() -> None:
         assert np.flatnonzero(rows["terminations"][part]).tolist() == ([3] if length == 4 else [])
         assert np.flatnonzero(rows["truncations"][part]).tolist() == ([] if length == 4 else [2])
     np.testing.assert_array_equal(rows["actions"], rows["observations"][:, :2] / np.float32(10))
+
+
+def test_record_closes_the_environment_that_it_makes(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = vec()
+    closed: list[bool] = []
+    monkeypatch.setattr(made, "close", lambda: closed.append(True))
+    monkeypatch.setattr("sb3_sample.replay.recording.make_vec_env", lambda env: made)
+    assert record(Linear(), "an id", 2).n_episodes == 2 and closed == [True]
 
 
 def test_record_takes_original_observations_of_a_normalized_environment() -> None:

@@ -21,7 +21,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_sample import DiagnosticsCallback, MultiTaskEvalCallback, evaluate_tasks, multi_task_env, study
+from sb3_sample import Dataset, DiagnosticsCallback, MultiTaskEvalCallback, evaluate_tasks, multi_task_env, study
 from sb3_sample.learner.batch import Batch, Noise
 from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.learner.scalars import TaskLogScalar
@@ -533,6 +533,13 @@ def test_evaluation_by_task() -> None:
     returns = [sum(alone.step(np.array([[-2.0]]))[1][0] for _ in range(8)) for _ in range(3)]
     assert found[PENDULUM].returns == pytest.approx(returns, rel=1e-4)
     assert found[PENDULUM].mean_return == pytest.approx(np.mean(returns), rel=1e-4)
+
+
+def test_evaluations_from_a_data_set_are_at_gradient_steps(tmp_path: Path) -> None:
+    data = Dataset.from_replay_buffer(make("SAC").learn(24).replay_buffer)
+    callback = MultiTaskEvalCallback(tasks(seed=9), eval_freq=10, n_eval_episodes=1, log_path=tmp_path, verbose=0)
+    make("SAC").learn_offline(data, 20, callback=callback)
+    assert np.load(tmp_path / PENDULUM / "evaluations.npz")["timesteps"].tolist()[-2:] == [10, 20]
 
 
 def test_a_later_training_in_the_same_folder_is_recorded_as_its_own(tmp_path: Path) -> None:

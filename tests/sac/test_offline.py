@@ -717,3 +717,18 @@ def test_transitions_held_out_are_never_trained_on() -> None:
         trained = {row.item() for batch in source.batches(40, 64) for row in batch.rewards}
         held = {row.item() for _ in range(300) for row in source.held_out().rewards}
     assert len(trained) == 150 and len(held) == 50 and not trained & held
+
+
+def test_images_with_their_channels_last_are_refused_before_anything_learns() -> None:
+    space = spaces.Box(0, 255, (40, 40, 3), np.uint8)
+    images = np.random.default_rng(0).integers(0, 256, (20, 40, 40, 3)).astype(np.uint8)
+    given: Any = (np.zeros((20, 1)), np.zeros(20), np.arange(20) == 9, np.arange(20) == 19)
+    turned = np.moveaxis(images, -1, 1)
+    data = Dataset.from_arrays(images, *given, next_observations=images, observation_space=space)
+    model = BC("CnnPolicy", None, compile=False, batch_size=4)
+    with pytest.raises(
+        ValueError, match=r"dataset must have images in observations with their channels first.*moveaxis"
+    ):
+        model.learn_offline(data, 1)
+    first = spaces.Box(0, 255, (3, 40, 40), np.uint8)
+    model.learn_offline(Dataset.from_arrays(turned, *given, next_observations=turned, observation_space=first), 1)

@@ -12,6 +12,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_sample import IQL, SAC, VPLSAC, Dataset, DebiasedRQ, PrioritizedReplayBuffer
@@ -141,6 +142,10 @@ def test_hindsight_relabels_the_replay_buffers_part_only(batches: list[Any]) -> 
         (
             {"prior_data": prior(), "replay_buffer_class": PrioritizedReplayBuffer},
             "prior_data have no priorities, by which replay_buffer_class=PrioritizedReplayBuffer draws",
+        ),
+        (
+            {"prior_data": prior(), "replay_buffer_class": NStepReplayBuffer, "replay_buffer_kwargs": {"n_steps": 3}},
+            "prior_data has transitions of one step, which replay_buffer_class=NStepReplayBuffer would mix",
         ),
         ({"prior_data": prior(keys=("a",))}, "prior_data must have observations of the model's shape"),
     ],

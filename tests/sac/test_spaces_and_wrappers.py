@@ -593,3 +593,15 @@ def test_target_update_interval() -> None:
             for old, new, critic in zip(previous, now, model.critic.parameters(), strict=True):
                 torch.testing.assert_close(new, (old + critic) / 2)
         previous = [p.clone() for p in now]
+
+
+@pytest.mark.parametrize(
+    ("space", "wrong"), [(spaces.Discrete(3), 3), (spaces.MultiDiscrete([3, 4]), [[0, 3], [0, 4]])]
+)
+def test_predict_refuses_numbers_outside_of_their_space(space: spaces.Space, wrong: Any) -> None:
+    for of, given in ((space, np.array(wrong)), (spaces.Dict({"k": space}), {"k": np.array(wrong)})):
+        policy = "MultiInputPolicy" if isinstance(of, spaces.Dict) else "MlpPolicy"
+        model = sac(vec(obs_space=of), policy=policy)
+        model.predict(of.sample())
+        with pytest.raises(ValueError, match=r"^observation.* must be numbers of (Multi)?Discrete\(.*\), not"):
+            model.predict(given)
