@@ -94,8 +94,8 @@ class FiniteCheck:
             index = next(i for i in range(len(array)) if not _is_fine(np.asarray(array[i])))
             name = f"{what} {key!r}" if key else what
             raise ValueError(
-                f"environment {index + offset} gave {_article(what)} {name} that is not finite {when}: {array[index]!s:.300}. "
-                f"Allowed are finite numbers, up to {LARGEST:.3g}, the largest that networks take. Training stopped "
+                f"environment {index + offset} gave {_article(what)} {name} that is not finite {when}: "
+                f"{array[index]!s:.300}. Allowed are finite numbers, up to {LARGEST:.3g}, the largest that networks take. Training stopped "
                 "before the value reached the replay buffer."
             )
 

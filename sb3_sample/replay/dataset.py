@@ -251,8 +251,8 @@ class Dataset:
         :param seed: of the generator that the batches are drawn from
         :param memory_map: as in :meth:`from_arrays`
         :return: the data set, environment after environment
-        :raises ValueError: if the buffer is empty, if its actions are not of a bounded Box, or if one of its own columns
-            has the name of a part of every step
+        :raises ValueError: if the buffer is empty, if its actions are not of a bounded Box, or if one of its own
+            columns has the name of a part of every step
         """
         return cls.from_arrays(**arrays_of(buffer), seed=seed, memory_map=memory_map)
 
