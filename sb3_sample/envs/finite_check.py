@@ -95,8 +95,8 @@ class FiniteCheck:
             name = f"{what} {key!r}" if key else what
             raise ValueError(
                 f"environment {index + offset} gave {_article(what)} {name} that is not finite {when}: "
-                f"{array[index]!s:.300}. Allowed are finite numbers, up to {LARGEST:.3g}, the largest that networks take. Training stopped "
-                "before the value reached the replay buffer."
+                f"{array[index]!s:.300}. Allowed are finite numbers, up to {LARGEST:.3g}, the largest that networks "
+                "take. Training stopped before the value reached the replay buffer."
             )
 
 

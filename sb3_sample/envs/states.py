@@ -10,9 +10,11 @@ A state can be restored any number of times, in its own environment or in anothe
 
 import collections
 import copy
+import enum
 import functools
 import io
 import operator
+import random
 import types
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -22,13 +24,13 @@ import numpy as np
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_sample.envs.atari import is_atari
-from sb3_sample.saving.attributes import is_view_of_foreign_memory
+from sb3_sample.saving.attributes import IMMUTABLE, attributes_of, is_view_of_foreign_memory
 
 #: Attributes of these types cannot change, so that they are kept as they are.
-_CONSTANTS = (type(None), bool, int, float, complex, str, bytes, np.generic)
+_CONSTANTS = (type(None), bool, int, float, complex, str, bytes, np.generic, enum.Enum, *IMMUTABLE)
 #: Attributes of these types are part of the state, with what they contain.
-_CONTAINERS = (list, tuple, dict, set, collections.deque)
-_GENERATORS = (np.random.Generator, np.random.RandomState)
+_CONTAINERS = (list, tuple, dict, set, frozenset, collections.deque)
+_GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
 #: Descriptions of an environment or its interface: never a part of the state.
 _NOT_STATE = (
     gym.Env, gym.Space, gym.envs.registration.EnvSpec, io.IOBase, type, types.ModuleType, types.FunctionType
@@ -56,12 +58,14 @@ class EnvState(NamedTuple):
     :param model: arrays of MuJoCo's model and numbers of its options, by name: ``body_mass``, ``opt.gravity``
     :param console: state of the Arcade Learning Environment's console, including its generator; None for other
         environments
+    :param names: names of all attributes of each layer, for those that an environment gets later
     """
 
     layers: list[dict[str, Any]]
     data: Any
     model: dict[str, Any]
     console: Any = None
+    names: tuple[frozenset[str], ...] = ()
 
 
 def save_state(env: gym.Env) -> EnvState:
@@ -79,7 +83,8 @@ def save_state(env: gym.Env) -> EnvState:
     # Copied together, so that a generator that two of them share is shared in the copy.
     attributes = _copies(layers, [state_attributes(layer) for layer in layers])
     base: Any = env.unwrapped
-    return EnvState(attributes, data, model, base.clone_state(include_rng=True) if is_atari(env) else None)
+    console = base.clone_state(include_rng=True) if is_atari(env) else None
+    return EnvState(attributes, data, model, console, tuple(frozenset(vars(layer)) for layer in layers))
 
 
 def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None = None) -> None:
@@ -88,9 +93,9 @@ def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None
 
     :param env: the environment that the state was saved from, or one made in the same way
     :param state: from :func:`save_state`; it is not changed
-    :param rng: if given, the environment's random generators are seeded anew from it, so that a task that is random
-        after its reset continues at random from the state. The generator of Atari's console, which draws sticky
-        actions, cannot be seeded and is restored
+    :param rng: if given, the environment's random generators, NumPy's and Python's, are seeded anew from it wherever
+        they are, so that a task that is random after its reset continues at random from the state. The generator of
+        Atari's console, which draws sticky actions, cannot be seeded and is restored
     :raises ValueError: ``state`` is of an environment with other wrappers, or of another model
     """
     layers, simulator = layers_of(env), simulator_of(env)
@@ -116,11 +121,19 @@ def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None
     if state.console is not None:
         base: Any = env.unwrapped
         base.restore_state(state.console)
-    for layer, attributes in zip(layers, _copies(layers, state.layers), strict=True):
+    restored = _copies(layers, state.layers)
+    if rng is not None:
+        # Not among the rewards of the episode, which grow with it.
+        values = [value for each in restored for name, value in each.items() if name != REWARDS]
+        for generator in _generators_in(values, set()):
+            _reseed(generator, int(rng.integers(2**63)))
+    for layer, attributes in zip(layers, restored, strict=True):
         for name, value in attributes.items():
-            if rng is not None and isinstance(value, _GENERATORS):
-                value = type(value)(_bit_generator(value, int(rng.integers(2**63))))
             setattr(layer, name, value)
+    for layer, names in zip(layers, state.names, strict=bool(state.names)):
+        for name in vars(layer).keys() - names:
+            if _is_state(vars(layer)[name], set()):
+                delattr(layer, name)
 
 
 def check_restorable(env: gym.Env, other: gym.Env | None = None, n_steps: int = 20, seed: int = 0) -> None:
@@ -157,6 +170,40 @@ def check_restorable(env: gym.Env, other: gym.Env | None = None, n_steps: int = 
         raise ValueError(f"{message}it fails after its state was restored ({error!r})") from error
     if not _equal(first, second):
         raise ValueError(f"{message}the same actions gave something else after its state was restored")
+
+
+def check_step(env: gym.Env, state: EnvState, action: Any, observation: Any, reward: float, ended: bool) -> None:
+    """
+    Take an action once more from a saved state, and compare with what came of it.
+
+    :param env: environment to restore the state in
+    :param state: the state in which the action was taken
+    :param action: the action
+    :param observation: the observation that followed
+    :param reward: the reward
+    :param ended: whether the episode ended
+    :raises ValueError: if another observation, reward or end follows
+    """
+    restore_state(env, state)
+    try:
+        again, its_reward, terminated, truncated, _ = env.step(action)
+    except Exception as error:  # an environment whose state is restored only in part may raise anything
+        raise ValueError(f"it fails after its state was restored ({error!r})") from error
+    got = {
+        "observation": _equal(_as_given(again, observation), observation),
+        "reward": np.float32(its_reward) == np.float32(reward),
+        "end of the episode": (terminated or truncated) == ended,
+    }
+    wrong = [name for name, same in got.items() if not same]
+    if wrong:
+        raise ValueError(f"after its state was restored, the same action gave another {' and another '.join(wrong)}")
+
+
+def _as_given(observation: Any, given: Any) -> Any:
+    """An observation in the types of another, in which a vectorised environment holds it."""
+    if isinstance(given, dict):
+        return {key: _as_given(observation[key], value) for key, value in given.items()}
+    return np.asarray(observation).astype(np.asarray(given).dtype)
 
 
 def random_action(space: gym.Space, rng: np.random.Generator) -> Any:
@@ -353,13 +400,40 @@ def _is_state(value: Any, seen: set[int]) -> bool:
     if isinstance(value, functools.partial):
         called = isinstance(value.func, types.FunctionType) or _is_state(value.func, seen)
         return called and all(_is_state(item, seen) for item in (*value.args, *value.keywords.values()))
-    if isinstance(value, _NOT_STATE) or not hasattr(value, "__dict__"):
+    if isinstance(value, _NOT_STATE) or not (hasattr(value, "__dict__") or attributes_of(value)):
         return False
     # Objects of a wrapper, such as the running mean and variance of a normalisation. A simulator's are the layers' and
     # the data's; an environment inside of another attribute is none of the wrappers that this module knows.
     return not type(value).__module__.startswith(("mujoco", "dm_control", "gymnasium.envs")) and all(
-        _is_state(item, seen) for item in vars(value).values()
+        _is_state(item, seen) for item in attributes_of(value).values()
     )
+
+
+def _generators_in(value: Any, seen: set[int]) -> Iterator[Any]:
+    """
+    Random generators in a value of state attributes, each once, in the order of the attributes.
+
+    :param value: any that consists of data only, or a container of such
+    :param seen: ids of the values examined so far
+    """
+    if isinstance(value, (np.ndarray, *_CONSTANTS)) or id(value) in seen:
+        return
+    seen.add(id(value))
+    items: Any = ()
+    if isinstance(value, _GENERATORS):
+        yield value
+    elif isinstance(value, dict):
+        items = value.values()
+    elif isinstance(value, _CONTAINERS):
+        items = value
+    elif isinstance(value, types.MethodType):
+        items = (value.__self__,)
+    elif isinstance(value, functools.partial):
+        items = (value.func, *value.args, *value.keywords.values())
+    elif not isinstance(value, _NOT_STATE):
+        items = attributes_of(value).values()
+    for item in items:
+        yield from _generators_in(item, seen)
 
 
 def is_simulator(value: Any) -> bool:
@@ -370,11 +444,15 @@ def is_simulator(value: Any) -> bool:
     return not _is_state(value, set()) and not isinstance(value, (*_NOT_STATE, *BOUND))
 
 
-def _bit_generator(generator: Any, seed: int) -> Any:
-    """A bit generator of the same kind as the generator's."""
+def _reseed(generator: Any, seed: int) -> None:
+    """Seed a generator anew, in place, as several attributes may hold it."""
     if isinstance(generator, np.random.RandomState):
-        return np.random.MT19937(seed)
-    return type(generator.bit_generator)(seed)
+        fresh = np.random.RandomState(type(generator._bit_generator)(seed))  # type: ignore[attr-defined]
+        generator.set_state(fresh.get_state(legacy=False))
+    elif isinstance(generator, np.random.Generator):
+        generator.bit_generator.state = type(generator.bit_generator)(seed).state
+    else:
+        generator.seed(seed)
 
 
 # ---------------------------------------------------------------- the check

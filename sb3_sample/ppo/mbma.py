@@ -1,6 +1,7 @@
 """MBMA: extra actions at the real states, their Q-values from rollouts of a learned model."""
 
 import torch
+from gymnasium import spaces
 
 from sb3_sample.constructor import argument
 from sb3_sample.ppo.model_based import ModelBasedPPO
@@ -27,6 +28,8 @@ class MBMAPPO(ModelBasedPPO):
         self, observations: torch.Tensor, values: torch.Tensor, n_simulated: int, noise: torch.Tensor | None
     ) -> SimulatedSamples:
         """Noise: (H, N, X, A), the first entry for the extra actions, the others for the actions in the rollouts."""
+        if noise is not None and not isinstance(self.action_space, spaces.Box):
+            raise ValueError("noise is that of Gaussian actions, which a Discrete space has not: leave it out")
         actions, log_probs, weights = self._many_actions(observations, n_simulated, None if noise is None else noise[0])
         n_columns = actions.shape[1]
         flat_actions = actions.flatten(0, 1)

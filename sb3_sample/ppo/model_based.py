@@ -152,7 +152,8 @@ class ModelBasedPPO(SimulatedPPO):
         sizes = self.flat_observations.size, self.model_actions.size
         #: The model. For ``simulate`` any object with its ``predict`` can replace it, elsewhere only a subclass.
         self.dynamics = Dynamics(*sizes, **network, terminations=self.predict_termination).to(self.device)
-        #: The model's training transitions, as the environments gave them, not normalised by ``VecNormalize``.
+        #: The model's training transitions, as the environments gave them, not normalised by ``VecNormalize``; but the
+        #: last observation of an episode comes from it, within its ``clip_obs``, as in Stable-Baselines3's replay.
         self.transitions = TransitionBuffer(self.dynamics_buffer_size, *sizes)
         # Number of transitions in the buffer that the model has not been trained on.
         self._n_new = 0

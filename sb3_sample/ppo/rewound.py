@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_sample.constructor import Given, argument
 from sb3_sample.envs.rewinding import rewound_returns, sibling_of
-from sb3_sample.envs.states import EnvState, check_restorable, save_state
+from sb3_sample.envs.states import EnvState, check_restorable, check_step, save_state
 from sb3_sample.kinds import Kind, integer
 from sb3_sample.ppo.samples import SimulatedSamples
 from sb3_sample.ppo.simulated_ppo import ExtraSamplesPPO
@@ -31,6 +31,8 @@ from sb3_sample.saving.kept import Kept
 
 #: Vectorised wrappers that leave observations, rewards and actions unchanged.
 _TRANSPARENT = (VecCheckNan, VecMonitor)
+#: Steps of a rollout that are repeated in a copy, to compare what comes of them.
+REPEATED = 32
 
 
 class RewoundPPO(ExtraSamplesPPO):
@@ -266,7 +268,9 @@ class RewoundPPO(ExtraSamplesPPO):
 
 class _Saver(BaseCallback):
     """
-    Wraps the user's callback during a rollout and saves the states in which actions are taken.
+    Wraps the user's callback during a rollout, saves the states in which actions are taken, and repeats some of the
+    steps in a copy: a state that changes late in an episode, or that a copy shares with its original, is not seen by
+    the check at the start.
 
     :param agent: the agent that collects the rollout
     :param callback: the user's callback
@@ -276,7 +280,11 @@ class _Saver(BaseCallback):
     def __init__(self, agent: RewoundPPO, callback: BaseCallback, n_steps: int):
         super().__init__()
         self.agent, self.callback, self.n_steps = agent, callback, n_steps
-        self.envs = agent._venv(agent.env).envs
+        self.venv = agent._venv(agent.env)
+        self.envs = self.venv.envs
+        self.every = max(1, n_steps // REPEATED)
+        # Other ones in each rollout.
+        self.first = agent.num_timesteps // (n_steps * len(self.envs)) % self.every
 
     def on_rollout_start(self) -> None:
         self.callback.on_rollout_start()
@@ -289,6 +297,9 @@ class _Saver(BaseCallback):
         self.callback.update_locals(locals_)
 
     def on_step(self) -> bool:
+        step = len(self.agent._states) - 1
+        if step % self.every == self.first:
+            self._repeat(step // self.every % len(self.envs))
         # The callback first, since it may change the environment in which the next action is taken.
         goes_on = self.callback.on_step()
         if goes_on and len(self.agent._states) < self.n_steps:
@@ -297,6 +308,28 @@ class _Saver(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
+
+    def _repeat(self, index: int) -> None:
+        """
+        Repeat the last step of an environment in a copy.
+
+        :raises ValueError: if something else comes of it
+        """
+        ended, info = bool(self.venv.buf_dones[index]), self.venv.buf_infos[index]
+        held: Any = {key: values[index] for key, values in self.venv.buf_obs.items()}
+        observation = info["terminal_observation"] if ended else held.get(None, held)
+        agent = self.agent
+        try:
+            check_step(
+                agent._siblings[0], agent._states[-1][index], self.venv.actions[index], observation,
+                self.venv.buf_rews[index], ended,
+            )  # fmt: skip
+        except ValueError as error:
+            raise ValueError(
+                f"env must be an environment whose state can be saved and restored, and environment {index} is not: "
+                f"{error}. Keep all that changes in attributes of data, without functions and arrays that refer to "
+                f"others, or pass {agent.plain} for plain PPO"
+            ) from error
 
     def _save(self) -> None:
         self.agent._states.append([save_state(env) for env in self.envs])
@@ -333,8 +366,9 @@ class _Follower:
 
     def values(self, observations: Any) -> np.ndarray:
         with torch.no_grad():
+            # Not every device has float64.
             values: np.ndarray = (
-                self._policy.predict_values(self._tensor(observations)).double().flatten().cpu().numpy()
+                self._policy.predict_values(self._tensor(observations)).flatten().cpu().double().numpy()
             )
         return values
 

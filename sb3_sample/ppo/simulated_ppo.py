@@ -368,8 +368,9 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         noise: torch.Tensor | None = None,
     ) -> SimulatedSamples:
         """
-        Draw extra samples of the current policy and estimate their Q-values. Nothing but the random generators changes;
-        ``train`` calls ``model.simulate(rollout.observations)`` with ``rollout = model.current_rollout()``.
+        Draw extra samples of the current policy and estimate their Q-values. Nothing but the random generators changes,
+        and the number of rewound steps of ``RewoundPPO``; ``train`` calls ``model.simulate(rollout.observations)`` with
+        ``rollout = model.current_rollout()``.
 
         At the real states, actions of a Discrete space are not drawn: all of them are returned, each with the weight X
         pi(a|s), which X draws have in expectation.
@@ -377,12 +378,14 @@ class ExtraSamplesPPO(PolicyUpdate, PPOArguments, SafeFiles, PPO):
         :param observations: real observations, flat, as the policy sees them (normalised by ``VecNormalize``), (N, O)
         :param values: the critic's values of the observations, (N,); computed if None
         :param n_simulated: X, at least 1; the current iteration's if None
-        :param noise: standard Gaussian noise of the simulated actions, in the algorithm's own shape; drawn if None. The
-            same noise reproduces the samples exactly
+        :param noise: random numbers of the simulated actions, in the algorithm's own shape; drawn if None. The same
+            noise reproduces the samples of a learned model exactly; ``RewoundPPO`` takes them for the first actions
         :return: N times X samples
         """
         self._check_simulates()
         n = self.current_n_simulated() if n_simulated is None else n_simulated
+        if n_simulated is None and n == 0:
+            raise ValueError("n_simulated must be passed, as the current iteration has no simulated samples")
         check_value("n_simulated", n, integer(1))
         self.policy.set_training_mode(False)
         with torch.no_grad():

@@ -57,7 +57,7 @@ _LIBRARIES = (
     "sb3_contrib", "sb3_sample", "mujoco", "dm_control", "dm_env", "metaworld", "myosuite",
 )  # fmt: skip
 #: Immutable types that are not plain values; comparing values shows whether they stayed the same.
-_IMMUTABLE = (
+IMMUTABLE = (
     range, slice, re.Pattern, datetime.date, datetime.time, datetime.timedelta, datetime.tzinfo, decimal.Decimal,
     fractions.Fraction, uuid.UUID,
 )  # fmt: skip
@@ -306,7 +306,7 @@ class Describer:
 
     def _glance(self, value: Any) -> Node:
         """A description that can be compared with one made at another time."""
-        if isinstance(value, _IMMUTABLE):
+        if isinstance(value, IMMUTABLE):
             return {"value": value}
         other = Describer(whole=True)
         other._inert = self._inert

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_sample.envs.atari import make_atari_env
+from sb3_sample.envs.atari import is_atari_id, make_atari_env
 from sb3_sample.envs.scores import score_of
 from sb3_sample.kinds import check_value, integer
 
@@ -89,11 +89,21 @@ class AtariEvaluation(BaseCallback):
 
     def __init__(self, env_id: str, every: int = 10_000, n_episodes: int = 100, verbose: int = 0):
         super().__init__(verbose)
+        if not is_atari_id(env_id):
+            raise ValueError(f"env_id must be the id of an Atari game, ALE/<Game>-v5, not {env_id!r}")
         self.env_id = env_id
         self.every: int = check_value("every", every, integer(1))
         self.n_episodes: int = check_value("n_episodes", n_episodes, integer(1))
         #: Decisions at the evaluations so far, and their mean returns.
         self.results: list[tuple[int, float]] = []
+
+    def _init_callback(self) -> None:
+        env = evaluation_env(self.env_id)
+        env.close()
+        for name in ("observation_space", "action_space"):
+            theirs, ours = getattr(env, name), getattr(self.model, name)
+            if theirs != ours:
+                raise ValueError(f"env_id={self.env_id!r} has another {name} than the model: {theirs}, not {ours}")
 
     def _on_step(self) -> bool:
         if self.num_timesteps // self.every == (self.num_timesteps - self.training_env.num_envs) // self.every:

@@ -73,7 +73,8 @@ class Agent:
         :return: the critic's values, (B,)
         """
         with torch.no_grad():
-            return self.policy.predict_values(self._tensor(observations)).double().flatten().cpu().numpy()
+            # Not every device has float64.
+            return self.policy.predict_values(self._tensor(observations)).flatten().cpu().double().numpy()
 
     def to_env(self, actions: np.ndarray) -> np.ndarray:
         """

@@ -123,7 +123,7 @@ class Scores:
 def check_policy(policy: Any) -> None:
     """
     :param policy: anything
-    :raises TypeError: it is not a policy of ``PPO`` or ``A2C``
+    :raises TypeError: it is not a policy of ``PPO`` or ``A2C``, or depends on more than the observation
     :raises ValueError: actions depend on something other than linear layers, each used once, and a Gaussian's
         ``log_std``; or the policy uses generalised state-dependent exploration
     """
@@ -136,8 +136,13 @@ def check_policy(policy: Any) -> None:
         raise ValueError(f"policy must take observations that are one array, not {space}")
     assert space.shape is not None
     observations: Any = policy.obs_to_tensor(np.zeros((2, *space.shape), space.dtype))[0]
-    with torch.no_grad():
-        actions = policy.get_distribution(observations).mode()
+    try:
+        with torch.no_grad():
+            actions = policy.get_distribution(observations).mode()
+    except TypeError as error:
+        raise TypeError(
+            f"policy must depend on the observation alone, and {type(policy).__name__} does not ({error})"
+        ) from error
     counted = sum(
         (0 if inputs is None else inputs.shape[-1] * outputs.shape[-1])
         + (outputs.shape[-1] if inputs is None or has_bias else 0)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -231,6 +232,15 @@ def test_simulating_with_nothing_to_simulate_with() -> None:
     model = tiny()
     with pytest.raises(ValueError, match="n_simulated must be an integer of at least 1, not 0"):
         model.simulate(None, n_simulated=0)
+    with pytest.raises(ValueError, match="n_simulated must be passed, as the current iteration has no simulated"):
+        tiny(warm_up_until=0.5).simulate(None)
+
+
+def test_actions_of_a_discrete_space_take_no_noise() -> None:
+    model = tiny(MBMAPPO, vec(action_space=spaces.Discrete(2)), warm_up_until=0).learn(16)
+    rollout = model.current_rollout()
+    with pytest.raises(ValueError, match="noise is that of Gaussian actions, which a Discrete space has not"):
+        model.simulate(rollout.observations, noise=torch.zeros(3, 16, 2, 1))
 
 
 @pytest.mark.parametrize("cls", ALGORITHMS)

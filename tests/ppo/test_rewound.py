@@ -1,6 +1,10 @@
 """Actions from the rewound environment: exact gradients, the environment's own stream, and what cannot be rewound."""
 
+import dataclasses
+import datetime
+import enum
 import functools
+import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -624,3 +628,174 @@ def test_it_is_exported_as_the_others(tmp_path: Path) -> None:
     from tests.test_export import check, shake
 
     check(shake(rewound(n_actions=2)), tmp_path)
+
+
+# ---------------------------------------------------------------- what the check at the start does not see
+
+
+class Phase(enum.Enum):
+    DAY = 0
+    NIGHT = 1
+
+
+@dataclasses.dataclass(slots=True)
+class Cell:
+    number: int
+
+
+class Changing(gym.Env):
+    """Pays 1 after step 50 of an episode, by an attribute of some kind; the actions change nothing."""
+
+    def __init__(self, kind: str = "int"):
+        self.observation_space, self.action_space = spaces.Box(-1, 1, (1,), np.float32), spaces.Discrete(2)
+        self.kind = kind
+
+    def _of(self, number: int) -> Any:
+        return {
+            "int": number, "enum": Phase(number), "frozenset": frozenset([number]), "list": [Phase(number)],
+            "slots": Cell(number), "date": datetime.date(2000, 1, 1 + number),
+        }[self.kind]  # fmt: skip
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.t, self.phase = 0, self._of(0)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.t += 1
+        if self.t == 50:
+            self.phase = self._of(1)
+        return np.zeros(1, np.float32), float(self.phase == self._of(1)), False, self.t >= 100, {}
+
+
+def rewards_and_further(make: Callable[[], gym.Env], n_steps: int = 100, n_actions: int = 2) -> tuple[Any, Any]:
+    """Rewards of a rollout, and those of the further actions at its states, (n_steps, n_actions - 1)."""
+    model = RewoundPPO(
+        "MlpPolicy", DummyVecEnv([make]), n_actions=n_actions, horizon=1, gamma=0.0, n_steps=n_steps,
+        batch_size=n_steps, n_epochs=1, policy_kwargs={"net_arch": [4]}, seed=0, device="cpu", copies=2,
+        sample_actions="draw",
+    ).learn(n_steps)  # fmt: skip
+    rollout = model.current_rollout()
+    found = model.simulate(rollout.observations, rollout.values, n_actions - 1).q_values
+    return model.rollout_buffer.rewards.flatten(), found.numpy()
+
+
+@pytest.mark.parametrize("kind", ["int", "enum", "frozenset", "list", "slots", "date"])
+def test_attributes_of_every_kind_go_back(kind: str) -> None:
+    real, further = rewards_and_further(lambda: Changing(kind))
+    assert real.sum() == 51 and np.array_equal(real, further[:, 0])
+
+
+class Late(Changing):
+    """Gets its attribute in the midst of an episode."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        vars(self).pop("bonus", None)
+        return super().reset(seed=seed)
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        observation, _, *rest = super().step(action)
+        if self.t == 50:
+            self.bonus = 1.0
+        return observation, getattr(self, "bonus", 0.0), *rest  # type: ignore[return-value]
+
+
+def test_attributes_that_came_later_are_gone() -> None:
+    env = Late()
+    env.reset()
+    state = save_state(env)
+    assert sum(env.step(0)[1] for _ in range(60)) == 11
+    restore_state(env, state)
+    assert env.step(0)[1] == 0.0
+
+
+class Closure(Changing):
+    """Its reward is of a function that refers to the environment it was made by, in a copy too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.t = 0
+        self.paid = lambda: float(self.t)
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        observation, _, *rest = super().step(action)
+        return observation, self.paid(), *rest  # type: ignore[return-value]
+
+
+class Views(Changing):
+    """Observes an array that is a part of another one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.whole = np.zeros(4, np.float32)
+        self.part = self.whole[:1]
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.whole[:] = (self.whole + 0.01) % 1
+        return self.part.copy(), *super().step(action)[1:]  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize(("make", "words"), [(Closure, "another reward"), (Views, "another observation")])
+def test_copies_that_are_wrong_alike_are_seen_in_the_first_rollout(make: Any, words: str) -> None:
+    with pytest.raises(ValueError, match=rf"environment 0 is not: after its state was restored.*{words}.*plain PPO"):
+        rewards_and_further(make)
+
+
+class Wind:
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+
+    def normal(self) -> float:
+        return float(self.rng.normal())
+
+
+class Windy(Changing):
+    """Pays noise of a generator that is kept in some place."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        if seed is not None or not hasattr(self, "wind"):
+            self.wind: Any = {
+                "attribute": lambda: np.random.default_rng(seed),
+                "nested": lambda: Wind(seed or 0),
+                "in a dict": lambda: {"a": [np.random.RandomState(seed)]},
+                "legacy": lambda: np.random.RandomState(seed),
+                "python": lambda: random.Random(seed),
+            }[self.noise]()
+        return super().reset(seed=seed)
+
+    def __init__(self, noise: str) -> None:
+        super().__init__()
+        self.noise = noise
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        observation, _, *rest = super().step(action)
+        wind = self.wind["a"][0] if self.noise == "in a dict" else self.wind
+        drawn = wind.gauss(0, 1) if self.noise == "python" else wind.normal()
+        return observation, float(drawn), *rest  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("noise", ["attribute", "nested", "in a dict", "legacy", "python"])
+def test_generators_draw_anew_wherever_they_are(noise: str) -> None:
+    real, further = rewards_and_further(lambda: Windy(noise), n_steps=20, n_actions=3)
+    assert len({*real, *further.flatten()}) == 60
+    # Without a generator to seed them by they go on as they would have.
+    env = Windy(noise)
+    env.reset(seed=3)
+    state = save_state(env)
+    first = [env.step(0)[1] for _ in range(3)]
+    restore_state(env, state)
+    assert [env.step(0)[1] for _ in range(3)] == first
+    # By the same one they draw the same.
+    drawn = []
+    for _ in range(2):
+        restore_state(env, state, np.random.default_rng(5))
+        drawn.append([env.step(0)[1] for _ in range(3)])
+    assert drawn[0] == drawn[1] != first
+
+
+def test_a_generator_of_two_attributes_stays_one() -> None:
+    env = Windy("attribute")
+    env.reset(seed=3)
+    env.alias = {"of": env.wind}
+    restore_state(env, save_state(env), np.random.default_rng(0))
+    assert env.alias["of"] is env.wind

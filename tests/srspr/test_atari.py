@@ -242,6 +242,11 @@ def test_evaluations_while_training(monkeypatch: pytest.MonkeyPatch) -> None:
     for wrong in ({"every": 0}, {"n_episodes": 0}):
         with pytest.raises(ValueError, match=f"{next(iter(wrong))} must be an integer of at least 1, not 0"):
             AtariEvaluation("ALE/Breakout-v5", **wrong)
+    with pytest.raises(ValueError, match="env_id must be the id of an Atari game, ALE/<Game>-v5, not 'Pong-v5'"):
+        AtariEvaluation("Pong-v5")
+    monkeypatch.setattr(Scripted, "action_space", gym.spaces.Discrete(9))
+    with pytest.raises(ValueError, match=r"'ALE/Breakout-v5' has another action_space than the model: Discrete\(9\)"):
+        tiny(venv(1)).learn(1, AtariEvaluation("ALE/Breakout-v5"))
 
 
 def test_games_that_there_are_not() -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from sb3_contrib import RecurrentPPO
 from stable_baselines3 import A2C, PPO, SAC
 
 from sb3_sample.variance.scores import Scores, check_policy
@@ -93,6 +94,9 @@ def test_policies_that_are_refused() -> None:
         check_policy(SAC("MlpPolicy", Spaces(box(4), box(2)), buffer_size=1).policy)
     with pytest.raises(ValueError, match="use_sde must be False"):
         check_policy(model(box(2), use_sde=True).policy)
+    recurrent = RecurrentPPO("MlpLstmPolicy", Spaces(box(4), box(2)), n_steps=8, batch_size=8)
+    with pytest.raises(TypeError, match="policy must depend on the observation alone, and Recurrent.* does not"):
+        check_policy(recurrent.policy)
     image = spaces.Box(0, 255, (3, 36, 36), np.uint8)
     with pytest.raises(ValueError, match=r"policy must be of linear layers.*cnn\.0\.weight"):
         check_policy(A2C("CnnPolicy", Spaces(image, spaces.Discrete(2)), device="cpu").policy)
