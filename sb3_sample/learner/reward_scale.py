@@ -123,7 +123,7 @@ class ReturnScale(RewardScale):
 class StdScale(ReturnScale):
     """
     XQC's rule (Palenicek et al. 2026): the divisor is the standard deviation of G plus ``eps``, from population
-    statistics in float64 without start values. Before the first step the rewards are unchanged.
+    statistics in float64 without start values. The rewards are unchanged until two values of G differ.
 
     :param learner: the learner
     :param eps: added to the standard deviation
@@ -133,9 +133,15 @@ class StdScale(ReturnScale):
         super().__init__(learner, 0.0, torch.float64)
         check_value("eps", eps, ABOVE_0)
         self.eps = eps
+        self._varies = False
 
     def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
         return self.moments.var.sqrt() + self.eps
+
+    def transform(self, batch: Batch, noise: torch.Tensor | None) -> Batch:
+        # Read on the host no longer than it takes.
+        self._varies = self._varies or bool(self.moments.var > 0)
+        return super().transform(batch, noise) if self._varies else batch
 
 
 class StdOrMaxScale(ReturnScale):

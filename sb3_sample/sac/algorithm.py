@@ -80,6 +80,12 @@ Self = TypeVar("Self", bound="SAC")
 
 # Batches of at most this many gradient steps are drawn at once, to bound the memory they take.
 MAX_BATCHES_AT_ONCE = 64
+#: Arguments that mean nothing where another one is None or empty.
+_ONLY_WITH = {
+    "learning_rate_schedule": ("final_learning_rate", "schedule_steps", "warm_up_steps", "warm_up_learning_rate"),
+    "redo_period": ("redo_threshold",),
+    "resets": ("reset_shrink", "resets_to", "resets_keep"),
+}
 
 
 class GradientStepBar(ProgressBarCallback):
@@ -305,13 +311,26 @@ class SAC(  # type: ignore[misc]  # actor
             implied |= {"_prior_of": None, "prior_share": default_of(cls, "prior_share")}
         if kwargs.get("backbone") == "td3":
             # That a file's networks are others is said of the backbone, not of entropies.
-            implied |= {name: default_of(cls, name) for name in ("ent_coef", "target_entropy")}
+            implied |= {"ent_coef": "auto", "target_entropy": default_of(cls, "target_entropy")}
+        for name, others in _ONLY_WITH.items():
+            if name in kwargs and not kwargs[name] and kwargs.get("reset_gradient_steps") is None:
+                # The file's arguments of what is left out mean nothing.
+                implied |= {other: default_of(cls, other) for other in others}
         # One way to count resets replaces the file's other one.
         if kwargs.get("reset_gradient_steps") is not None:
             implied["resets"] = ()
         elif "resets" in kwargs:
             implied["reset_gradient_steps"] = None
         return implied
+
+    @classmethod
+    def _completed(cls, content: Any, kwargs: dict[str, Any]) -> dict[str, Any]:
+        kwargs = super()._completed(content, kwargs)
+        if "reward_scale" not in kwargs or kwargs["reward_scale"] == _in_file(content, "reward_scale"):
+            return kwargs
+        # Another rule has other statistics.
+        content.start_anew("reward_scaler")
+        return {"reward_scale_kwargs": default_of(cls, "reward_scale_kwargs"), **kwargs}
 
     @classmethod
     def _made(cls, content: Any, attributes: dict[str, Any], kwargs: dict[str, Any], *args: Any) -> Any:
@@ -757,11 +776,15 @@ class SAC(  # type: ignore[misc]  # actor
         return metrics
 
 
+def _in_file(content: Any, name: str) -> Any:
+    """An argument's value in a model's file; None if it has none that can be read."""
+    with contextlib.suppress(BadFile):
+        return content.attributes(content.tree["attributes"].keys() - {name}, {}).get(name)
+    return None
+
+
 def _return_range_of(content: Any) -> float | None:
     """The ``return_range`` of a model's file, from which its scale of rewards follows; None if there is none."""
-    others = content.tree["attributes"].keys() - {"reward_scale_kwargs"}
-    with contextlib.suppress(BadFile):
-        kwargs = content.attributes(others, {}).get("reward_scale_kwargs")
-        found = kwargs.get("return_range") if isinstance(kwargs, dict) else None
-        return found if ABOVE_0.fits(found) else None
-    return None
+    kwargs = _in_file(content, "reward_scale_kwargs")
+    found = kwargs.get("return_range") if isinstance(kwargs, dict) else None
+    return found if ABOVE_0.fits(found) else None

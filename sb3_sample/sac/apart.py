@@ -47,6 +47,9 @@ class Apart:
         self._lock = threading.Lock()
         self._handed_over_at = -1
         self._pairs = self._all_pairs()
+        norms = [each.networks.observation_norm for each in (self._learner, model.learner)]
+        # Running statistics of the observations: the acting networks', and the learner's.
+        self._statistics = [list(norm.buffers()) for norm in norms if norm is not None]
         self.hand_over()
         #: Gradient steps that are due.
         self.n_due = 0
@@ -126,6 +129,11 @@ class Apart:
         """
         self._n_stored += len(step.dones)
         self.n_due += n_due
+        if self._statistics:
+            # They follow the observations, not the gradient steps, of which there are none in the warm-up.
+            ours, theirs = self._statistics
+            with self._lock, torch.no_grad():
+                torch._foreach_copy_(ours, theirs)
         self._recent.append((step.begun, n_due))
         while self._recent[0][0] <= step.begun - LAPSE:
             self._recent.popleft()

@@ -74,11 +74,17 @@ class TaskEmbedding(BaseFeaturesExtractor):
 
     :param observation_space: a Dict of "observation", a Box, and "task", a Discrete
     :param size: size of an embedding
+    :raises ValueError: if the observations are images
     """
 
     def __init__(self, observation_space: spaces.Dict, size: int = 32):
         task = observation_space["task"]
         assert isinstance(task, spaces.Discrete)
+        if is_image_space(observation_space["observation"]):
+            raise ValueError(
+                f"embeddings of tasks stand beside vectors, not beside images of {observation_space['observation']}: "
+                "pass multitask=True, for the one-hot vector of the task beside convolutions"
+            )
         super().__init__(observation_space, get_flattened_obs_dim(observation_space["observation"]) + size)
         #: A row for each task; its length is learned as well, without effect on the embedding.
         self.table = nn.Parameter(torch.randn(int(task.n), size) / size**0.5)

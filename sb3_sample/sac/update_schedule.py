@@ -27,8 +27,10 @@ class UpdateSchedule(DecidesCompiling, UpdatesOwed):
             # Optimizers count their steps over the model's life.
             coming = round(self._updates_in(n_steps))
             self.planned_updates = self._n_updates + coming if coming else None
-            # With a replay ratio of 0, or less than one step in all, a later call that takes some plans them.
-            if self.planned_updates is None and n_steps > 0 and self.replay_ratio is None:
+            # With a replay ratio of 0, or less than one step in all, a later call that takes some plans them. So does
+            # ``train`` itself where ``learn`` is to take none.
+            is_unknown = self.replay_ratio is None and self.gradient_steps != 0
+            if self.planned_updates is None and n_steps > 0 and is_unknown:
                 raise ValueError(
                     f"schedule_steps must be given, as learning_rate_schedule={self.learning_rate_schedule!r} needs to "
                     "know how many gradient steps are planned, and the arguments do not say it"

@@ -156,6 +156,7 @@ class Content:
         #: Attributes that the file was written without, and that the caller has not given, with the reason.
         self.left_out: dict[str, str] = {}
         self._parameters: dict[str, Any] | None = None
+        self._anew: set[str] = set()
 
     def _check_class(self, ours: list[str]) -> None:
         """Check the class; if a program has moved its own class, the nearest class of this package above it counts."""
@@ -291,7 +292,10 @@ class Content:
         """
         if self._parameters is None:
             try:
-                self._parameters = {name: self._state(model, name) for name in self.tree["parameters"]}
+                names = self.tree["parameters"].keys() - self._anew
+                self._parameters = {name: self._state(model, name) for name in self.tree["parameters"] if name in names}
+                for name in self._anew.intersection(model._get_torch_save_params()[0]):
+                    self._parameters[name] = recursive_getattr(model, name).state_dict()
                 for name, tree in self.tree["metadata"].items():
                     if isinstance(state := self._parameters.get(name), OrderedDict) and not is_left_out(tree):
                         metadata = vars(state)["_metadata"] = self._decoded(tree, name)
@@ -299,6 +303,14 @@ class Content:
             except NotTrusted as error:
                 raise BadFile(f"{self.name}: {error}: trusted_modules=[...] takes it") from error
         return self._parameters
+
+    def start_anew(self, name: str) -> None:
+        """
+        Take parameters that the caller replaces from the new model, whether the file has them or not.
+
+        :param name: name of the parameters
+        """
+        self._anew.add(name)
 
     def _state(self, model: BaseAlgorithm, name: str) -> Any:
         tree = self.tree["parameters"][name]

@@ -45,6 +45,16 @@ def test_xqc_by_hand() -> None:
     assert scale.divisor(None).item() == pytest.approx(np.std(RETURNS) + 1e-8, rel=1e-12)
 
 
+def test_xqc_leaves_rewards_as_they_are_until_two_returns_differ() -> None:
+    """After one step of one environment the standard deviation is 0, and the reward would be multiplied by 1e8."""
+    o = torch.zeros(2, 1)
+    batch = Batch(o, o, o, o, torch.tensor([[3.0], [-1.0]]), 0.9, {})
+    for rewards, divisor in (([], 1.0), ([3.0], 1.0), ([0.0, 0.0], 1.0), ([3.0, 1.0], np.std([3.0, 3.7]))):
+        scale, _ = told("xqc", rewards, [0] * len(rewards))
+        found = scale.transform(batch, None).rewards.flatten()
+        assert found.tolist() == pytest.approx([3 / divisor, -1 / divisor], rel=1e-6)
+
+
 def test_simbav2_by_hand() -> None:
     scale, _ = told("simbav2", REWARDS, ENDS, max_return=100.0)
     mean, var, count = 0.0, 1.0, 1e-4
@@ -158,6 +168,28 @@ def test_trains_saves_and_goes_on(rule: str, tmp_path: Path) -> None:
     assert loaded.reward_scaler.divisor(None) == model.reward_scaler.divisor(None)
     # With another number of environments the returns so far begin anew.
     SAC.load(tmp_path / "model", env=vec(3)).learn(12)
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [("xqc", None), (None, "xqc"), ("xqc", "simbav2"), ("simbav2", "xqc"), ("simbav2", "brc"), ("xqc", "flashsac")],
+)
+def test_another_rule_at_loading_starts_anew(before: str | None, after: str | None, tmp_path: Path) -> None:
+    kwargs = {"max_return": 3.0} if before == "simbav2" else None
+    model = sac(reward_scale=before, reward_scale_kwargs=kwargs).learn(30)
+    model.save(tmp_path / "model")
+    loaded = SAC.load(tmp_path / "model", env=vec(), reward_scale=after)
+    fresh = sac(reward_scale=after)
+    assert loaded.reward_scale == after and loaded.reward_scale_kwargs is None
+    ours, theirs = loaded.policy.state_dict(), model.policy.state_dict()
+    assert ours.keys() == theirs.keys() and all(torch.equal(ours[name], theirs[name]) for name in ours)
+    if after is not None:
+        ours, theirs = loaded.reward_scaler.state_dict(), fresh.reward_scaler.state_dict()
+        assert ours.keys() == theirs.keys() and str(ours) == str(theirs)
+    assert loaded.learn(20).num_timesteps == 20
+    # The file's own rule keeps its statistics.
+    again = SAC.load(tmp_path / "model", env=vec(), reward_scale=before)
+    assert not differing(state(model), state(again)) and again.reward_scale_kwargs == kwargs
 
 
 @pytest.mark.parametrize("rule", sampled(RULES, ("linear", "simbav2")))

@@ -101,6 +101,9 @@ def test_stable_baselines3s_arguments() -> None:
     model = sac(learning_rate_schedule="linear", train_freq=(1, "episode"), gradient_steps=5)
     with pytest.raises(ValueError, match="schedule_steps must be given"):
         model.learn(40)
+    # Collected first, to be learned from later.
+    model = sac(learning_rate_schedule="linear", train_freq=1, gradient_steps=0).learn(40)
+    assert model.num_timesteps == 40 and model._n_updates == 0 and model.planned_updates is None
 
 
 def test_the_zoos_numbers_are_numbers(tmp_path: Path) -> None:

@@ -525,6 +525,22 @@ def test_running_statistics_of_an_explorer_are_handed_over(clock: Made) -> None:
     assert ours.keys() == theirs.keys() and all(torch.equal(ours[name], theirs[name]) for name in theirs)
 
 
+def test_running_statistics_of_observations_are_those_of_the_steps_taken_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the warm-up too, which has no gradient steps after which parameters would be handed over."""
+    found = []
+    note = Apart.note
+
+    def noted(self: Apart, *args: Any) -> None:
+        note(self, *args)
+        ours, theirs = (each.networks.observation_norm for each in (self._learner, self._model.learner))
+        found.append((float(ours.count), float(theirs.count), torch.equal(ours.mean, theirs.mean)))
+
+    monkeypatch.setattr(Apart, "note", noted)
+    MAKERS["SimBa"](learning_starts=40, replay_ratio=0.1).learn(30, asynchronous=True, control_frequency=100)
+    assert len(found) == 30 and all(ours == theirs and same for ours, theirs, same in found)
+    assert found[-1][0] > found[0][0] > 0
+
+
 class Embedding(BaseFeaturesExtractor):
     def __init__(self, observation_space: Any):
         super().__init__(observation_space, 4)

@@ -151,6 +151,16 @@ def test_one_task_has_no_embedding() -> None:
     assert not isinstance(model.critic.features_extractor, TaskEmbedding)
 
 
+def test_embeddings_do_not_stand_beside_images() -> None:
+    space = spaces.Dict({"observation": spaces.Box(0, 255, (3, 36, 36), np.uint8), "task": spaces.Discrete(2)})
+    env = DummyVecEnv([lambda: Toy(space)])
+    with pytest.raises(
+        ValueError, match="embeddings of tasks stand beside vectors, not beside images .*multitask=True"
+    ):
+        brc(env)
+    MAKERS["BRC"](env, policy="MultiInputPolicy", multitask=True)
+
+
 @pytest.mark.parametrize(
     ("kwargs", "words"),
     [

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from torch import nn
 
-from sb3_sample import BRO, CompactReplayBuffer
+from sb3_sample import BRO, CompactReplayBuffer, SimBa
 from sb3_sample.sac import SAC, BROFast
 from sb3_sample.sac.policies import SACPolicy
 from sb3_sample.saving import container
@@ -93,6 +93,35 @@ def test_another_actor_than_the_files_is_what_is_refused(kwargs: dict[str, Any],
     sac(**kwargs).save(tmp_path / "model")
     with pytest.raises(ValueError, match="^backbone: with these arguments the model has other networks"):
         SAC.load(tmp_path / "model", backbone="td3")
+
+
+def test_a_deterministic_actors_file_may_be_told_so(tmp_path: Path) -> None:
+    """With a class whose own default of the entropy's weight such an actor has not."""
+    MAKERS["SimBa"](backbone="td3").save(tmp_path / "model")
+    assert SimBa.load(tmp_path / "model", backbone="td3").backbone == "td3"
+
+
+@pytest.mark.parametrize(
+    ("made", "given", "left"),
+    [
+        (
+            {"learning_rate_schedule": "cosine", "final_learning_rate": 1e-5, "schedule_steps": 90, "warm_up_steps": 9},
+            {"learning_rate_schedule": None},
+            {"final_learning_rate": 0.0, "schedule_steps": None, "warm_up_steps": 0},
+        ),
+        ({"redo_period": 50, "redo_threshold": 0.1}, {"redo_period": None}, {"redo_threshold": 0.025}),
+        ({"resets": [100], "reset_shrink": 0.5}, {"resets": ()}, {"reset_shrink": 0.0}),
+        ({"resets": [100], "reset_shrink": 0.5}, {"resets": (), "reset_gradient_steps": 50}, {"reset_shrink": 0.5}),
+    ],
+)
+def test_what_goes_with_an_argument_goes_with_it(
+    made: dict[str, Any], given: dict[str, Any], left: dict[str, Any], tmp_path: Path
+) -> None:
+    sac(**made).save(tmp_path / "model")
+    loaded: Any = SAC.load(tmp_path / "model", **given)
+    assert {name: getattr(loaded, name) for name in left} == left
+    loaded.save(tmp_path / "again")
+    SAC.load(tmp_path / "again")
 
 
 @pytest.mark.parametrize("maker", sampled(OFF_POLICY))
