@@ -67,7 +67,7 @@ def check(agent: Any) -> None:
     elif agent.n_quantiles is not None:
         raise ValueError(
             f"n_quantiles={agent.n_quantiles} and value_head={agent.value_head!r} are two value heads: pass "
-            "n_quantiles=None"
+            "value_head=None for quantiles, or n_quantiles=None"
         )
     if agent.reward_scale is None:
         check_unused(agent, ["reward_scale_kwargs"], "reward_scale=None")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import HerReplayBuffer
@@ -129,7 +129,8 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
         (OAC, {"exploration": "actor", "optimism": 1.0}, ("optimism=1.0", "exploration='actor'")),
     ],
     "`target_subset` above the number of critics": [(SAC, {"target_subset": 3}, ("target_subset", "n_critics", "3"))],
-    "a rule of pessimism, or OAC, with one critic or one target": [
+    "a rule of pessimism, a number other than 0 and the class's default, or OAC, with one critic or one target": [
+        (SimBa, {"pessimism": 0.5, "policy_kwargs": TINY_RESIDUAL}, ("pessimism=0.5", "n_critics=1")),
         (SAC, {"pessimism": "gpl", "policy_kwargs": {"n_critics": 1}}, ("pessimism='gpl'", "n_critics=1")),
         (OAC, {"policy_kwargs": {"n_critics": 1}}, ("exploration='oac'", "n_critics=1")),
         (SAC, {"pessimism": "gpl", "target_subset": 1}, ("pessimism='gpl'", "target_subset=1")),
@@ -153,8 +154,8 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
         ),
         (FlashSAC, {"redo_period": 5, "policy_kwargs": TINY_FLASH}, ("redo_period=5", "no neuron of FlashNet can be")),
     ],
-    '`target_update_interval`, and without `backbone="td3"`, whose actor has a target, `tau`, with '
-    '`critic_network="crossq"`, as in `CrossQ` without `weight_norm`': [
+    '`target_update_interval` with `critic_network="crossq"`, as in `CrossQ` without `weight_norm`; `tau` too, unless '
+    '`backbone="td3"`, whose actor has a target': [
         (CrossQ, {"tau": 0.9}, ("tau=0.9", "without target networks")),
         (CrossQ, {"target_update_interval": 7}, ("target_update_interval=7", "without target networks")),
         (CrossQ, {"target_update_interval": 7, "backbone": "td3"}, ("target_update_interval=7", "without target")),
@@ -195,8 +196,18 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
         (SAC, {"train_freq": (1, "episode"), "env": vec(2)}, ("train_freq=(1, 'episode')", "one environment")),
     ],
     "`use_sde=True`": [(SAC, {"use_sde": True}, ("use_sde=True",))],
-    "`prior_data` with `n_steps` above 1, `PrioritizedReplayBuffer` or `DebiasedRQ`": [
+    "`n_steps` above 1 with a buffer that makes no returns of several steps: `FadedReplayBuffer`, "
+    "`PrioritizedReplayBuffer`, one's own": [
+        (SAC, {"n_steps": 3, "replay_buffer_class": cls}, ("n_steps=3", f"replay_buffer_class={cls.__name__}"))
+        for cls in (FadedReplayBuffer, PrioritizedReplayBuffer, type("Mine", (ReplayBuffer,), {}))
+    ],
+    "`prior_data` with `n_steps` above 1, `NStepReplayBuffer`, `PrioritizedReplayBuffer` or `DebiasedRQ`": [
         (SAC, {"prior_data": PRIOR, "n_steps": 3}, ("prior_data", "n_steps=3")),
+        (
+            SAC,
+            {"prior_data": PRIOR, "replay_buffer_class": NStepReplayBuffer, "replay_buffer_kwargs": {"n_steps": 3}},
+            ("prior_data", "replay_buffer_class=NStepReplayBuffer"),
+        ),
         (
             SAC,
             {"prior_data": PRIOR, "replay_buffer_class": PrioritizedReplayBuffer},
