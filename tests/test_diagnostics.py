@@ -775,3 +775,14 @@ def test_models_that_do_not_fit() -> None:
         ready(sac(gamma=1.0), Toy())
     with pytest.raises(ValueError, match="init_callback"):
         DiagnosticsCallback(Toy()).measure()
+
+
+def test_held_out_actions_of_integers_are_whole() -> None:
+    """The buffer holds actions scaled to [-1, 1], which integers would cut to 0."""
+    space = spaces.Box(0, 10, (2,), np.int64)
+    model = sac(vec(action_space=space)).learn(30)
+    callback = DiagnosticsCallback(vec(action_space=space), n_start_states=2, rollout_length=20, seed=1, verbose=0)
+    callback.init_callback(model)
+    callback.measure()
+    held = callback._store.actions[: callback._store.size()]
+    assert held.dtype == np.float32 and len(np.unique(held)) > 2

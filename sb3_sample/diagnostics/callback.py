@@ -12,7 +12,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import GymEnv, TrainFreq, TrainFrequencyUnit
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_sample.diagnostics.measures import (
     Rollout,
@@ -24,10 +24,12 @@ from sb3_sample.diagnostics.measures import (
 )
 from sb3_sample.diagnostics.periodic import PeriodicMeasurement
 from sb3_sample.diagnostics.reading import batch_at, newest_overfitting, noise, targets, training_places, untouched
+from sb3_sample.envs.identities import identities
 from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.pessimism import epistemic_std
 from sb3_sample.learner.target import values
 from sb3_sample.networks import neuron_scores
+from sb3_sample.replay.buffers import store_float_actions
 from sb3_sample.sac import SAC
 from sb3_sample.saving.rings import Ring
 
@@ -156,12 +158,13 @@ class DiagnosticsCallback(PeriodicMeasurement):
             self._env.seed(int(self._rng.integers(2**31)))
         store: Any = DictReplayBuffer if isinstance(model.observation_space, spaces.Dict) else ReplayBuffer
         self._store = store(self.validation_size, model.observation_space, model.action_space, device=model.device)
+        store_float_actions(self._store)
 
     def _checked_env(self) -> VecEnv:
         """The environment of the rollouts, vectorised and below its normalisation."""
         if self.eval_env is None:
             raise ValueError("eval_env must be an environment, not None: only sb3-sample train and studies make one")
-        if _environments(self.eval_env) & _environments(self.training_env):
+        if identities(self.eval_env) & identities(self.training_env):
             raise ValueError("eval_env is the training environment: its rollouts need an environment of their own")
         env = self.model._wrap_env(self.eval_env, monitor_wrapper=False)
         normalize = unwrap_vec_normalize(env)
@@ -379,10 +382,3 @@ class DiagnosticsCallback(PeriodicMeasurement):
         if len(places) == 0:
             return None
         return batch_at(self.model, buffer, self._rng.choice(places, min(self.batch_size, len(places)), replace=False))
-
-
-def _environments(env: GymEnv) -> set[int]:
-    """Identities of the environments in an environment, below all wrappers that can be unwrapped."""
-    innermost = env.unwrapped
-    inside = [e.unwrapped for e in innermost.envs] if isinstance(innermost, DummyVecEnv) else []
-    return {id(e) for e in [innermost, *inside]}

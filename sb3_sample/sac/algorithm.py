@@ -10,7 +10,7 @@ import copy
 import pathlib
 import time
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -151,6 +151,9 @@ class SAC(  # type: ignore[misc]  # actor
         if given["policy"] == "MlpPolicy" and is_multi_task(getattr(given["env"], "observation_space", None)):
             # "MlpPolicy" is accepted, since the observation is only a vector and the number of a task.
             given["policy"] = "MultiInputPolicy"
+        if isinstance(kwargs := given["policy_kwargs"], dict) and kwargs.get("use_sde") is False:
+            # Stable-Baselines3's SAC writes it into the dict that it is given, which a script may pass to both.
+            given["policy_kwargs"] = {name: value for name, value in kwargs.items() if name != "use_sde"}
         if given["train_freq"] is not None or given["gradient_steps"] is not None:
             # Stable-Baselines3's two arguments are in force.
             given["replay_ratio"] = None
@@ -305,8 +308,10 @@ class SAC(  # type: ignore[misc]  # actor
             implied["compiled"] = None
         if "schedule_steps" in kwargs:
             implied["planned_updates"] = kwargs["schedule_steps"]
-        if "train_freq" in kwargs or "gradient_steps" in kwargs:
+        if kwargs.get("train_freq") is not None or kwargs.get("gradient_steps") is not None:
             implied["replay_ratio"] = None
+        elif kwargs.get("replay_ratio") is not None:
+            implied |= {"train_freq": 1, "gradient_steps": 1}
         if "prior_data" in kwargs and kwargs["prior_data"] is None:
             implied |= {"_prior_of": None, "prior_share": default_of(cls, "prior_share")}
         if kwargs.get("backbone") == "td3":
@@ -326,6 +331,8 @@ class SAC(  # type: ignore[misc]  # actor
     @classmethod
     def _completed(cls, content: Any, kwargs: dict[str, Any]) -> dict[str, Any]:
         kwargs = super()._completed(content, kwargs)
+        for name in {"train_freq", "gradient_steps"} & kwargs.keys():
+            kwargs = {**kwargs, name: 1 if kwargs[name] is None else kwargs[name]}
         if "reward_scale" not in kwargs or kwargs["reward_scale"] == _in_file(content, "reward_scale"):
             return kwargs
         # Another rule has other statistics.
@@ -343,6 +350,12 @@ class SAC(  # type: ignore[misc]  # actor
                 others = {name: value for name, value in of_buffer.items() if name not in ("n_steps", "gamma")}
                 attributes["replay_buffer_kwargs"] = others
         prior_of, (_, env, *_) = attributes.get("_prior_of"), args
+        buffer_class = kwargs.get("replay_buffer_class", attributes.get("replay_buffer_class"))
+        if env is None and isinstance(buffer_class, type) and issubclass(buffer_class, HerReplayBuffer):
+            raise ValueError(
+                f"env must be passed with replay_buffer_class={buffer_class.__name__}, which asks it for rewards; for "
+                "prediction alone pass replay_buffer_class=None, replay_buffer_kwargs=None"
+            )
         if prior_of is not None and env is not None and "prior_data" not in kwargs:
             checks.check_prior_of(prior_of)
             raise ValueError(
@@ -472,11 +485,11 @@ class SAC(  # type: ignore[misc]  # actor
             )
         checks.check_sampling(self, buffer)
 
-    def _arguments_in_parameters(self, given: Collection[str]) -> list[torch.Tensor]:
+    def _arguments_in_parameters(self) -> list[torch.Tensor]:
         scale, found = self.learner.reward_scaler, []
-        if "ent_coef" in given and isinstance(self.learner.temperature, FixedScalar):
+        if isinstance(self.learner.temperature, FixedScalar):
             found.append(self.learner.temperature.value)
-        if "reward_scale_kwargs" in given and isinstance(scale, LinearScale) and scale.return_range is None:
+        if isinstance(scale, LinearScale) and scale.return_range is None:
             found.append(scale.factor)
         return found
 

@@ -14,6 +14,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_sample.envs.identities import identities
 from sb3_sample.faults import TrainingDiverged
 from sb3_sample.kinds import check_value, integer
 from sb3_sample.lockstep import Group, Seat
@@ -110,6 +111,13 @@ def train_many(
             # It may hold the state of a stochastic process, which advances with a learner's steps.
             own["action_noise"] = copy.deepcopy(noise)
         model = models[index] = cls(policy, made, seed=seed, **own)
+        others: list[Any] = [other.env for at, other in enumerate(models) if other is not None and at != index]
+        mine: Any = model.env
+        if not isinstance(env, str) and any(identities(mine) & identities(other) for other in others):
+            raise ValueError(
+                "env must make an environment at each call, and gave the same one to two learners, which would step it "
+                "in turns: pass a function that makes a new one"
+            )
         callbacks = None if callback is None else callback(index)
         if eval_env is not None:
             evaluation = _evaluation(eval_env, seed, eval_freq, n_eval_episodes, model.n_envs, folder)

@@ -449,7 +449,8 @@ def _normalized_shape(space: spaces.Space) -> tuple[int, ...]:
             "normalize_observations=False"
         )
     raise ValueError(
-        f"normalize_observations=True needs observations of a Box of floats, not of {space}: use VecNormalize"
+        f"normalize_observations=True needs observations of a Box of floats, not of {space}: pass "
+        "normalize_observations=False, and the environment in a VecNormalize (with a reward_scale, norm_reward=False)"
     )
 
 

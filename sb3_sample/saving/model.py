@@ -2,7 +2,7 @@
 
 import io
 import pathlib
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import torch
@@ -149,8 +149,8 @@ class SafeFiles(BaseAlgorithm):
                 kwargs["policy_class"] = cls._policy_class(kwargs.pop(name))
             if "stats_window_size" in kwargs:
                 kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
-            if "policy_kwargs" in kwargs:
-                kwargs["policy_kwargs"] = kwargs["policy_kwargs"] or {}
+            for name in {"policy_kwargs", "replay_buffer_kwargs"} & kwargs.keys():
+                kwargs[name] = kwargs[name] or {}
             try:
                 with paths.opened(path, "zip") as file:
                     content = Content(file, cls, SafeFiles, trusted)
@@ -250,11 +250,7 @@ class SafeFiles(BaseAlgorithm):
             if kwargs:
                 content.check_shapes(model)
             content.check_parameters(model)
-            kept = [(tensor, tensor.clone()) for tensor in model._arguments_in_parameters(given)]
             model.set_parameters(content.parameters(model), exact_match=True, device=device)
-            with torch.no_grad():
-                for tensor, value in kept:
-                    tensor.copy_(value)
             content.set_own(model, given)
             if model.use_sde:
                 model.policy.reset_noise()  # type: ignore[operator]
@@ -273,10 +269,9 @@ class SafeFiles(BaseAlgorithm):
             raise BadFile(f"{lacks}{content.name}: no {cls.__name__} can be made of what it holds: {why}") from error
         return model
 
-    def _arguments_in_parameters(self, given: Collection[str]) -> list[torch.Tensor]:
+    def _arguments_in_parameters(self) -> list[torch.Tensor]:
         """
-        :param given: names of arguments
-        :return: tensors among the parameters that are nothing but values of these arguments
+        :return: tensors among the parameters that are nothing but values of arguments
         """
         return []
 
@@ -296,7 +291,8 @@ class SafeFiles(BaseAlgorithm):
     ) -> None:
         """
         Load parameters, as in Stable-Baselines3. The optimizers' moments are loaded, but their settings (learning rate,
-        weight decay, ...) stay this model's, so that other settings passed to ``load`` take effect.
+        weight decay, ...) and a fixed temperature stay this model's, so that other settings passed to ``load`` take
+        effect.
 
         :param load_path_or_dict: a file, or parameters as ``get_parameters`` gives them
         :param exact_match: whether parameters for every module must be there, and no others
@@ -324,6 +320,7 @@ class SafeFiles(BaseAlgorithm):
             [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
             for optimizer in optimizers
         ]
+        kept = [(tensor, tensor.clone()) for tensor in self._arguments_in_parameters()]
         try:
             super().set_parameters(parameters, exact_match, device)
         except Exception as error:
@@ -333,6 +330,9 @@ class SafeFiles(BaseAlgorithm):
                 raise
             where = "" if content is None else f"{content.name}: "
             raise ParametersDoNotFit(f"{where}{error}") from error
+        with torch.no_grad():
+            for tensor, value in kept:
+                tensor.copy_(value)
         for optimizer, own_groups in zip(optimizers, settings, strict=True):
             for group, own in zip(optimizer.param_groups, own_groups, strict=True):
                 for key in group.keys() - own.keys() - {"params"}:

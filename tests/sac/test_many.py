@@ -28,7 +28,7 @@ from sb3_sample.learner.group import LearnerGroup
 from sb3_sample.sac import many
 from sb3_sample.saving import training_state
 from sb3_sample.saving.run_folder import RunFolder, common_starts
-from tests.sac.common import TINY_BRO, TINY_DR_Q, TINY_SAC, Toy, sampled, state
+from tests.sac.common import TINY_BRO, TINY_DR_Q, TINY_SAC, Toy, sampled, state, vec
 
 SEEDS = (3, 0, 5)
 STEPS, EVERY = 48, 16
@@ -616,3 +616,9 @@ def test_where_runs_go_on(tmp_path: Path) -> None:
     (x / "checkpoint-000000000090" / "model.zip").write_bytes(b"of other kind")
     with pytest.warns(UserWarning, match=r"model.zip is damaged: .*\. The runs go on from 80 steps instead"):
         assert common_starts([x, y]).steps == 80
+
+
+def test_one_environment_for_two_learners_is_refused() -> None:
+    for env in (Toy(), vec(2)):
+        with pytest.raises(ValueError, match="env must make an environment at each call, and gave the same one to two"):
+            train_many(SAC, "MlpPolicy", lambda env=env: env, seeds=[0, 1], total_timesteps=20, **TINY_SAC)

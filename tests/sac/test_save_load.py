@@ -10,15 +10,18 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from stable_baselines3 import SAC as PlainSAC
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
 from sb3_sample import BRO, CompactReplayBuffer, SimBa
 from sb3_sample.sac import SAC, BROFast
 from sb3_sample.sac.policies import SACPolicy
-from sb3_sample.saving import container
+from sb3_sample.saving import BadFile, container
 from tests.agents import OFF_POLICY, env_of, seen_by
-from tests.sac.common import MAKERS, REPRESENTATIVE, bro, differing, sac, sampled, state, vec
+from tests.sac.common import MAKERS, REPRESENTATIVE, Toy, bro, differing, sac, sampled, state, vec
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(16, 3)).astype(np.float32)
 
@@ -363,3 +366,56 @@ def test_logging_and_prediction_change_nothing() -> None:
     loud.predict(OBSERVATIONS, deterministic=True)
     loud.learn(36, log_interval=1)
     assert not differing(state(quiet), state(loud))
+
+
+@pytest.mark.parametrize("as_file", [True, False])
+def test_a_fixed_temperature_stays_the_models(as_file: bool, tmp_path: Path) -> None:
+    """As in Stable-Baselines3, whose parameters do not include it."""
+    theirs, model = sac(ent_coef=0.2), sac(ent_coef=0.5)
+    theirs.save(tmp_path / "model")
+    model.set_parameters(str(tmp_path / "model") if as_file else theirs.get_parameters())
+    assert model.ent_coef == 0.5 and float(model.ent_coef_tensor) == 0.5
+    assert float(SAC.load(tmp_path / "model").ent_coef_tensor) == pytest.approx(0.2)
+    assert float(SAC.load(tmp_path / "model", ent_coef=0.7).ent_coef_tensor) == pytest.approx(0.7)
+
+
+def test_the_replay_ratio_replaces_stable_baselines3s_arguments(tmp_path: Path) -> None:
+    sac(train_freq=64, gradient_steps=64).save(tmp_path / "model")
+    loaded: Any = SAC.load(tmp_path / "model", env=vec(), replay_ratio=2)
+    assert loaded.train_freq.frequency == 1 and loaded.gradient_steps == 1
+    assert loaded.learn(20).num_timesteps == 20
+    # The constructor's defaults mean the same here.
+    defaults: dict[str, Any] = {"replay_buffer_kwargs": None, "train_freq": None, "gradient_steps": None}
+    again: Any = SAC.load(tmp_path / "model", replay_ratio=2, **defaults)
+    assert again.replay_ratio == 2 and again.train_freq.frequency == 1
+    loaded.save(tmp_path / "other")
+    kept: Any = SAC.load(tmp_path / "other", train_freq=3)
+    assert kept.replay_ratio is None and kept.train_freq.frequency == 3
+
+
+def test_a_dict_of_stable_baselines3s_sac(tmp_path: Path) -> None:
+    """It writes ``use_sde=False`` into the dict that it is given."""
+    kwargs = {"net_arch": [8]}
+    PlainSAC("MlpPolicy", vec(), policy_kwargs=kwargs, buffer_size=1)
+    assert kwargs["use_sde"] is False
+    assert "use_sde" not in sac(policy_kwargs=kwargs).policy_kwargs and "use_sde" in kwargs
+    with pytest.raises(ValueError, match="policy_kwargs has 'use_sde'"):
+        sac(policy_kwargs={"use_sde": True})
+
+
+def test_a_model_with_hindsight_needs_its_environment(tmp_path: Path) -> None:
+    space = spaces.Dict({key: spaces.Box(-10, 10, (3,)) for key in ("observation", "achieved_goal", "desired_goal")})
+    env = DummyVecEnv([lambda: Goals(obs_space=space)])
+    model = sac(env, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer)
+    model.save(tmp_path / "model")
+    with pytest.raises(ValueError, match="^env must be passed with replay_buffer_class=HerReplayBuffer") as error:
+        SAC.load(tmp_path / "model")
+    assert not isinstance(error.value, BadFile)
+    alone = SAC.load(tmp_path / "model", replay_buffer_class=None, replay_buffer_kwargs=None)
+    observation = space.sample()
+    assert np.array_equal(*(each.predict(observation, deterministic=True)[0] for each in (model, alone)))
+
+
+class Goals(Toy):
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, infos: Any) -> np.ndarray:
+        return np.zeros(len(achieved))
