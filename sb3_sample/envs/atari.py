@@ -34,6 +34,15 @@ def is_atari(env: gym.Env) -> bool:
     return type(env.unwrapped).__module__.partition(".")[0] == "ale_py"
 
 
+def repeats_actions(env: gym.Env) -> bool:
+    """
+    :param env: an environment for which :func:`is_atari` holds
+    :return: whether its console repeats the last action at random (sticky actions)
+    """
+    base: Any = env.unwrapped
+    return bool(base.ale.getFloat("repeat_action_probability") > 0)
+
+
 def make_atari_env(env_id: str, training: bool = True, noop_max: int | None = 30, **kwargs: Any) -> gym.Env:
     """
     Make an Atari game whose observations are stacks of frames, for ``SRSPR`` or Stable-Baselines3's ``DQN``.

@@ -16,7 +16,7 @@ import io
 import operator
 import random
 import types
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -24,7 +24,7 @@ import numpy as np
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_sample.envs.atari import is_atari
-from sb3_sample.saving.attributes import IMMUTABLE, attributes_of, is_view_of_foreign_memory
+from sb3_sample.saving.attributes import IMMUTABLE, attributes_of, is_view_of_foreign_memory, keeps_more
 
 #: Attributes of these types cannot change, so that they are kept as they are.
 _CONSTANTS = (type(None), bool, int, float, complex, str, bytes, np.generic, enum.Enum, *IMMUTABLE)
@@ -93,9 +93,11 @@ def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None
 
     :param env: the environment that the state was saved from, or one made in the same way
     :param state: from :func:`save_state`; it is not changed
-    :param rng: if given, the environment's random generators, NumPy's and Python's, are seeded anew from it wherever
-        they are, so that a task that is random after its reset continues at random from the state. The generator of
-        Atari's console, which draws sticky actions, cannot be seeded and is restored
+    :param rng: if given, the environment's random generators, NumPy's and Python's, in attributes and in containers and
+        objects there, are replaced by others with seeds drawn from it, so that a task that is random after its reset
+        continues at random from the state. The generator of Atari's console, which draws sticky actions, cannot be
+        seeded and is restored. The action that a sticky action of the next step would repeat is not: it is the last one
+        taken in ``env``
     :raises ValueError: ``state`` is of an environment with other wrappers, or of another model
     """
     layers, simulator = layers_of(env), simulator_of(env)
@@ -121,13 +123,16 @@ def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None
     if state.console is not None:
         base: Any = env.unwrapped
         base.restore_state(state.console)
-    restored = _copies(layers, state.layers)
+    fresh: dict[int, Any] = {}
     if rng is not None:
-        # Not among the rewards of the episode, which grow with it.
-        values = [value for each in restored for name, value in each.items() if name != REWARDS]
-        for generator in _generators_in(values, set()):
-            _reseed(generator, int(rng.integers(2**63)))
-    for layer, attributes in zip(layers, restored, strict=True):
+        values = [
+            value
+            for layer, each in zip(layers, state.layers, strict=True)
+            for name, value in each.items()
+            if not (isinstance(layer, Monitor) and name == REWARDS)  # numbers, which grow with the episode
+        ]
+        fresh = {id(each): _seeded(each, int(rng.integers(2**63))) for each in _generators_in(values, set())}
+    for layer, attributes in zip(layers, _copies(layers, state.layers, fresh), strict=True):
         for name, value in attributes.items():
             setattr(layer, name, value)
     for layer, names in zip(layers, state.names, strict=bool(state.names)):
@@ -179,7 +184,8 @@ def check_step(env: gym.Env, state: EnvState, action: Any, observation: Any, rew
     :param env: environment to restore the state in
     :param state: the state in which the action was taken
     :param action: the action
-    :param observation: the observation that followed
+    :param observation: the observation that followed; not compared at an end, as the environment may have changed it in
+        the reset that came after
     :param reward: the reward
     :param ended: whether the episode ended
     :raises ValueError: if another observation, reward or end follows
@@ -190,7 +196,7 @@ def check_step(env: gym.Env, state: EnvState, action: Any, observation: Any, rew
     except Exception as error:  # an environment whose state is restored only in part may raise anything
         raise ValueError(f"it fails after its state was restored ({error!r})") from error
     got = {
-        "observation": _equal(_as_given(again, observation), observation),
+        "observation": ended or _equal(_as_given(again, observation), observation),
         "reward": np.float32(its_reward) == np.float32(reward),
         "end of the episode": (terminated or truncated) == ended,
     }
@@ -364,14 +370,19 @@ def state_attributes(layer: Any) -> dict[str, Any]:
     }
 
 
-def _copies(layers: Sequence[Any], attributes: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Deep copies of the layers' attributes; Monitor's rewards of this episode, which are numbers, as a whole."""
+def _copies(
+    layers: Sequence[Any], attributes: list[dict[str, Any]], replaced: Mapping[int, Any] | None = None
+) -> list[dict[str, Any]]:
+    """
+    Deep copies of the layers' attributes; Monitor's rewards of this episode, which are numbers, as a whole. Of objects
+    whose ids are in ``replaced``, the objects there in place of a copy.
+    """
     rewards = [
         each[REWARDS]
         for layer, each in zip(layers, attributes, strict=True)
         if isinstance(layer, Monitor) and REWARDS in each
     ]
-    return copy.deepcopy(attributes, {id(each): list(each) for each in rewards})
+    return copy.deepcopy(attributes, {**{id(each): list(each) for each in rewards}, **(replaced or {})})
 
 
 def _is_state(value: Any, seen: set[int]) -> bool:
@@ -400,7 +411,9 @@ def _is_state(value: Any, seen: set[int]) -> bool:
     if isinstance(value, functools.partial):
         called = isinstance(value.func, types.FunctionType) or _is_state(value.func, seen)
         return called and all(_is_state(item, seen) for item in (*value.args, *value.keywords.values()))
-    if isinstance(value, _NOT_STATE) or not (hasattr(value, "__dict__") or attributes_of(value)):
+    if isinstance(value, _NOT_STATE):
+        return False
+    if not hasattr(value, "__dict__") and (keeps_more(type(value)) or not attributes_of(value)):
         return False
     # Objects of a wrapper, such as the running mean and variance of a normalisation. A simulator's are the layers' and
     # the data's; an environment inside of another attribute is none of the wrappers that this module knows.
@@ -444,15 +457,15 @@ def is_simulator(value: Any) -> bool:
     return not _is_state(value, set()) and not isinstance(value, (*_NOT_STATE, *BOUND))
 
 
-def _reseed(generator: Any, seed: int) -> None:
-    """Seed a generator anew, in place, as several attributes may hold it."""
+def _seeded(generator: Any, seed: int) -> Any:
+    """A generator of the same kind with a seed of its own, for numbers and for the generators that it spawns."""
     if isinstance(generator, np.random.RandomState):
-        fresh = np.random.RandomState(type(generator._bit_generator)(seed))  # type: ignore[attr-defined]
-        generator.set_state(fresh.get_state(legacy=False))
-    elif isinstance(generator, np.random.Generator):
-        generator.bit_generator.state = type(generator.bit_generator)(seed).state
-    else:
-        generator.seed(seed)
+        return np.random.RandomState(type(generator._bit_generator)(seed))  # type: ignore[attr-defined]
+    if isinstance(generator, np.random.Generator):
+        return type(generator)(type(generator.bit_generator)(seed))
+    other = copy.deepcopy(generator)
+    other.seed(seed)
+    return other
 
 
 # ---------------------------------------------------------------- the check

@@ -133,15 +133,13 @@ class StdScale(ReturnScale):
         super().__init__(learner, 0.0, torch.float64)
         check_value("eps", eps, ABOVE_0)
         self.eps = eps
-        self._varies = False
 
     def divisor(self, task: torch.Tensor | None) -> torch.Tensor:
         return self.moments.var.sqrt() + self.eps
 
     def transform(self, batch: Batch, noise: torch.Tensor | None) -> Batch:
-        # Read on the host no longer than it takes.
-        self._varies = self._varies or bool(self.moments.var > 0)
-        return super().transform(batch, noise) if self._varies else batch
+        scaled = super().transform(batch, noise)
+        return scaled._replace(rewards=torch.where(self.moments.var > 0, scaled.rewards, batch.rewards))
 
 
 class StdOrMaxScale(ReturnScale):

@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_sample.constructor import Given, argument
+from sb3_sample.envs.atari import is_atari, repeats_actions
 from sb3_sample.envs.rewinding import rewound_returns, sibling_of
 from sb3_sample.envs.states import EnvState, check_restorable, check_step, save_state
 from sb3_sample.kinds import Kind, integer
@@ -31,7 +32,7 @@ from sb3_sample.saving.kept import Kept
 
 #: Vectorised wrappers that leave observations, rewards and actions unchanged.
 _TRANSPARENT = (VecCheckNan, VecMonitor)
-#: Steps of a rollout that are repeated in a copy, to compare what comes of them.
+#: About how many steps of a rollout are repeated in a copy, to compare what comes of them.
 REPEATED = 32
 
 
@@ -283,8 +284,10 @@ class _Saver(BaseCallback):
         self.venv = agent._venv(agent.env)
         self.envs = self.venv.envs
         self.every = max(1, n_steps // REPEATED)
-        # Other ones in each rollout.
-        self.first = agent.num_timesteps // (n_steps * len(self.envs)) % self.every
+        # Other steps, and of other environments, in each rollout.
+        self.rollout = agent.num_timesteps // (n_steps * len(self.envs))
+        # The states of Atari's console lack the action that a sticky action repeats.
+        self.is_exact = not any(is_atari(env) and repeats_actions(env) for env in self.envs)
 
     def on_rollout_start(self) -> None:
         self.callback.on_rollout_start()
@@ -298,8 +301,8 @@ class _Saver(BaseCallback):
 
     def on_step(self) -> bool:
         step = len(self.agent._states) - 1
-        if step % self.every == self.first:
-            self._repeat(step // self.every % len(self.envs))
+        if self.is_exact and step % self.every == self.rollout % self.every:
+            self._repeat((self.rollout + step // self.every) % len(self.envs))
         # The callback first, since it may change the environment in which the next action is taken.
         goes_on = self.callback.on_step()
         if goes_on and len(self.agent._states) < self.n_steps:
@@ -315,14 +318,12 @@ class _Saver(BaseCallback):
 
         :raises ValueError: if something else comes of it
         """
-        ended, info = bool(self.venv.buf_dones[index]), self.venv.buf_infos[index]
         held: Any = {key: values[index] for key, values in self.venv.buf_obs.items()}
-        observation = info["terminal_observation"] if ended else held.get(None, held)
         agent = self.agent
         try:
             check_step(
-                agent._siblings[0], agent._states[-1][index], self.venv.actions[index], observation,
-                self.venv.buf_rews[index], ended,
+                agent._siblings[0], agent._states[-1][index], self.venv.actions[index], held.get(None, held),
+                self.venv.buf_rews[index], bool(self.venv.buf_dones[index]),
             )  # fmt: skip
         except ValueError as error:
             raise ValueError(

@@ -33,7 +33,7 @@ from sb3_sample.faults import MetricWatch, check_finite_parameters, diverged, no
 from sb3_sample.kinds import ABOVE_0, check_value, instance, integer
 from sb3_sample.learner.batch import SLOTS, Batch, Noise
 from sb3_sample.learner.learner import Learner
-from sb3_sample.learner.reward_scale import LinearScale
+from sb3_sample.learner.reward_scale import REWARD_SCALES, LinearScale
 from sb3_sample.learner.scalars import FixedScalar
 from sb3_sample.replay.buffers import (
     WITH_SPLIT,
@@ -333,7 +333,14 @@ class SAC(  # type: ignore[misc]  # actor
         kwargs = super()._completed(content, kwargs)
         for name in {"train_freq", "gradient_steps"} & kwargs.keys():
             kwargs = {**kwargs, name: 1 if kwargs[name] is None else kwargs[name]}
-        if "reward_scale" not in kwargs or kwargs["reward_scale"] == _in_file(content, "reward_scale"):
+        if "reward_scale" not in kwargs:
+            return kwargs
+        try:
+            theirs = _in_file(content, "reward_scale")
+        except BadFile:
+            # A class that is not trusted to be named by the file, and is passed in its place.
+            return kwargs
+        if _rule(kwargs["reward_scale"]) is _rule(theirs):
             return kwargs
         # Another rule has other statistics.
         content.start_anew("reward_scaler")
@@ -789,15 +796,20 @@ class SAC(  # type: ignore[misc]  # actor
         return metrics
 
 
+def _rule(reward_scale: Any) -> Any:
+    """The class of a rule that scales rewards, which may be given by its name."""
+    return REWARD_SCALES.get(reward_scale, reward_scale) if isinstance(reward_scale, str) else reward_scale
+
+
 def _in_file(content: Any, name: str) -> Any:
-    """An argument's value in a model's file; None if it has none that can be read."""
-    with contextlib.suppress(BadFile):
-        return content.attributes(content.tree["attributes"].keys() - {name}, {}).get(name)
-    return None
+    """An argument's value in a model's file, None if it has none; raises BadFile if it cannot be read."""
+    return content.attributes(content.tree["attributes"].keys() - {name}, {}).get(name)
 
 
 def _return_range_of(content: Any) -> float | None:
     """The ``return_range`` of a model's file, from which its scale of rewards follows; None if there is none."""
-    kwargs = _in_file(content, "reward_scale_kwargs")
-    found = kwargs.get("return_range") if isinstance(kwargs, dict) else None
-    return found if ABOVE_0.fits(found) else None
+    with contextlib.suppress(BadFile):
+        kwargs = _in_file(content, "reward_scale_kwargs")
+        found = kwargs.get("return_range") if isinstance(kwargs, dict) else None
+        return found if ABOVE_0.fits(found) else None
+    return None

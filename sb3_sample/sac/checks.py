@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import ConstantSchedule
 from stable_baselines3.her import HerReplayBuffer
@@ -129,11 +129,11 @@ def check_dataset(name: str, dataset: Any, observation_space: Any, action_space:
     :raises ValueError: if its observations or actions are others
     """
     for key, part in _parts(dataset.observation_space).items():
-        if is_image_space(part, check_channels=False) and not is_image_space_channels_first(part):
+        if is_image_space(part) and part.shape[2] < min(part.shape[:2]):
             which = f"observations[{key!r}]" if key else "observations"
             raise ValueError(
-                f"{name} must have images in {which} with their channels first, as models get those of an environment, "
-                f"not of shape {part.shape}: pass numpy.moveaxis(images, -1, 1) where the data set is made"
+                f"{name} must have images in {which} with their channels first, as Stable-Baselines3 turns those of "
+                f"environments, not of shape {part.shape}: pass numpy.moveaxis(images, -1, 1) where it is made"
             )
     ours, theirs = _shapes(observation_space), _shapes(dataset.observation_space)
     if ours != theirs:

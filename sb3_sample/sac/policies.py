@@ -379,9 +379,10 @@ class SACPolicy(BasePolicy):
         :return: tensors, (B, O), and whether there are several
         :raises ValueError: if a number of a Discrete or MultiDiscrete space lies outside of it
         """
-        if isinstance(self.observation_space, spaces.Dict) == isinstance(observation, Mapping):
-            check_numbers("observation", self.observation_space, observation)
-        return super().obs_to_tensor(observation)
+        # Checks shapes first.
+        converted = super().obs_to_tensor(observation)
+        check_numbers("observation", self.observation_space, observation)
+        return converted
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
         return self(observation, deterministic)

@@ -140,8 +140,11 @@ def attributes_of(owner: Any) -> dict[str, Any]:
     return {**slots, **getattr(owner, "__dict__", {})}
 
 
-def _keeps_more(cls: type) -> bool:
-    """Whether objects of a class have state besides their attributes, in memory that a C library has added."""
+def keeps_more(cls: type) -> bool:
+    """
+    :param cls: a class
+    :return: whether its objects have state besides their attributes, in memory that a C library has added
+    """
     n_pointers = len(_slots(cls)) + (cls.__dictoffset__ > 0) + (cls.__weakrefoffset__ > 0)
     return cls.__itemsize__ != 0 or cls.__basicsize__ > object.__basicsize__ + n_pointers * _POINTER
 
@@ -190,7 +193,7 @@ def without_generators(space: gym.Space) -> gym.Space:
 def _is_opaque(value: Any) -> bool:
     """Whether a value is more than its attributes, so that none of them is described."""
     foreign = isinstance(value, (gym.Env, *_CONTAINERS)) or _in(value, _FOREIGN_MODULES)
-    return foreign or _keeps_more(type(value)) or not (hasattr(value, "__dict__") or _slots(type(value)))
+    return foreign or keeps_more(type(value)) or not (hasattr(value, "__dict__") or _slots(type(value)))
 
 
 def _may_have(owner: Any, name: str) -> bool:

@@ -12,7 +12,7 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sample.learner.batch import Batch
-from sb3_sample.learner.reward_scale import REWARD_SCALES
+from sb3_sample.learner.reward_scale import REWARD_SCALES, StdOrMaxScale, StdScale
 from sb3_sample.sac import DAC, SAC
 from tests.sac.common import MAKERS, differing, random_batch, sac, sampled, state, vec
 
@@ -50,7 +50,10 @@ def test_xqc_leaves_rewards_as_they_are_until_two_returns_differ() -> None:
     o = torch.zeros(2, 1)
     batch = Batch(o, o, o, o, torch.tensor([[3.0], [-1.0]]), 0.9, {})
     for rewards, divisor in (([], 1.0), ([3.0], 1.0), ([0.0, 0.0], 1.0), ([3.0, 1.0], np.std([3.0, 3.7]))):
-        scale, _ = told("xqc", rewards, [0] * len(rewards))
+        scale, of = told("xqc", [], [])
+        scale.transform(batch, None)  # leaves nothing behind
+        for reward in rewards:
+            scale.on_step(of, np.array([reward]), np.array([False]), [{}])
         found = scale.transform(batch, None).rewards.flatten()
         assert found.tolist() == pytest.approx([3 / divisor, -1 / divisor], rel=1e-6)
 
@@ -190,6 +193,20 @@ def test_another_rule_at_loading_starts_anew(before: str | None, after: str | No
     # The file's own rule keeps its statistics.
     again = SAC.load(tmp_path / "model", env=vec(), reward_scale=before)
     assert not differing(state(model), state(again)) and again.reward_scale_kwargs == kwargs
+
+
+class Mine(StdOrMaxScale):
+    """A rule of one's own, which a file is not trusted to name."""
+
+
+@pytest.mark.parametrize(("before", "again"), [(Mine, Mine), ("xqc", StdScale), (StdScale, "xqc")])
+def test_the_same_rule_at_loading_keeps_its_statistics(before: Any, again: Any, tmp_path: Path) -> None:
+    kwargs = {"max_return": 3.0} if before is Mine else {"eps": 1e-3}
+    model = sac(reward_scale=before, reward_scale_kwargs=kwargs).learn(30)
+    model.save(tmp_path / "model")
+    loaded = SAC.load(tmp_path / "model", reward_scale=again)
+    assert loaded.reward_scale_kwargs == kwargs
+    assert loaded.reward_scaler.divisor(None) == model.reward_scaler.divisor(None) != 1
 
 
 @pytest.mark.parametrize("rule", sampled(RULES, ("linear", "simbav2")))

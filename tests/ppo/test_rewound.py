@@ -5,6 +5,7 @@ import datetime
 import enum
 import functools
 import random
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -775,7 +776,7 @@ class Windy(Changing):
 
 
 @pytest.mark.parametrize("noise", ["attribute", "nested", "in a dict", "legacy", "python"])
-def test_generators_draw_anew_wherever_they_are(noise: str) -> None:
+def test_generators_draw_anew(noise: str) -> None:
     real, further = rewards_and_further(lambda: Windy(noise), n_steps=20, n_actions=3)
     assert len({*real, *further.flatten()}) == 60
     # Without a generator to seed them by they go on as they would have.
@@ -799,3 +800,55 @@ def test_a_generator_of_two_attributes_stays_one() -> None:
     env.alias = {"of": env.wind}
     restore_state(env, save_state(env), np.random.default_rng(0))
     assert env.alias["of"] is env.wind
+
+
+def test_seeds_are_those_of_spawned_generators_too() -> None:
+    env = Windy("attribute")
+    env.reset(seed=3)
+    # As the generators of any environment, whatever Monitor keeps under that name.
+    env.rewards = np.random.default_rng(1)
+    state, drawn = save_state(env), []
+    for seed in (0, 1):
+        restore_state(env, state, np.random.default_rng(seed))
+        drawn.append((env.rewards.random(), env.wind.spawn(1)[0].random()))
+    assert drawn[0][0] != drawn[1][0] and drawn[0][1] != drawn[1][1]
+
+
+def test_what_is_in_a_c_librarys_memory_is_no_state() -> None:
+    env = Changing()
+    env.reset()
+    with socket.socket() as env.handle:
+        assert "handle" not in save_state(env).layers[0]
+
+
+class OwnArray(Changing):
+    """Gives its own array as the observation, and changes it at the reset."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.own = np.zeros(1, np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.own[:] = 0
+        return self.own, {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        _, reward, _, _, info = super().step(action)
+        self.own[:] = self.t / 100
+        return self.own, reward, self.t >= 20, False, info
+
+
+def test_an_environments_own_array_is_no_reason_to_stop() -> None:
+    real, further = rewards_and_further(OwnArray)
+    assert np.array_equal(real, further[:, 0])
+
+
+def test_sticky_actions_are_no_reason_to_stop() -> None:
+    """The console's state lacks the action that would be repeated."""
+    pytest.importorskip("ale_py")
+    model = RewoundPPO(
+        "MlpPolicy", make_env("ALE/Pong-v5", obs_type="ram"), n_actions=2, horizon=1, n_steps=64, batch_size=64,
+        n_epochs=1, copies=2, seed=1, device="cpu", policy_kwargs={"net_arch": [4]},
+    )  # fmt: skip
+    assert model.learn(64).num_rewound_steps == 64

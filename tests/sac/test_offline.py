@@ -732,3 +732,14 @@ def test_images_with_their_channels_last_are_refused_before_anything_learns() ->
         model.learn_offline(data, 1)
     first = spaces.Box(0, 255, (3, 40, 40), np.uint8)
     model.learn_offline(Dataset.from_arrays(turned, *given, next_observations=turned, observation_space=first), 1)
+
+
+@pytest.mark.parametrize("shape", [(12, 10, 10), (16, 8, 8), (3, 40, 40)])
+def test_more_channels_than_pixels_are_not_taken_for_channels_last(shape: tuple[int, ...]) -> None:
+    space = spaces.Box(0, 255, shape, np.uint8)
+    images = np.random.default_rng(0).integers(0, 256, (21, *shape)).astype(np.uint8)
+    data = Dataset.from_arrays(
+        images[:-1], np.zeros((20, 1)), np.zeros(20), np.arange(20) == 9, np.arange(20) == 19,
+        next_observations=images[1:], observation_space=space,
+    )  # fmt: skip
+    assert BC("MlpPolicy", None, compile=False, batch_size=4, policy_kwargs={"net_arch": [4]}).learn_offline(data, 1)

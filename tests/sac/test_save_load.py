@@ -99,7 +99,7 @@ def test_another_actor_than_the_files_is_what_is_refused(kwargs: dict[str, Any],
 
 
 def test_a_deterministic_actors_file_may_be_told_so(tmp_path: Path) -> None:
-    """With a class whose own default of the entropy's weight such an actor has not."""
+    """In a class whose own default weighs an entropy, which such an actor has not."""
     MAKERS["SimBa"](backbone="td3").save(tmp_path / "model")
     assert SimBa.load(tmp_path / "model", backbone="td3").backbone == "td3"
 

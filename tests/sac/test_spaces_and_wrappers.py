@@ -605,3 +605,5 @@ def test_predict_refuses_numbers_outside_of_their_space(space: spaces.Space, wro
         model.predict(of.sample())
         with pytest.raises(ValueError, match=r"^observation.* must be numbers of (Multi)?Discrete\(.*\), not"):
             model.predict(given)
+    with pytest.raises(ValueError, match="Unexpected observation shape"):
+        sac(vec(obs_space=spaces.MultiDiscrete([3, 4]))).predict(np.array([0, 1, 2]))
