@@ -10,7 +10,7 @@ import copy
 import pathlib
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -492,11 +492,12 @@ class SAC(  # type: ignore[misc]  # actor
             )
         checks.check_sampling(self, buffer)
 
-    def _arguments_in_parameters(self) -> list[torch.Tensor]:
+    def _arguments_in_parameters(self, given: Collection[str] | None) -> list[torch.Tensor]:
         scale, found = self.learner.reward_scaler, []
-        if isinstance(self.learner.temperature, FixedScalar):
+        if (given is None or "ent_coef" in given) and isinstance(self.learner.temperature, FixedScalar):
             found.append(self.learner.temperature.value)
-        if isinstance(scale, LinearScale) and scale.return_range is None:
+        of_scale = given is None or "reward_scale_kwargs" in given
+        if of_scale and isinstance(scale, LinearScale) and scale.return_range is None:
             found.append(scale.factor)
         return found
 

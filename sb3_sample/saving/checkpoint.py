@@ -270,7 +270,7 @@ class Checkpointer:
         segments = self._folder.segments(self._manifest)
         with self._restoring(state):
             with self._folder.opened(f"{state['path'].name}/{MODEL}") as file, importing_nothing():
-                safe_files.set_parameters(file, trusted_modules=_own_modules(model))
+                safe_files._take_parameters(file, trusted_modules=_own_modules(model))
             training_state.restore_attributes(model, state["attributes"])
             check_counts(model, "the checkpoint")
             if model.num_timesteps != self._manifest["steps"]:

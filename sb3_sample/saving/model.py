@@ -2,7 +2,7 @@
 
 import io
 import pathlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import torch
@@ -250,7 +250,7 @@ class SafeFiles(BaseAlgorithm):
             if kwargs:
                 content.check_shapes(model)
             content.check_parameters(model)
-            model.set_parameters(content.parameters(model), exact_match=True, device=device)
+            model._take_parameters(content.parameters(model), device=device, given=given)
             content.set_own(model, given)
             if model.use_sde:
                 model.policy.reset_noise()  # type: ignore[operator]
@@ -269,9 +269,10 @@ class SafeFiles(BaseAlgorithm):
             raise BadFile(f"{lacks}{content.name}: no {cls.__name__} can be made of what it holds: {why}") from error
         return model
 
-    def _arguments_in_parameters(self) -> list[torch.Tensor]:
+    def _arguments_in_parameters(self, given: Collection[str] | None) -> list[torch.Tensor]:
         """
-        :return: tensors among the parameters that are nothing but values of arguments
+        :param given: names of arguments; None: all of the constructor's
+        :return: tensors among the parameters that are nothing but values of these arguments
         """
         return []
 
@@ -302,12 +303,33 @@ class SafeFiles(BaseAlgorithm):
         :raises BadFile: (a ``ValueError``) if the file is damaged, hostile, pickled, or of another class
         :raises ParametersDoNotFit: (a ``ValueError``) if the parameters are of other networks or parts
         """
-        parameters: Any = load_path_or_dict
+        self._take_parameters(load_path_or_dict, exact_match, device, allow_pickle, trusted_modules, given=None)
+
+    def _take_parameters(
+        self,
+        source: Any,
+        exact_match: bool = True,
+        device: torch.device | str = "auto",
+        allow_pickle: bool = False,
+        trusted_modules: Sequence[str] = (),
+        given: Collection[str] | None = (),
+    ) -> None:
+        """
+        Load parameters of this very model, with the numbers among them that stand for arguments.
+
+        :param source: as in :meth:`set_parameters`
+        :param exact_match: likewise
+        :param device: likewise
+        :param allow_pickle: likewise
+        :param trusted_modules: likewise
+        :param given: names of arguments whose numbers stay this model's; None: all of the constructor's
+        """
+        parameters: Any = source
         content = None
-        if not isinstance(load_path_or_dict, dict):
+        if not isinstance(source, dict):
             try:
                 trusted = (*self._trusted_modules, *check_trusted(trusted_modules))
-                with paths.opened(load_path_or_dict, "zip") as file:
+                with paths.opened(source, "zip") as file:
                     content = Content(file, type(self), SafeFiles, trusted)
                 content.check_parameters(self)
                 parameters = content.parameters(self)
@@ -320,7 +342,7 @@ class SafeFiles(BaseAlgorithm):
             [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
             for optimizer in optimizers
         ]
-        kept = [(tensor, tensor.clone()) for tensor in self._arguments_in_parameters()]
+        kept = [(tensor, tensor.clone()) for tensor in self._arguments_in_parameters(given)]
         try:
             super().set_parameters(parameters, exact_match, device)
         except Exception as error:

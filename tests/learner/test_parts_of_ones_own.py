@@ -171,7 +171,7 @@ def test_classes_in_the_place_of_names(kwargs: dict[str, Any], check: Any, tmp_p
         ({"pessimism": Rule, "pessimism_kwargs": {"other": 1}}, r"pessimism_kwargs has 'other', .*takes \['weight'\]"),
         ({"exploration": Pessimism}, "exploration must be one of .*, or a class derived from Exploration, not"),
         ({"value_head": nn.Module}, "value_head must be one of .*, or a class derived from ValueHead, or None"),
-        ({"value_head": TwoHot, "n_quantiles": 5}, r"n_quantiles=5 and value_head=.* pass n_quantiles=None"),
+        ({"value_head": TwoHot, "n_quantiles": 5}, r"n_quantiles=5 and value_head=.* value_head=None .* n_quantiles"),
         ({"value_head_kwargs": {"low": 1}}, "value_head_kwargs"),
         ({"batch_transforms": [Part]}, "batch_transforms must be classes derived from BatchTransform"),
         ({"batch_transforms": Scaled}, "batch_transforms must be classes derived from BatchTransform"),

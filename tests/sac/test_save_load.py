@@ -379,6 +379,14 @@ def test_a_fixed_temperature_stays_the_models(as_file: bool, tmp_path: Path) -> 
     assert float(SAC.load(tmp_path / "model", ent_coef=0.7).ent_coef_tensor) == pytest.approx(0.7)
 
 
+def test_a_fixed_temperature_that_was_set_goes_on(tmp_path: Path) -> None:
+    kwargs = {"checkpoint": tmp_path, "checkpoint_freq": 10}
+    model = sac(ent_coef=0.25)
+    model.ent_coef_tensor = 0.125
+    model.learn(20, **kwargs)
+    assert float(sac(ent_coef=0.25).learn(30, **kwargs).ent_coef_tensor) == 0.125
+
+
 def test_the_replay_ratio_replaces_stable_baselines3s_arguments(tmp_path: Path) -> None:
     sac(train_freq=64, gradient_steps=64).save(tmp_path / "model")
     loaded: Any = SAC.load(tmp_path / "model", env=vec(), replay_ratio=2)
