@@ -354,7 +354,8 @@ def test_refused(tmp_path: Path) -> None:
         model.export(tmp_path / "file" / "policy")
 
 
-@pytest.mark.parametrize("family", ["sac", pytest.param("ppo", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("family", ["sac", "ppo"])
 def test_statistics_that_are_missing_are_asked_for(family: str, tmp_path: Path) -> None:
     env = VecNormalize(vec())
     model = sac(env).learn(12) if family == "sac" else tiny(MBMAPPO, env).learn(16)

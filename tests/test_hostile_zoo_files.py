@@ -42,7 +42,6 @@ from tests.hostile_zoo_files import (
     set_yaml,
     throw,
 )
-from tests.sac.common import sampled
 from tests.saving.hostile import MARKER, Payload
 
 
@@ -113,7 +112,8 @@ def _throw_all(chosen: list[Case], good: Path, place: Path, watch: FolderWatch) 
     assert not wrong, f"{len(wrong)} of {len(results)}: {wrong[:20]}"
 
 
-@pytest.mark.parametrize("file", sampled(READERS, (f"{RUN}/{ENV}/config.yml",)))
+@pytest.mark.slow
+@pytest.mark.parametrize("file", READERS)
 def test_some_hostile_files(
     file: str, good: Path, here: Path, tmp_path: Path, watch: FolderWatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:

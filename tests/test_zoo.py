@@ -452,7 +452,8 @@ def test_the_stock_command_trains_in_the_repository(tmp_path: Path) -> None:
     assert (tmp_path / "bro/dmc-pendulum-swingup-v0_1/dmc-pendulum-swingup-v0.zip").exists()
 
 
-@pytest.mark.parametrize("module", ["rl_zoo3.train", pytest.param("rl_zoo3.record_video", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("module", ["rl_zoo3.train", "rl_zoo3.record_video"])
 def test_the_stock_zoo_knows_the_algorithms_whichever_module_comes_first(module: str) -> None:
     result = in_repository("-m", module, "--help")
     assert result.returncode == 0, result.stderr

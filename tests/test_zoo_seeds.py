@@ -84,6 +84,7 @@ def callback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ["callback:'called_back.Callback'"]
 
 
+@pytest.mark.slow
 def test_interrupted_and_started_again(
     call: Call, callback: list[str], monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:

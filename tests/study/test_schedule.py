@@ -37,6 +37,7 @@ def made(folder: Path) -> list[str]:
     return (folder / "made.txt").read_text().splitlines()
 
 
+@pytest.mark.slow
 def test_each_run_is_made_once_and_not_again(tmp_path: Path) -> None:
     plan = nothing.plan(4)
     found = run(plan, tmp_path)

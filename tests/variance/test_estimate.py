@@ -205,6 +205,7 @@ def test_the_seed_fixes_the_estimate_and_nothing_else_is_touched() -> None:
     assert first.components.policy_variance != third.components.policy_variance
 
 
+@pytest.mark.slow
 def test_returns_are_unbiased_for_any_horizon() -> None:
     env, (_, _, policy) = Tabular(), softmax_policy(3, 2)
     truth = Exact(env, policy)
