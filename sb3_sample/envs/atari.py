@@ -34,6 +34,15 @@ def is_atari(env: gym.Env) -> bool:
     return type(env.unwrapped).__module__.partition(".")[0] == "ale_py"
 
 
+def check_atari_id(env_id: str) -> None:
+    """
+    :param env_id: id of an environment
+    :raises ValueError: if it is not that of a game
+    """
+    if not is_atari_id(env_id):
+        raise ValueError(f"env_id must be the id of an Atari game, {ATARI}<Game>-v5, not {env_id!r}")
+
+
 def repeats_actions(env: gym.Env) -> bool:
     """
     :param env: an environment for which :func:`is_atari` holds
@@ -57,8 +66,7 @@ def make_atari_env(env_id: str, training: bool = True, noop_max: int | None = 30
     :raises gymnasium.error.UnregisteredEnv: there is no such game; the message names the closest ones
     :raises ValueError: ``env_id`` is of another suite, or an argument is out of range
     """
-    if not is_atari_id(env_id):
-        raise ValueError(f"env_id must be the id of an Atari game, {ATARI}<Game>-v5, not {env_id!r}")
+    check_atari_id(env_id)
     env: Any = Monitor(make_env(env_id, **{**ENV_KWARGS, **kwargs}))
     return AtariFrames(env, noop_max=noop_max, episodic_life=training, clip_reward=training)
 

@@ -79,9 +79,8 @@ class FiniteCheck:
             wrong = outside(space, values[key] if key else values)
             if wrong.any():
                 index = int(wrong.argmax())
-                name = f"{what} {key!r}" if key else what
                 raise ValueError(
-                    f"environment {index + offset} gave {_article(what)} {name} that is not of {space} {when}: "
+                    f"environment {index + offset} gave {_named(what, key)} that is not of {space} {when}: "
                     f"{(values[key] if key else values)[index]!s:.300}. Training stopped before the value reached the "
                     "replay buffer."
                 )
@@ -92,16 +91,17 @@ class FiniteCheck:
             if _is_fine(array):
                 continue
             index = next(i for i in range(len(array)) if not _is_fine(np.asarray(array[i])))
-            name = f"{what} {key!r}" if key else what
             raise ValueError(
-                f"environment {index + offset} gave {_article(what)} {name} that is not finite {when}: "
+                f"environment {index + offset} gave {_named(what, key)} that is not finite {when}: "
                 f"{array[index]!s:.300}. Allowed are finite numbers, up to {LARGEST:.3g}, the largest that networks "
                 "take. Training stopped before the value reached the replay buffer."
             )
 
 
-def _article(what: str) -> str:
-    return "an" if what == "observation" else "a"
+def _named(what: str, key: str) -> str:
+    """What an environment gave, with its article, and its key in dict observations."""
+    article = "an" if what == "observation" else "a"
+    return f"{article} {what} {key!r}" if key else f"{article} {what}"
 
 
 def _is_fine(array: np.ndarray) -> bool:

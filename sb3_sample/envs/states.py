@@ -16,7 +16,7 @@ import io
 import operator
 import random
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -64,8 +64,8 @@ class EnvState(NamedTuple):
     layers: list[dict[str, Any]]
     data: Any
     model: dict[str, Any]
-    console: Any = None
-    names: tuple[frozenset[str], ...] = ()
+    console: Any
+    names: tuple[frozenset[str], ...]
 
 
 def save_state(env: gym.Env) -> EnvState:
@@ -135,7 +135,7 @@ def restore_state(env: gym.Env, state: EnvState, rng: np.random.Generator | None
     for layer, attributes in zip(layers, _copies(layers, state.layers, fresh), strict=True):
         for name, value in attributes.items():
             setattr(layer, name, value)
-    for layer, names in zip(layers, state.names, strict=bool(state.names)):
+    for layer, names in zip(layers, state.names, strict=True):
         for name in vars(layer).keys() - names:
             if _is_state(vars(layer)[name], set()):
                 delattr(layer, name)
@@ -400,26 +400,32 @@ def _is_state(value: Any, seen: set[int]) -> bool:
     if id(value) in seen:
         return True
     seen.add(id(value))
+    if not isinstance(value, (*_CONTAINERS, *BOUND)):
+        # Objects of a wrapper, such as the running mean and variance of a normalisation. A simulator's are the layers'
+        # and the data's; an environment inside of another attribute is none of the wrappers that this module knows.
+        if isinstance(value, _NOT_STATE) or type(value).__module__.startswith(
+            ("mujoco", "dm_control", "gymnasium.envs")
+        ):
+            return False
+        if not hasattr(value, "__dict__") and (keeps_more(type(value)) or not attributes_of(value)):
+            return False
+    return all(_is_state(item, seen) for item in _inside(value))
+
+
+def _inside(value: Any) -> Iterable[Any]:
+    """What a container, an object or a callable that is bound to objects holds."""
     if isinstance(value, dict):
-        return all(_is_state(item, seen) for item in value.values())
+        return value.values()
     if isinstance(value, _CONTAINERS):
-        return all(_is_state(item, seen) for item in value)
+        return value  # type: ignore[no-any-return]
     if isinstance(value, types.MethodType):
         # A method of an environment or a wrapper is no state: its copy would be bound to a copy of them, which nothing
         # steps.
-        return _is_state(value.__self__, seen)
+        return (value.__self__,)
     if isinstance(value, functools.partial):
-        called = isinstance(value.func, types.FunctionType) or _is_state(value.func, seen)
-        return called and all(_is_state(item, seen) for item in (*value.args, *value.keywords.values()))
-    if isinstance(value, _NOT_STATE):
-        return False
-    if not hasattr(value, "__dict__") and (keeps_more(type(value)) or not attributes_of(value)):
-        return False
-    # Objects of a wrapper, such as the running mean and variance of a normalisation. A simulator's are the layers' and
-    # the data's; an environment inside of another attribute is none of the wrappers that this module knows.
-    return not type(value).__module__.startswith(("mujoco", "dm_control", "gymnasium.envs")) and all(
-        _is_state(item, seen) for item in attributes_of(value).values()
-    )
+        called = () if isinstance(value.func, types.FunctionType) else (value.func,)
+        return (*called, *value.args, *value.keywords.values())
+    return attributes_of(value).values()
 
 
 def _generators_in(value: Any, seen: set[int]) -> Iterator[Any]:
@@ -429,23 +435,13 @@ def _generators_in(value: Any, seen: set[int]) -> Iterator[Any]:
     :param value: any that consists of data only, or a container of such
     :param seen: ids of the values examined so far
     """
-    if isinstance(value, (np.ndarray, *_CONSTANTS)) or id(value) in seen:
+    if isinstance(value, (np.ndarray, *_CONSTANTS, *_NOT_STATE)) or id(value) in seen:
         return
     seen.add(id(value))
-    items: Any = ()
     if isinstance(value, _GENERATORS):
         yield value
-    elif isinstance(value, dict):
-        items = value.values()
-    elif isinstance(value, _CONTAINERS):
-        items = value
-    elif isinstance(value, types.MethodType):
-        items = (value.__self__,)
-    elif isinstance(value, functools.partial):
-        items = (value.func, *value.args, *value.keywords.values())
-    elif not isinstance(value, _NOT_STATE):
-        items = attributes_of(value).values()
-    for item in items:
+        return
+    for item in _inside(value):
         yield from _generators_in(item, seen)
 
 

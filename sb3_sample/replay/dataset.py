@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from sb3_sample.envs.numbers import check_numbers, counts
+from sb3_sample.envs.numbers import check_numbers
 from sb3_sample.learner.batch import Batch, for_each
 from sb3_sample.replay.dataset_buffers import arrays_of
 from sb3_sample.replay.dataset_files import opened_hdf5, read_minari, write_minari
@@ -163,8 +163,9 @@ class Dataset:
             },
         )
         check_actions(steps.actions, action_space)
-        for name, value in {"observations": observations, **given}.items():
-            _check_numbers(name, observation_space, value)
+        check_numbers("observations", observation_space, steps.observations)
+        if given:
+            check_numbers("next_observations", observation_space, steps.next_observations)
         n_left_out = 0
         if given:
             breaks = _breaks(steps) & ~terminated & ~truncated
@@ -541,16 +542,6 @@ def _space_of(observations: Any) -> spaces.Space:
     if observations.dtype.kind == "b":
         return spaces.MultiBinary(observations.shape[1:])
     return spaces.Box(np.iinfo(kind).min, np.iinfo(kind).max, observations.shape[1:], kind)
-
-
-def _check_numbers(name: str, space: spaces.Space, observations: Any) -> None:
-    """Numbers of Discrete and MultiDiscrete parts must be of their spaces, as networks read them as one-hot vectors."""
-    if isinstance(space, spaces.Dict):
-        for key, part in space.spaces.items():
-            _check_numbers(f"{name}[{key!r}]", part, observations[key])
-    elif counts(space):
-        for rows in pieces(len(observations), observations):
-            check_numbers(name, space, np.asarray(observations[rows]))
 
 
 def _check_shapes(name: str, space: spaces.Space, observations: Any) -> None:

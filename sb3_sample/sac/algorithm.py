@@ -317,16 +317,15 @@ class SAC(  # type: ignore[misc]  # actor
         if kwargs.get("backbone") == "td3":
             # That a file's networks are others is said of the backbone, not of entropies.
             implied |= {"ent_coef": "auto", "target_entropy": default_of(cls, "target_entropy")}
-        for name, others in _ONLY_WITH.items():
-            if name in kwargs and not kwargs[name] and kwargs.get("reset_gradient_steps") is None:
-                # The file's arguments of what is left out mean nothing.
-                implied |= {other: default_of(cls, other) for other in others}
+        without = [name for name in ("learning_rate_schedule", "redo_period") if kwargs.get(name, name) is None]
         # One way to count resets replaces the file's other one.
         if kwargs.get("reset_gradient_steps") is not None:
             implied["resets"] = ()
         elif "resets" in kwargs:
             implied["reset_gradient_steps"] = None
-        return implied
+            without += [] if checks.has_resets(kwargs["resets"]) else ["resets"]
+        # The file's arguments of what is left out mean nothing.
+        return implied | {other: default_of(cls, other) for name in without for other in _ONLY_WITH[name]}
 
     @classmethod
     def _completed(cls, content: Any, kwargs: dict[str, Any]) -> dict[str, Any]:
@@ -606,11 +605,12 @@ class SAC(  # type: ignore[misc]  # actor
     @contextlib.contextmanager
     def _learning_from(self, dataset: Dataset) -> Iterator[None]:
         """Put a data set in the place of the replay buffer, and a placeholder in the place of a missing environment."""
-        if not hasattr(self, "observation_space"):
-            checks.check_dataset("dataset", dataset, dataset.observation_space, dataset.action_space)
+        is_new = not hasattr(self, "observation_space")
+        own: Any = dataset if is_new else self
+        checks.check_dataset("dataset", dataset, own.observation_space, own.action_space)
+        if is_new:
             self.observation_space, self.action_space, self.n_envs = dataset.observation_space, dataset.action_space, 1
             self._setup_model()
-        checks.check_dataset("dataset", dataset, self.observation_space, self.action_space)
         env, source = self.env, self._source
         checks.check_offline(self)
         self._tell_of(dataset)

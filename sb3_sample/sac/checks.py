@@ -130,19 +130,18 @@ def check_dataset(name: str, dataset: Any, observation_space: Any, action_space:
     """
     for key, part in _parts(dataset.observation_space).items():
         if is_image_space(part) and part.shape[2] < min(part.shape[:2]):
-            which = f"observations[{key!r}]" if key else "observations"
             raise ValueError(
-                f"{name} must have images in {which} with their channels first, as Stable-Baselines3 turns those of "
-                f"environments, not of shape {part.shape}: pass numpy.moveaxis(images, -1, 1) where it is made"
+                f"{name} must have images in {_named(key)} with their channels first, as Stable-Baselines3 turns those "
+                f"of environments, not of shape {part.shape}: pass numpy.moveaxis(images, -1, 1) where it is made"
             )
     ours, theirs = _shapes(observation_space), _shapes(dataset.observation_space)
     if ours != theirs:
         raise ValueError(f"{name} must have observations of the model's shape, {ours}, not {theirs}")
     for key, part in _parts(observation_space).items():
-        other, which = _parts(dataset.observation_space)[key], f"observations[{key!r}]" if key else "observations"
+        other = _parts(dataset.observation_space)[key]
         if not _means_alike(part, other):
             raise ValueError(
-                f"{name} must have {which} that mean the same numbers as the model's {part}, not {other}: pass "
+                f"{name} must have {_named(key)} that mean the same numbers as the model's {part}, not {other}: pass "
                 "observation_space= where the data set is made, with pictures of its range"
             )
     own, other = action_space, dataset.action_space
@@ -222,6 +221,11 @@ def _shapes(space: Any) -> Any:
 
 def _parts(space: Any) -> dict[str, Any]:
     return dict(space.spaces) if isinstance(space, spaces.Dict) else {"": space}
+
+
+def _named(key: str) -> str:
+    """Name of a part of the observations, for errors."""
+    return f"observations[{key!r}]" if key else "observations"
 
 
 def _means_alike(ours: Any, theirs: Any) -> bool:

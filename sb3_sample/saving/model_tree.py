@@ -292,8 +292,8 @@ class Content:
         """
         if self._parameters is None:
             try:
-                names = self.tree["parameters"].keys() - self._anew
-                self._parameters = {name: self._state(model, name) for name in self.tree["parameters"] if name in names}
+                kept = (name for name in self.tree["parameters"] if name not in self._anew)
+                self._parameters = {name: self._state(model, name) for name in kept}
                 for name in self._anew.intersection(model._get_torch_save_params()[0]):
                     self._parameters[name] = recursive_getattr(model, name).state_dict()
                 for name, tree in self.tree["metadata"].items():

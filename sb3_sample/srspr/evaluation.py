@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_sample.envs.atari import is_atari_id, make_atari_env
+from sb3_sample.envs.atari import check_atari_id, make_atari_env
 from sb3_sample.envs.scores import score_of
 from sb3_sample.kinds import check_value, integer
 
@@ -89,8 +89,7 @@ class AtariEvaluation(BaseCallback):
 
     def __init__(self, env_id: str, every: int = 10_000, n_episodes: int = 100, verbose: int = 0):
         super().__init__(verbose)
-        if not is_atari_id(env_id):
-            raise ValueError(f"env_id must be the id of an Atari game, ALE/<Game>-v5, not {env_id!r}")
+        check_atari_id(env_id)
         self.env_id = env_id
         self.every: int = check_value("every", every, integer(1))
         self.n_episodes: int = check_value("n_episodes", n_episodes, integer(1))

@@ -113,6 +113,11 @@ def test_a_deterministic_actors_file_may_be_told_so(tmp_path: Path) -> None:
             {"final_learning_rate": 0.0, "schedule_steps": None, "warm_up_steps": 0},
         ),
         ({"redo_period": 50, "redo_threshold": 0.1}, {"redo_period": None}, {"redo_threshold": 0.025}),
+        (
+            {"redo_period": 50, "redo_threshold": 0.1},
+            {"redo_period": None, "reset_gradient_steps": 50},
+            {"redo_threshold": 0.025},
+        ),
         ({"resets": [100], "reset_shrink": 0.5}, {"resets": ()}, {"reset_shrink": 0.0}),
         ({"resets": [100], "reset_shrink": 0.5}, {"resets": (), "reset_gradient_steps": 50}, {"reset_shrink": 0.5}),
     ],
