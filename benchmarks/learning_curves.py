@@ -15,22 +15,26 @@ for step.
 
     python benchmarks/learning_curves.py --agent "CrossQ (sb3_contrib)" --env HalfCheetah-v5 --steps 50000
 
-CrossQ and sb3_contrib's, with the published sizes and random steps.
+CrossQ and sb3_contrib's, with the published sizes and random steps. If a run of stable_baselines3's or sb3_contrib's
+agent is interrupted and started again, it resumes from its last 1,000 steps.
 
 The run goes to ``OUTPUT/AGENT/seed_SEED`` (``evaluations.npz``, Monitor files), ``learning_summary.py`` makes a table
 and a picture of all of them.
 """
 
 import argparse
+import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import sb3_contrib
 import stable_baselines3
 import torch
-from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 import sb3_sample
@@ -58,13 +62,18 @@ ON_POLICY: dict[str, tuple[str, dict[str, Any]]] = {
 SB3 = "SAC (stable_baselines3)"
 #: sb3_contrib.CrossQ with the published sizes and random steps, which CrossQ has by default.
 CONTRIB = "CrossQ (sb3_contrib)"
+#: Steps from one state of SB3 or CONTRIB to the next.
+SAVE_EVERY = 1_000
 
 
-def environment(args: argparse.Namespace, seed: int, folder: Path | None = None) -> VecEnv:
+def environment(args: argparse.Namespace, seed: int, folder: Path | None = None, resumed: bool = False) -> VecEnv:
     """The environment for training, with Monitor files in ``folder``, or for evaluation."""
     kwargs = {} if args.action_repeat is None else {"action_repeat": args.action_repeat}
     training = folder is not None
-    env = make_vec_env(args.env, seed=seed, env_kwargs=kwargs, monitor_dir=str(folder) if training else None)
+    env = make_vec_env(
+        args.env, seed=seed, env_kwargs=kwargs, monitor_dir=str(folder) if training else None,
+        monitor_kwargs={"override_existing": not resumed} if training else None,
+    )  # fmt: skip
     return VecNormalize(env, training=training, norm_reward=training) if args.agent in ON_POLICY else env
 
 
@@ -85,7 +94,54 @@ def build(agent: str, env: VecEnv, seed: int) -> Any:
     return getattr(sb3_sample, agent)("MlpPolicy", env, seed=seed, device="cpu", **AGENTS[agent])
 
 
-def main() -> None:
+class SaveState(BaseCallback):
+    """Save the agent and its replay buffer in ``FOLDER/STEPS``, and delete the state before once they are complete."""
+
+    model: OffPolicyAlgorithm
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self.folder = folder
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps % SAVE_EVERY == 0:
+            before = saved_states(self.folder)
+            new = self.folder / "incomplete"
+            shutil.rmtree(new, ignore_errors=True)
+            new.mkdir(parents=True)
+            self.model.save(new / "model")
+            self.model.save_replay_buffer(new / "replay_buffer")
+            new.rename(self.folder / str(self.num_timesteps))
+            for state in before:
+                shutil.rmtree(state)
+        return True
+
+
+def saved_states(folder: Path) -> list[Path]:
+    """Complete states in ``folder``, the last at the end."""
+    states = [state for state in folder.glob("*") if state.name.isdecimal()]
+    return sorted(states, key=lambda state: int(state.name))
+
+
+def resume(args: argparse.Namespace, state: Path, folder: Path, evaluation: EvalCallback) -> OffPolicyAlgorithm:
+    """The agent of ``state``, with a new episode and new random numbers, and the evaluations up to there."""
+    agent = stable_baselines3.SAC if args.agent == SB3 else sb3_contrib.CrossQ
+    model: OffPolicyAlgorithm = agent.load(
+        state / "model", environment(args, args.seed, folder, resumed=True), device="cpu"
+    )
+    model.load_replay_buffer(state / "replay_buffer")
+    model.set_random_seed(args.seed + model.num_timesteps)
+    evaluation.n_calls = model.num_timesteps
+    if (folder / "evaluations.npz").exists():
+        with np.load(folder / "evaluations.npz") as found:
+            n = int((found["timesteps"] <= model.num_timesteps).sum())
+            evaluation.evaluations_timesteps = found["timesteps"][:n].tolist()
+            evaluation.evaluations_results = found["results"][:n].tolist()
+            evaluation.evaluations_length = found["ep_lengths"][:n].tolist()
+    return model
+
+
+def main(given: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--agent", required=True, choices=[SB3, CONTRIB, *AGENTS, *ON_POLICY])
     parser.add_argument("--seed", type=int, default=0)
@@ -95,18 +151,28 @@ def main() -> None:
     parser.add_argument("--eval-freq", type=int, default=5_000)
     parser.add_argument("--eval-episodes", type=int, default=5)
     parser.add_argument("--output", type=Path, default=Path("runs"))
-    args = parser.parse_args()
+    args = parser.parse_args(given)
     torch.set_num_threads(1)
 
     folder = args.output / args.agent / f"seed_{args.seed}"
     folder.mkdir(parents=True, exist_ok=True)
-    model = build(args.agent, environment(args, args.seed, folder), args.seed)
     evaluation = EvalCallback(
         environment(args, args.seed + 1_000), n_eval_episodes=args.eval_episodes, eval_freq=args.eval_freq,
         log_path=str(folder), verbose=0,
     )  # fmt: skip
-    model.set_logger(configure(str(folder), ["csv"]))
-    model.learn(args.steps, callback=evaluation)
+    states = saved_states(folder / "states")
+    if states:
+        model = resume(args, states[-1], folder, evaluation)
+    else:
+        model = build(args.agent, environment(args, args.seed, folder), args.seed)
+    log = folder / f"from_{model.num_timesteps}" if states else folder
+    model.set_logger(configure(str(log), ["csv"]))
+    peer = args.agent in (SB3, CONTRIB)
+    model.learn(
+        args.steps - model.num_timesteps,
+        callback=[evaluation, SaveState(folder / "states")] if peer else evaluation,
+        reset_num_timesteps=not states,
+    )
     model.save(folder / "model")
 
 

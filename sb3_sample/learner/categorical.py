@@ -8,6 +8,7 @@ import torch
 from sb3_sample.kinds import ABOVE_0, FINITE, TRUE_OR_FALSE, check_value, integer
 from sb3_sample.learner.batch import Batch
 from sb3_sample.learner.heads import HalfSquaredHead, ValueHead
+from sb3_sample.learner.projection import project
 from sb3_sample.learner.target import td_target
 
 
@@ -107,12 +108,8 @@ class CategoricalHead(ValueHead):
         :param positions: positions of these probabilities, (B, K); clipped to the support
         :return: probabilities of the atoms, (B, K)
         """
-        clipped = self._clipped(positions)
-        # In units of the spacing, where the shares of two neighbours add up to 1.
-        place = ((clipped - self.v_min) / self.spacing).clamp(0, self.n_outputs - 1)
-        atoms = torch.arange(self.n_outputs, device=place.device, dtype=place.dtype)
-        shares = (1 - (place.unsqueeze(-1) - atoms).abs()).clamp(min=0)
-        return (probabilities.unsqueeze(-1) * shares).sum(dim=1)
+        place = (self._clipped(positions) - self.v_min) / self.spacing
+        return project(probabilities, place.clamp(0, self.n_outputs - 1))
 
     def _clipped(self, values: torch.Tensor) -> torch.Tensor:
         # One end after the other: torch refuses a number beside a tensor, which an end that differs between the

@@ -3,11 +3,12 @@
 import torch
 from torch.nn import functional as F
 
+from sb3_sample.learner import projection
+
 
 def project(probabilities: torch.Tensor, positions: torch.Tensor, atoms: torch.Tensor) -> torch.Tensor:
     """
-    Project probabilities onto the atoms of the support, each onto the two nearest atoms in proportion to their
-    closeness (C51, Bellemare et al. 2017).
+    Project probabilities onto the atoms of the support by :func:`sb3_sample.learner.projection.project`.
 
     :param probabilities: (B, K)
     :param positions: their positions, (B, K); those outside the support are moved to its ends
@@ -15,11 +16,8 @@ def project(probabilities: torch.Tensor, positions: torch.Tensor, atoms: torch.T
     :return: probabilities of the atoms, (B, K)
     """
     spacing = (atoms[-1] - atoms[0]) / (len(atoms) - 1)
-    # In units of the spacing, so that the shares of two neighbours add up to 1.
-    places = ((positions.clamp(atoms[0], atoms[-1]) - atoms[0]) / spacing).clamp(0, len(atoms) - 1)
-    numbers = torch.arange(len(atoms), device=atoms.device, dtype=places.dtype)
-    shares = (1 - (places.unsqueeze(-1) - numbers).abs()).clamp(min=0)
-    return (probabilities.unsqueeze(-1) * shares).sum(dim=1)
+    places = (positions.clamp(atoms[0], atoms[-1]) - atoms[0]) / spacing
+    return projection.project(probabilities, places.clamp(0, len(atoms) - 1))
 
 
 def n_step_return(rewards: torch.Tensor, terminated: torch.Tensor, gamma: float) -> tuple[torch.Tensor, torch.Tensor]:
