@@ -20,7 +20,8 @@ class BC(SAC):
     or minimises the squared distance of a deterministic actor's actions to them.
 
     It needs no critics; those that every policy of the family has consist of one unit here and do not learn. It does
-    not learn in an environment.
+    not learn in an environment, so that arguments of its steps there (``learning_starts``, ``replay_ratio``,
+    ``train_freq``, ``gradient_steps``, ``action_noise``) have no effect.
 
     :raises ValueError: if an argument is out of range or contradicts another
     """
@@ -45,7 +46,8 @@ class BC(SAC):
         _check_no_entropy(self)
         of_values = ("sam_radius", "target_subset", "n_quantiles", "value_head", "actor_first", "reward_scale")
         of_pessimism = ("pessimism", "pessimism_kwargs", "actor_pessimism")
-        check_unused(self, ("prior_data", *of_values, *of_pessimism, "redo_period"), "BC")
+        of_targets = ("gamma", "tau", "target_update_interval")
+        check_unused(self, ("prior_data", *of_values, *of_targets, *of_pessimism, "redo_period"), "BC")
         _check_explores_by_actor(self)
         of_critics = ("critic_network", "critic_network_kwargs", "critic_optimizer_kwargs", "n_critics")
         given = sorted({*of_critics, "share_features_extractor"} & self.policy_kwargs.keys())
