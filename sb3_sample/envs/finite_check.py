@@ -99,7 +99,7 @@ class FiniteCheck:
 
 
 def _named(what: str, key: str) -> str:
-    """What an environment gave, with its article, and its key in dict observations."""
+    """Name of an environment's value, with its article, and its key in dict observations."""
     article = "an" if what == "observation" else "a"
     return f"{article} {what} {key!r}" if key else f"{article} {what}"
 

@@ -413,7 +413,7 @@ def _is_state(value: Any, seen: set[int]) -> bool:
 
 
 def _inside(value: Any) -> Iterable[Any]:
-    """What a container, an object or a callable that is bound to objects holds."""
+    """Values that a container, an object or a callable bound to objects holds."""
     if isinstance(value, dict):
         return value.values()
     if isinstance(value, _CONTAINERS):

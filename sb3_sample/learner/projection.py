@@ -9,8 +9,8 @@ def project(probabilities: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
     (C51, Bellemare et al. 2017).
 
     :param probabilities: (B, K), K at least 2
-    :param places: their positions in units of the spacing, counted from the first atom, in [0, K - 1], (B, K); what is
-        not a number makes probabilities that are none
+    :param places: their positions in units of the spacing, counted from the first atom, in [0, K - 1], (B, K); NaN is
+        passed on to probabilities of its row
     :return: probabilities of the atoms, (B, K)
     """
     return (by_index if places.device.type == "cpu" else by_distance)(probabilities, places)

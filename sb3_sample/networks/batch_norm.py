@@ -76,7 +76,7 @@ class BatchNorm(nn.Module):
         return torch.addcmul(offset, centred, scale)
 
     def _scale_and_offset(self, mean: torch.Tensor, var: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """What to multiply a batch by, whose mean is 0 now, and what to add, given its moments."""
+        """Factor and offset of a batch from which its mean has been subtracted, given its moments."""
         return self.weight * (var + self.eps).rsqrt(), self.bias
 
     @torch.no_grad()

@@ -19,8 +19,8 @@ class UnitNorm(nn.Module):
     @torch.no_grad()
     def project(self) -> None:
         """Bring the weights back to length 1, in place."""
-        # The inputs are axis 1 of (out, in) and of (E, in, out) alike; over the latter's, vector_norm takes ten times as
-        # long on a CPU.
+        # The inputs are axis 1 of (out, in) and of (E, in, out) alike. Over those of the second, vector_norm takes ten
+        # times as long on a CPU.
         length = self.weight.square().sum(dim=1, keepdim=True).sqrt()
         if not self.joint_bias:
             self.weight.div_(length.clamp_min(1e-8))
