@@ -314,9 +314,12 @@ def test_every_number_may_differ(maker: str) -> None:
             (batch.observations, learner.explorer.draw_noise(learner, batch.observations))
             for batch, learner in zip(batches, learners, strict=True)
         ]
-        found = group.act(inputs)
-        for model, own, theirs in zip(alone, inputs, found, strict=True):
-            assert torch.allclose(model.learner.action_step(*own)["actions"], theirs["actions"], atol=1e-4)
+        found = [each["actions"].clone() for each in group.act(inputs)]
+        # From the same parameters: a bias before batch norm moves by rounding, which shows in evaluation mode.
+        group.release()
+        for learner, own, actions in zip(learners, inputs, found, strict=True):
+            assert torch.allclose(learner.action_step(*own)["actions"], actions, atol=1e-5)
+    assert not torch.allclose(found[0], found[1], atol=1e-2)
 
 
 def test_frozen_parameters() -> None:
