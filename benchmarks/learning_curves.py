@@ -64,6 +64,8 @@ SB3 = "SAC (stable_baselines3)"
 CONTRIB = "CrossQ (sb3_contrib)"
 #: Steps from one state of SB3 or CONTRIB to the next.
 SAVE_EVERY = 1_000
+#: Monitor file of the one environment.
+MONITOR = "0.monitor.csv"
 
 
 def environment(args: argparse.Namespace, seed: int, folder: Path | None = None, resumed: bool = False) -> VecEnv:
@@ -95,7 +97,10 @@ def build(agent: str, env: VecEnv, seed: int) -> Any:
 
 
 class SaveState(BaseCallback):
-    """Save the agent and its replay buffer in ``FOLDER/STEPS``, and delete the state before once they are complete."""
+    """
+    Save the agent, its replay buffer and the Monitor file in ``FOLDER/states/STEPS``, and delete the state before once
+    they are complete.
+    """
 
     model: OffPolicyAlgorithm
 
@@ -106,25 +111,28 @@ class SaveState(BaseCallback):
     def _on_step(self) -> bool:
         if self.num_timesteps % SAVE_EVERY == 0:
             before = saved_states(self.folder)
-            new = self.folder / "incomplete"
+            states = self.folder / "states"
+            new = states / "incomplete"
             shutil.rmtree(new, ignore_errors=True)
             new.mkdir(parents=True)
             self.model.save(new / "model")
             self.model.save_replay_buffer(new / "replay_buffer")
-            new.rename(self.folder / str(self.num_timesteps))
+            shutil.copy(self.folder / MONITOR, new)
+            new.rename(states / str(self.num_timesteps))
             for state in before:
                 shutil.rmtree(state)
         return True
 
 
 def saved_states(folder: Path) -> list[Path]:
-    """Complete states in ``folder``, the last at the end."""
-    states = [state for state in folder.glob("*") if state.name.isdecimal()]
+    """Complete states of the run in ``folder``, the last at the end."""
+    states = [state for state in folder.glob("states/*") if state.name.isdecimal()]
     return sorted(states, key=lambda state: int(state.name))
 
 
 def resume(args: argparse.Namespace, state: Path, folder: Path, evaluation: EvalCallback) -> OffPolicyAlgorithm:
-    """The agent of ``state``, with a new episode and new random numbers, and the evaluations up to there."""
+    """The agent of ``state``, with a new episode and new random numbers; evaluations and episodes end there."""
+    shutil.copy(state / MONITOR, folder)
     agent = stable_baselines3.SAC if args.agent == SB3 else sb3_contrib.CrossQ
     model: OffPolicyAlgorithm = agent.load(
         state / "model", environment(args, args.seed, folder, resumed=True), device="cpu"
@@ -160,7 +168,7 @@ def main(given: list[str] | None = None) -> None:
         environment(args, args.seed + 1_000), n_eval_episodes=args.eval_episodes, eval_freq=args.eval_freq,
         log_path=str(folder), verbose=0,
     )  # fmt: skip
-    states = saved_states(folder / "states")
+    states = saved_states(folder)
     if states:
         model = resume(args, states[-1], folder, evaluation)
     else:
@@ -170,7 +178,7 @@ def main(given: list[str] | None = None) -> None:
     peer = args.agent in (SB3, CONTRIB)
     model.learn(
         args.steps - model.num_timesteps,
-        callback=[evaluation, SaveState(folder / "states")] if peer else evaluation,
+        callback=[evaluation, SaveState(folder)] if peer else evaluation,
         reset_num_timesteps=not states,
     )
     model.save(folder / "model")
