@@ -176,7 +176,8 @@ def check_arguments(
     kinds = {name: parameter.kind for name, parameter in signature.parameters.items()}
     many = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     allowed = [name for name, kind in list(kinds.items())[len(given) :] if kind not in many and name not in fixed]
-    if inspect.Parameter.VAR_KEYWORD not in kinds.values():
+    # torch's __init__ takes any arguments, to refuse them.
+    if inspect.Parameter.VAR_KEYWORD not in kinds.values() or getattr(cls, "__init__", None) is nn.Module.__init__:
         for name in kwargs:
             if name not in allowed:
                 where = argument if argument.endswith("]") else f"{argument}_kwargs"

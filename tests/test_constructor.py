@@ -114,6 +114,14 @@ def test_a_name_that_is_none_is_refused_with_the_one_that_was_meant() -> None:
         BRO("MlpPolicy")  # type: ignore[call-arg]
 
 
+def test_an_argument_of_learn_is_refused_with_its_place() -> None:
+    for cls in (BRO, MBMAPPO):
+        with pytest.raises(
+            TypeError, match=rf"^{cls.__name__}: .*'callback'\. It is passed as learn\(callback=\.\.\.\)$"
+        ):
+            cls("MlpPolicy", "Pendulum-v1", callback=None)  # type: ignore[call-arg]
+
+
 def test_an_argument_of_the_policy_is_refused_with_its_place() -> None:
     with pytest.raises(TypeError, match=r"'n_critics'\. It is passed as policy_kwargs=dict\(n_critics=\.\.\.\)$"):
         BRO("MlpPolicy", "Pendulum-v1", n_critics=5)  # type: ignore[call-arg]

@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -83,6 +84,7 @@ def train_many(
     :raises TypeError: if ``cls`` has no such argument
     """
     _check_class(cls)
+    _check_arguments(cls, arguments)
     names = _checked_seeds(seeds)
     for name, value in (("env", env), ("eval_env", eval_env)):
         _check_env(name, value)
@@ -189,6 +191,19 @@ def _check_class(cls: Any) -> None:
         f"cls must be an off-policy algorithm of this package, SAC or a class derived from it, not {shown}: the "
         "learners' gradient steps have to be alike, on batches of a replay buffer"
     )
+
+
+def _check_arguments(cls: type[SAC], arguments: Mapping[str, Any]) -> None:
+    """Refuse arguments of ``learn`` that ``train_many`` does not take, which are none of ``cls``."""
+    of_learn = inspect.signature(cls.learn).parameters
+    own = inspect.signature(train_many).parameters
+    for name in arguments:
+        if name in of_learn:
+            taken = ", ".join(each for each in of_learn if each in own)
+            raise TypeError(
+                f"train_many: got an unexpected keyword argument {name!r}, an argument of learn, of which it takes "
+                f"{taken}"
+            )
 
 
 def _checked_seeds(seeds: Any) -> list[int]:

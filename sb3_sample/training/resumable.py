@@ -72,7 +72,10 @@ class Resumable(Constructed, Exportable, BaseAlgorithm):
     def place_of(cls, name: str) -> str:
         of_policy = inspect.signature(next(iter(cls.policy_aliases.values()))).parameters.get(name)
         is_choice = of_policy is not None and of_policy.default is not inspect.Parameter.empty
-        return f"policy_kwargs=dict({name}=...)" if is_choice else ""
+        if is_choice:
+            return f"policy_kwargs=dict({name}=...)"
+        of_learn = inspect.signature(cls.learn).parameters
+        return f"learn({name}=...)" if name in of_learn and name != "self" else ""
 
     def _setup_model(self) -> None:
         self._check_arguments()

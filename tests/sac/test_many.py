@@ -407,6 +407,12 @@ def test_what_the_constructor_refuses() -> None:
         train_many(SAC, "MlpPolicy", Toy, seeds=(1, 2), total_timesteps=5, learning_rat=1.0)
 
 
+def test_arguments_of_learn_that_are_not_taken_are_refused() -> None:
+    words = "train_many: .*'progress_bar', an argument of learn, of which it takes total_timesteps, callback, log_inter"
+    with pytest.raises(TypeError, match=words):
+        train_many(SAC, "MlpPolicy", Toy, seeds=(1, 2), total_timesteps=5, progress_bar=True)
+
+
 def test_what_cannot_be_taken_together(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(learners: Sequence[Any]) -> Any:
         raise ValueError(f"{len(learners)} learners: critic_network=Own cannot be batched")

@@ -206,6 +206,10 @@ def test_a_part_given_at_loading_is_taken_or_refused(tmp_path: Path) -> None:
         BRO.load(tmp_path / "m", env=vec(), exploration="actor", exploration_kwargs=None)
     with pytest.raises(ValueError, match="exploration_kwargs has 'network_kwargs', but exploration='actor' takes none"):
         BRO.load(tmp_path / "m", env=vec(), exploration="actor")
+    sac(value_head="categorical", value_head_kwargs={"v_min": -5.0}).save(tmp_path / "m")
+    # A class without an __init__ of its own.
+    with pytest.raises(ValueError, match="value_head_kwargs has 'v_min', but value_head='half_squared' takes none"):
+        SAC.load(tmp_path / "m", env=vec(), value_head="half_squared")
 
 
 def test_n_step_returns_are_those_of_the_arguments(tmp_path: Path) -> None:
