@@ -159,8 +159,9 @@ def main(given: list[str] | None = None) -> None:
     parser.add_argument("--eval-freq", type=int, default=5_000)
     parser.add_argument("--eval-episodes", type=int, default=5)
     parser.add_argument("--output", type=Path, default=Path("runs"))
+    parser.add_argument("--threads", type=int, default=1, help="threads of torch")
     args = parser.parse_args(given)
-    torch.set_num_threads(1)
+    torch.set_num_threads(args.threads)
 
     folder = args.output / args.agent / f"seed_{args.seed}"
     folder.mkdir(parents=True, exist_ok=True)
