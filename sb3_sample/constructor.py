@@ -236,7 +236,7 @@ def _constructor(cls: type[Constructed], signature: inspect.Signature) -> Callab
             bound = signature.bind(self, *args, **kwargs)
         except TypeError as error:
             raise TypeError(f"{type(self).__name__}: {error}{_meant(type(self), signature, kwargs)}") from None
-        passed = set(bound.arguments)
+        passed = set(bound.arguments) - {"self"}
         bound.apply_defaults()
         given = Given(bound.arguments, passed)
         del given["self"]

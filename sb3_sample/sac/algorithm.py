@@ -154,9 +154,7 @@ class SAC(  # type: ignore[misc]  # actor
         if isinstance(kwargs := given["policy_kwargs"], dict) and kwargs.get("use_sde") is False:
             # Stable-Baselines3's SAC writes it into the dict that it is given, which a script may pass to both.
             given["policy_kwargs"] = {name: value for name, value in kwargs.items() if name != "use_sde"}
-        if given["train_freq"] is not None or given["gradient_steps"] is not None:
-            # Stable-Baselines3's two arguments are in force.
-            given["replay_ratio"] = None
+        self._settle_replay_ratio(given)
         if given["reset_gradient_steps"] is not None and given["resets"] is default_of(type(self), "resets"):
             # A class's default resets give way. Compared by identity: resets that are passed, even equal ones, are
             # another object.
@@ -164,8 +162,6 @@ class SAC(  # type: ignore[misc]  # actor
         if given["backbone"] == "td3" and "ent_coef" not in given.passed:
             # A class's default weighs an entropy, which this actor has not.
             given["ent_coef"] = "auto"
-        for name in "train_freq", "gradient_steps":
-            given[name] = 1 if given[name] is None else given[name]
         is_set_up = given.pop("_init_setup_model")
         spaces_given = {name: given.pop(name) for name in ("observation_space", "action_space")}
         theirs = self._store(given, OffPolicyAlgorithm)
@@ -303,15 +299,11 @@ class SAC(  # type: ignore[misc]  # actor
 
     @classmethod
     def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
-        implied: dict[str, Any] = {}
+        implied = super()._implied(kwargs)
         if "compile" in kwargs:
             implied["compiled"] = None
         if "schedule_steps" in kwargs:
             implied["planned_updates"] = kwargs["schedule_steps"]
-        if kwargs.get("train_freq") is not None or kwargs.get("gradient_steps") is not None:
-            implied["replay_ratio"] = None
-        elif kwargs.get("replay_ratio") is not None:
-            implied |= {"train_freq": 1, "gradient_steps": 1}
         if "prior_data" in kwargs and kwargs["prior_data"] is None:
             implied |= {"_prior_of": None, "prior_share": default_of(cls, "prior_share")}
         if kwargs.get("backbone") == "td3":
@@ -330,8 +322,6 @@ class SAC(  # type: ignore[misc]  # actor
     @classmethod
     def _completed(cls, content: Any, kwargs: dict[str, Any]) -> dict[str, Any]:
         kwargs = super()._completed(content, kwargs)
-        for name in {"train_freq", "gradient_steps"} & kwargs.keys():
-            kwargs = {**kwargs, name: 1 if kwargs[name] is None else kwargs[name]}
         if "reward_scale" not in kwargs:
             return kwargs
         try:

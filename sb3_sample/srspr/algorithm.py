@@ -69,11 +69,7 @@ class SRSPR(  # type: ignore[misc]
     def _construct(self, given: Given) -> None:
         check_program(type(self), given)
         given["env"] = _made(given["env"])
-        if given["train_freq"] is not None or given["gradient_steps"] is not None:
-            # Stable-Baselines3's two arguments replace it.
-            given["replay_ratio"] = None
-        for name in "train_freq", "gradient_steps":
-            given[name] = 1 if given[name] is None else given[name]
+        self._settle_replay_ratio(given)
         is_set_up = given.pop("_init_setup_model")
         theirs = self._store(given, OffPolicyAlgorithm)
         OffPolicyAlgorithm.__init__(self, **theirs, sde_support=False, support_multi_env=True)
@@ -153,10 +149,8 @@ class SRSPR(  # type: ignore[misc]
 
     @classmethod
     def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
-        implied: dict[str, Any] = {"compiled": None} if "compile" in kwargs else {}
-        if "train_freq" in kwargs or "gradient_steps" in kwargs:
-            implied["replay_ratio"] = None
-        return implied
+        implied = super()._implied(kwargs)
+        return {**implied, "compiled": None} if "compile" in kwargs else implied
 
     @classmethod
     def _made(  # type: ignore[override]

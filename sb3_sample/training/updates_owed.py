@@ -1,8 +1,25 @@
 """Gradient steps due for collected transitions, in every algorithm with a replay buffer."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+
+from sb3_sample.constructor import Given
+from sb3_sample.warn import warn
+
+
+def replacing_replay_ratio(passed: Mapping[str, Any]) -> str:
+    """
+    Find which of Stable-Baselines3's arguments replaces ``replay_ratio``.
+
+    :param passed: arguments that were passed, by name
+    :return: ``train_freq`` or ``gradient_steps`` with its value, in the form of the call; empty if neither was passed
+    """
+    for name in ("train_freq", "gradient_steps"):
+        if passed.get(name) is not None:
+            return f"{name}={passed[name]!r}"
+    return ""
 
 
 class UpdatesOwed:
@@ -10,6 +27,38 @@ class UpdatesOwed:
     Part of an algorithm with ``replay_ratio``, ``train_freq``, ``gradient_steps`` and ``_updates_owed``, before
     Stable-Baselines3's class.
     """
+
+    @staticmethod
+    def _settle_replay_ratio(given: Given) -> None:
+        """
+        Decide between ``replay_ratio`` and Stable-Baselines3's two arguments, which are 1 unless they were passed.
+
+        :param given: arguments of the constructor, changed in place
+        """
+        if replacing := replacing_replay_ratio(given):
+            if "replay_ratio" in given.passed and given["replay_ratio"] is not None:
+                warn(f"replay_ratio={given['replay_ratio']!r} has no effect with {replacing}: pass one of the two")
+            given["replay_ratio"] = None
+        for name in "train_freq", "gradient_steps":
+            given[name] = 1 if given[name] is None else given[name]
+
+    @classmethod
+    def _implied(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
+        implied: dict[str, Any] = super()._implied(kwargs)  # type: ignore[misc]
+        replay_ratio = kwargs.get("replay_ratio")
+        if replacing := replacing_replay_ratio(kwargs):
+            if replay_ratio is not None:
+                raise ValueError(f"replay_ratio={replay_ratio!r} has no effect with {replacing}: pass one of the two")
+            implied["replay_ratio"] = None
+        elif replay_ratio is not None:
+            implied |= {"train_freq": 1, "gradient_steps": 1}
+        return implied
+
+    @classmethod
+    def _completed(cls, content: Any, kwargs: dict[str, Any]) -> dict[str, Any]:
+        kwargs = super()._completed(content, kwargs)  # type: ignore[misc]
+        nothing = [name for name in ("train_freq", "gradient_steps") if kwargs.get(name, name) is None]
+        return {**kwargs, **dict.fromkeys(nothing, 1)}
 
     @property
     def _tasks_together(self: Any) -> int:

@@ -233,7 +233,12 @@ ROWS: dict[str, list[tuple[type[SAC], dict[str, Any], tuple[str, ...]]]] = {
             for network in ("crossq", "flash", "xqc")
         ),
     ],
-    '`BC` with anything of critics, `reward_scale`, `actor_first`, or `exploration` other than `"actor"`': [
+    (
+        "`BC` with anything of critics and their targets (`gamma`, `tau`, `target_update_interval`), `prior_data`, "
+        '`reward_scale`, `actor_first`, or `exploration` other than `"actor"`'
+    ): [
+        (BC, {"gamma": 0.9}, ("gamma=0.9", "BC")),
+        (BC, {"prior_data": PRIOR}, ("prior_data", "BC")),
         (BC, {"n_quantiles": 5}, ("n_quantiles=5", "BC")),
         (BC, {"policy_kwargs": {"n_critics": 3}}, ("n_critics", "BC")),
         (BC, {"reward_scale": "xqc"}, ("reward_scale='xqc'", "BC")),
